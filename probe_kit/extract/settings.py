@@ -52,7 +52,7 @@ CONFIG = "config"
 
 
 def _read_source(value: Any) -> Any:
-    """Settings of a source from the part of a file, by its kind. Raises UsageError for what is no part."""
+    """Return settings of a source from the part of a file, by its kind. Raises UsageError for what is no part."""
     if value is None or isinstance(value, SourceSettings):
         return value
     fields = _fields_of("source", value)
@@ -60,14 +60,14 @@ def _read_source(value: Any) -> Any:
 
 
 def _fields_of(part: str, values: Any) -> dict[str, Any]:
-    """The fields of a part. Raises UsageError for what is no part, such as a text in a file."""
+    """Return the fields of a part. Raises UsageError for what is no part, such as a text in a file."""
     if not isinstance(values, Mapping | Part):
         raise UsageError(f"{part} is {values!r}; expected its settings by name, as --print-config writes them")
     return dict(values)
 
 
 def _checked_label(label: str | None) -> str | None:
-    """The label. Raises UsageError for one that tables cannot show."""
+    """Return the label. Raises UsageError for one that tables cannot show."""
     if label is not None:
         from probe_kit.runs.root import check_label
 
@@ -76,7 +76,7 @@ def _checked_label(label: str | None) -> str | None:
 
 
 def _model_of(settings: "type[Settings]", part: str) -> Any:
-    """The model of a part; the base class, which is never made, has several."""
+    """Return the model of a part; the base class, which is never made, has several."""
     return settings.model_fields[part].annotation
 
 
@@ -84,7 +84,8 @@ class Settings(Part):
     """Settings of a run of any kind; the defaults are the command line's.
 
     Attributes:
-        asks: Whether the model is asked, and does not act.
+        asks: Whether the model answers questions, and does not act.
+        seed: The seed from which the seeds of all rows derive.
         label: The name of the run in tables and legends; None for the model and what sets it apart, see
             `run_label`.
     """
@@ -116,11 +117,16 @@ class Settings(Part):
             )
 
     def __init__(self, model: Any = None, checkpoint: str | None = None, **values: Any) -> None:
-        """Take parts, or fields of any part by their names. model: a family, or the part.
+        """Take parts, or fields of any part by their names.
+
+        Args:
+            model: The name of a family, or the part `model`.
+            checkpoint: The field `checkpoint` of the model; None leaves it out.
+            **values: Parts, or fields of any part, by name.
 
         Raises:
             UsageError: For values that cannot be used.
-            SceneError: For values that cannot be used.
+            SceneError: For values that no scene can have.
             TypeError: For a name that is no field.
         """
         fields = {} if checkpoint is None else {"checkpoint": checkpoint}
@@ -138,7 +144,7 @@ class Settings(Part):
 
     @classmethod
     def _by_part(cls, model: Any, values: Mapping[str, Any]) -> dict[str, Any]:
-        """The values of `__init__` by part, with a scene for a source that has one."""
+        """Return the values of `__init__` by part, with a scene for a source that has one."""
         places = {name: part for part in _PARTS for name in _model_of(cls, part).model_fields}
         places |= dict.fromkeys((*SceneSettings.model_fields, *SceneOptions.model_fields), "source")
         places |= dict.fromkeys(cls.model_fields, "")
@@ -165,12 +171,12 @@ class Settings(Part):
         return {*cls.model_fields}.union(*(_model_of(cls, part).model_fields for part in _PARTS))
 
     def changed(self, **values: Any) -> Self:
-        """The settings with other fields, by their names; fields of a scene replace those of the scene."""
+        """Return the settings with other fields, by their names; fields of a scene replace those of the scene."""
         return type(self)(**(dict(self) | values))
 
     @classmethod
     def option_models(cls) -> Iterator[Any]:
-        """The models whose fields are the options of a command that makes these settings."""
+        """Yield the models whose fields are the options of a command that makes these settings."""
         yield from (_model_of(cls, part) for part in _PARTS)
         yield from (cls, SceneOptions, *SOURCES)
 
@@ -178,15 +184,16 @@ class Settings(Part):
     def of_command(
         cls, typed: Mapping[str, Any], file: Mapping[str, Any] | None = None, **further_fields: Any
     ) -> Self:
-        """The settings of a command.
+        """Return the settings of a command.
 
         Args:
             typed: The values that were typed, by parameter.
-            file: Settings by part, which typed ones replace.
-            **further_fields: By name.
+            file: Settings by part, which typed ones replace; None for the defaults.
+            **further_fields: Fields that no option gives, by name.
 
         Raises:
-            UsageError: For two sources, for options of another source, and what `__init__` raises.
+            UsageError: For two sources, for options of another source, and as `__init__` raises it.
+            SceneError: As `__init__` raises it.
         """
         parts = [
             option for part in (*(_model_of(cls, part) for part in _PARTS), cls) for option in options_of(part)
@@ -219,7 +226,7 @@ class Settings(Part):
     def _typed_source(
         cls, typed: Mapping[str, Any], before: SourceSettings | None
     ) -> tuple[type[SourceSettings], dict[str, Any]]:
-        """The kind of source that options name, and the values of its fields."""
+        """Return the kind of source that options name, and the values of its fields."""
         options = {
             kind: {option.parameter: option for option in kind.command_options().values()} for kind in SOURCES
         }
@@ -242,17 +249,17 @@ class Settings(Part):
 
     @property
     def wordings(self) -> "tuple[Wording, ...] | None":
-        """The wordings that every item is asked in, None for its own words alone."""
+        """The wordings in which every item is asked, None for its own words alone."""
         wordings: tuple[Wording, ...] | None = dict(self.source).get("wordings")
         return wordings
 
     def config(self) -> dict[str, Any]:
-        """All settings by part as plain values, of which `--config` makes them again."""
+        """Return all settings by part as plain values, of which `--config` makes them again."""
         by_part: dict[str, Any] = json.loads(self.model_dump_json())
         return by_part
 
     def stored_config(self) -> dict[str, Any]:
-        """All settings by part as a run stores them: without machine, label and places of this machine.
+        """Return all settings by part as a run stores them, without machine, label and folders of this machine.
 
         The process that plays records where these files lie.
         """
@@ -265,7 +272,7 @@ class Settings(Part):
         return {**config, "source": self.source.with_files(config["source"], files)}
 
     def identity(self) -> dict[str, Any]:
-        """Seed, capture and task, and what was requested of the model; neither machine nor label.
+        """Return seed, capture and task, and what was requested of the model; neither machine nor label.
 
         What model and source lead to, weights and rows, is known once they are opened.
         """
@@ -278,7 +285,7 @@ class Settings(Part):
         return {**model, "seed": self.seed, **self.capture.model_dump(mode="json"), **calls}
 
     def changed_fields(self) -> dict[str, Any]:
-        """The fields of all parts but the source that differ from their defaults, by name."""
+        """Return the fields of all parts but the source that differ from their defaults, by name."""
         parts = [getattr(self, part) for part in _PARTS]
         values = {
             name: value for part in parts for name, value in part if value != type(part).model_fields[name].default
@@ -288,27 +295,27 @@ class Settings(Part):
         }
 
     def most_inferences(self, execute: int) -> int:
-        """Inferences that an episode can have with `execute` actions per inference."""
+        """Return how many inferences an episode can have with `execute` actions per inference."""
         return -(-self.source.steps() // max(1, execute))
 
     def with_every_call(self, execute: int) -> Self:
-        """The settings with a number in place of `captured_calls` `all`."""
+        """Return the settings with a number in place of `captured_calls` `all`."""
         every = self.capture.captured_calls == "all"
         return self.changed(captured_calls=self.most_inferences(execute)) if every else self
 
     def followed(self) -> Self:
-        """The settings with all that a protocol decides of the task; of a question it decides the scene alone."""
+        """Return the settings with all that a protocol decides; of a question it decides the scene alone."""
         return self
 
     def follows(self) -> dict[str, Any]:
-        """The protocol that the task follows, as a run stores it; empty without one."""
+        """Return the protocol that the task follows, as a run stores it; empty without one."""
         return {}
 
     def refuse(self, names: Iterable[str], why: str) -> None:
         """Raise UsageError for fields that were chosen and have no effect.
 
         Args:
-            names: Of fields, or NAME=VALUE where only that value has none.
+            names: Names of fields, or NAME=VALUE where only that value has no effect.
             why: The remainder of the sentence.
         """
         changed, wrong = self.changed_fields(), []
@@ -323,19 +330,19 @@ class Settings(Part):
             raise UsageError(f"{', '.join(wrong)} {why}")
 
     def folder_name(self, digest: str) -> str:
-        """The default name of a run's folder. digest: of what the run depends on."""
+        """Return the default name of a run's folder, from the digest of what the run depends on."""
         return f"{self.model.family}-{digest}"
 
     def marks(self) -> list[str]:
-        """The parts of a label behind the model and its checkpoint."""
+        """Return the parts of a label behind the model and its checkpoint."""
         return []
 
 
 class ExtractSettings(Settings):
     """All settings of `probe-kit extract`; the model may also be scripted: `expert`, `expert-mirrored`, `idle`.
 
-    source: in place of suite and scene, recordings to show, and the model does not act; or an environment of the
-    user's own, in which it acts.
+    The part `source` may be recordings to show, in place of suite and scene, and the model does not act. It may
+    also be an environment of the user's own, in which the model acts.
     """
 
     capture: Capture
@@ -365,11 +372,11 @@ class ExtractSettings(Settings):
         return {**super().identity(), **task, **rotation, **self.follows()}
 
     def follows(self) -> dict[str, Any]:
-        """The protocol, and where the run differs from it."""
+        """Return the protocol, and where the run differs from it."""
         return protocol_identity(self.model, self.task, self.source)
 
     def followed(self) -> Self:
-        """The settings with all that was not chosen as their protocol has it for the model.
+        """Return the settings with all that was not chosen as their protocol sets it for the model.
 
         Raises:
             UsageError: For a model that the protocol does not use.
@@ -428,17 +435,17 @@ class AskSettings(Settings):
         typed: Mapping[str, Any],
         file: Mapping[str, Any] | None = None,
     ) -> list[Self]:
-        """Settings of one run per prompt and picture size, prompts outermost.
+        """Return the settings of one run per prompt and picture size, prompts outermost.
 
         Args:
             prompts: Names or files of templates; None for those of the file, else those of the paper, or for the
                 instruction on a source without objects.
             picture_sizes: (width, height) in pixels, of a scene; None for the file's, else 224 x 224.
-            typed: See `of_command`.
-            file: As `typed`.
+            typed: The values that were typed, by parameter.
+            file: Settings by part, which typed ones replace; None for the defaults.
 
         Raises:
-            UsageError: For two runs of one name, and what `of_command` raises.
+            UsageError: For two runs of one name, and as `of_command` raises it.
         """
         parameters = {option.parameter for kind in SOURCES for option in options_of(kind)}
         options = {name: value for name, value in typed.items() if name in parameters}
@@ -462,13 +469,13 @@ class AskSettings(Settings):
 
     @property
     def short_name(self) -> str:
-        """Prompt, size of the picture and what is unusual, as a folder is called."""
+        """The prompt, the size of the picture and what is unusual, as in a folder's name."""
         task = self.task
         parts = [task.prompt.name, self.source.picture_words, task.picture, task.query]
         return "-".join(part for part in parts if part not in ("", "frame", "target"))
 
     def folder_name(self, digest: str) -> str:
-        """The default name of a run's folder, with prompt and size of the picture."""
+        """Return the default name of a run's folder, with prompt and size of the picture."""
         return f"ask-{self.model.family}-{self.short_name}-{digest}"
 
     def identity(self) -> dict[str, Any]:
@@ -486,7 +493,7 @@ class AskSettings(Settings):
         return {**super().identity(), "ask": ask}
 
     def marks(self) -> list[str]:
-        """Prompt and size, and what is unusual about picture and object."""
+        """Return prompt and size, and what is unusual about picture and object."""
         task, size = self.task, self.source.picture_words.replace("x", "×")
         return [
             task.prompt.name,
@@ -497,7 +504,7 @@ class AskSettings(Settings):
 
 
 def _merged(former: Part, fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Typed fields, in which KEY=VALUE options replace those of equal keys alone."""
+    """Return typed fields, in which KEY=VALUE options replace those of equal keys alone."""
     if "options" not in fields:
         return dict(fields)
     return {**fields, "options": {**dict(former)["options"], **read_options(fields["options"])}}
@@ -510,7 +517,7 @@ def _refuse(names: Iterable[str], source: type[SourceSettings]) -> NoReturn:
 
 
 def _with_scene(parts: Mapping[str, Any], fields: dict[str, Any]) -> Any:
-    """The source of settings by part. fields: of a scene and its questions, by name.
+    """Return the source of settings by part, with `fields` of a scene and its questions, by name.
 
     Raises:
         UsageError: For such fields with another source.
@@ -533,14 +540,14 @@ def _with_scene(parts: Mapping[str, Any], fields: dict[str, Any]) -> Any:
 
 
 def _short(checkpoint: str) -> str:
-    """The last part of a checkpoint's name; a revision may have slashes of its own."""
+    """Return the last part of a checkpoint's name; a revision may have slashes of its own."""
     name, at, revision = checkpoint.partition("@")
     on_hub = bool(at) and is_on_hub(checkpoint)
     return f"{Path(name).name}@{revision.replace('/', '-')}" if on_hub else Path(checkpoint).name
 
 
 def run_label(settings: Settings) -> str:
-    """The name of the run in tables: checkpoints and options of one family differ in it."""
+    """Return the name of the run in tables: checkpoints and options of one family differ in it."""
     if settings.label is not None:
         # A model is asked in several runs of one label.
         return " · ".join([settings.label, *(settings.marks() if settings.asks else [])])

@@ -19,28 +19,28 @@ if TYPE_CHECKING:
 
 
 EPISODE = 40_000
-"""Bytes of an episode's commit, trajectory and files of the file system (measured: 12 to 30 kB)."""
+"""The bytes of an episode's commit, trajectory and files of the file system (measured: 12 to 30 kB)."""
 THUMBNAILS = 15_000
-"""Bytes of the first and last frame of an episode."""
+"""The bytes of the first and last frame of an episode."""
 FRAME = 5_000
-"""Bytes of a small frame where all are kept (measured: 4 kB)."""
+"""The bytes of a small frame where all are kept (measured: 4 kB)."""
 FILM = 1_500_000
-"""Bytes of a film of sixty actions."""
+"""The bytes of a film of sixty actions."""
 DECISION = 16
-"""Bytes that probes keep per site and episode: decisions, labels and directions, by category and pooled."""
+"""The bytes that probes keep per site and episode: decisions, labels and directions, by category and pooled."""
 _PICTURE, _INSTRUCTION = (480, 640), "put the red block on the green plate to the left"
-"""An observation of usual size, of which tokens are counted where nothing else is asked."""
+"""An observation of usual size, whose tokens are counted where no other is known."""
 REPORT = 5_000_000
-"""Bytes of a report with its figures."""
+"""The bytes of a report with its figures."""
 
 
 def space_needed(plan: Plan, settings: Settings) -> dict[str, int]:
-    """Bytes by part, uncompressed. Probes are those of one view; more views take as much again each."""
+    """Return the bytes by part, uncompressed. Probes are those of one view; each further view takes as much."""
     return space_of(plan.streams, len(plan.episodes), settings)
 
 
 def space_of(streams: Sequence[StoredStream], episodes: int, settings: Settings) -> dict[str, int]:
-    """The same for a number of episodes that store these streams."""
+    """Return the bytes by part, uncompressed, of a number of episodes that store these streams."""
     calls, later, with_tokens = (
         settings.capture.calls,
         settings.capture.later_views,
@@ -61,10 +61,12 @@ def space_of(streams: Sequence[StoredStream], episodes: int, settings: Settings)
 
 @dataclass(frozen=True)
 class PlannedSizes:
-    """The sizes of a model that was not loaded. streams: as a run stores them. source: whose sizes these are.
+    """The sizes of a model that was not loaded.
 
     Attributes:
-        outline: The model without numbers, where its configuration is here.
+        streams: The streams as a run stores them.
+        source: The origin of the sizes, in words.
+        outline: The model without weights, where its configuration is on this machine.
     """
 
     streams: tuple[StoredStream, ...]
@@ -73,20 +75,22 @@ class PlannedSizes:
 
     @property
     def execute(self) -> int:
-        """Actions of an inference that are executed; 1 where that is not known, as a model may execute more."""
+        """The number of executed actions of an inference; 1 if it is unknown, as a model may execute more."""
         model = None if self.outline is None else self.outline.model
         return 1 if model is None else max(1, model.card.execute)
 
 
 def planned_sizes(settings: Settings, instructions: Sequence[str] = ()) -> PlannedSizes | None:
-    """The streams of a model by its configuration, where that is here, else as its family declares them.
+    """Return the streams of a model by its configuration, where that is here, else as its family declares them.
+
+    Reads no weights and asks no network. A checkpoint in a folder raises what loading it raises.
 
     Args:
-        instructions: Texts that it will read, for the number of tokens; else one of about ten words.
+        settings: The settings of the run.
+        instructions: The texts that it will read, for the number of tokens; empty for one of about ten words.
 
     Returns:
-        None for a model that declares none. Reads no weights and asks no network. Raises what loading raises for a
-        checkpoint in a folder.
+        None for a model that declares no streams.
     """
     from probe_kit.hooks.registry import get_family
 
@@ -118,7 +122,7 @@ def planned_sizes(settings: Settings, instructions: Sequence[str] = ()) -> Plann
 
 
 def _tokens(model: "Model", instructions: Sequence[str]) -> dict[str, int]:
-    """The longest sequence of every stream; empty where its tokenizer or processor is not here."""
+    """Return the longest sequence of every stream; empty where its tokenizer or processor is not here."""
     from probe_kit.hooks.checkpoints.checkpoint import without_network
     from probe_kit.hooks.contract.observation import Observation
 
@@ -135,7 +139,7 @@ def _tokens(model: "Model", instructions: Sequence[str]) -> dict[str, int]:
 def _parameters(
     family: "Family", checkpoint: str | None, options: Mapping[str, Any], dtype: str | None
 ) -> int | None:
-    """Parameters of a network of the configuration that is here; None where it is not, or cannot be built."""
+    """Count the parameters of a network by the configuration that is here; None without a usable one."""
     try:
         outline = family.outline(checkpoint, options, dtype)
     except ProbeKitError:  # a plan or a run of this checkpoint says what is wrong with it
@@ -150,15 +154,18 @@ def weights_needed(
     dtype: str | None,
     parameters: int | None = None,
 ) -> str:
-    """Memory for the weights and the size of a download, in words; empty for a model that declares no size.
+    """Return memory for the weights and the size of a download, in words; empty for a model that declares no size.
 
-    Of the checkpoint's configuration where it is here, else of the released size.
+    The sizes are those of the checkpoint's configuration where it is here, else the released ones. No network is
+    asked: a download is counted from the index of the weights in the cache. Else it is estimated from the number
+    of parameters, whose stored precision is not known.
 
     Args:
-        dtype: None for both.
-        parameters: Of a model that is loaded; None for one that is not. No network is asked: a download is counted
-            from the index of the weights in the cache, else estimated from the number of parameters, whose stored
-            precision is not known.
+        model: The name of a family.
+        checkpoint: A folder or hub id; None for the family's default.
+        options: The options of the family, by name.
+        dtype: The data type of the weights; None for float32 and bfloat16.
+        parameters: The number of parameters of a model that is loaded; None for one that is not.
     """
     from probe_kit.hooks.registry import get_family
     from probe_kit.runs.run_folders import in_units

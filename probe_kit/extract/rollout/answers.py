@@ -378,9 +378,9 @@ class Choice:
 def letter_margins(
     model: "AnswerModel", residuals: NDArray[np.float32], letters: NDArray[Any], margin: float
 ) -> list[float]:
-    """Return the logit lens at every layer: the letter for left minus that for right, by the model's norm and head.
+    """Return the logit lens at every layer: the letter for left minus that for right, by the model's own head.
 
-    One layer is computed at a time, so that no batch changes a number.
+    The model's own norm comes before its head. One layer is computed at a time, so that no batch changes a number.
 
     Args:
         model: A model with an unembedding.

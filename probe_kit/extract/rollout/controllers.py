@@ -401,7 +401,7 @@ class PolicyController(ModelController["Policy", Observation]):
     outputs = "actions"
 
     def __init__(self, policy: "Policy", source: Source[Any], settings: ExtractSettings) -> None:
-        """Prepare a policy for a source as it is shown that. Raises UsageError for more actions than a chunk has."""
+        """Prepare a policy for a source as it is shown it. Raises UsageError for more actions than a chunk."""
         task, card, self._source = settings.task, policy.card, source
         with while_acting(settings.model.family, card.checkpoint):
             # Of all instructions: the store makes room for the longest prompt.
@@ -495,7 +495,7 @@ class PolicyController(ModelController["Policy", Observation]):
         return executed_actions(chunks, self.execute, exponent, self.rotation)
 
     def certificate(self) -> dict[str, Any]:
-        """Return the certificate of every model, with the rotation that reached the arm's controller, and edits."""
+        """Return the certificate of every model, with the rotation that reached the arm's controller and edits."""
         rotation = {} if self.capture_only or self._source.own_units else {"rotation": self.rotation}
         return {**super().certificate(), **rotation, **({"edits": self._edit_log} if self._edits else {})}
 

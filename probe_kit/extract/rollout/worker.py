@@ -227,10 +227,17 @@ _FILM_SIZE = (320, 240)
 
 
 class Worker:
-    """Plays and commits episodes; a context manager, because it holds simulators and a writing thread.
+    """A worker that plays and commits episodes; a context manager, as it holds simulators and a writing thread.
 
     Episodes are written by one thread while the next ones are played. An error in it is raised with the next
     episode; on leaving, whatever was handed to it is written first.
+
+    Args:
+        writer: The writer of the run.
+        settings: The settings of the run.
+        controller: The controller that infers.
+        source: The source that is played.
+        episodes: The most episodes that it will play; for few of them no processes are started.
     """
 
     def __init__(
@@ -286,7 +293,7 @@ class Worker:
         )
 
     def run(self, next_number: Callable[[], int | None]) -> Iterator[Event]:
-        """Play what `next_number` gives until it gives None; an event per episode, when it is committed."""
+        """Play what `next_number` returns until it returns None; yield an event per episode once it is committed."""
 
         def next_episode() -> Row | None:
             number = next_number()
@@ -306,7 +313,7 @@ class Worker:
             yield self._pending.popleft().result()
 
     def _write(self, playing: Playing, ending: Ending) -> Done:
-        """On the writing thread."""
+        """Write an episode, on the writing thread."""
         outcome = playing.outcome(ending)
         try:
             playing.buffers.wait()  # copies from a GPU may still be under way
@@ -326,12 +333,12 @@ class Worker:
         return Done(playing.planned.index, outcome)
 
     def _certificate(self) -> dict[str, Any]:
-        """The controller's, and the origin of this process."""
+        """Return the controller's certificate, and the origin of this process."""
         certificate = self._controller.certificate()
         return {**certificate, ORIGIN: origin_of_process(self._settings, certificate["policy"]).to_json()}
 
     def _pictures(self, planned: Row, outcome: Mapping[str, Any], ending: Ending) -> dict[str, bytes]:
-        """Content by key of what is kept for people."""
+        """Return the pictures that are kept for people, as content by key."""
         pictures = {}
         if ending.small_frames:
             frames = as_thumbnail(ending.small_frames, self._settings.machine.frames)
@@ -349,7 +356,7 @@ class Worker:
 
 @contextmanager
 def torch_threads(count: int | None) -> Iterator[None]:
-    """Let torch use so many threads in the body; None for its own choice."""
+    """Let torch use `count` threads in the body; None for its own choice."""
     # The calibration enters it too: another number of threads sums in another order, and rounds otherwise.
     if count is None:
         yield
@@ -365,7 +372,7 @@ def torch_threads(count: int | None) -> Iterator[None]:
 
 
 def _film(frames: Sequence[NDArray[np.uint8]]) -> bytes:
-    """The frames as a GIF."""
+    """Return the frames as a GIF."""
     small = [np.asarray(Image.fromarray(frame).resize(_FILM_SIZE, Image.Resampling.LANCZOS)) for frame in frames]
     with tempfile.TemporaryDirectory() as folder:  # `save_gif` writes to paths, and a run may lie in a bucket
         save_gif(Path(folder) / "film.gif", small)

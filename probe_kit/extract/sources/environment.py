@@ -23,12 +23,12 @@ SUCCESS = "success"
 
 @dataclass(frozen=True)
 class EnvEpisode:
-    """One episode that an environment can play.
+    """An episode that an environment can play.
 
     Attributes:
-        id: The same in every selection.
-        seed: Decides everything that is random.
-        instruction: What the model reads.
+        id: The name of the episode, the same in every selection.
+        seed: The seed that decides everything that is random.
+        instruction: The words that the model reads.
         group: Episodes of one group share a scene; folds and nulls keep it together. None for a group of its own.
     """
 
@@ -43,6 +43,7 @@ class Step:
     """The state of an environment after an action.
 
     Attributes:
+        observation: The observation that the model gets next.
         done: Whether the episode is over.
         facts: Numbers or truth values by name, which become labels of the next inference; every step of every
             episode has the same names. `success` becomes the outcome.
@@ -57,24 +58,25 @@ class OwnEnvironment(Protocol):
     """An environment that `extract --env MODULE:CLASS` plays; equal seeds give equal episodes.
 
     Attributes:
-        revision: What its numbers depend on, such as versions; part of a run's identity.
-        action_names: Of the numbers of an action, in the units of the checkpoint that plays it.
+        revision: A text that changes with whatever its numbers depend on, such as versions; part of a run's
+            identity.
+        action_names: The names of the numbers of an action, in the units of the checkpoint that plays it.
     """
 
     revision: str
     action_names: Sequence[str]
 
     def episodes(self) -> Iterable[EnvEpisode]:
-        """All episodes, in the same order every time."""
+        """Return all episodes, in the same order every time."""
 
     def reset(self, episode: EnvEpisode) -> Observation | Step:
-        """Set an episode up, and show its beginning; as a `Step` with the facts that are true there."""
+        """Set an episode up, and return its beginning; as a `Step` with the facts that are true there."""
 
     def step(self, action: NDArray) -> Step:  # type: ignore[type-arg]  # as a user writes it
-        """Execute one action (D,) float32."""
+        """Execute one action (D,) float32, and return the state after it."""
 
     def close(self) -> None:
-        """Free what it holds."""
+        """Free what the environment holds."""
 
 
 LEROBOT = "lerobot"
@@ -96,8 +98,11 @@ class EnvSource(SourceSettings):
             or the name of an entry point of the group `probe_kit.environments`.
         options: Keyword arguments of the class.
         episodes: Indices among its episodes; None for all.
-        max_steps: Actions after which an episode ends. pixels: whether pictures at 32 × 32 are stored for
-            controls. Raises UsageError for what no environment can have.
+        max_steps: The number of actions after which an episode ends.
+        pixels: Whether pictures at 32 × 32 are stored for controls.
+
+    Raises:
+        UsageError: For what no environment can have.
     """
 
     kind: Literal["env"] = "env"
@@ -152,7 +157,7 @@ class EnvSource(SourceSettings):
 
     @classmethod
     def with_files(cls, values: Mapping[str, Any], files: Mapping[str, str]) -> dict[str, Any]:
-        """Return the same values: they name a module, and `find_again` leads to it."""
+        """Return the same values: they name a module, and `find_again` makes it importable."""
         del files
         return dict(values)
 
@@ -163,7 +168,7 @@ class EnvSource(SourceSettings):
 
     @classmethod
     def find_again(cls, files: Mapping[str, str]) -> None:
-        """Let the module be imported from where a run imported it, behind all other places."""
+        """Let the module be imported from where a run imported it, after all other folders."""
         if (folder := files.get("environment")) is not None and folder not in sys.path:
             sys.path.append(folder)
 

@@ -19,15 +19,19 @@ from probe_kit.extract.sources.environment_source import (
 )
 
 STEPS = 5
-"""Actions per episode that the check executes."""
+"""The actions per episode that the check executes."""
 EPISODES = 2
 _SIZE = 0.01
-"""Standard deviation of their numbers: small in metres, in radians and in normalised units."""
+"""The standard deviation of their numbers: small in metres, in radians and in normalized units."""
 
 
 @dataclass(frozen=True)
 class EnvironmentCheck:
-    """One promise of the contract. problem: what was seen and expected; empty where the promise holds."""
+    """The result of checking one promise of the contract.
+
+    Attributes:
+        problem: The text of what was seen and expected; empty where the promise holds.
+    """
 
     name: str
     sentence: str
@@ -40,7 +44,7 @@ class EnvironmentCheck:
 
 
 class _Trial:
-    """An environment under check, its first episodes, and their steps: each is there once its check passed."""
+    """An environment under check, its first episodes, and their steps: each exists once its check passed."""
 
     environment: OwnEnvironment
     episodes: list[EnvEpisode]
@@ -75,7 +79,7 @@ class _Trial:
                     fact_values(step.facts, names, f"{self.source.name}, step() {number}")
 
     def repeats(self) -> None:
-        """The first episode again, behind the other one."""
+        """Repeat the first episode, after the other one."""
         again = self._play(self.environment, self.episodes[0])
         _check_equal(self.steps[0], again, "the same episode, played again behind another one")
 
@@ -122,7 +126,7 @@ class _Trial:
 
 
 class _BrokenError(ProbeKitError):
-    """A promise is broken."""
+    """The error of a broken promise."""
 
 
 _CHECKS: Sequence[tuple[str, str, Callable[[_Trial], None]]] = (
@@ -150,14 +154,14 @@ _CHECKS: Sequence[tuple[str, str, Callable[[_Trial], None]]] = (
 
 
 def check_environment(source: EnvSource | str) -> Iterator[EnvironmentCheck]:
-    """The promises of the contract, each tried on the first two episodes; an error is a failure.
+    """Check the promises of the contract, each on the first two episodes; an error is a failure.
 
     Args:
         source: An `EnvSource`, or MODULE:CLASS.
 
     Raises:
         UsageError: If there is no such class.
-        MissingExtraError: Naming a simulator that is not installed.
+        MissingExtraError: If a simulator is not installed; the message names it.
     """
     trial = _Trial(EnvSource(source) if isinstance(source, str) else source)
     for name, sentence, check in _CHECKS:

@@ -1,6 +1,6 @@
 """Opened environments of the user's own: chosen episodes, and the player that plays them.
 
-Whatever the code of an environment raises becomes an OwnEnvironmentError.
+Every error of an environment's code becomes an OwnEnvironmentError.
 """
 
 import sys
@@ -51,12 +51,12 @@ ENTRY_POINTS = "probe_kit.environments"
 METHODS = ("episodes", "reset", "step", "close")
 MOST_EPISODES = 1_000_000
 LONGEST = 200
-"""Characters of an episode's id or group."""
+"""The most characters of an episode's id or group."""
 
 
 @contextmanager
 def naming_environment(name: str, doing: str) -> Iterator[None]:
-    """Errors of an environment's code in the body. Raises OwnEnvironmentError, or an error of ours."""
+    """Replace errors of an environment's code in the body by OwnEnvironmentError; those of probe_kit stay."""
     try:
         yield
     except ProbeKitError:
@@ -67,10 +67,10 @@ def naming_environment(name: str, doing: str) -> Iterator[None]:
 
 
 def factory_of(name: str) -> Callable[..., Any]:
-    """The class or function that `name` leads to.
+    """Return the class or function that `name` leads to.
 
     Raises:
-        UsageError: For an import that fails.
+        UsageError: If there is no such module, class or entry point.
         OwnEnvironmentError: For an import that fails.
     """
     module, colon, attribute = name.partition(":")
@@ -108,7 +108,7 @@ def factory_of(name: str) -> Callable[..., Any]:
 
 
 def open_environment(source: EnvSource) -> OwnEnvironment:
-    """A new environment. Raises OwnEnvironmentError if it breaks its contract, and as `factory_of`."""
+    """Open a new environment. Raises OwnEnvironmentError if it breaks its contract, and as `factory_of`."""
     factory = factory_of(source.environment)
     with naming_environment(source.environment, "its constructor"):
         environment: OwnEnvironment = factory(**dict(source.options))
@@ -117,7 +117,7 @@ def open_environment(source: EnvSource) -> OwnEnvironment:
 
 
 def check_members(environment: object, name: str) -> None:
-    """Raise OwnEnvironmentError unless revision, names of actions and all methods are there."""
+    """Raise OwnEnvironmentError unless the environment has revision, names of actions and all methods."""
     missing = [method for method in METHODS if not callable(getattr(environment, method, None))]
     if missing:
         raise OwnEnvironmentError(f"{name} has no method {missing[0]!r}; expected {', '.join(METHODS)}")
@@ -135,7 +135,7 @@ def check_members(environment: object, name: str) -> None:
 
 
 def listed_episodes(environment: OwnEnvironment, source: EnvSource) -> list[tuple[int, EnvEpisode]]:
-    """The chosen episodes with their indices. Raises OwnEnvironmentError for equal ids."""
+    """Return the chosen episodes with their indices. Raises OwnEnvironmentError for equal ids."""
     indices = source.episodes
     most = MOST_EPISODES if indices is None else indices[-1] + 1
     with naming_environment(source.name, "episodes()"):
@@ -174,7 +174,7 @@ def _check_episode(episode: object, where: str) -> None:
 
 
 def started(environment: OwnEnvironment, episode: EnvEpisode, where: str) -> Step:
-    """The beginning of an episode, as `checked_step` gives it. Raises OwnEnvironmentError."""
+    """Return the beginning of an episode, as `checked_step` returns it. Raises OwnEnvironmentError."""
     with naming_environment(where, "reset()"):
         answer = environment.reset(episode)
     step = checked_step(Step(answer) if isinstance(answer, Observation) else answer, episode, f"{where}, reset()")
@@ -184,11 +184,12 @@ def started(environment: OwnEnvironment, episode: EnvEpisode, where: str) -> Ste
 
 
 def checked_step(answer: object, episode: EnvEpisode, where: str) -> Step:
-    """A step with pictures, state and facts as the contract has them, in copies of its own.
+    """Return a step with pictures, state and facts as the contract requires them, in copies of its own.
 
     An environment may write into its arrays afterwards.
 
-    Raises OwnEnvironmentError.
+    Raises:
+        OwnEnvironmentError: For a step that breaks the contract.
     """
     if not isinstance(answer, Step) or not isinstance(answer.observation, Observation):
         kind = type(answer.observation if isinstance(answer, Step) else answer).__name__
@@ -242,7 +243,7 @@ def _copied(step: Step) -> Step:
 
 
 def fact_values(facts: Mapping[str, Any], names: Sequence[str], where: str) -> list[float]:
-    """The values of facts in the order of their names. Raises OwnEnvironmentError for other names."""
+    """Return the values of facts in the order of their names. Raises OwnEnvironmentError for other names."""
     if sorted(facts) != sorted(names):
         raise OwnEnvironmentError(
             f"{where} has the facts {sorted(facts)}; expected {sorted(names)}, the same at every step"
@@ -251,22 +252,23 @@ def fact_values(facts: Mapping[str, Any], names: Sequence[str], where: str) -> l
 
 
 CATEGORY = "all"
-"""Of every row: environments have no categories."""
+"""The category of every row: environments have no categories."""
 SUCCEEDED, FAILED, ENDED = "success", "failure", "ended"
-"""Outcomes: whether the fact `success` is true at the last step; the last one where there is no such fact."""
+"""The outcomes: whether the fact `success` is true at the last step; the last one where there is no such fact."""
 
 
 class EnvironmentSource(Source[EnvSource]):
-    """Names and chosen episodes of an environment, read once.
+    """The names and chosen episodes of an environment, read once.
 
-    Once checked against a policy: seen, the first observation; cameras, by the model's names; columns, the facts;
-    truths, those that are truth values; chunk, the actions that the policy predicts at a time.
+    Further attributes exist once it is checked against a policy. `seen` is the first observation, and `cameras`
+    has the cameras by the model's names. `columns` has the facts, and `truths` those that are truth values.
+    `chunk` is the number of actions that the policy predicts at a time.
     """
 
     def __init__(
         self, settings: EnvSource, revision: str, actions: Sequence[str], episodes: Sequence[Any]
     ) -> None:
-        """episodes: pairs of the index in the environment and the episode."""
+        """Keep what the environment says; `episodes` has pairs of the index in the environment and the episode."""
         self.settings, self.revision, self.actions = settings, revision, tuple(actions)
         self.episodes: list[tuple[int, EnvEpisode]] = list(episodes)
         self.seen: Observation | None = None
@@ -286,7 +288,7 @@ class EnvironmentSource(Source[EnvSource]):
             environment.close()
 
     def rows(self, seed: int) -> tuple[Row, ...]:
-        """A row per episode."""
+        """Return a row per episode."""
         return tuple(
             Row(
                 index,
@@ -325,6 +327,7 @@ class EnvironmentSource(Source[EnvSource]):
             OwnEnvironmentError: For cameras, states or actions that do not fit.
             UnitsError: For states far outside the checkpoint's statistics.
             CheckpointError: For a policy whose predictions are no actions.
+            UsageError: For a policy that averages overlapping chunks.
         """
         if policy.predicts_relative:
             raise CheckpointError(
@@ -362,7 +365,10 @@ class EnvironmentSource(Source[EnvSource]):
         self.truths = [name for name in self.columns if isinstance(step.facts[name], bool | np.bool_)]
 
     def shown_cameras(self, declared: Sequence[str] | None = None) -> tuple[str, ...] | None:
-        """The first one, and those that the first observation names: it is looked at where none was yet."""
+        """Return the first camera, and those that the first observation names.
+
+        The first episode is set up for this, unless one was before.
+        """
         if not self.cameras and declared is not None:
             self.watched(declared)
         return tuple(self.cameras) or None
@@ -386,7 +392,7 @@ class EnvironmentSource(Source[EnvSource]):
             )
 
     def _predicted(self, policy: "Policy", observation: Observation) -> NDArray[np.float32]:
-        """(chunk, D) of one prediction. Raises OwnEnvironmentError for actions of another width or order."""
+        """Return the actions (chunk, D) of one prediction. Raises OwnEnvironmentError if width or order differ."""
         predicted = predicted_once(policy, observation)
         if predicted.shape[1] != len(self.actions):
             raise OwnEnvironmentError(
@@ -400,7 +406,7 @@ class EnvironmentSource(Source[EnvSource]):
         return predicted
 
     def example(self, instruction: str) -> Observation:
-        """The first observation with a blank picture."""
+        """Return the first observation with a blank picture."""
         assert self.seen is not None
         return replace(self.seen, image=np.zeros_like(self.seen.image), instruction=instruction)
 
@@ -415,7 +421,7 @@ class EnvironmentSource(Source[EnvSource]):
         return [] if self.seen is None else [str(position) for position in range(self.seen.state.size)]
 
     def identity(self, execute: int) -> dict[str, Any]:
-        """The environment by its revision, and what it shows; empty before a model is loaded."""
+        """Return the environment by its revision, and what it shows; empty before a model is loaded."""
         if self.seen is None:
             return {ENVIRONMENT: {}}
         settings, observation = self.settings, self.seen
@@ -454,11 +460,11 @@ class EnvironmentSource(Source[EnvSource]):
         return {"played": {"name": self.name, "episodes": [row.columns["env_episode"] for row in rows]}}
 
     def targets(self) -> tuple[str, ...]:
-        """The facts of the environment."""
+        """Return the facts of the environment."""
         return tuple(f"env.{name}" for name in self.columns)
 
     def describe(self, rows: Sequence[Row]) -> dict[str, str]:
-        """Environment, cameras, actions, facts and episodes."""
+        """Return environment, cameras, actions, facts and episodes."""
         groups = f"{len(rows)} in {len({row.columns['group_id'] for row in rows})} groups"
         if self.seen is None:
             return {"environment": terminal_safe(self.name), "episodes": groups}
@@ -472,10 +478,12 @@ class EnvironmentSource(Source[EnvSource]):
 
 
 class EnvironmentPlayer(InputsPlayer):
-    """Plays the episodes of one environment, and keeps what labels and controls are made of.
+    """A player of the episodes of one environment, which keeps what labels and controls are made of.
 
     Args:
-        facts: Names, in stored order.
+        settings: The settings of the environment, of which the player opens its own.
+        facts: The names of the facts, in stored order.
+        played: The frames and inferences to keep.
     """
 
     def __init__(self, settings: EnvSource, facts: Sequence[str], played: Played) -> None:
@@ -533,12 +541,12 @@ class EnvironmentPlayer(InputsPlayer):
         return self._ending(outcome, self._small_frames(_pictures(step)))
 
     def _small_frames(self, last: list[NDArray[np.uint8]]) -> SmallFrames:
-        """The first and the last frame of all cameras side by side, in small."""
+        """Return the first and the last frame of all cameras side by side, in small."""
         return () if self._played.frames == "none" else (shrink(*self._first), shrink(*last))
 
 
 def _pictures(step: Step) -> list[NDArray[np.uint8]]:
-    """The pictures of all cameras, the first one in front."""
+    """Return the pictures of all cameras, the first one in front."""
     return [step.observation.image, *step.observation.cameras.values()]
 
 

@@ -18,7 +18,7 @@ INSTRUCTION, STATE, PICTURE = "instruction", "state", "picture"
 STATE_SHARE = 0.01
 """The share of its spread over frames by which a control moves a state."""
 FIRST = ""
-"""The first camera, among the names of cameras."""
+"""The name of the first camera, among the names of cameras."""
 Picture = NDArray[np.uint8]
 
 
@@ -32,7 +32,7 @@ def with_input(clean: Observation, vary: str, donor: Observation) -> Observation
 
 
 def same_input(first: Observation, second: Observation, vary: str) -> bool:
-    """Return whether two observations hold the same of one input."""
+    """Return whether two observations have the same value of one input."""
     if vary == INSTRUCTION:
         return first.instruction == second.instruction
     if vary == STATE:
@@ -52,10 +52,8 @@ def content_of(observation: Observation, vary: str) -> bytes:
 def hardly_changed(clean: Observation, vary: str, spread: NDArray[np.floating]) -> Observation:
     """Return the clean observation after a change of one input that means nothing.
 
-    The full stop, a JPEG round trip, a hundredth of the state's spread.
-
-    Args:
-        spread: (D,) of the state.
+    The instruction gains or loses its period, pictures pass through JPEG, and the state moves by a hundredth of
+    its `spread` (D,).
     """
     if vary == INSTRUCTION:
         return replace(clean, instruction=with_other_stop(clean.instruction))
@@ -66,12 +64,12 @@ def hardly_changed(clean: Observation, vary: str, spread: NDArray[np.floating]) 
 
 
 def with_other_stop(text: str) -> str:
-    """Return a text with its full stop removed, or one added."""
+    """Return a text with its period removed, or one added."""
     return text[:-1] if text.endswith(".") else f"{text}."
 
 
 def blank_of(observations: Sequence[Observation]) -> Observation:
-    """Return an observation without content: no words, pictures of the mean colour of all, the mean state."""
+    """Return an observation without content: no words, pictures of the mean color of all, the mean state."""
     first = observations[0]
     states = np.stack([observation.state for observation in observations]).astype(np.float64)
     cameras: Mapping[str, Picture] = {
@@ -92,7 +90,7 @@ def _mean_colour(pictures: Sequence[Picture]) -> Picture:
 
 
 def with_pictures(clean: Observation, vary: str, picture: Callable[[str], Picture]) -> Observation:
-    """The observation with other pictures of the cameras that an input names. picture: by the camera's name."""
+    """Return the observation with other pictures of the cameras that an input names, by the camera's name."""
     pictures = {name: picture(name) for name in _cameras(clean, vary)}
     image = pictures.pop(FIRST, clean.image)
     return replace(clean, image=image, cameras={**clean.cameras, **pictures})
@@ -106,33 +104,31 @@ def _cameras(observation: Observation, vary: str) -> tuple[str, ...]:
 
 
 def picture_of(observation: Observation, camera: str) -> Picture:
-    """Return (H, W, 3) the picture of a camera; of the first one for a name that no further camera has."""
+    """Return the picture (H, W, 3) of a camera; of the first one for a name that no further camera has."""
     return observation.cameras.get(camera, observation.image)
 
 
 NEAREST = 8
-"""Frames with the nearest states among which the donor of a picture is drawn, so that the picture fits the arm."""
+"""The frames with the nearest states from which a picture's donor is drawn, so that the picture fits the arm."""
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One observation that a policy gets, alone; its pictures are read when they are needed.
-
-    Of a run:
+    """An observation that a policy gets, alone; its pictures are read when they are needed.
 
     Attributes:
         group: The unit that is resampled, such as an episode, or a couple of items.
-        seed: Of the inference.
-        instruction: Of the observation.
-        state: As `instruction`.
-        observe: Reads it, given the frame.
+        seed: The seed of the inference.
+        instruction: The instruction of the observation.
+        state: The state of the observation.
+        observe: A function that reads the observation, given the frame.
         other_words: The same instruction in other words; empty where the source has none.
-        row: In its episodes.
-        number: Of the recorded frame; 0 of an environment.
-        item: Of the row.
-        episode: As `item`.
-        category: As `item`.
-        stored: (n, D) actions that the run has of it, None without any.
+        row: The row in a run's episodes; -1 outside a run.
+        number: The number of the recorded frame; 0 in an environment.
+        item: The item of the row in a run.
+        episode: The id of the row in a run.
+        category: The category of the row in a run.
+        stored: (n, D) actions that the run stores for it, None without any.
     """
 
     name: str
@@ -151,13 +147,13 @@ class Frame:
 
     @classmethod
     def of(cls, name: str, observation: Observation, group: str, seed: int) -> "Frame":
-        """Return the frame of an observation that is there already."""
+        """Return the frame of an observation that exists already."""
         state = np.asarray(observation.state, np.float64)
         return cls(name, group, seed, observation.instruction, state, lambda _: observation)
 
     @property
     def observation(self) -> Observation:
-        """Return the observation."""
+        """The observation, read when it is asked for."""
         return self.observe(self)
 
 
@@ -166,12 +162,16 @@ def draw_donors(
 ) -> list[tuple[int, int]]:
     """Return pairs (frame, donor) of indices: up to `count` donors per frame.
 
-    A donor is of another group, and holds another value of the input. That of a picture is one of the `NEAREST`
+    A donor is of another group, and has another value of the input. The donor of a picture is one of the `NEAREST`
     frames by state, in spreads of every number, and of all that are equally near. Frames without any donor are
     left out.
 
     Args:
-        of: The frames that get donors; None for all.
+        frames: The frames, among which donors are drawn too.
+        vary: The name of the input.
+        rng: The generator of the draws.
+        count: The most donors of a frame.
+        of: The indices of the frames that get donors; None for all.
     """
     groups = np.array([frame.group for frame in frames])
     states = np.stack([np.asarray(frame.state, np.float64) for frame in frames])
@@ -197,7 +197,10 @@ def draw_donors(
 def _nearest(
     frames: Sequence[Frame], index: int, vary: str, ordered: NDArray[np.intp], distances: NDArray[np.float64]
 ) -> NDArray[np.intp]:
-    """Return the nearest candidates with another picture, in the order of the frames. ordered: nearest first."""
+    """Return the nearest candidates with another picture, in the order of the frames.
+
+    The candidates `ordered` come nearest first.
+    """
     clean, limits = frames[index].observation, np.sort(distances)
     nearest: list[int] = []
     limit = np.inf

@@ -22,11 +22,11 @@ OWN: tuple[type[SourceSettings], ...] = (SceneSettings, LeRobotSource, EnvSource
 
 
 class BrokenSourceWarning(UserWarning):
-    """A third party's source cannot be used; all others can."""
+    """A warning that a third party's source cannot be used; all others can."""
 
 
 def _third_party() -> Iterator[type[SourceSettings]]:
-    """The settings that entry points name; a warning for each that cannot be used."""
+    """Yield the settings that entry points name; warn of each that cannot be used."""
     options = {option.parameter for kind in OWN for option in kind.command_options().values()}
     kinds = {kind.model_fields["kind"].default for kind in OWN}
     for entry in entry_points(group=ENTRY_POINTS):
@@ -49,7 +49,7 @@ def _third_party() -> Iterator[type[SourceSettings]]:
 
 
 def _problem(settings: Any, kinds: set[str], options: set[str]) -> str:
-    """The reason why an entry point names no further source; empty if it does."""
+    """Return why an entry point names no further source; empty if it does."""
     if not (isinstance(settings, type) and issubclass(settings, SourceSettings)):
         return "it is no class derived from SourceSettings"
     if (kind := settings.model_fields["kind"].default) in kinds or not isinstance(kind, str):
@@ -64,7 +64,7 @@ def _problem(settings: Any, kinds: set[str], options: set[str]) -> str:
 
 
 SOURCES: tuple[type[SourceSettings], ...] = (*OWN, *_third_party())
-"""The settings of all sources; that of no option, the scene, first."""
+"""The settings of all sources; the scene, which no option names, comes first."""
 
 
 def kinds_typed(typed: Collection[str]) -> dict[type[SourceSettings], str]:

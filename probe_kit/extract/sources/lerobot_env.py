@@ -1,6 +1,6 @@
-"""`--env lerobot:TYPE`: the environments that lerobot configures, with lerobot's own processors.
+"""The environments of `--env lerobot:TYPE`, which lerobot configures, with lerobot's own processors.
 
-The simulators are packages of their own; without one, its name is said and nothing is played.
+The simulators are packages of their own; without one, an error names it and nothing is played.
 """
 
 import json
@@ -21,18 +21,21 @@ from probe_kit.hooks.families.shared.kinds import IMAGES, STATE
 
 IMAGE = "observation.image"
 PER_TASK = 20
-"""Episodes per task where none are named."""
+"""The episodes per task where no number is given."""
 
 
 class LeRobotEnvironment:
     """The environments of one `EnvConfig` of lerobot: every task, with a number of seeds each.
 
     Args:
-        kind: Lerobot's name, such as `libero`, `pusht`, `aloha` or `metaworld`.
-        per_task: Episodes of a task.
-        instruction: What the model reads where the environment has no text. options: fields of the configuration,
-            as text or values. Raises UsageError for an unknown name or field, and for one whose code is fetched
-            from the hub; MissingExtraError without the simulator.
+        kind: The name in lerobot, such as `libero`, `pusht`, `aloha` or `metaworld`.
+        per_task: The number of episodes of a task.
+        instruction: The words that the model reads where the environment has no text; None for the environment's.
+        **options: Fields of the configuration, as text or values.
+
+    Raises:
+        UsageError: For an unknown name or field, and for one whose code is fetched from the hub.
+        MissingExtraError: Without the simulator.
     """
 
     def __init__(
@@ -50,7 +53,7 @@ class LeRobotEnvironment:
         )
 
     def _created(self) -> dict[str, Any]:
-        """The only environment of every task, not vectorised."""
+        """Return the only environment of every task, not vectorized."""
         with _naming_simulator(self._kind):
             suites = self._config.create_envs(n_envs=1, use_async_envs=False)
         return {
@@ -60,7 +63,7 @@ class LeRobotEnvironment:
         }
 
     def episodes(self) -> Iterator[EnvEpisode]:
-        """Every task with the seeds 0, 1, 2 …; a task is a group."""
+        """Yield every task with the seeds 0, 1, 2 …; a task is a group."""
         for task, environment in self._tasks.items():
             text = self._instruction or _text(environment)
             if not text:
@@ -72,7 +75,7 @@ class LeRobotEnvironment:
                 yield EnvEpisode(f"{task}/{seed:04d}", seed, text, task)
 
     def reset(self, episode: EnvEpisode) -> Step:
-        """Set a task up from the episode's seed; where a task has stored beginnings, seed n is the n-th."""
+        """Set a task up from the episode's seed; where a task has stored beginnings, seed n chooses the n-th."""
         self._episode = episode
         self._environment = self._tasks[str(episode.group)]
         inner = self._environment.unwrapped
@@ -83,7 +86,7 @@ class LeRobotEnvironment:
         return Step(self._observed(observation))
 
     def step(self, action: NDArray[np.float32]) -> Step:
-        """Execute an action behind lerobot's processor of actions."""
+        """Execute an action that lerobot's processor of actions has converted."""
         import torch
 
         passed = self._after({"action": torch.from_numpy(action)[None]})["action"]
@@ -99,7 +102,7 @@ class LeRobotEnvironment:
             environment.close()
 
     def _observed(self, observation: Mapping[str, Any]) -> Observation:
-        """An observation as lerobot shows its policies: its names, its order of states, its turned pictures."""
+        """Return an observation as lerobot's policies get it: its names, order of states and turned pictures."""
         from lerobot.envs.utils import preprocess_observation
 
         features = self._before(preprocess_observation(_batched(observation)))
@@ -152,7 +155,7 @@ def _configuration(kind: str, options: Mapping[str, Any]) -> Any:
 
 
 def _value(text: Any) -> Any:
-    """A number, list or truth value that a text spells, else the text."""
+    """Return the number, list or truth value that a text spells, else the text."""
     if not isinstance(text, str):
         return text
     try:
@@ -162,7 +165,7 @@ def _value(text: Any) -> Any:
 
 
 def _simulator(kind: str) -> str:
-    """The version of the package that simulates, where it has the usual name."""
+    """Return the version of the package that simulates, where it has the usual name."""
     for name in (f"gym-{kind}", kind, f"hf-{kind}"):
         try:
             return f", {name} {version(name)}"
@@ -178,13 +181,13 @@ def _text(environment: Any) -> str | None:
 
 
 def _batched(observation: Any) -> Any:
-    """The arrays of an observation with a first axis of one, as lerobot's processors expect."""
+    """Return the arrays of an observation with a first axis of one, as lerobot's processors expect."""
     if isinstance(observation, Mapping):
         return {name: _batched(value) for name, value in observation.items()}
     return np.asarray(observation)[None]
 
 
 def _picture(floats: Any) -> NDArray[np.uint8]:
-    """(H, W, 3) uint8 of lerobot's (1, 3, H, W) floats in [0, 1]."""
+    """Return a picture (H, W, 3) uint8 of lerobot's (1, 3, H, W) floats in [0, 1]."""
     values = np.asarray(floats[0], np.float32).transpose(1, 2, 0)
     return np.ascontiguousarray(np.rint(255 * values).astype(np.uint8))

@@ -1,4 +1,4 @@
-"""A LeRobotDataset of format 3.0 that lies here: features, files, their hashes, and its download.
+"""A LeRobotDataset of format 3.0 on this machine: features, files, their hashes, and its download.
 
 Rows and pictures are read from the very files that are hashed, without a cache that is keyed by path and time. A
 file that meta does not name is never read.
@@ -32,16 +32,16 @@ from probe_kit.hooks.checkpoints.checkpoint import OFFLINE_WAY_OUT, hub_reason, 
 from probe_kit.suite.pictures import LARGEST_PICTURE, decode_bytes
 
 MOST_FRAMES = 64
-"""Chosen frames that one row holds."""
+"""The most chosen frames that one row holds."""
 _COMMIT = re.compile(r"[0-9a-f]{40}")
 
 
 class LeRobotFolder(LeRobotMeta):
-    """A data set that lies here, its meta read."""
+    """A data set on this machine whose meta is read."""
 
     @property
     def columns(self) -> list[str]:
-        """Features of one number each, without those that lead to other tables."""
+        """The features of one number each, without those that lead to other tables."""
         return [
             name
             for name, feature in self.features.items()
@@ -49,7 +49,7 @@ class LeRobotFolder(LeRobotMeta):
         ]
 
     def width(self, feature: str) -> int | None:
-        """Numbers of a feature; None where the data set lacks it."""
+        """Return how many numbers a feature has; None where the data set lacks it."""
         if feature not in self.features:
             return None
         shape = tuple(self.features[feature]["shape"])
@@ -61,25 +61,25 @@ class LeRobotFolder(LeRobotMeta):
         return int(shape[0])
 
     def names(self, feature: str) -> list[str]:
-        """The names of the numbers of a feature; their positions where the data set names none."""
+        """Return the names of the numbers of a feature; their positions where the data set names none."""
         return list(self.feature_names(feature) or map(str, range(self.width(feature) or 0)))
 
     def picture_shape(self, feature: str) -> tuple[int, int]:
-        """(height, width) of a camera."""
+        """Return height and width of a camera's pictures."""
         shape, names = self.features[feature]["shape"], list(self.features[feature].get("names") or ())
         if names and names[0].startswith("channel"):
             return int(shape[1]), int(shape[2])
         return int(shape[0]), int(shape[1])
 
     def encoding(self, feature: str) -> str:
-        """The storage of a camera's pictures: `image`, or the codec of its video."""
+        """Return the storage of a camera's pictures: `image`, or the codec of its video."""
         entry = self.features[feature]
         info = entry.get("info") or entry.get("video_info") or {}
         return IMAGE if entry["dtype"] == IMAGE else str(info.get("video.codec", "video"))
 
     @cached_property
     def lengths(self) -> list[int]:
-        """Frames of every episode."""
+        """The number of frames of every episode."""
         return [episode.length for episode in self.episodes]
 
     @cached_property
@@ -98,11 +98,11 @@ class LeRobotFolder(LeRobotMeta):
         return self.opened.hash_of(sorted(path for path in (self.path / "meta").rglob("*") if path.is_file()))
 
     def content_blake2b(self, episode: int, cameras: Sequence[str]) -> str:
-        """The hash of the files that hold the numbers of an episode, and the pictures of some cameras."""
+        """Return the hash of the files that hold the numbers of an episode, and the pictures of some cameras."""
         return self.opened.hash_of(self.files(episode, cameras))
 
     def files(self, episode: int, cameras: Sequence[str]) -> list[Path]:
-        """The files that hold an episode and the videos of some cameras."""
+        """Return the files that hold an episode and the videos of some cameras."""
         meta = self.episodes[episode]
         videos = [meta.videos[key].file for key in cameras if self.is_video(key)]
         return [self.path / file for file in (meta.file, *videos)]
@@ -110,7 +110,7 @@ class LeRobotFolder(LeRobotMeta):
     # -- checks ----------------------------------------------------------------------------------------
 
     def select_episodes(self, episodes: Sequence[int] | None) -> list[int]:
-        """The episodes that were asked for, all for None. Raises RecordingError for one that is not there."""
+        """Return the episodes that were asked for, all for None. Raises RecordingError for a missing one."""
         count = len(self.lengths)
         if outside := [number for number in episodes or () if number >= count]:
             raise RecordingError(
@@ -120,7 +120,7 @@ class LeRobotFolder(LeRobotMeta):
         return list(range(count)) if episodes is None else list(episodes)
 
     def check_files(self, episodes: Sequence[int], cameras: Sequence[str]) -> None:
-        """Raise RecordingError for a missing file of these episodes, or one of data that meta does not name."""
+        """Raise RecordingError for a missing file of these episodes, or a file of data that meta does not name."""
         self._check_unnamed()
         for episode in episodes:
             for file in self.files(episode, cameras):
@@ -131,7 +131,7 @@ class LeRobotFolder(LeRobotMeta):
                     )
 
     def _check_unnamed(self) -> None:
-        """Raise RecordingError for a Parquet file of data that no episode is in; hidden files are none."""
+        """Raise RecordingError for a Parquet file of data that no episode is in; hidden files do not count."""
         listed = set(self.by_file)
         folders = {self.path / episode.file.parts[0] for episode in self.episodes if len(episode.file.parts) > 1}
         present = {path for folder in folders for path in folder.rglob("*.parquet") if path.name[0] != "."}
@@ -143,11 +143,11 @@ class LeRobotFolder(LeRobotMeta):
 
 
 def open_lerobot(source: LeRobotSource) -> LeRobotFolder:
-    """The data set of `source`, which is downloaded if it is one of the hub; only its `meta` then.
+    """Open the data set of `source`; one of the hub is downloaded, but only its `meta`.
 
     Raises:
         RecordingError: For another format or missing files.
-        UsageError: For a hub data set without network or at a revision that is none.
+        UsageError: For a hub data set without network or at a revision that does not exist.
         MissingExtraError: Without the extra of recordings.
     """
     if source.is_local:
@@ -158,7 +158,7 @@ def open_lerobot(source: LeRobotSource) -> LeRobotFolder:
 
 
 def resolved_commit(repo: str, revision: str) -> str:
-    """The 40-digit commit of a hub data set. Raises UsageError without network or for no such revision."""
+    """Return the 40-digit commit of a hub data set. Raises UsageError without network or such a revision."""
     if _COMMIT.fullmatch(revision):
         return revision
     if reason := unreachable():
@@ -213,19 +213,20 @@ def _download(repo: str, commit: str, patterns: list[str]) -> Path:
 
 
 OFF_GRID_S = 1e-4
-"""Seconds by which a timestamp may differ from frame / fps, and a picture of a video from its timestamp."""
+"""The seconds by which a timestamp may differ from frame / fps, and a picture of a video from its timestamp."""
 MOST_AT_ONCE = 32_000_000
-"""Bytes of columns that are read of a whole file, so that not every episode opens it."""
+"""The bytes of columns that are read of a whole file, so that not every episode opens it."""
 OTHER_RATE = 0.05
-"""Share by which the frame rate of a video may differ from the data set's."""
+"""The share by which the frame rate of a video may differ from the data set's."""
 _EPISODE, _INDEX = "episode_index", "index"
 
 
 @dataclass(frozen=True)
 class _DataFile:
-    """One Parquet file of data. first: of each of its episodes, the row of the first frame.
+    """A Parquet file of data.
 
     Attributes:
+        first: For each of its episodes, the row of the first frame.
         latest: By columns the rows that were read last, whole row groups, and the number of the first of them.
     """
 
@@ -235,7 +236,7 @@ class _DataFile:
 
 
 class LeRobotFrames:
-    """Frames and numbers of chosen episodes, decoded when they are asked for. Opened once per process."""
+    """The frames and numbers of chosen episodes, decoded when they are asked for. Opened once per process."""
 
     def __init__(self, folder: LeRobotFolder) -> None:
         self.folder = folder
@@ -243,7 +244,7 @@ class LeRobotFrames:
         self._lengths: dict[Path, tuple[float, float]] = {}
 
     def pictures(self, episode: int, frame: int, cameras: Sequence[str]) -> dict[str, NDArray[np.uint8]]:
-        """(H, W, 3) uint8 by camera; of stored images the very bytes. Raises RecordingError."""
+        """Return pictures (H, W, 3) uint8 by camera; of stored images the very bytes. Raises RecordingError."""
         return {
             camera: self._of_video(episode, frame, camera)
             if self.folder.is_video(camera)
@@ -252,7 +253,7 @@ class LeRobotFrames:
         }
 
     def numbers(self, episode: int, features: Sequence[str]) -> dict[str, NDArray[np.float64]]:
-        """(T, D) of every feature, of one number (T, 1); an empty cell is NaN.
+        """Return the numbers (T, D) of every feature, of one number (T, 1); an empty cell is NaN.
 
         Raises:
             RecordingError: If the frames are not a grid, or a feature has other numbers than meta says.
@@ -264,7 +265,7 @@ class LeRobotFrames:
         return values
 
     def check(self, episodes: Sequence[int], cameras: Sequence[str]) -> None:
-        """Raise RecordingError for what the numbers or the files of these episodes cannot be shown for.
+        """Raise RecordingError for numbers or files of these episodes because of which they cannot be shown.
 
         Every video must be as long as its episodes say. Two pictures of the first episode are decoded.
         """
@@ -279,7 +280,7 @@ class LeRobotFrames:
     # -- rows ------------------------------------------------------------------------------------------
 
     def _rows(self, episode: int, columns: Sequence[str]) -> Any:
-        """The table (T rows) of an episode. Row groups are kept until another one is read with these columns."""
+        """Return the table (T rows) of an episode. Row groups are kept until others with these columns are read."""
         meta, key = self.folder.episodes[episode], tuple(columns)
         data = self._data_file(self.folder.path / meta.file)
         first = data.first[episode]
@@ -289,7 +290,7 @@ class LeRobotFrames:
         return latest.slice(first - begin, meta.length)
 
     def _read(self, path: Path, columns: Sequence[str], first: int, end: int) -> tuple[Any, int]:
-        """Row groups that hold rows `first` to `end`, or all where they are small, and the first row of them."""
+        """Return row groups that hold rows `first` to `end`, or all if small, and the number of their first row."""
         with self.folder.opened.parquet(path) as parquet:
             if missing := [name for name in columns if name not in parquet.schema_arrow.names]:
                 raise RecordingError(
@@ -304,7 +305,7 @@ class LeRobotFrames:
             return read_parquet(parquet, columns, groups.tolist()), int((ends - sizes)[groups[0]])
 
     def _scanned(self, path: Path) -> _DataFile:
-        """A data file whose rows are those that meta says. Raises RecordingError for others."""
+        """Return a data file whose rows are those that meta says. Raises RecordingError for others."""
         with self.folder.opened.parquet(path) as parquet:
             if missing := [name for name in (_EPISODE, _INDEX) if name not in parquet.schema_arrow.names]:
                 raise RecordingError(
@@ -340,7 +341,7 @@ class LeRobotFrames:
         return _DataFile(path, first)
 
     def _values(self, episode: int, name: str, column: Any) -> NDArray[np.float64]:
-        """(T, D) of one column, in the type that meta says."""
+        """Return one column (T, D), in the type that meta says."""
         feature, length = self.folder.features.get(name), self.folder.lengths[episode]
         width = 1 if feature is None else int(np.prod(feature["shape"]))
         where = f"{self.folder.path.name}, episode {episode}: {name}"
@@ -421,7 +422,7 @@ class LeRobotFrames:
             )
 
     def _length_of(self, path: Path) -> tuple[float, float]:
-        """Seconds and frames per second of a video, by its header."""
+        """Return seconds and frames per second of a video, by its header."""
         import av
 
         if path not in self._lengths:
@@ -450,7 +451,7 @@ class LeRobotFrames:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """No log of lerobot, which warns of its other decoder once in each process."""
+    """Silence the log of lerobot, which warns about its other decoder once in each process."""
     level = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:
@@ -460,7 +461,7 @@ def _quiet() -> Iterator[None]:
 
 
 def _size_of(metadata: Any, columns: Sequence[str]) -> int:
-    """Bytes of some columns of a Parquet file, uncompressed."""
+    """Return the bytes of some columns of a Parquet file, uncompressed."""
     groups = [metadata.row_group(number) for number in range(metadata.num_row_groups)]
     chunks = (group.column(number) for group in groups for number in range(group.num_columns))
     return sum(

@@ -24,9 +24,9 @@ INFO, TASKS, EPISODES = "meta/info.json", "meta/tasks.parquet", "meta/episodes"
 PARQUET = "parquet"
 NUMERIC = ("float32", "float64", "int8", "int16", "int32", "int64", "uint8", "bool")
 KEYS = ("episode_index", "index", "task_index")
-"""Features of one number that lead to other tables."""
+"""The features of one number that lead to other tables."""
 HALF = 0.5
-"""Frames by which a time range of a video may differ from whole frames."""
+"""The frames by which a time range of a video may differ from whole frames."""
 RATE_ROUNDING = 1e-3
 _NUMBER, _LENGTH, _FROM, _TO = "episode_index", "length", "dataset_from_index", "dataset_to_index"
 _CHUNK, _FILE = "data/chunk_index", "data/file_index"
@@ -35,7 +35,7 @@ _UNNAMED_INDEX = "__index_level_0__"
 _AGAIN = "Copy the data set again, or repair its meta"
 _DIGITS = 16
 _MOST_BYTES = 1 << 40
-"""Of a file, videos included: no bound but that of a disk."""
+"""The most bytes of a file, videos included: no bound but that of a disk."""
 _Stamp = tuple[int, ...]
 
 
@@ -51,14 +51,14 @@ class HashedFiles:
         self._hashed: dict[Path, tuple[str, _Stamp]] = {}
 
     def hash_of(self, files: Iterable[Path]) -> str:
-        """The blake2b hash of names and bytes of several files, in their order. Raises RecordingError."""
+        """Return the blake2b hash of names and bytes of several files, in their order. Raises RecordingError."""
         together = blake2b(digest_size=_DIGITS)
         for file in files:
             together.update(f"{file.relative_to(self._root).as_posix()} {self._hash(file)}\n".encode())
         return together.hexdigest()
 
     def open(self, file: Path) -> BinaryIO:
-        """A file for reading. Raises RecordingError if it is missing, or was changed after it was hashed."""
+        """Open a file for reading. Raises RecordingError if it is missing, or was changed after it was hashed."""
         digest = self._hash(file)
         opened = _opened(file, self._root)
         if _stamp(opened) != self._hashed[file][1]:
@@ -74,7 +74,7 @@ class HashedFiles:
 
     @contextmanager
     def parquet(self, file: Path, remedy: str = "Copy the data set again") -> Iterator[Any]:
-        """A Parquet file, opened as the file that was hashed. Raises RecordingError for an unreadable one."""
+        """Yield a Parquet file, opened as the file that was hashed. Raises RecordingError if it is unreadable."""
         pa = require("pyarrow", EXTRA)
         try:
             with self.open(file) as opened, open_parquet(opened, EXTRA) as parquet:
@@ -84,7 +84,7 @@ class HashedFiles:
             raise RecordingError(f"{where} cannot be read: {str(error)[:300]}. {remedy}") from error
 
     def check(self, file: Path) -> None:
-        """Raise as `open`, for a file that a library reads by its name."""
+        """Raise as `open` does, for a file that a library reads by its name."""
         self.open(file).close()
 
     def _hash(self, file: Path) -> str:
@@ -104,7 +104,7 @@ def _opened(file: Path, root: Path) -> BinaryIO:
 
 
 def _digest(opened: BinaryIO) -> tuple[str, _Stamp]:
-    """Hash and stamp of an open file, which is then at its beginning."""
+    """Return hash and stamp of an open file, which is then at its beginning."""
     stamp = _stamp(opened)
     digest = file_digest(opened, lambda: blake2b(digest_size=_DIGITS)).hexdigest()  # type: ignore[arg-type]
     opened.seek(0)
@@ -121,7 +121,13 @@ def _stamp(opened: BinaryIO) -> _Stamp:
 
 @dataclass(frozen=True)
 class VideoRange:
-    """The part of a video file that shows an episode. begin, end: seconds in the file. file: in the data set."""
+    """The part of a video file that shows an episode.
+
+    Attributes:
+        file: The path of the file in the data set.
+        begin: The time in the file at which the episode begins, in seconds.
+        end: The time in the file at which the episode ends, in seconds.
+    """
 
     file: Path
     begin: float
@@ -130,7 +136,14 @@ class VideoRange:
 
 @dataclass(frozen=True)
 class EpisodeMeta:
-    """One episode. start: index of its first frame in the data set. file: of its numbers. videos: by camera."""
+    """The meta of one episode.
+
+    Attributes:
+        length: The number of frames.
+        start: The index of its first frame in the data set.
+        file: The path of the file of its numbers, in the data set.
+        videos: The parts of video files, by camera.
+    """
 
     number: int
     length: int
@@ -146,8 +159,8 @@ class LeRobotMeta:
     Attributes:
         opened: The files of the data set by their hashes.
         tasks: (number, text) of each line.
-        repo: Of the hub, or None.
-        revision: As `repo`.
+        repo: The name on the hub, None for a folder.
+        revision: The commit on the hub, None for a folder.
     """
 
     path: Path
@@ -160,7 +173,7 @@ class LeRobotMeta:
 
     @classmethod
     def read(cls, root: Path, repo: str | None = None, revision: str | None = None) -> Self:
-        """The meta of the data set in `root`.
+        """Return the meta of the data set in `root`.
 
         Raises:
             RecordingError: For another format, a missing file, and where two parts contradict each other.
@@ -185,18 +198,18 @@ class LeRobotMeta:
 
     @cached_property
     def fps(self) -> float:
-        """Frames per second."""
+        """The frames per second."""
         return float(self.info["fps"])
 
     @property
     def features(self) -> Mapping[str, Any]:
-        """Type, shape and names by feature."""
+        """The type, shape and names of numbers by feature."""
         features: Mapping[str, Any] = self.info["features"]
         return features
 
     @property
     def cameras(self) -> list[str]:
-        """Features that are colour pictures."""
+        """The features that are color pictures."""
         return [
             name
             for name, feature in self.features.items()
@@ -208,12 +221,12 @@ class LeRobotMeta:
         return bool(self.features[feature]["dtype"] == VIDEO)
 
     def feature_names(self, feature: str) -> tuple[str, ...] | None:
-        """The names of the numbers of a feature; None where the data set names none, or not all."""
+        """Return the names of the numbers of a feature; None where the data set names none, or not all."""
         names = _flat_names(self.features[feature].get("names"))
         return names if names is not None and (len(names),) == tuple(self.features[feature]["shape"]) else None
 
     def task(self, number: int) -> str:
-        """The text of a task. Raises RecordingError for a number that is not named once, or that has no text."""
+        """Return the text of a task. Raises RecordingError for a number that is not named once, or has no text."""
         texts = self._texts.get(number, [])
         if len(texts) != 1:
             raise RecordingError(
@@ -281,7 +294,7 @@ class LeRobotMeta:
                 )
 
     def _check_videos(self) -> None:
-        """Raise RecordingError for time ranges that overlap, or do not hold as many frames as their episode."""
+        """Raise RecordingError for time ranges that overlap, or do not have as many frames as their episode."""
         for camera in filter(self.is_video, self.cameras):
             rate = (self.features[camera].get("info") or {}).get("video.fps")
             if rate is not None and not _equal_rates(rate, self.fps):
@@ -312,7 +325,7 @@ class LeRobotMeta:
 
 
 def _equal_rates(rate: Any, other: float) -> bool:
-    """Whether two rates are equal but for the rounding of one such as 30000 / 1001."""
+    """Whether two rates are equal up to the rounding of one such as 30000 / 1001."""
     return isinstance(rate, int | float) and abs(rate - other) <= RATE_ROUNDING * other
 
 
@@ -323,7 +336,7 @@ def _depth(feature: Mapping[str, Any]) -> bool:
 
 
 def _flat_names(names: Any) -> tuple[str, ...] | None:
-    """Names as a list: of {"motors": […]}, of groups of names, or of places by name."""
+    """Return names as a list, from {"motors": […]}, from groups of names, or from places by name."""
     if isinstance(names, Mapping):
         places = list(names.values())
         if sorted(map(repr, places)) == sorted(map(repr, range(len(places)))):
@@ -360,7 +373,7 @@ def _read_info(root: Path, files: HashedFiles) -> Mapping[str, Any]:
 
 
 def _check_info(root: Path, info: Mapping[str, Any]) -> None:
-    """Raise RecordingError unless rate and features are what frames can be read by."""
+    """Raise RecordingError unless rate and features are such that frames can be read."""
     fps = info.get("fps")
     if isinstance(fps, bool) or not isinstance(fps, int | float) or not (isfinite(fps) and fps > 0):
         raise RecordingError(f"{root.name}: {INFO} has fps {fps!r}; expected a number above 0. {_AGAIN}")
@@ -379,7 +392,7 @@ def _is_feature(feature: Any) -> bool:
 
 
 def _read_table(root: Path, files: HashedFiles, path: Path, columns: Sequence[str] | None = None) -> Any:
-    """The table of a Parquet file of meta. Raises RecordingError for one that cannot be read or lacks a column."""
+    """Return the table of a Parquet file of meta. Raises RecordingError if it is unreadable or lacks a column."""
     with files.parquet(path, _AGAIN) as parquet:
         if missing := [column for column in columns or () if column not in parquet.schema_arrow.names]:
             raise RecordingError(f"{root.name}: {path.relative_to(root)} has no column {missing[0]!r}. {_AGAIN}")
@@ -387,7 +400,10 @@ def _read_table(root: Path, files: HashedFiles, path: Path, columns: Sequence[st
 
 
 def _read_tasks(root: Path, files: HashedFiles) -> tuple[tuple[Any, Any], ...]:
-    """Number and text of every task. lerobot has the texts in the index of pandas; others in a column `task`."""
+    """Return number and text of every task.
+
+    The package lerobot stores the texts in the index of pandas; others store them in a column `task`.
+    """
     table = _read_table(root, files, root / TASKS)
     index = (table.schema.pandas_metadata or {}).get("index_columns", [])
     candidates = dict.fromkeys([_TASK, *(name for name in index if isinstance(name, str)), _UNNAMED_INDEX])
@@ -402,7 +418,7 @@ def _read_tasks(root: Path, files: HashedFiles) -> tuple[tuple[Any, Any], ...]:
 
 
 def _read_episodes(root: Path, files: HashedFiles, info: Mapping[str, Any]) -> Iterator[EpisodeMeta]:
-    """Every line of `meta/episodes`, by number."""
+    """Yield every line of `meta/episodes`, by number."""
     cameras = [name for name, feature in info["features"].items() if feature["dtype"] == VIDEO]
     parts = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
     columns = [_NUMBER, _LENGTH, _FROM, _TO, _CHUNK, _FILE]
@@ -454,7 +470,7 @@ def _check_line(line: Mapping[str, Any], where: str) -> None:
 
 
 def _path_of(root: Path, info: Mapping[str, Any], template: str, episode: int, **parts: Any) -> Path:
-    """A file that `info` names, in the data set's folder. Raises RecordingError for one that is outside it."""
+    """Return a file that `info` names, in the data set's folder. Raises RecordingError for one outside it."""
     try:
         path = Path(str(info[template]).format(**parts))
     except (KeyError, IndexError, ValueError, AttributeError) as error:

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from probe_kit.hooks import Policy
 
 PICTURE, INSTRUCTION, ID, GROUP = "picture", "instruction", "id", "group"
-"""Columns of the table; the first two are required, and all others become labels."""
+"""The columns of the table; the first two are required, and all others become labels."""
 Cells = dict[str, str | None]
 """A line of the table by heading; None for a missing cell."""
 _DIGITS = 16
@@ -50,10 +50,10 @@ class PictureFolder(SourceSettings):
     """Pictures in place of a scene: the model predicts once about each, and nothing moves.
 
     Attributes:
-        folder: Of the pictures.
-        table: A CSV file with the columns `picture` (a file in the folder) and `instruction`; `id` and `group`
-            name a line and what folds keep together; every other column holds numbers, truth values or texts, and
-            becomes a label.
+        folder: The folder of the pictures.
+        table: A CSV file with the columns `picture` (a file in the folder) and `instruction`. The columns `id` and
+            `group` name a line and what folds keep together. Every other column holds numbers, truth values or
+            texts, and becomes a label.
         pixels: Whether pictures at 32 × 32 are stored for controls.
     """
 
@@ -94,7 +94,7 @@ class PictureFolder(SourceSettings):
 
     @property
     def name(self) -> str:
-        """The name of the folder; where it lies is no part of a run."""
+        """The name of the folder; its place on this machine is no part of a run."""
         return Path(self.folder).expanduser().resolve().name
 
     def files(self) -> dict[str, Path]:
@@ -104,7 +104,12 @@ class PictureFolder(SourceSettings):
 
 @dataclass(frozen=True)
 class Line:
-    """A line of the table. content: hash of the picture's bytes. numbers: its cells as `_coded` gives them."""
+    """A line of the table.
+
+    Attributes:
+        content: The hash of the picture's bytes.
+        numbers: The cells as `_coded` returns them.
+    """
 
     picture: Path
     content: str
@@ -112,7 +117,10 @@ class Line:
 
 
 class PictureSource(Source[PictureFolder]):
-    """The lines of a table, whose pictures were all read once. prediction: (chunk, D) of the checked policy."""
+    """The lines of a table, whose pictures were all read once.
+
+    The attribute `prediction` is the shape (chunk, D) of a prediction of the checked policy.
+    """
 
     executes = False
     groups = "groups of pictures"
@@ -125,7 +133,15 @@ class PictureSource(Source[PictureFolder]):
         lines: Sequence[tuple[Cells, Line]],
         digest: str,
     ) -> None:
-        """names: as a run stores them: of columns of truth values, and of the classes of columns of texts."""
+        """Keep the lines of a table.
+
+        Args:
+            settings: The folder and the table.
+            columns: The names of the columns that become labels.
+            names: The names that a run stores: of columns of truth values, and of the classes of columns of texts.
+            lines: The cells of every line, and the line.
+            digest: The hash of the table's file.
+        """
         self.settings, self.columns, self._names, self.lines = settings, tuple(columns), dict(names), list(lines)
         self._digest = digest
         self.cameras: list[str] = []
@@ -163,7 +179,7 @@ class PictureSource(Source[PictureFolder]):
         return {"captured_calls": 1, "capture_only": True, "frames": "none"}
 
     def rows(self, seed: int) -> tuple[Row, ...]:
-        """A row per line, with the columns of a recorded episode of one frame."""
+        """Return a row per line, with the columns of a recorded episode of one frame."""
         rows = []
         for number, (text, line) in enumerate(self.lines):
             name = _id(text, number)
@@ -204,7 +220,7 @@ class PictureSource(Source[PictureFolder]):
         return self, policy
 
     def shown_cameras(self, declared: Sequence[str] | None = None) -> tuple[str, ...]:
-        """The first one: a row has one picture."""
+        """Return the first camera: a row has one picture."""
         return tuple(declared or (CAMERA,))[:1]
 
     def watched(self, cameras: Sequence[str]) -> Self:
@@ -213,7 +229,7 @@ class PictureSource(Source[PictureFolder]):
         return self
 
     def example(self, instruction: str) -> Observation:
-        """A blank picture of the first one's shape."""
+        """Return a blank picture of the first one's shape."""
         return Observation(np.zeros(self._shape, np.uint8), np.zeros(ARM_NUMBERS, np.float32), instruction)
 
     def play(self, played: Played) -> Opens:
@@ -222,7 +238,7 @@ class PictureSource(Source[PictureFolder]):
         return partial(PicturePlayer, self.settings.pixels)
 
     def identity(self, execute: int) -> dict[str, Any]:
-        """The table by its content; rows hold the hashes of pictures."""
+        """Return the table by its content; rows hold the hashes of pictures."""
         # A table may have no numbers, and Zarr has no array without any.
         shapes = {"columns": [len(self.columns)]} if self.columns else {}
         shapes |= {"prediction": list(self.prediction)} if execute else {}
@@ -242,16 +258,16 @@ class PictureSource(Source[PictureFolder]):
         return {DATASET: data_set}
 
     def selection(self, rows: Sequence[Row]) -> dict[str, Any]:
-        """All lines of the table."""
+        """Return all lines of the table."""
         selected = {"name": self.name, "episodes": list(range(len(rows))), RECORDED_EPISODES: len(rows)}
         return {"recording": {**selected, OTHER_ACTIONS: "pictures have no actions"}}
 
     def targets(self) -> tuple[str, ...]:
-        """The columns of the table that become labels."""
+        """Return the columns of the table that become labels."""
         return tuple(f"dataset.{name}" for name in self.columns)
 
     def describe(self, rows: Sequence[Row]) -> dict[str, str]:
-        """Folder, columns and pictures."""
+        """Return folder, columns and pictures."""
         return {
             "pictures": f"{len(rows)} of {terminal_safe(self.name)}",
             "camera": terminal_safe(", ".join(self.cameras)) or "the first of the model",
@@ -260,13 +276,13 @@ class PictureSource(Source[PictureFolder]):
 
 
 class PicturePlayer(InputsPlayer):
-    """Shows a picture, and keeps what is predicted about it. pixels: whether a small copy is stored."""
+    """A player that shows a picture, and keeps what is predicted about it; with `pixels` also a small copy."""
 
     def __init__(self, pixels: bool) -> None:
         self._pixels = pixels
 
     def begin(self, row: Row, film: bool) -> Answer:
-        """Show the picture of a line. Raises RecordingError if it is another one than when the run was planned."""
+        """Show the picture of a line. Raises RecordingError if the file changed since the run was planned."""
         del film
         self.row = row
         self._clear()
@@ -283,7 +299,7 @@ class PicturePlayer(InputsPlayer):
 
 
 def read_picture(line: Line) -> NDArray[np.uint8]:
-    """(H, W, 3) uint8. Raises RecordingError for a file that changed after it was hashed, or is no picture."""
+    """Return the picture (H, W, 3) uint8. Raises RecordingError for a file that changed, or is no picture."""
     content, where = _read(line.picture), line.picture.name
     if _digest(content) != line.content:
         raise RecordingError(f"{where} was changed after the run was planned; leave the pictures as they are")
@@ -293,9 +309,10 @@ def read_picture(line: Line) -> NDArray[np.uint8]:
 def _coded(
     table: TextTable, lines: Sequence[tuple[int, Cells]], names: Sequence[str]
 ) -> tuple[list[list[float]], dict[str, list[str]]]:
-    """The columns that become labels as numbers, and the names that a run stores of them.
+    """Return the columns that become labels as numbers, and the names that a run stores of them.
 
-    NaN where the cell is empty; true and false as 1 and 0; of texts the position in alphabetical order.
+    A number is NaN where the cell is empty. True and false are 1 and 0; a text is its position in alphabetical
+    order.
 
     Raises:
         UsageError: For a cell that breaks a rule of labels.
@@ -318,7 +335,7 @@ def _coded(
 
 
 def _with_groups(table: TextTable, lines: list[tuple[int, Cells]]) -> list[tuple[int, Cells]]:
-    """The lines with one spelling per group. Raises UsageError for two spellings of what is probably one."""
+    """Return the lines with one spelling per group. Raises UsageError for two spellings of probably one group."""
     grouped = [(number, text) for number, text in lines if text.get(GROUP)]
     spelled = group_names(
         [text[GROUP] for _, text in grouped], lambda row: table.where(grouped[row][0], GROUP), UsageError
@@ -328,7 +345,7 @@ def _with_groups(table: TextTable, lines: list[tuple[int, Cells]]) -> list[tuple
 
 
 def _line(text: Cells, folder: Path, where: str, numbers: tuple[float, ...]) -> Line:
-    """A line of the table. Raises RecordingError naming what is wrong with it."""
+    """Return a line of the table. Raises RecordingError naming what is wrong with it."""
     for name in (PICTURE, INSTRUCTION):
         if not text[name] or UNSAFE.search(text[name] or ""):
             raise RecordingError(f"{where} has the {name} {text[name] or ''!r}; expected plain text")

@@ -1,4 +1,4 @@
-"""`Row` and `Player`: what is played of a source, and what shows it, here or in a process of its own."""
+"""Players, which show the rows of a source, in this process or in a process of their own."""
 
 import traceback
 from abc import ABC, abstractmethod
@@ -49,7 +49,7 @@ EPISODE_ERRORS = (
 
 @dataclass(frozen=True)
 class Done:
-    """Episode `number` is committed."""
+    """The event of an episode that is committed."""
 
     number: int
     outcome: dict[str, Any]
@@ -57,7 +57,12 @@ class Done:
 
 @dataclass(frozen=True)
 class Failed:
-    """Episode `number` went wrong. traceback: of its error, empty if its process died."""
+    """The event of an episode that failed.
+
+    Attributes:
+        reason: The reason in words.
+        traceback: The traceback of its error; empty if its process died.
+    """
 
     number: int
     reason: str
@@ -67,7 +72,7 @@ class Failed:
 Event = Done | Failed
 
 LONGEST_TRACEBACK = 20_000
-"""Characters of a traceback that are kept: its end, which names the error."""
+"""The characters of a traceback that are kept: its end, which names the error."""
 
 
 def add_traceback(error: BaseException) -> None:
@@ -76,24 +81,27 @@ def add_traceback(error: BaseException) -> None:
 
 
 def traceback_of(error: BaseException) -> str:
-    """The traceback of `error`, after that of the process it was sent from."""
+    """Return the traceback of `error`, after that of the process it was sent from."""
     local = "".join(traceback.format_exception(error))
     sent: str = error.__dict__.get("probe_kit_traceback", "")
     return (sent + local)[-LONGEST_TRACEBACK:]
 
 
 SIDE = 32
-"""Pixels along the stored pictures."""
+"""The pixels along a side of the stored pictures."""
 
 
 @dataclass(frozen=True)
 class Ending:
-    """The end of an episode: its record as flat columns, a frame per action if it was filmed, its small frames.
+    """The end of an episode.
 
     Attributes:
+        outcome: The record of the episode as flat columns.
+        frames: A frame per action if the episode was filmed, else empty.
+        small_frames: The small frames of the episode.
         trajectory: (T + 1, C) float32; see `probe_kit.env.scoring`.
-        seconds: That the player worked on the episode, by the wall clock.
-        inputs: (n, …) by kind what was shown in n inferences, of sources without a scene.
+        seconds: The wall-clock seconds that the player worked on the episode.
+        inputs: (n, …) by kind the inputs that were shown in n inferences, of sources without a scene.
     """
 
     outcome: dict[str, Any]
@@ -108,14 +116,14 @@ Answer = Observation | Ending
 
 
 class Player(ABC):
-    """One source of observations with its current episode, and the seconds it worked on that."""
+    """A source of observations with its current episode, and the seconds it worked on that."""
 
     row: Row
     _seconds = 0.0
 
     @abstractmethod
     def begin(self, row: Row, film: bool) -> Answer:
-        """Set an episode up and show its beginning. film: whether every frame is kept."""
+        """Set an episode up and show its beginning; with `film` every frame is kept."""
 
     @abstractmethod
     def advance(self, actions: NDArray[np.float32]) -> Answer:
@@ -126,7 +134,7 @@ class Player(ABC):
         raise NotImplementedError
 
     def close(self) -> None:  # noqa: B027 - most players hold nothing
-        """Free what it holds."""
+        """Free what the player holds."""
 
     def answer(self, method: str, arguments: tuple[Any, ...]) -> Answer:
         """Call `begin`, `advance` or `dismiss`; an ending says how many seconds all calls of its episode took.
@@ -166,7 +174,7 @@ class InputsPlayer(Player):
             self._keep("pixels", np.stack([small_picture(picture) for picture in pictures]), most)
 
     def dismiss(self) -> Ending:
-        """End after the first observation: its model was asked."""
+        """End the episode after its first observation: its model was asked."""
         return self._ending({"outcome": CAPTURE_ONLY})
 
     def _ending(self, outcome: Mapping[str, Any], small_frames: SmallFrames = ()) -> Ending:
@@ -175,7 +183,7 @@ class InputsPlayer(Player):
 
 
 def small_picture(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """(SIDE, SIDE, 3): each pixel the mean of its part of the picture."""
+    """Return the picture (SIDE, SIDE, 3), in which each pixel is the mean of its part of the picture."""
     return np.asarray(Image.fromarray(picture).resize((SIDE, SIDE), Image.Resampling.BOX))
 
 
@@ -184,7 +192,7 @@ def small_picture(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
 Request = tuple[str, tuple[Any, ...]]
 """A method of `Player` and its arguments."""
 Opens = Callable[[], Player]
-"""What opens a player; a child process imports it by its name."""
+"""A function that opens a player; a child process imports it by its name."""
 
 
 class LocalPlayer:
@@ -194,15 +202,14 @@ class LocalPlayer:
         self._player = opens()
 
     def ask(self, method: str, *arguments: Any, then: Request | None = None) -> None:
-        """Start `begin`, `advance` or `dismiss`.
+        """Start `begin`, `advance` or `dismiss`; `then` starts at once if that ends the episode, and only then.
 
-        Args:
-            then: What to start at once where that ends the episode, and only there; its answer is the next one.
+        The answer to `then` is the next one.
         """
         self._request, self._then = (method, arguments), then
 
     def answer(self) -> Answer:
-        """Return what the last request gave; raise what it raised."""
+        """Return the answer to the last request, or raise its error."""
         answer = self._player.answer(*self._request)
         if self._then is not None and isinstance(answer, Ending):
             self._request, self._then = self._then, None
@@ -214,7 +221,10 @@ class LocalPlayer:
 
 
 class ProcessPlayer:
-    """The same in a child process: several work at a time. One that dies costs its episode and is replaced."""
+    """A player in a child process, of which several work at a time.
+
+    A child that dies costs its episode and is replaced.
+    """
 
     def __init__(self, opens: Opens) -> None:
         self._opens = opens
@@ -255,7 +265,7 @@ AskablePlayer = LocalPlayer | ProcessPlayer
 
 
 def serve(connection: Connection) -> None:
-    """Answer requests until the parent hangs up: the child's side."""
+    """Answer requests in the child process until the parent hangs up."""
     try:
         player = connection.recv()()
     except ProbeKitError as error:

@@ -14,7 +14,7 @@ from probe_kit.extract.sources.source import REFUSED_WITHOUT_ACTING, SourceSetti
 from probe_kit.hooks.families.shared.kinds import IMAGES
 
 TURNS = (90, 180, 270)
-"""Degrees that pictures can be rotated by, counterclockwise."""
+"""The degrees by which pictures can be rotated, counterclockwise."""
 MOST_EPISODES = 1_000_000
 _RANGE = re.compile(r"(\d+)(?::(\d+))?")
 _EVERY = re.compile(r"every:([1-9]\d*)")
@@ -25,9 +25,10 @@ Pairs = tuple[tuple[str, str], ...]
 
 
 def read_episodes(value: Any) -> Any:
-    """Indices, each once and in order: of `0:5` (0 to 4), `7`, several such with commas, or numbers.
+    """Return indices, each once and in order: of `0:5` (0 to 4), `7`, several such with commas, or numbers.
 
-    Raises UsageError.
+    Raises:
+        UsageError: For a text that names no episodes, or for negative numbers.
     """
     if value is None:
         return None
@@ -72,7 +73,7 @@ Pixels = Annotated[
 
 
 def _every(value: Any) -> Any:
-    """N of `every:N`, or a number as it is. Raises UsageError."""
+    """Return N of `every:N`, or a number as it is. Raises UsageError."""
     if not isinstance(value, str):
         return value
     matched = _EVERY.fullmatch(value)
@@ -82,7 +83,7 @@ def _every(value: Any) -> Any:
 
 
 def _pairs(option: str, example: str, value: Any) -> Any:
-    """CAMERA=VALUE texts, a dictionary, or pairs, as pairs. Raises UsageError."""
+    """Return CAMERA=VALUE texts, a dictionary, or pairs, as pairs. Raises UsageError."""
     if isinstance(value, Mapping):
         return tuple(value.items())
     pairs = []
@@ -112,13 +113,16 @@ class LeRobotSource(SourceSettings):
 
     Attributes:
         folder: The data set's folder, or USER/NAME@COMMIT of the hub.
-        episodes: Indices; None for all.
-        every: Of each episode, frame 0 and each so many frames on.
-        cameras: Feature of the data set by camera of the model; empty where both have one, or the names are equal.
-        rotations: Degrees by camera of the model, counterclockwise.
-        instruction: What the model reads in place of the task of a frame.
-        pixels: Whether pictures at 32 × 32 are stored for controls. Raises UsageError for what no data set can
-            have.
+        episodes: Indices of episodes; None for all.
+        every: The step between shown frames: of each episode frame 0 and each so many frames on.
+        cameras: The feature of the data set by camera of the model; empty where both have one, or the names are
+            equal.
+        rotations: The degrees by camera of the model, counterclockwise.
+        instruction: The words that the model reads in place of the task of a frame; None for that task.
+        pixels: Whether pictures at 32 × 32 are stored for controls.
+
+    Raises:
+        UsageError: For what no data set can have.
     """
 
     kind: Literal["lerobot"] = "lerobot"
@@ -193,14 +197,14 @@ class LeRobotSource(SourceSettings):
 
     @property
     def is_local(self) -> bool:
-        """Whether it names a folder, not a data set of the hub."""
+        """Whether the source names a folder, not a data set of the hub."""
         return Path(self.folder).expanduser().exists() or not _HUB.fullmatch(self.folder)
 
     @property
     def name(self) -> str:
-        """The name in tables; where the folder lies is no part of a run."""
+        """The name in tables; the folder's place on this machine is no part of a run."""
         return Path(self.folder).expanduser().resolve().name if self.is_local else self.folder.partition("@")[0]
 
     def files(self) -> dict[str, Path]:
-        """Return the folder of recordings that lie here."""
+        """Return the folder of recordings on this machine."""
         return {"folder": Path(self.folder).expanduser()} if self.is_local else {}

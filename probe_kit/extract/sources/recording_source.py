@@ -1,4 +1,4 @@
-"""Opened recordings: chosen frames of a LeRobotDataset that lies here, and the player that shows them."""
+"""Opened recordings: chosen frames of a LeRobotDataset on this machine, and the player that shows them."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property, partial
@@ -42,32 +42,38 @@ if TYPE_CHECKING:
     from probe_kit.hooks import Policy
 
 CATEGORY = "all"
-"""Of every row: recordings have no categories."""
+"""The category of every row: recordings have no categories."""
 NO_STATE = np.zeros(ARM_NUMBERS, np.float32)
 """The state for a policy that reads none, of a data set without one."""
 NAMED = 0.01
-"""Share of unusual values of a number of the state, from which on it is named."""
+"""The share of unusual values of a number of the state, from which on it is named."""
 _LONGEST = 12
-"""Tasks and numbers that are listed."""
+"""The most tasks and numbers that are listed."""
 _TASK = "task_index"
 
 
 class RecordingSource(Source[LeRobotSource]):
-    """A data set that lies here, and what was chosen of it.
+    """A data set on this machine, and what was chosen of it.
 
-    prediction: (chunk, D) of the policy that was checked. unusual: (D,) share of the chosen frames whose number of
-    the state is unusual; empty where the policy normalises none. other_actions: why recorded actions are not what
+    The attribute `prediction` is the shape (chunk, D) of a prediction of the policy that was checked. The
+    attribute `unusual` is (D,), for each number of the state the share of the chosen frames where it is unusual;
+    empty where the policy normalizes none. The attribute `other_actions` says why recorded actions are not what
     the policy predicts; None if they are.
 
     Args:
-        stretch: Most frames of a row.
+        settings: The chosen episodes, frames and cameras.
+        folder: The data set.
+        stretch: The most frames of a row.
+
+    Raises:
+        RecordingError: For an episode that the data set lacks.
     """
 
     executes = False
     groups = "recorded episodes"
 
     def __init__(self, settings: LeRobotSource, folder: LeRobotFolder, stretch: int = MOST_FRAMES) -> None:
-        """Raises RecordingError for an episode that is not there."""
+        """Select the episodes and prepare to read them."""
         self.settings, self.folder, self.stretch = settings, folder, stretch
         self.episodes = tuple(folder.select_episodes(settings.episodes))
         self.reader = LeRobotFrames(folder)
@@ -77,7 +83,7 @@ class RecordingSource(Source[LeRobotSource]):
 
     @classmethod
     def open(cls, settings: LeRobotSource, selects_only: bool) -> Self:
-        """The data set, with the numbers of the chosen episodes here. Raises as `open_lerobot`."""
+        """Open the data set, with the numbers of the chosen episodes on this machine. Raises as `open_lerobot`."""
         del selects_only
         folder = open_lerobot(settings)
         if folder.repo is not None:
@@ -106,21 +112,21 @@ class RecordingSource(Source[LeRobotSource]):
 
     @property
     def features(self) -> list[str]:
-        """Pictures of the data set, in the order of the model's cameras."""
+        """The pictures of the data set, in the order of the model's cameras."""
         return [feature for _, feature in self.settings.cameras]
 
     @property
     def most_frames(self) -> int:
-        """Chosen frames of the longest row that any episode of the data set can have."""
+        """The number of chosen frames of the longest row that any episode of the data set can have."""
         return min(self.stretch, -(-max(self.folder.lengths, default=1) // self.settings.every))
 
     @cached_property
     def instructions(self) -> tuple[str, ...]:
-        """Every instruction once, in the order of their letters."""
+        """Every instruction once, in alphabetical order."""
         return tuple(sorted({text for episode in self.episodes for text in self._texts(episode)}))
 
     def rows(self, seed: int) -> tuple[Row, ...]:
-        """Stretches of the chosen episodes, in order."""
+        """Return stretches of the chosen episodes, in order."""
         return tuple(row for row in self._rows(seed))
 
     def _rows(self, seed: int) -> Iterator[Row]:
@@ -151,7 +157,7 @@ class RecordingSource(Source[LeRobotSource]):
                     index, part = index + 1, part + 1
 
     def _texts(self, episode: int) -> list[str]:
-        """The instruction at every frame of an episode."""
+        """Return the instruction at every frame of an episode."""
         if self.settings.instruction is not None:
             return [self.settings.instruction] * self.folder.lengths[episode]
         numbers = self.reader.numbers(episode, [_TASK])[_TASK][:, 0].astype(int)
@@ -162,16 +168,16 @@ class RecordingSource(Source[LeRobotSource]):
     def early_checks(
         self, cameras: Sequence[str], state: int | None, checkpoint: str
     ) -> list[Callable[[], object]]:
-        """Cameras and the width of the state."""
+        """Return checks of the cameras and the width of the state."""
         return [lambda: self.mapped(cameras), lambda: self.check_state_width(checkpoint, state)]
 
     def shown_cameras(self, declared: Sequence[str] | None = None) -> tuple[str, ...] | None:
-        """Return those that a feature was mapped to, or would be mapped to."""
+        """Return the cameras to which a feature was mapped, or would be mapped."""
         pairs = self.settings.cameras if declared is None else self.mapped(declared).settings.cameras
         return tuple(camera for camera, _ in pairs) or None
 
     def mapped(self, cameras: Sequence[str]) -> Self:
-        """The same with a feature for the model's cameras. Raises RecordingError where none follows."""
+        """Return the same recordings with a feature for the model's cameras. Raises RecordingError without."""
         pairs = mapped_cameras(self.settings.cameras, cameras, self.folder.cameras)
         names = [camera for camera, _ in pairs]
         if strange := [camera for camera, _ in self.settings.rotations if camera not in names]:
@@ -194,8 +200,8 @@ class RecordingSource(Source[LeRobotSource]):
     def check_frames(self) -> None:
         """Raise RecordingError for files, numbers or pictures of the chosen episodes that cannot be shown.
 
-        Pictures are those of the mapped cameras, or of all where none is mapped. Of a hub data set they are not
-        here before that.
+        Pictures are those of the mapped cameras, or of all where none is mapped. Those of a hub data set are not
+        on this machine before cameras are mapped.
         """
         features = self.features or ([] if self.folder.repo is not None else self.folder.cameras)
         self.folder.check_files(self.episodes, features)
@@ -240,7 +246,7 @@ class RecordingSource(Source[LeRobotSource]):
         check_units(self.unusual, names, f"{self.folder.path.name}, {STATE}", policy, accepted)
 
     def _chosen_numbers(self) -> dict[str, NDArray[np.float32]]:
-        """(n, D) state and action of every chosen frame, as far as they are recorded."""
+        """Return state and action (n, D) of every chosen frame, as far as they are recorded."""
         names = [name for name in (STATE, ACTION) if self.folder.width(name) is not None]
         episodes, every = [self.reader.numbers(episode, names) for episode in self.episodes], self.settings.every
         return {
@@ -257,7 +263,7 @@ class RecordingSource(Source[LeRobotSource]):
         return unusual_shares(policy, states)
 
     def _other_actions(self, policy: "Policy", predicted: int, actions: NDArray[np.float32] | None) -> str | None:
-        """Why the recorded actions are not what a policy predicts; None if they are, as far as anything says."""
+        """Return why the recorded actions are not what a policy predicts; None without a sign of that."""
         if actions is None:
             return "the data set has no actions"
         if actions.shape[1] != predicted:
@@ -276,7 +282,7 @@ class RecordingSource(Source[LeRobotSource]):
         return f"recorded actions lie outside the statistics of the checkpoint ({far}), so the units differ"
 
     def example(self, instruction: str) -> Observation:
-        """Blank pictures and a state of zeros."""
+        """Return blank pictures and a state of zeros."""
         turned, pictures = dict(self.settings.rotations), {}
         for camera, feature in self.settings.cameras:
             height, width = self.folder.picture_shape(feature)
@@ -294,7 +300,7 @@ class RecordingSource(Source[LeRobotSource]):
     # -- what a run says of it -----------------------------------------------------------------------
 
     def identity(self, execute: int) -> dict[str, Any]:
-        """The data set by its content, and how it is shown."""
+        """Return the data set by its content, and how it is shown."""
         settings, folder = self.settings, self.folder
         state, action = folder.width(STATE), folder.width(ACTION)
         shapes: dict[str, list[int]] = {"prediction": list(self.prediction)} if execute else {}
@@ -333,12 +339,12 @@ class RecordingSource(Source[LeRobotSource]):
 
     @property
     def decoder(self) -> str | None:
-        """PyAV where a camera is a video: pixels of lossy videos are those of their decoder."""
+        """The version of PyAV where a camera is a video: pixels of lossy videos are those of their decoder."""
         encodings = {self.folder.encoding(feature) for feature in self.features}
         return f"PyAV {version('av')}" if encodings - {IMAGE} else None
 
     def targets(self) -> tuple[str, ...]:
-        """The recorded numbers."""
+        """Return the recorded numbers."""
         parts = [("state", STATE), ("action", ACTION)]
         numbers = [f"dataset.{part}.{name}" for part, feature in parts for name in self._names(feature)]
         return (*numbers, *(f"dataset.{name}" for name in self.folder.columns))
@@ -347,7 +353,7 @@ class RecordingSource(Source[LeRobotSource]):
         return [] if self.folder.width(feature) is None else self.folder.names(feature)
 
     def describe(self, rows: Sequence[Row]) -> dict[str, str]:
-        """Data set, cameras and frames of a plan."""
+        """Return data set, cameras and frames of a plan."""
         settings, folder = self.settings, self.folder
         turned = dict(settings.rotations)
         cameras = [
@@ -367,7 +373,7 @@ class RecordingSource(Source[LeRobotSource]):
         }
 
     def facts(self) -> dict[str, str]:
-        """Format, episodes, frames, tasks and features of the data set, in words, for `dataset show`."""
+        """Return format, episodes, frames, tasks and features of the data set, in words, for `dataset show`."""
         folder, lengths = self.folder, [self.folder.lengths[episode] for episode in self.episodes]
         every, texts = self.settings.every, self.instructions
         more = f" and {len(texts) - _LONGEST} more" if len(texts) > _LONGEST else ""
@@ -421,10 +427,9 @@ class RecordingSource(Source[LeRobotSource]):
 
 
 class RecordingPlayer(InputsPlayer):
-    """Shows the stretches of one data set, frame by frame, and keeps what controls are made of.
+    """A player that shows the stretches of one data set, frame by frame, and keeps what controls are made of.
 
-    Args:
-        settings: With every camera of the model mapped.
+    The settings have every camera of the model mapped.
     """
 
     def __init__(self, settings: LeRobotSource) -> None:
@@ -453,7 +458,7 @@ class RecordingPlayer(InputsPlayer):
         return self._see() if self._position < len(self.row.frames) else self._ending({"outcome": CAPTURE_ONLY})
 
     def _check_content(self, row: Row) -> None:
-        """Raise RecordingError unless the files of an episode are those that the plan was made of."""
+        """Raise RecordingError unless the files of an episode are those from which the plan was made."""
         recording, planned = self._recording, row.columns["content_blake2b"]
         now = recording.folder.content_blake2b(row.columns["source_episode"], recording.features)
         if now != planned:
@@ -485,12 +490,16 @@ class RecordingPlayer(InputsPlayer):
 
 
 def mapped_cameras(typed: Pairs, model: Sequence[str], recorded: Sequence[str]) -> Pairs:
-    """Camera of the model and feature of the data set, in the model's order.
-
-    Raises RecordingError.
+    """Return pairs of a camera of the model and a feature of the data set, in the model's order.
 
     Args:
-        typed: As the user mapped them; empty for equal names, or the only one of either.
+        typed: The pairs as the user mapped them; empty for equal names, or the only one of either.
+        model: The cameras of the model, the first one in front.
+        recorded: The features of the data set that are pictures.
+
+    Raises:
+        RecordingError: For a camera or feature that does not exist. Also if the model's first camera gets no
+            picture.
     """
     both = f"the model has {', '.join(model) or 'none'}; the data set has {', '.join(recorded) or 'none'}"
     how = (
@@ -515,13 +524,13 @@ def mapped_cameras(typed: Pairs, model: Sequence[str], recorded: Sequence[str]) 
 def observation_of(
     pictures: Mapping[str, NDArray[np.uint8]], state: NDArray[np.float32], instruction: str
 ) -> Observation:
-    """The observation of pictures by camera, the first of which is the main one."""
+    """Return the observation of pictures by camera, the first of which is the main one."""
     first, *other_cameras = pictures
     return Observation(pictures[first], state, instruction, None, {name: pictures[name] for name in other_cameras})
 
 
 def _ahead(actions: NDArray[np.float64], frame: int, count: int) -> NDArray[np.float32]:
-    """(count, D) the recorded actions from a frame on; behind the end of the episode they are not numbers."""
+    """Return the recorded actions (count, D) from a frame on; behind the end of the episode they are NaN."""
     ahead = np.full((count, actions.shape[1]), np.nan, np.float32)
     recorded = actions[frame : frame + count]
     ahead[: len(recorded)] = recorded

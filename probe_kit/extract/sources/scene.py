@@ -35,8 +35,10 @@ def _size(value: Any) -> Any:
 class SceneOptions(Part):
     """The changes that a command or a study makes to a scene: a preset, and fields of `SceneSpec`.
 
+    None and False leave the preset's value.
+
     Attributes:
-        scene: The preset; None for the protocol's or the model's own. None and False leave the preset's value.
+        scene: The preset; None for the protocol's or the model's own.
     """
 
     scene: common.Scene = None
@@ -91,11 +93,12 @@ class SceneSettings(SourceSettings):
     """Questions of a suite in the built-in scene.
 
     Attributes:
-        suite: Suite folder; None for the embedded suite.
-        categories: Slugs; None for all of the suite.
-        items: Items per category; None for all.
-        wordings: Of `suite.items.WORDINGS`, each a condition of the run; None for the items' own words alone.
-        scene: By default the model's own, see `Family.home`.
+        suite: The suite's folder; None for the embedded suite.
+        categories: Slugs of categories; None for all of the suite.
+        items: The number of items per category; None for all.
+        wordings: Names of `suite.items.WORDINGS`, each a condition of the run; None for the items' own words
+            alone.
+        scene: The scene, by default the model's own, see `Family.home`.
     """
 
     kind: Literal["scene"] = "scene"
@@ -126,7 +129,7 @@ class SceneSettings(SourceSettings):
     loads: ClassVar[str] = "suite"
 
     def model_post_init(self, _: Any) -> None:
-        """Raise UsageError for wordings that come twice, or none."""
+        """Raise UsageError for wordings that come twice, or an empty list of them."""
         if self.wordings is not None:
             check_wordings(self.wordings)
 

@@ -1,4 +1,4 @@
-"""The opened scene: every item of a suite in both layouts, and the player whose arm carries out actions."""
+"""The opened scene: every item of a suite in both layouts, and the player whose arm executes actions."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -33,10 +33,12 @@ if TYPE_CHECKING:
 
 
 class ScenePlayer(Player):
-    """Plays episodes of the scene.
+    """A player of episodes of the scene.
 
     Args:
-        played: With the script `expert`, `expert-mirrored` or `idle`, that plays every episode to its end at once.
+        scene: The scene.
+        played: The frames to keep, and a script. The script `expert`, `expert-mirrored` or `idle` plays every
+            episode to its end at once. None: no frames and no script.
     """
 
     def __init__(self, scene: SceneSpec, played: Played | None = None) -> None:
@@ -74,7 +76,7 @@ class ScenePlayer(Player):
         self._keep_small()
 
     def advance(self, actions: Iterable[NDArray[np.float32]]) -> Answer:
-        """Carry out actions until they or the episode end."""
+        """Execute actions until they or the episode end."""
         return self._carry_out(actions) or self._see()
 
     def dismiss(self) -> Ending:
@@ -82,7 +84,7 @@ class ScenePlayer(Player):
         return Ending({"outcome": CAPTURE_ONLY, **self._facts}, self._frames, tuple(self._small_frames))
 
     def tile_masks(self) -> dict[Side, NDArray[np.bool_]]:
-        """(H, W) where in the last picture each tile's own picture is seen."""
+        """Return masks (H, W) of where each tile's own picture is visible in the last picture."""
         return self._env.tile_masks()
 
     def close(self) -> None:
@@ -130,12 +132,15 @@ class ScenePlayer(Player):
 
 
 def frame_sha256(frame: NDArray[np.uint8]) -> str:
-    """Hex sha256 of a frame (H, W, 3) as rendered, before it is resized for a model: its shape and every byte."""
+    """Return the hex sha256 of a frame (H, W, 3) as rendered, of its shape and every byte.
+
+    The frame is not yet resized for a model.
+    """
     return sha256(f"{frame.shape}".encode() + np.ascontiguousarray(frame).tobytes()).hexdigest()
 
 
 def _record(env: Act2AnswerEnv) -> dict[str, Any]:
-    """The outcome as flat columns, beside those the plan already has."""
+    """Return the outcome as flat columns, without those that the plan already has."""
     outcome = env.outcome().to_json()
     x, y = outcome.pop("cube_xy")
     return {
@@ -147,11 +152,15 @@ def _record(env: Act2AnswerEnv) -> dict[str, Any]:
 
 
 EPISODES = 3
-"""If the scene of one episode cannot be built, so many are tried: a single one costs no run."""
+"""The number of episodes that are tried if the scene of one cannot be built: a single one costs no run."""
 
 
 class SceneSource(Source[SceneSettings]):
-    """Questions of a suite in a scene. suite: with the chosen categories and items."""
+    """Questions of a suite in a scene.
+
+    Attributes:
+        suite: The suite with the chosen categories and items.
+    """
 
     own_units = False
     suite: Suite
@@ -161,7 +170,7 @@ class SceneSource(Source[SceneSettings]):
 
     @classmethod
     def open(cls, settings: SceneSettings, selects_only: bool) -> Self:
-        """The suite of some settings, its chosen items. selects_only: its first items alone are needed."""
+        """Return the suite of some settings with its chosen items; with `selects_only` its first items suffice."""
         categories, count = settings.categories, settings.items
         if settings.suite is not None:
             return cls(settings, load_suite(settings.suite).select(categories, count))
@@ -172,22 +181,22 @@ class SceneSource(Source[SceneSettings]):
 
     @property
     def name(self) -> str:
-        """Name, version and hash of the suite."""
+        """The name, version and hash of the suite."""
         return self.suite.identity
 
     @cached_property
     def instructions(self) -> tuple[str, ...]:
-        """Every instruction once, in the order of their letters."""
+        """Every instruction once, in alphabetical order."""
         return tuple(sorted({episode.item.instruction for episode in self._episodes()}))
 
     def rows(self, seed: int) -> tuple[Row, ...]:
-        """Every episode in order, with its seeds, in each wording that its item has.
+        """Return every episode in order, with its seeds, in each wording that its item has.
 
         Both layouts of an item start from the same scene, and all wordings of an episode from the same seeds.
 
         Raises:
             UsageError: For a wording that no item has.
-            SuiteError: If an item's own words for one are none.
+            SuiteError: If an item's own words for a wording are empty or unusable.
         """
         # Of the items themselves: an episode in another wording holds its item with that wording as instruction.
         content = {item.item_id: item.content_sha256 for item in self.suite.items}
@@ -224,26 +233,26 @@ class SceneSource(Source[SceneSettings]):
     # -- what a run says of it -----------------------------------------------------------------------
 
     def known_early(self) -> dict[str, Any]:
-        """The suite and the scene, which no model decides."""
+        """Return the suite and the scene, which no model decides."""
         return self.identity(0)
 
     def identity(self, execute: int) -> dict[str, Any]:
-        """Name and version of the suite, and the scene; items are compared one by one, by their content."""
+        """Return name and version of the suite, and the scene; items are compared one by one, by their content."""
         del execute
         suite = {"name": self.suite.name, "version": self.suite.version}
         return {"suite": suite, "scene": self.settings.scene.to_json()}
 
     def name_parts(self) -> list[Any]:
-        """The whole suite, the selected categories, and the wordings."""
+        """Return the whole suite, the selected categories, and the wordings."""
         return [self.suite.complete.content_sha256, self.suite.categories, self.settings.wordings]
 
     @property
     def suite_parent(self) -> Any:
-        """The suite that this one was selected of."""
+        """The hash of the suite that this one was selected from."""
         return self.suite.parent
 
     def selection(self, rows: Sequence[Row]) -> dict[str, Any]:
-        """The selected part of the suite, and the texts of wordings."""
+        """Return the selected part of the suite, and the texts of wordings."""
         suite = self.suite
         selected: dict[str, Any] = {
             "suite": {
@@ -264,7 +273,7 @@ class SceneSource(Source[SceneSettings]):
         return selected
 
     def describe(self, rows: Sequence[Row]) -> dict[str, str]:
-        """Suite, categories, scene, episodes and wordings."""
+        """Return suite, categories, scene, episodes and wordings."""
         scene, skipped = self.settings.scene, self._skipped(rows)
         early = ", less once the cube was released and rests" if scene.early_stop else ""
         wordings = ", ".join(
@@ -279,19 +288,19 @@ class SceneSource(Source[SceneSettings]):
         }
 
     def targets(self) -> tuple[str, ...]:
-        """The sides of the correct and of the chosen picture."""
+        """Return the sides of the correct and of the chosen picture."""
         return ("side.correct", "side.chosen")
 
     # -- what a model sees ---------------------------------------------------------------------------
 
     def example(self, instruction: str) -> Observation:
-        """A blank picture of the scene's size."""
+        """Return a blank picture of the scene's size."""
         scene = self.settings.scene
         blank, state = np.zeros((*scene.picture_shape, 3), np.uint8), np.zeros(8, np.float32)
         return Observation(blank, state, instruction, scene.intrinsics)
 
     def shown_cameras(self, declared: Sequence[str] | None = None) -> tuple[str, ...]:
-        """The first one: the scene has one camera."""
+        """Return the first camera: the scene has one."""
         return tuple(declared or (CAMERA,))[:1]
 
     def check(self, policy: "Policy", accept_units: bool) -> "tuple[Self, Policy]":
@@ -305,7 +314,7 @@ class SceneSource(Source[SceneSettings]):
         return self, policy
 
     def _first_states(self) -> Any:
-        """(n, 8) states of the arm at the first inference of some rows; those that cannot be set up are left out.
+        """Return states (n, 8) of the arm at the first inference of some rows, as far as they can be set up.
 
         Raises:
             SceneError: If none can be set up.
@@ -352,9 +361,9 @@ class SceneSource(Source[SceneSettings]):
 
 
 def _first_items(categories: Sequence[str] | None, count: int) -> Suite:
-    """The first items of the embedded suite, drawn alone: fewer items are the beginning of more.
+    """Return the first items of the embedded suite, drawn alone: fewer items are the beginning of more.
 
-    It is said to be selected from the category that a plan looks at for further items, which is drawn in full.
+    They are marked as selected from the category that a plan looks at for further items, which is drawn in full.
     """
     drawn = min(max(2, count + count % 2), ITEMS)
     suite = default_suite(categories, drawn).select(None, count)
@@ -364,7 +373,7 @@ def _first_items(categories: Sequence[str] | None, count: int) -> Suite:
 def scene_row(
     index: int, episode: Episode, scene_seed: int, policy_seed: int, content_sha256: str | None = None
 ) -> Row:
-    """The row of an episode. content_sha256: of its item; None outside a plan."""
+    """Return the row of an episode; `content_sha256` is the hash of its item, None outside a plan."""
     item, wording = episode.item, episode.wording
     columns: Mapping[str, Any] = {
         "episode_id": episode.episode_id,

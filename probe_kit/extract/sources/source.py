@@ -1,4 +1,4 @@
-"""`Source`: where the observations of a run come from. A source is one class and its settings.
+"""The class `Source`: the observations of a run come from it. A source is one class and its settings.
 
 A source knows neither what a model does with its observations nor how runs are stored.
 """
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 REFUSED_WITHOUT_ACTING = (
     "protocol", "rotation", "video", "batch=auto", "execute", "later_views", "edits",
 )  # fmt: skip
-"""Fields of other parts that do not apply to a source that shows what was recorded."""
+"""The fields of other parts that do not apply to a source that shows what was recorded."""
 
 
 class SourceSettings(Part):
@@ -39,15 +39,15 @@ class SourceSettings(Part):
 
     Attributes:
         kind: The name of the source in files.
-        command: The option that a command names it with; empty for the scene.
+        command: The option by which a command names it; empty for the scene.
         shows: The reason why options of other sources do not apply.
         opens: MODULE:CLASS of the `Source`, which is imported when it is opened.
-        subject: What its options are about, and what is loaded of it, in words.
-        loads: As `subject`.
-        decides: Fields of other parts that are the source's own.
-        refuses: Fields of other parts that do not apply, some with the only value that does not.
-        moves: Fields that a later command may give anew, with what it says of them, because a file or module lies
-            elsewhere.
+        subject: The subject of its options, in words.
+        loads: The things that are loaded of it, in words.
+        decides: The fields of other parts that are the source's own.
+        refuses: The fields of other parts that do not apply, some with the only value that does not.
+        moves: The fields that a later command may give anew, because a file or module lies elsewhere, with their
+            help.
         played: The word before the name in a run's label; empty for a label without it.
     """
 
@@ -69,7 +69,7 @@ class SourceSettings(Part):
         return self.kind
 
     def open(self, selects_only: bool = False) -> "Source[Any]":
-        """Open the source. selects_only: nothing but the chosen rows is needed. Raises what is wrong with it."""
+        """Open the source; with `selects_only` only the chosen rows are needed. Raises what is wrong with it."""
         module, _, name = self.opens.partition(":")
         source: type[Source[Any]] = getattr(import_module(module), name)
         return source.open(self, selects_only)
@@ -99,7 +99,7 @@ class SourceSettings(Part):
         return {field for field, option in cls.command_options().items() if option.parameter in typed}
 
     def files(self) -> dict[str, Path]:
-        """Return files and folders of this machine that the source is made of, by the field that gives them.
+        """Return files and folders of this machine from which the source is made, by the field that gives them.
 
         A field of a scene is `scene.NAME`. A run records them, so that `--config RUN` finds them again.
         """
@@ -127,7 +127,13 @@ class SourceSettings(Part):
 
 @dataclass(frozen=True)
 class Played:
-    """A player's settings beside its source: frames to keep, inferences whose inputs count, a script."""
+    """The settings of a player beside its source.
+
+    Attributes:
+        frames: The frames to keep: `ends`, `all` or `none`.
+        calls: The number of inferences whose inputs are kept.
+        script: The name of a script that plays by itself, None without one.
+    """
 
     frames: str = "none"
     calls: int = 1
@@ -135,15 +141,15 @@ class Played:
 
 
 class Source[Chosen: SourceSettings](ABC):
-    """An opened source; `check` gives the same source as it is shown to a model.
+    """An opened source; `check` returns the same source as it is shown to a model.
 
     Attributes:
         own_units: Whether actions are predictions in the checkpoint's own units; those of an arm otherwise.
         executes: Whether actions move anything.
-        groups: What rows are grouped by, in words.
-        columns: Names of numbers that become labels, such as facts.
-        chunk: Actions that a policy predicts at a time; 0 where its card says so.
-        suite: Of questions with two pictures.
+        groups: The groups of rows, in words.
+        columns: The names of numbers that become labels, such as facts.
+        chunk: The number of actions that a policy predicts at a time; 0 where its card says it.
+        suite: The suite of questions with two pictures; None for other sources.
     """
 
     own_units: ClassVar[bool] = True
@@ -160,13 +166,13 @@ class Source[Chosen: SourceSettings](ABC):
         """Open the source that settings choose; see `SourceSettings.open`."""
 
     def for_questions(self) -> Self:
-        """Return the source of which questions are asked: one row is one question, about its first observation."""
+        """Return the source with a row per question, which is about the row's first observation."""
         return self
 
     def watched(self, cameras: Sequence[str]) -> Self:
-        """Return the source as a model sees it that answers and does not act. cameras: of the model.
+        """Return the source as it is shown to a model with these cameras that answers and does not act.
 
-        Raises for cameras that get no picture.
+        Raises an error for cameras that get no picture.
         """
         del cameras
         return self
@@ -182,64 +188,61 @@ class Source[Chosen: SourceSettings](ABC):
 
     @abstractmethod
     def rows(self, seed: int) -> "tuple[Row, ...]":
-        """The rows in order; nothing about a row depends on which others were selected."""
+        """Return the rows in order; nothing about a row depends on which others were selected."""
 
     @abstractmethod
     def identity(self, execute: int) -> dict[str, Any]:
-        """The part of a run's identity that says where observations come from.
+        """Return the part of a run's identity that says where observations come from.
 
-        Args:
-            execute: Actions per inference; 0 for a model that predicts none.
+        The number of actions per inference, `execute`, is 0 for a model that predicts none.
         """
 
     @abstractmethod
     def selection(self, rows: "Sequence[Row]") -> dict[str, Any]:
-        """The settings that say what was selected; no part of a run's identity."""
+        """Return the settings that say what was selected; no part of a run's identity."""
 
     @abstractmethod
     def describe(self, rows: "Sequence[Row]") -> dict[str, str]:
-        """The lines of a plan that say what is shown, by heading."""
+        """Return the lines of a plan that say what is shown, by heading."""
 
     @abstractmethod
     def check(self, policy: "Policy", accept_units: bool) -> "tuple[Self, Policy]":
-        """The source as a policy is shown it, and the policy for its cameras.
+        """Return the source as a policy is shown it, and the policy for its cameras.
 
-        Raises for cameras, states, units or actions that do not fit.
+        Raises an error for cameras, states, units or actions that do not fit.
         """
 
     @abstractmethod
     def play(self, played: Played) -> "Opens":
-        """Return what opens a player of this source, here or in a process of its own."""
+        """Return a function that opens a player of this source, here or in a process of its own."""
 
     @abstractmethod
     def example(self, instruction: str) -> "Observation":
-        """A blank observation of the source's shapes, of which tokens are counted."""
+        """Return a blank observation of the source's shapes, whose tokens are counted."""
 
     @cached_property
     def instructions(self) -> tuple[str, ...]:
-        """Every instruction once, in the order of their letters."""
+        """Every instruction once, in alphabetical order."""
         return tuple(sorted({row.instruction for row in self.rows(0)}))
 
     def early_checks(
         self, cameras: Sequence[str], state: int | None, checkpoint: str
     ) -> list[Callable[[], object]]:
-        """Checks against the cameras and numbers of the state that a checkpoint declares, before it is loaded."""
+        """Return checks against the cameras and state width that a checkpoint declares, before it is loaded."""
         del cameras, state, checkpoint
         return []
 
     def shown_cameras(self, declared: Sequence[str] | None = None) -> tuple[str, ...] | None:
-        """Return the model's cameras that get a picture, the first one in front; None where only a model can say.
+        """Return the model's cameras that get a picture, the first one in front; None if only a model can say.
 
-        Of a source that was checked against a model they are those of the model.
-
-        Args:
-            declared: The cameras of a checkpoint that is not loaded yet, None where its files do not say.
+        They are those of the model once the source was checked against it. Before, `declared` has the cameras of a
+        checkpoint that is not loaded yet, None where its files do not say.
         """
         del declared
         return None
 
     def known_early(self) -> dict[str, Any] | None:
-        """The settings of a run that are known before a model is loaded; None where there are none."""
+        """Return the settings of a run that are known before a model is loaded; None where there are none."""
         return None
 
     def check_same(self, settings: Mapping[str, Any]) -> None:
@@ -247,25 +250,25 @@ class Source[Chosen: SourceSettings](ABC):
         del settings
 
     def name_parts(self) -> list[Any]:
-        """The parts of a run's default name beside its identity."""
+        """Return the parts of a run's default name beside its identity."""
         return []
 
     def rehearse(self, rows: "Iterable[Row]") -> None:
-        """Set the first rows up. Raises if none can be."""
+        """Set the first rows up. Raises an error if none can be."""
         del rows
 
     @property
     def suite_parent(self) -> Any:
-        """The hash of the suite that a suite was selected of; None for all else."""
+        """The hash of the suite that a suite was selected from; None for any other."""
         return None
 
     @property
     def decoder(self) -> str | None:
-        """The name and version of what makes pictures of stored videos here; None where nothing is decoded."""
+        """The name and version of the decoder of stored videos on this machine; None where nothing is decoded."""
         return None
 
     def targets(self) -> tuple[str, ...]:
-        """The built-in targets of probes that the rows have, such as `side.correct` or `env.left`."""
+        """Return the built-in targets of probes that the rows have, such as `side.correct` or `env.left`."""
         return ()
 
 
@@ -285,15 +288,15 @@ def raise_together(checks: Iterable[Callable[[], object]]) -> None:
 
 
 MOST_UNUSUAL = 0.2
-"""Share of unusual values of one number of the state, above which a run is refused."""
+"""The share of unusual values of one number of the state, above which a run is refused."""
 FIRST_EPISODES = 4
-"""Episodes of a scene or environment whose first states are compared, before any is played."""
+"""The episodes of a scene or environment whose first states are compared, before any is played."""
 
 
 def unusual_shares(policy: "Policy", states: NDArray[np.float32]) -> NDArray[np.float64]:
-    """(D,) share of the states (n, D) whose number lies far outside the checkpoint's statistics.
+    """Return by number (D,) the share of states (n, D) in which it lies far outside the checkpoint's statistics.
 
-    Empty for a policy that normalises no state.
+    It is empty for a policy that normalizes no state.
     """
     if policy.state_numbers is None:
         return np.zeros(0)
@@ -308,8 +311,10 @@ def check_units(
 
     Args:
         shares: (D,) of `unusual_shares`.
-        names: Of the numbers of the state.
-        where: The source.
+        names: The names of the numbers of the state.
+        where: The source, for the message.
+        policy: The policy whose checkpoint the message names.
+        accepted: Whether such states are accepted.
     """
     if accepted or not (shares > MOST_UNUSUAL).any():
         return
@@ -325,9 +330,9 @@ def check_units(
 
 
 def other_order(policy: "Policy", names: Sequence[str]) -> str | None:
-    """Why numbers of these names are not the actions of a policy in their order; None where nothing says so.
+    """Return why numbers of these names are not a policy's actions in their order; None where nothing says so.
 
-    Names are compared where both sides have any: positions such as `0`, `1` are none.
+    Names are compared where both sides have any; positions such as `0`, `1` are no names.
     """
     predicted = policy.action_names
     if predicted is None or tuple(names) == predicted or all(name.isdecimal() for name in names):
@@ -347,7 +352,7 @@ def exchanged_names(policy: "Policy", names: Sequence[str]) -> str | None:
 
 
 def predicted_once(policy: "Policy", observation: Observation) -> NDArray[np.float32]:
-    """(chunk, D): one prediction of a policy, in its own units. Raises PolicyFailedError for anything else."""
+    """Return one prediction (chunk, D) of a policy, in its own units. Raises PolicyFailedError otherwise."""
     with while_acting(policy.card.family, policy.card.checkpoint):
         chunks = policy.predict(copied([observation]), [0])
         check_predictions(chunks, 1)
@@ -356,9 +361,9 @@ def predicted_once(policy: "Policy", observation: Observation) -> NDArray[np.flo
 
 
 def check_predictions(chunks: Any, count: int, width: int | None = None) -> None:
-    """Raise PolicyFailedError unless these are chunks of actions (count, chunk, D) float32. width: D, if known.
+    """Raise PolicyFailedError unless these are chunks of actions (count, chunk, D) float32, of D `width` if known.
 
-    Actions that are NaN cost their own episode only, so the environment is left to say that.
+    Actions that are NaN cost their own episode only; the environment raises the error for them.
     """
     array = chunks if isinstance(chunks, np.ndarray) else None
     shape: tuple[int, ...] = () if array is None else array.shape
