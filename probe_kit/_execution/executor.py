@@ -109,21 +109,15 @@ class GivenUp[T]:
 class TaskQueue[T]:
     """Tasks for workers, handed out in order.
 
-    A task that failed, or was in the hands of a worker that died, is suspect: it is tried again when all others
-    are handed out, by a worker that holds nothing else, so that it can take no other task down with it.
+    A task that failed, or was in the hands of a worker that died, is suspect. It is tried again when all others
+    are handed out, by a worker that holds nothing else. So it can take no other task down with it.
 
-    Attributes:
+    Args:
         tasks: Keys and tasks in order, of which one is read ahead.
         noun: A word for one task, in the singular, as messages name it.
         tries: The number of failures after which a task is given up.
         fits: Whether a worker, by number, can do a task; all tasks are then read at once. None: every worker can
             do each.
-
-    Args:
-        tasks: By key, read one ahead.
-        noun: A word for one of them.
-        tries: Failures after which it is given up.
-        fits: Whether a worker can do a task; all tasks are then read at once.
     """
 
     def __init__(
@@ -203,7 +197,7 @@ def work_off[T](pool: Pool, queue: TaskQueue[T]) -> Iterator[tuple[int, Any]]:
     warning; a task that is lost once too often is the event `GivenUp`. A worker without further tasks is stopped.
 
     Raises:
-        ProbeKitError: That which a worker sends.
+        ProbeKitError: The error that a worker sends.
         WorkerDiedError: If `MOST_STILLBORN` workers in a row die before their first task.
         UsageError: If no worker can take a task that is left.
     """

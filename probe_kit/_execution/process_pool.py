@@ -80,17 +80,13 @@ A signal that arrives just before the system call does not end it: an endless wa
 class ProcessPool:
     """Workers in processes, numbered from 0. A context manager.
 
-    Attributes:
+    Args:
         work: The work of every worker.
         setup: The first argument of `work`, which is sent to every process.
         size: The number of processes.
-        environment: By number, variables of the process beyond those of this one. None: no others.
-        exits: By exit code, the predicate of a sentence that says why a process ended. None: the sentence names
-            the code.
-
-    Args:
-        environment: By number, variables of the process beyond those of this one.
-        exits: By exit code, the predicate of a sentence that says why a process ended.
+        environment: Variables of a process beyond those of this one, by its number. None: no others.
+        exits: The predicate of a sentence that says why a process ended, by exit code. A code without one is
+            named.
     """
 
     def __init__(
@@ -132,7 +128,7 @@ class ProcessPool:
         self._children[slot] = Child("probe_kit._execution.executor:serve", environment)
 
     def pid(self, slot: int) -> int:
-        """The process id of a worker."""
+        """Return the process id of a worker."""
         return self._children[slot].pid
 
     def send(self, slot: int, message: object) -> None:
@@ -157,7 +153,7 @@ class ProcessPool:
 
 
 def share_of_machine(slot: int, size: int, device: str) -> dict[str, str]:
-    """The variables of process number `slot` of `size`: a share of the cores, and one GPU if `device` is a GPU.
+    """Return the variables of process number `slot` of `size`: a share of the cores, and a GPU if `device` is one.
 
     It is a share of what this process itself has: a worker of a pool that opens a pool divides its own share.
     """

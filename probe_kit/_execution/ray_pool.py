@@ -60,14 +60,11 @@ class RayPool:
 
     Each holds a core and its GPUs, so that nodes share them. One without room begins later and delays no other.
 
-    Attributes:
+    Args:
         work: The work of every worker.
         setup: The first argument of `work`; the cluster stores it once.
         address: The cluster's address; `AUTO` stands for the one this process belongs to, or a new one here.
-        gpus: The GPUs of every worker, from the resources of the cluster (`CPU`, `GPU`).
-
-    Args:
-        gpus: By the resources of the cluster (`CPU`, `GPU`), the GPUs of every worker.
+        gpus: A function of the cluster's resources (`CPU`, `GPU`) that returns the GPUs of every worker.
     """
 
     def __init__(
@@ -79,7 +76,7 @@ class RayPool:
         self._nodes: dict[int, str] = {}
         """The node of every worker that has begun."""
         self._alive_at_start: dict[int, set[str]] = {}
-        """By worker, the nodes that were alive when it was started."""
+        """The nodes that were alive when a worker was started, by worker."""
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
@@ -164,7 +161,7 @@ class RayPool:
 
 @contextmanager
 def ray_cluster(address: str) -> Iterator[Any]:
-    """The module `ray`, connected to the cluster at `address` while the body runs.
+    """Yield the module `ray`, connected to the cluster at `address` while the body runs.
 
     A connection that was there before stays. This process prints what workers print.
 

@@ -93,8 +93,8 @@ def load_yaml(file: Path) -> Any:
     """Return the value in a file of safe YAML.
 
     Raises:
-        OSError: As `read_regular` does.
-        ValueError: For other text, for text that nests too deeply, and for aliases that stand for more than
+        OSError: For a file that `read_regular` refuses.
+        ValueError: For other text, and for text that nests too deeply. Also for aliases that stand for more than
             `MOST_NODES` values: nine lines can stand for a billion.
     """
     import yaml
@@ -112,7 +112,7 @@ def load_yaml(file: Path) -> Any:
 
 
 def _nodes(value: Any, counted: dict[int, int]) -> int:
-    """The number of values below one, where an alias counts as all that it stands for."""
+    """Return the number of values below one, where an alias counts as all that it stands for."""
     if not isinstance(value, dict | list | set | tuple):
         return 1
     if id(value) not in counted:
@@ -152,7 +152,7 @@ def parse_json(content: bytes | str, **options: Any) -> Any:
 
 
 def parse_strict_json(content: bytes) -> Any:
-    """The value of JSON that probe_kit wrote itself.
+    """Return the value of JSON that probe_kit wrote itself.
 
     Raises:
         ValueError: For what `parse_json` refuses, for a byte order mark, and for a number that is not finite.
@@ -181,8 +181,8 @@ def load_json(file: Path, most: int = MOST_BYTES) -> Any:
     """Return the value in a file of at most `most` bytes.
 
     Raises:
-        OSError: As `read_regular` does.
-        ValueError: As `parse_json` does.
+        OSError: For a file that `read_regular` refuses.
+        ValueError: For a text that `parse_json` refuses.
     """
     return parse_json(read_regular(file, most))
 
@@ -212,7 +212,7 @@ def read_json(
         kind: `dict` or `list` if the value must be one; `object` accepts every value.
 
     Raises:
-        ProbeKitError: Of class `raises`, for any file that cannot be used.
+        ProbeKitError: For any file that cannot be used, of class `raises`, with `advice`.
     """
     try:
         value = load_json(file, most)

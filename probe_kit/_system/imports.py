@@ -20,7 +20,7 @@ def lazy_names(package: str, homes: Mapping[str, str]) -> tuple[Callable[[str], 
 
     Args:
         package: The full name of the package, as `__name__` has it.
-        homes: By name its module inside the package, `module:other_name` where it has another name there, or
+        homes: The module of every name inside the package; `module:other_name` where it has another name there, or
             `module:` where the name is the module's own. A module of another package begins with `probe_kit.`.
     """
 
@@ -77,7 +77,7 @@ _ROOT = Path(__file__).parents[2]
 
 
 def install_command(extra: str = "", rebuild: str = "") -> str:
-    """The shell command that installs probe_kit again, with an extra or with one package built anew.
+    """Return the shell command that installs probe_kit again, with an extra or with one package built anew.
 
     In a checkout's own environment it is `./with-uv`, which brings uv. Elsewhere it is the pip of the running
     Python, or `uv pip` where that Python has none.
@@ -97,14 +97,15 @@ def install_command(extra: str = "", rebuild: str = "") -> str:
 
 
 def install_folder_command(folder: Path) -> str:
-    """The shell command that installs the package in `folder` for the running Python; it stays editable."""
+    """Return the shell command that installs the package in `folder` for the running Python, editable."""
     return f"{_installer()} -e {shlex.quote(str(folder))}"
 
 
 def install_here_command() -> str:
-    """The shell command that installs, editable, the package in the shell's folder, in an activated environment.
+    """Return the shell command that installs the package in the shell's folder, in an activated environment.
 
-    It holds on any machine, unless uv is the one that `with-uv` fetched into its folder.
+    The package stays editable. The command holds on any machine, unless uv is the one that `with-uv` fetched into
+    its folder.
     """
     return "pip install -e ." if _has_pip() else f"{_uv()} pip install -e ."
 
@@ -129,7 +130,7 @@ def _installer() -> str:
 
 
 def _uv() -> str:
-    """The uv that a shell finds, or that `with-uv` uses."""
+    """Return the uv that a shell finds, or that `with-uv` uses."""
     usual = (Path.home() / ".local/bin/uv", Path.home() / ".cargo/bin/uv", _ROOT / ".uv/bin/uv")
     if shutil.which("uv") is not None:
         return "uv"
@@ -137,7 +138,7 @@ def _uv() -> str:
 
 
 def _python() -> str:
-    """The running Python as a shell finds it."""
+    """Return the running Python as a shell finds it."""
     name = Path(sys.executable).name
     path = shutil.which(name)
     return name if path is not None and Path(path) == Path(sys.executable) else shlex.quote(sys.executable)

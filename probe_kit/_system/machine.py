@@ -41,7 +41,7 @@ def check_device_name(device: str, present: bool = True) -> None:
 
 
 def what_is_here() -> str:
-    """A sentence on the devices that torch finds or, before torch is imported, that the system shows."""
+    """Return a sentence on the devices that torch finds or, before torch is imported, that the system shows."""
     return f"This machine has {', '.join(_devices())}"
 
 
@@ -64,7 +64,7 @@ def _of_torch() -> list[str]:
 
 
 def _of_system() -> list[str]:
-    """The devices that the system shows without torch."""
+    """Return the devices that the system shows without torch."""
     if sys.platform == "darwin":
         return ["mps"]
     models = [

@@ -120,7 +120,7 @@ def _spelling(cell: str) -> tuple[str, str]:
 def group_names(cells: Sequence[Any], where: Callable[[int], str], error: Callable[[str], Exception]) -> list[str]:
     """Return cells as names of groups: `7` and `7.0` are one group; texts are compared as `name_of` returns them.
 
-    Raises `error` for two spellings of one name, and for a cell that may mean a missing value.
+    Two spellings of one name, and a cell that may mean a missing value, raise `error`.
     """
     names = []
     for row, cell in enumerate(cells):
@@ -186,8 +186,8 @@ def values_of(
         otherwise: How the caller declares texts `as_names`, at the end of a message.
 
     Raises:
-        UsageError: For a text that looks like a quantity and is not a plain number (unless texts are `as_names`),
-            for a cell that may mean a missing value, and for two spellings of one class.
+        UsageError: For a text that looks like a quantity and is not a plain number, unless texts are `as_names`.
+            Also for a cell that may mean a missing value, and for two spellings of one class.
     """
     texts: list[Cell] = [name_of(cell) if isinstance(cell, str) else cell for cell in cells]
     for row, cell in enumerate(texts):

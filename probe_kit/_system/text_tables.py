@@ -72,8 +72,8 @@ class TextTable:
         Rows without any text are left out. `columns` are those to read, by default all with a heading.
 
         Raises:
-            ProbeKitError: Of the table's class `error`, for a column that occurs twice, for a row with more or
-                fewer cells than the heading, and by default for a cell without a heading.
+            ProbeKitError: For a column that occurs twice, and for a row with more or fewer cells than the heading.
+                By default also for a cell without a heading. Its class is the table's `error`.
         """
         read = [name for name in self.names if name] if columns is None else columns
         unnamed = [at for at, name in enumerate(self.names) if not name] if columns is None else []
@@ -123,8 +123,8 @@ def open_table(
         most_characters: The most characters of a cell.
 
     Raises:
-        ProbeKitError: Of class `error`, for a file that cannot be read, is in another encoding, or has a heading
-            that several separators explain.
+        ProbeKitError: For a file that cannot be read, is in another encoding, or has a heading that several
+            separators explain. Its class is `error`.
     """
     encoding = _encoding(path, error)
     with _opened(path, encoding, error) as file:

@@ -15,7 +15,7 @@ Number = Mapping[str, Any]
 _LIMITS = re.compile(r"(?<!^) ?(\[[^\]]*\])")
 """An interval behind its value."""
 _UNITS = re.compile(r"(,? (%|cm|points))?( \[[^\]]*\])?$")
-"""What a heading has behind its term."""
+"""The part of a heading behind its term."""
 _NUMBER = re.compile(r"[-+−±]?\d|< \d|n/a|–|$")
 """The beginning of a cell of numbers."""
 
@@ -90,8 +90,9 @@ class Content:
         notes: Sentences below the table, which need no capital letter and no period.
         numbers: An object per row or per number, shares in [0, 1], None where unknown.
         is_partial: Whether runs are missing that could be played; a note names them.
-        overflow: What a terminal does with columns that do not fit: `split` into further tables, `leave out` by
-            name, first `fold` intervals below their values, or `wrap` text, for columns of words.
+        overflow: The way in which a terminal shows columns that do not fit. `split`: in further tables. `leave
+            out`: by name only. `fold`: first with intervals below their values. `wrap`: with wrapped text, for
+            columns of words.
     """
 
     title: str
@@ -166,7 +167,7 @@ class Content:
 
     @property
     def are_numeric(self) -> tuple[bool, ...]:
-        """Return by column whether it holds numbers, which are aligned to the right."""
+        """A flag per column: whether it holds numbers, which are aligned to the right."""
         return tuple(
             at >= self.names and any(texts) and all(map(_NUMBER.match, texts))
             for at, texts in enumerate(self._by_column)

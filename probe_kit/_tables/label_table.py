@@ -25,7 +25,7 @@ class LabelTable:
         source: The path of the file, or `DataFrame`.
         unit: `line` of a file, or `row` where there are no lines.
         names: The headings of all columns of the table.
-        columns: The cells by column of those that were asked for: texts of a CSV file, texts and typed values of a
+        columns: The cells of the columns that were asked for: texts of a CSV file, texts and typed values of a
             data frame, None where missing.
         lines: The number of every row in its file.
         semicolons: Whether semicolons separate the cells.

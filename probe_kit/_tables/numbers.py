@@ -1,4 +1,4 @@
-"""Number formats of tables, sentences and figures: a dash stands for a number that there is not."""
+"""The formats of numbers in tables, sentences and figures: a dash stands for a missing number."""
 
 from collections.abc import Callable, Sequence
 from math import isfinite

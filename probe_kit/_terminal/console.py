@@ -1,8 +1,8 @@
 """Consoles, progress bars and comma-separated lists, shared by the commands.
 
-All output of commands passes through this module, because much of it is foreign text: names in suites
-and checkpoints, paths, messages of libraries. What a terminal would obey (escape sequences, marks
-that turn the direction of text around) becomes a visible sign, and square brackets are never read as styles.
+All output of commands passes through this module, because much of it is foreign text: names in suites and
+checkpoints, paths, messages of libraries. What a terminal would obey (escape sequences, marks that turn the
+direction of text around) becomes a visible sign. Square brackets are never read as styles.
 """
 
 import json
@@ -222,7 +222,7 @@ def spoken(seconds: float) -> str:
 
 
 def _per_time(rate: float) -> str:
-    """Return a rate per second in the unit in which it is at least one: per second, per minute or per hour."""
+    """Return a `rate` per second in the unit in which it is at least one: per second, minute or hour."""
     for seconds, unit in ((1, "s"), (60, "min")):
         if rate * seconds >= 1:
             return f"{rate * seconds:.1f} per {unit}"

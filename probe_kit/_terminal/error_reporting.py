@@ -26,8 +26,9 @@ _LONGEST = 300
 def report_error(error: BaseException) -> int:
     """Print on stderr why a command ended, and return its exit code.
 
-    1: the result is not as requested, or an internal error occurred, whose traceback is in the file that is named.
-    2: an argument or a path that was given cannot be used. 3: refused, or the disk is full or read-only.
+    The code is 1 if the result is not as requested, or if an internal error occurred. The traceback of the latter
+    is in the file that is named. It is 2 if an argument or a path that was given cannot be used. It is 3 if the
+    command refused, or if the disk is full or read-only.
     """
     if isinstance(error, KeyboardInterrupt):
         say(marked("[yellow]interrupted[/]. Completed work is saved; run the same command to resume."))

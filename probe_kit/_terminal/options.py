@@ -1,7 +1,7 @@
 """Options that several commands share, each declared once as an annotated type.
 
 `def command(partial: Partial = False, device: Device = "cpu")` gives a command the option with its help. Closed
-vocabularies are `Literal` types of the library, whose values help lists and parsing checks; `some_of` and `one_of`
+vocabularies are `Literal` types of the library, whose values help lists and parsing checks. `some_of` and `one_of`
 do the same for comma-separated values and for the names of a registry.
 """
 

@@ -62,8 +62,8 @@ class Extraction:
         card: The part of the identity that the loaded model decides.
         controller: The controller of the loaded model. None: workers elsewhere load the model again.
         calibration: The measurement that chose the batch; None if it was not requested or is left to workers.
-        declared: The origin of the sizes of the streams where no model was loaded and the run has no name yet;
-            empty where a model was loaded.
+        declared: The origin of the sizes of the streams, where no model was loaded and the run has no name yet.
+            Empty where a model was loaded.
     """
 
     settings: Settings
@@ -195,7 +195,7 @@ def load(
         settings: The settings of the run.
         rehearsed: Whether the source was tried before.
         location: The place of the run, if it is known, so that it is checked before the model is loaded.
-        model: The policy or answer model of these settings, if it is loaded already; it may be one of your own,
+        model: The policy or answer model of these settings, if it is loaded already. It may be one of your own,
             and several runs can share it.
         fetch: False makes the plan of the streams that the model's family declares: without weights, network or
             GPU. A family that declares none is loaded.
@@ -297,7 +297,7 @@ def check_model(settings: Settings, fetch: bool = True) -> None:
     Raises:
         UnknownModelError: For an unknown family.
         MissingExtraError: For workers on a Ray cluster without Ray.
-        ProbeKitError: As `Family.check` raises it.
+        ProbeKitError: For whatever else `Family.check` refuses.
     """
     if settings.machine.ray is not None and find_spec("ray") is None:
         raise MissingExtraError(f"--ray needs ray, which is not installed; `{install_command('ray')}`")
@@ -352,10 +352,10 @@ def _check_other_run(settings: Settings, source: Source[Any], location: Location
 
 
 def _selects_only(settings: Settings, location: Location | None) -> bool:
-    """Whether only the chosen items of the suite are needed.
+    """Whether only the chosen items of the suite are needed, and not the suite as a whole.
 
     Names of runs that are known before they are played hold the hash of the whole suite, and so does an existing
-    run; questions name objects of all its items.
+    run. Questions name objects of all its items.
     """
     if task_of(settings).names_all_items:
         return False
@@ -404,7 +404,7 @@ def play(prepared: Extraction, writer: RunWriter, numbers: list[int]) -> Generat
         WorkerDiedError: If workers die before they begin.
         MissingExtraError: Without Ray.
         UsageError: If no Ray cluster answers.
-        ProbeKitError: As a worker raises it.
+        ProbeKitError: The error that a worker raises.
     """
     queue = TaskQueue(((number, number) for number in numbers), "episode")
     settings = prepared.settings

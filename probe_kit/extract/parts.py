@@ -1,8 +1,8 @@
 """Parts of the settings of a run: model, capture, task, machine. The part of a field says if it is identity.
 
-`capture` and `task` are identity as they are; `model` and the source (in `sources/`) are by what they lead to, a
-hash of weights and a list of rows; `machine` never is. A field is declared here once: its annotation holds the
-option of the command line, and study files have the same fields.
+The parts `capture` and `task` are identity as they are. The part `model` and the source (in `sources/`) are
+identity by what they lead to, a hash of weights and a list of rows. The part `machine` never is. A field is
+declared here once: its annotation holds the option of the command line, and study files have the same fields.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -321,7 +321,7 @@ class Machine(Part):
         ray: The address of a Ray cluster, or `auto`; the workers then run there. None for this machine.
         inference_limit: The seconds that one call of the model may take in a worker. A worker that takes longer is
             ended; its episodes are tried once more, and given up by name. None for no limit.
-        allow_mixed: Continue a run whose episodes were made on another kind of device or with other versions; the
+        allow_mixed: Continue a run whose episodes were made on another kind of device or with other versions. The
             run is then marked as mixed wherever tables name it.
         accept_ignored_inputs: Accept a model that neither another picture nor another instruction changes.
     """

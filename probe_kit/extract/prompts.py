@@ -1,8 +1,8 @@
 """Questions in words to a model: phrases of objects, prompt templates, and pictures side by side.
 
-Places in a template: `the {object}` is the object with its article, if it has one, `{object}` without; `{A}` and
+Places in a template: `the {object}` is the object with its article, if it has one, `{object}` without. `{A}` and
 `{B}` are the words for the two sides, in either order. A letter A in front of `{A}` and a letter B in front of
-`{B}` make them options that are answered by their letter; without letters they are answered in words. A template
+`{B}` make them options that are answered by their letter. Without letters they are answered in words. A template
 with `{instruction}` shows a VLM the words of the policies, to compare activations with theirs.
 
 Phrases come from the items themselves, never out of an instruction.
@@ -107,7 +107,7 @@ def _distractor(item: Item, items: Sequence[Item], _seed: int) -> Phrase | None:
 def _absent(item: Item, items: Sequence[Item], seed: int) -> Phrase | None:
     """Return a phrase of the category whose concept is in neither picture.
 
-    Comparisons, such as "less smiling person", hold of some picture of every pair of their kind: where a category
+    Comparisons, such as "less smiling person", hold of some picture of every pair of their kind. Where a category
     has both kinds, an item gets a phrase of its own kind only.
     """
     concepts = {item.target_concept, item.distractor_concept}

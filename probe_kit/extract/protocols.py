@@ -127,7 +127,10 @@ def _used(model: ModelSettings, task: ActTask, scene: "SceneSpec") -> dict[str, 
 
 
 def _portable_value(value: str) -> str:
-    """Return the last name of a file or folder: its place on this machine is no part of a run."""
+    """Return only the last name of a file or folder: its place on this machine is no part of a run.
+
+    Other values are returned as they are.
+    """
     return Path(value).name if is_here(value) else value
 
 

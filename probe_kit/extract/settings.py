@@ -193,7 +193,7 @@ class Settings(Part):
 
         Raises:
             UsageError: For two sources, for options of another source, and as `__init__` raises it.
-            SceneError: As `__init__` raises it.
+            SceneError: For values that no scene can have.
         """
         parts = [
             option for part in (*(_model_of(cls, part) for part in _PARTS), cls) for option in options_of(part)

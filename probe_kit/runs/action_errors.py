@@ -106,8 +106,8 @@ def compare_actions(run: RunReader) -> ActionErrors:
     """Compare the predicted actions of a run on recordings with the recorded ones.
 
     Raises:
-        UsageError: For a run of another kind, or where the two are not the same numbers: another count, changes on
-            one side and positions on the other, or values outside the statistics of the checkpoint.
+        UsageError: For a run of another kind, or where the two are not the same numbers. They differ in count, one
+            has changes and the other positions, or values are outside the statistics of the checkpoint.
     """
     if not run.recorded:
         raise UsageError(f"{run.location} has no recorded actions: it is not of recordings")

@@ -24,7 +24,7 @@ class ArrayStore(Store):
 
     A wrong or missing object raises RunDamagedError. Of a shard, only the parts that are read are checked. The
     attribute `written` has the sums of what was written through the store. The attribute `shards` has the number
-    of inner chunks in every object of a sharded array, by the array's path; it is filled in before the array is
+    of inner chunks in every object of a sharded array, by the array's path. It is filled in before the array is
     written.
 
     Args:

@@ -68,9 +68,9 @@ def create_arrays(
     Pooled rows are float32 (episode, call, [iteration,] layer, view, feature), one chunk per episode, NaN where
     nothing was captured. Tokens are uint16, one shard per episode, with inner chunks of one layer x 128 tokens.
 
-    With `mean` for `later_views`, pooled rows hold the first inference alone, and `later` that view of the others:
-    uint16 (episode, call, [iteration,] layer, feature), one chunk per episode, `NOT_A_NUMBER` where nothing was
-    captured.
+    With `mean` for `later_views`, pooled rows hold the first inference alone, and `later` that view of the others.
+    These are uint16 (episode, call, [iteration,] layer, feature), one chunk per episode, `NOT_A_NUMBER` where
+    nothing was captured.
     """
     root = zarr.open_group(store, mode="w-", zarr_format=3)
     full = calls if later_views == "all" else 1
@@ -376,7 +376,7 @@ class StoredInputs:
         return np.stack(list(rows))
 
     def row(self, kind: str, position: int) -> NDArray[Any]:
-        """Return the inputs (C, …) of one kind of the row at a position. Raises as `read`."""
+        """Return the inputs (C, …) of one kind, of the row at a position. Raises KeyError, RunDamagedError."""
         if kind not in self.kinds:
             raise KeyError(kind)
         return Rows(open_array(self._store, f"{INPUTS}/{kind}"), self._numbers)[position]

@@ -10,8 +10,8 @@ them. They are derived: safe to delete, and used only while their stamp matches 
     sealed/<stamp>.json   the hash of every object there, and of which run and commits they are
 
 Their key carries the stamp, so that processes that saw different commits never mix them. A seal says which
-episodes it was made of. It is older than a run that has more; one that names an episode which is not committed any
-more shows that the run lost it.
+episodes it was made of. It is older than a run that has more. A seal that names an episode which is not committed
+any more shows that the run lost it.
 """
 
 from collections.abc import Mapping

@@ -170,7 +170,7 @@ def copy_run(
     Raises:
         UsageError: If anything lies at `out`.
         DiskSpaceError: If the disk of `out` takes no more.
-        ProbeKitError: As `open_run` raises it.
+        ProbeKitError: For a run that `open_run` refuses.
     """
     run, target = open_run(path, allow_partial), locate(out)
     # `root.arrays` has the inputs of recordings besides the streams: states and small pictures are left out too.

@@ -1,10 +1,9 @@
 """Directions from outside: vectors in safetensors or npz files, and the decoders of sparse autoencoders.
 
 A file holds arrays (D,) or (K, D) by name. The entry `directions` has, as JSON by name, the site, the role, the
-space and the hash of the weights: in safetensors it is metadata, in npz an array of one text. A direction in the
+space and the hash of the weights. In safetensors it is metadata, in npz an array of one text. A direction in the
 space `standardised` has an array NAME.scale (D,), by which it is multiplied. SAELens writes folders with
-`sae_weights.safetensors` and `cfg.json`; there NAME is the number of a feature, whose row of the decoder is
-read.
+`sae_weights.safetensors` and `cfg.json`; there NAME is the number of a feature, whose row of the decoder is read.
 """
 
 import hashlib

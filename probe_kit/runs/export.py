@@ -48,15 +48,15 @@ def export_run(
 ) -> Path:
     """Write the run at `path` to `out`, whole or not at all, with sha256 of every file, and return `out`.
 
-    h5: `<stream>/pooled`, `<stream>/later`, `<stream>/tokens`, and a dataset per column under `episodes`.
-    safetensors: the same with a dot, the last two true bfloat16; episodes in the metadata. Axes of both are
-    (episode, call, [iteration,] layer, view or token, feature). lerobot: a LeRobotDataset, of a run with `--frames
-    all`.
+    The format `h5` has `<stream>/pooled`, `<stream>/later`, `<stream>/tokens`, and a dataset per column under
+    `episodes`. The format `safetensors` has the same names with a dot, the last two arrays as true bfloat16, and
+    episodes in the metadata. Axes of both are (episode, call, [iteration,] layer, view or token, feature). The
+    format `lerobot` is a LeRobotDataset, of a run with `--frames all`.
 
-    Three formats hold the vectors that `sites` and `view` choose, see `choose`. parquet: a row per vector with
-    episode, group, inference, frame, site, view, role and token. directions: a vector per category, view and site,
-    see `write_class_means`; a .safetensors or .npz. sae: a folder with a memory map (N, D) per site in a drawn
-    order, an index, and the scale of every site.
+    Three formats hold the vectors that `sites` and `view` choose, see `choose`. The format `parquet` has a row per
+    vector with episode, group, inference, frame, site, view, role and token. The format `directions` has a vector
+    per category, view and site, see `write_class_means`, in a .safetensors or .npz. The format `sae` is a folder.
+    It has a memory map (N, D) per site in a drawn order, an index, and the scale of every site.
 
     Args:
         path: The folder or address of the run.
@@ -281,8 +281,9 @@ _STATE = [*STATE["tool"], "opening"]
 def write_lerobot(run: Run, folder: Path) -> None:
     """Write the data set in `folder`: an episode of T steps has T rows, each with what the policy did next.
 
-    `observation.state` is the measured tool, x, y, z, roll, pitch, yaw in metres and radians, and the opening of
-    the gripper; `action` is the commanded action. The frame behind the last action is left out.
+    The feature `observation.state` is the measured tool, x, y, z, roll, pitch, yaw in metres and radians, and the
+    opening of the gripper. The feature `action` is the commanded action. The frame behind the last action is left
+    out.
 
     Raises:
         UsageError: For a run without all frames.

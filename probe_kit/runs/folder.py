@@ -1,7 +1,7 @@
 """The operations of a location, and a folder on this machine or a shared file system as one.
 
 Everything in a run is an object with a key such as `commits/00000003.json`. All reads and writes of objects go
-through its location; differences between folders and object stores (locks, renaming, free space, flushing) are
+through its location. Differences between folders and object stores (locks, renaming, free space, flushing) are
 handled here and in `store` only.
 """
 

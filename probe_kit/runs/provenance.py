@@ -5,7 +5,7 @@
     certificates/<digits>.json    a record per process, named by the sha256 of its content
 
 Settings say what was asked for; provenance says what answered. Numbers made on another kind of device or by other
-libraries are not the same numbers, so a run is not continued there unless that is asked for, and then says so.
+libraries are not the same numbers. So a run is not continued there unless that is asked for, and then says so.
 """
 
 import json

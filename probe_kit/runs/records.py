@@ -5,9 +5,9 @@
                       └── stamp ── columns, probes
 
 The hash is that of the canonical JSON of the parsed content: another spelling of the same values is the same
-record; any other value, a key that is named twice, and a part that the model does not know are damage. A record
-names the run it belongs to by the hash of `run.json`, so none counts in another run.
-Hashes detect accidents. They are no protection against an attacker who recomputes them: see `docs/storage.md`.
+record. Any other value, a key that is named twice, and a part that the model does not know are damage. A record
+names the run it belongs to by the hash of `run.json`, so none counts in another run. Hashes detect accidents. They
+are no protection against an attacker who recomputes them: see `docs/storage.md`.
 """
 
 import json
@@ -42,8 +42,8 @@ class Sum(NamedTuple):
     """The length of an object in bytes, and the blake2b of these bytes as 64 hex digits.
 
     Attributes:
-        blocks: For a shard, 16 hex digits per inner chunk in the order of its index, then those of the index; so
-            that a part can be checked without reading the others. Empty for everything else.
+        blocks: For a shard, 16 hex digits per inner chunk in the order of its index, then those of the index. So a
+            part can be checked without reading the others. Empty for everything else.
     """
 
     length: int

@@ -82,7 +82,7 @@ class Bundle:
     Attributes:
         head: The settings of the producer.
         times: The times of the producer's events by name (UTC, ISO 8601).
-        files: By the name asked for, the name that counts now and the sum of it.
+        files: The name that counts now and the sum of every file, by the name asked for.
     """
 
     location: Location

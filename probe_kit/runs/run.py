@@ -589,7 +589,11 @@ class Run:
 
     @cached_property
     def behaviour(self) -> pd.DataFrame:
-        """A row per episode: its id, then what hand and cube did, see `probe_kit.env.scoring.Behaviour`."""
+        """A row per episode: its id, then what hand and cube did, see `probe_kit.env.scoring.Behaviour`.
+
+        Raises:
+            NoTrajectoryError: If the run keeps no trajectories.
+        """
         return (
             self._watched[1].assign(episode_id=self.episodes["episode_id"]).set_index("episode_id").reset_index()
         )
@@ -817,7 +821,7 @@ class Run:
     def gram(self, site: Site, role: str | None = None, call: int = 0) -> NDArray[np.float64]:
         """Return a linear kernel (E, E) float64 over the tokens of one site.
 
-        An entry is the sum of the products of tokens at equal positions, divided by sqrt(n_i n_j). n is an
+        An entry is the sum of the products of tokens at equal positions, divided by sqrt(n_i n_j). There n_i is an
         episode's number of chosen tokens, so that longer instructions have no larger weight.
         """
         kernel = np.zeros((len(self._numbers), len(self._numbers)))

@@ -194,8 +194,8 @@ class Audit:
 def verify_run(path: Path | str | Location, deep: bool = False) -> Audit:
     """Compare a run with its records. Problems are collected, not raised.
 
-    Compares records, the sizes of all objects, and their owners; with `deep` every byte, columns against rows, and
-    every reader of the run and of its stored results.
+    Compares records, the sizes of all objects, and their owners. With `deep` it also compares every byte, columns
+    against rows, and every reader of the run and of its stored results.
 
     Raises:
         RunNotFoundError: If there is no run at `path`.
@@ -217,7 +217,7 @@ def _audit(location: Location, deep: bool) -> Audit:
     problems: list[str] = []
 
     def checked[T](read: Callable[[], T], otherwise: T) -> T:
-        """The part of the run that `read` reads; its error is kept as a problem."""
+        """Return the part of the run that `read` reads; its error is kept as a problem."""
         try:
             return read()
         except RunDamagedError as error:

@@ -62,7 +62,7 @@ def growth_words(location: Location, plan: Plan) -> str:
     The line names the probes and interventions that are then of former episodes.
 
     Raises:
-        SettingsMismatchError: As `further_rows` raises it.
+        SettingsMismatchError: If the stored run cannot grow by this plan.
         ActivationsLeftOutError: For a copy without activations.
         RunDamagedError: If the stored run was changed.
     """
@@ -107,7 +107,7 @@ class EpisodeRecord:
     """All that is stored of one episode.
 
     Attributes:
-        arrays: By kind (`pooled`, `tokens`, `later`) and stream, each shaped like its row in the store.
+        arrays: Arrays by kind (`pooled`, `tokens`, `later`) and stream, each shaped like its row in the store.
         roles: Per captured inference and stream, the spans of roles.
         trajectory: (T + 1, C) float32 frames.
         instruction_ids: The token ids of the instruction as the policy received it.

@@ -1,7 +1,7 @@
 """The task ask: a model answers one question about the first frame of an episode.
 
-Every question is asked with the left side named first and, where the prompt can be turned round, once more with
-the right side named first. Each time the answer is both spoken and forced: greedy text, and the logits of the
+Every question is asked with the left side named first. Where the prompt can be turned round, it is asked once more
+with the right side named first. Each time the answer is both spoken and forced: greedy text, and the logits of the
 admissible answers at its beginning.
 """
 
@@ -312,7 +312,7 @@ class AnswerController(ModelController["AnswerModel", "Prompt"]):
         One question about a blank picture is asked: faults of prompt and options are raised before any episode.
 
         Raises:
-            UsageError: As `AnswerModel.read` does.
+            UsageError: For a prompt or options that `AnswerModel.read` refuses.
         """
         questions = self._blank_questions(blank)[:1]
         self.model.read(questions)

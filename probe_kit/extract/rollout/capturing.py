@@ -104,8 +104,8 @@ class EpisodeBuffers:
     def keep_tokens(self, stream: str, bits: "Tensor") -> None:
         """Copy int16 bit patterns (*lead, T, D) of the last inference begun; behind them come zeros.
 
-        The zeros are added on the device: a copy into part of a row goes through memory that is not locked, and
-        the model would wait for it.
+        The zeros are added on the device: a copy into part of a row goes through memory that is not locked. The
+        model would wait for it.
         """
         from torch.nn.functional import pad
 
@@ -213,7 +213,7 @@ class Capturer:
 
         Raises:
             CaptureChangedActionError: If the first capture of this process changes a number of the output.
-            CaptureError: As `capture` raises it.
+            CaptureError: For activations that cannot be captured.
         """
         from probe_kit.hooks import capture
         from probe_kit.hooks.contract.roles import prepare_pool

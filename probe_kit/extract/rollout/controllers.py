@@ -60,7 +60,7 @@ def check_inputs[Question](
         model: The model whose last residual is captured.
         infer: A function that makes one inference, always with the same seed, and returns its output.
         clean: The unchanged observation or prompt.
-        variants: By input, observations or prompts that differ from the clean one in it alone. The first that the
+        variants: Observations or prompts by input that differ from the clean one in it alone. The first that the
             model accepts is used; if it accepts none, the input is untested.
         last: The last residual before the output; None where no site may be captured.
         around: A context manager that changes the model at every inference as the run does.
@@ -204,9 +204,9 @@ def with_rotation_vectors(actions: NDArray[np.float32]) -> NDArray[np.float32]:
 def ensemble(chunks: Sequence[NDArray[np.float32]], exponent: float) -> NDArray[np.float32]:
     """Return the action (7,) float32 for this step, from the chunks (chunk, 7) of an episode, oldest first.
 
-    There is an inference per step, so a chunk made n steps ago contributes its n-th action, and one that is too
-    old not at all. Weights grow by e^exponent from each chunk to the next; the gripper is open or closed by their
-    majority.
+    There is an inference per step, so a chunk made n steps ago contributes its n-th action. One that is too old
+    contributes nothing. Weights grow by e^exponent from each chunk to the next; the gripper is open or closed by
+    their majority.
     """
     length = len(chunks[-1])
     # `reversed` counts ages from the newest chunk; the last [::-1] puts the oldest first again, as weights count.

@@ -293,7 +293,7 @@ class Worker:
         )
 
     def run(self, next_number: Callable[[], int | None]) -> Iterator[Event]:
-        """Play what `next_number` returns until it returns None; yield an event per episode once it is committed."""
+        """Play what `next_number` returns, up to None; yield an event per episode when it is committed."""
 
         def next_episode() -> Row | None:
             number = next_number()

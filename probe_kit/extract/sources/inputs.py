@@ -122,7 +122,7 @@ class Frame:
         instruction: The instruction of the observation.
         state: The state of the observation.
         observe: A function that reads the observation, given the frame.
-        other_words: The same instruction in other words; empty where the source has none.
+        other_words: The instruction in other words; empty where the source has none.
         row: The row in a run's episodes; -1 outside a run.
         number: The number of the recorded frame; 0 in an environment.
         item: The item of the row in a run.

@@ -1,6 +1,6 @@
 """The kinds of sources: those of probe_kit, and third-party ones from entry points.
 
-A third party's module of settings is imported with the command line, whose options it adds; it must not import
+A third party's module of settings is imported with the command line, whose options it adds. It must not import
 torch, and names the module of its `Source` in `opens`.
 """
 

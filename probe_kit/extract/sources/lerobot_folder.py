@@ -227,7 +227,8 @@ class _DataFile:
 
     Attributes:
         first: For each of its episodes, the row of the first frame.
-        latest: By columns the rows that were read last, whole row groups, and the number of the first of them.
+        latest: The rows that were read last, by their columns: whole row groups, and the number of their first
+            row.
     """
 
     path: Path
@@ -280,7 +281,7 @@ class LeRobotFrames:
     # -- rows ------------------------------------------------------------------------------------------
 
     def _rows(self, episode: int, columns: Sequence[str]) -> Any:
-        """Return the table (T rows) of an episode. Row groups are kept until others with these columns are read."""
+        """Return the table (T rows) of an episode. Row groups are kept until others of these columns are read."""
         meta, key = self.folder.episodes[episode], tuple(columns)
         data = self._data_file(self.folder.path / meta.file)
         first = data.first[episode]
@@ -290,7 +291,7 @@ class LeRobotFrames:
         return latest.slice(first - begin, meta.length)
 
     def _read(self, path: Path, columns: Sequence[str], first: int, end: int) -> tuple[Any, int]:
-        """Return row groups that hold rows `first` to `end`, or all if small, and the number of their first row."""
+        """Return row groups with rows `first` to `end`, or all if small, and the number of their first row."""
         with self.folder.opened.parquet(path) as parquet:
             if missing := [name for name in columns if name not in parquet.schema_arrow.names]:
                 raise RecordingError(

@@ -42,7 +42,7 @@ _Stamp = tuple[int, ...]
 class HashedFiles:
     """The files of one folder. Each is hashed once, and opened only while it is the file that was hashed.
 
-    A time of change alone proves nothing, because copies and version control set it; size, inode and the time of
+    A time of change alone proves nothing, because copies and version control set it. Size, inode and the time of
     the last change of the inode are compared too, and the content again where one of them differs.
     """
 

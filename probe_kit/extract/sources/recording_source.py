@@ -56,9 +56,9 @@ class RecordingSource(Source[LeRobotSource]):
     """A data set on this machine, and what was chosen of it.
 
     The attribute `prediction` is the shape (chunk, D) of a prediction of the policy that was checked. The
-    attribute `unusual` is (D,), for each number of the state the share of the chosen frames where it is unusual;
-    empty where the policy normalizes none. The attribute `other_actions` says why recorded actions are not what
-    the policy predicts; None if they are.
+    attribute `unusual` (D,) has for each number of the state the share of the chosen frames in which it is
+    unusual. It is empty where the policy normalizes no state. The attribute `other_actions` says why recorded
+    actions are not what the policy predicts; None if they are.
 
     Args:
         settings: The chosen episodes, frames and cameras.
@@ -122,7 +122,7 @@ class RecordingSource(Source[LeRobotSource]):
 
     @cached_property
     def instructions(self) -> tuple[str, ...]:
-        """Every instruction once, in alphabetical order."""
+        """The instructions, each once, in alphabetical order."""
         return tuple(sorted({text for episode in self.episodes for text in self._texts(episode)}))
 
     def rows(self, seed: int) -> tuple[Row, ...]:

@@ -186,7 +186,7 @@ class SceneSource(Source[SceneSettings]):
 
     @cached_property
     def instructions(self) -> tuple[str, ...]:
-        """Every instruction once, in alphabetical order."""
+        """The instructions, each once, in alphabetical order."""
         return tuple(sorted({episode.item.instruction for episode in self._episodes()}))
 
     def rows(self, seed: int) -> tuple[Row, ...]:

@@ -222,7 +222,7 @@ class Source[Chosen: SourceSettings](ABC):
 
     @cached_property
     def instructions(self) -> tuple[str, ...]:
-        """Every instruction once, in alphabetical order."""
+        """The instructions, each once, in alphabetical order."""
         return tuple(sorted({row.instruction for row in self.rows(0)}))
 
     def early_checks(
