@@ -47,7 +47,7 @@ class TextTable:
     """A file whose heading was read.
 
     Attributes:
-        names: The headings; empty for a column without one.
+        names: The headings; an empty text for a column without one.
         line: The line of the heading, counted from 1.
         encoding: Python's name of the encoding.
         error: The class of the error for rows that cannot be used.

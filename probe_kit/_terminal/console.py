@@ -176,7 +176,8 @@ EVERY = 60.0
 class Heartbeat:
     """A progress callback (finished, total, …): a line after `FIRST` seconds, every `EVERY`, and at the end.
 
-    The rate counts what was done since the first call: before it a model was loaded, or earlier work was read.
+    The rate counts what was done since the first call: before it a model was loaded, or a run that is continued
+    was made.
 
     Args:
         what: The things that are counted, at the beginning of a line.

@@ -126,7 +126,8 @@ class Extraction:
             UsageError: If the extraction was planned without its model.
             SettingsMismatchError: Before anything is written, if `out` holds a run with other settings.
             DiskSpaceError: Before anything is written, if the disk is too small.
-            StoreError: If `out` lies in an object store that cannot be used, as one that ignores conditional puts.
+            StoreError: If `out` lies in an object store that cannot be used, such as one that ignores conditional
+                puts.
             EpisodesFailedError: At the end, if episodes were given up.
         """
         location = locate(out)
@@ -252,7 +253,8 @@ def open_checked(
         settings: The settings of the run.
         location: The place of the run, if it is known.
         loaded: Whether the model is loaded already; it may be one that no name leads to.
-        fetch: False reads no file that would have to be downloaded, see `Family.check`.
+        fetch: Whether a checkpoint of the hub is downloaded and its weights are looked up; else only files on this
+            machine are read, see `Family.check`.
     """
     task = task_of(settings)
     check_meaningless(settings)
@@ -292,7 +294,8 @@ def check_model(settings: Settings, fetch: bool = True) -> None:
 
     Args:
         settings: The settings of the run.
-        fetch: False reads no file that would have to be downloaded, see `Family.check`.
+        fetch: Whether a checkpoint of the hub is downloaded and its weights are looked up; else only files on this
+            machine are read, see `Family.check`.
 
     Raises:
         UnknownModelError: For an unknown family.
@@ -493,8 +496,7 @@ def prepare(
 
     Args:
         settings: The settings of the run.
-        out: The folder or URL of the run, if it is known; what is wrong there is then said before the model is
-            loaded.
+        out: The folder or URL of the run, if it is known. Faults there are then raised before the model is loaded.
         model: The policy or answer model of these settings, if it is loaded already; several runs can share it.
             Workers load their own.
         fetch: False plans with the streams that the family declares, without weights, network or GPU; such an

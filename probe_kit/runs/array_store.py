@@ -22,10 +22,12 @@ _SPARE = 1 << 20
 class ArrayStore(Store):
     """The objects below `folder` that are known by their sums; any other object there does not exist for it.
 
-    A wrong or missing object raises RunDamagedError. Of a shard, only the parts that are read are checked. The
-    attribute `written` has the sums of what was written through the store. The attribute `shards` has the number
-    of inner chunks in every object of a sharded array, by the array's path. It is filled in before the array is
-    written.
+    A wrong or missing object raises RunDamagedError. Of a shard, only the parts that are read are checked.
+
+    Attributes:
+        written: The sums of what was written through the store.
+        shards: The number of inner chunks in every object of a sharded array, by the array's path. It is filled in
+            before the array is written.
 
     Args:
         location: The run that holds the folder.

@@ -352,10 +352,12 @@ def create_inputs(store: Store, calls: int, shapes: Mapping[str, list[int]], cod
 class StoredInputs:
     """The inputs of the committed rows of a run, in their order.
 
-    The attribute `kinds` has the kinds that are stored. The attribute `columns` has the names of the numbers of
-    the kind `columns`, and `names` those of `state` and `action`. The attribute `truths` has the columns of truth
-    values, stored as 0 and 1. The attribute `classes` has, by column of texts, the texts whose positions are
-    stored.
+    Attributes:
+        kinds: The kinds that are stored.
+        columns: The names of the numbers of the kind `columns`.
+        names: The names of the numbers of `state` and `action`.
+        truths: The columns that are truth values, stored as 0 and 1.
+        classes: The texts of which a column stores the position, by column of texts.
     """
 
     def __init__(self, store: Store, numbers: list[int], dataset: Mapping[str, Any]) -> None:

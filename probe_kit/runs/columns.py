@@ -53,7 +53,8 @@ class Seal(Record):
 class Columns:
     """The sealed columns of a run.
 
-    The attribute `advice` says what to do if they are damaged.
+    Attributes:
+        advice: The remedy if the columns are damaged.
 
     Args:
         location: The run that holds them.

@@ -124,12 +124,11 @@ def read_run(location: Location) -> "Run":
 class Run:
     """A stored run. Rows of every array follow `episodes`, which lists the committed ones in plan order.
 
-    The attribute `wording` is the only one whose episodes are shown, None for all; see `in_wording`. The attribute
-    `item_ids` has the only items whose episodes are shown, None for all; see `only`.
-
     Attributes:
         rule: The rule that gives outcomes, see `under`; `disc` at the last step is what was stored.
         last_steps: The number of control steps at the end that the rule judges.
+        wording: The only wording whose episodes are shown, None for all; see `in_wording`.
+        item_ids: The only items whose episodes are shown, None for all; see `only`.
     """
 
     rule: str = DEFAULT_RULE

@@ -26,12 +26,15 @@ if TYPE_CHECKING:
 class EpisodeBuffers:
     """Everything captured in one episode, shaped like its rows in the store.
 
-    The attributes are these. `pooled`: (S, *lead, V, D) float32 per stream, NaN where nothing was captured.
-    `tokens`: (S, *lead, T, D) uint16 bits of bfloat16 per stream, zero where there is no token; empty if only
-    views are stored. `later`: (S - 1, *lead, D) uint16 bits of bfloat16 per stream, the view `mean` of the
-    inferences after the first. It is empty unless they keep that view alone, and `pooled` then holds the first
-    one. `roles`: per captured inference and stream, the spans of roles. `lens_margins`: the logit lens of a
-    question that is answered by letter, see `letter_margins`; None for any other.
+    Attributes:
+        pooled: (S, *lead, V, D) float32 per stream, NaN where nothing was captured.
+        tokens: (S, *lead, T, D) uint16 bits of bfloat16 per stream, zero where there is no token; empty if only
+            views are stored.
+        later: (S - 1, *lead, D) uint16 bits of bfloat16 per stream, the view `mean` of the inferences after the
+            first. It is empty unless they keep that view alone, and `pooled` then holds the first one.
+        roles: The spans of roles, per captured inference and stream.
+        lens_margins: The logit lens of a question that is answered by letter, see `letter_margins`; None for any
+            other.
 
     Args:
         streams: The storage of the streams.
@@ -179,8 +182,9 @@ RolesByStream = Mapping[str, "Sequence[Roles]"]
 class Capturer:
     """A capturer that hands the activations of an inference to the buffers of its episodes.
 
-    The attribute `fires` has the counts of the last capture. The attribute `check` has the hashes of the first
-    outputs with and without hooks.
+    Attributes:
+        fires: The counts of the last capture.
+        check: The hashes of the first outputs with and without hooks.
 
     Args:
         model: The model whose sites are captured.
@@ -213,7 +217,7 @@ class Capturer:
 
         Raises:
             CaptureChangedActionError: If the first capture of this process changes a number of the output.
-            CaptureError: For activations that cannot be captured.
+            CaptureError: If a capture cannot be started.
         """
         from probe_kit.hooks import capture
         from probe_kit.hooks.contract.roles import prepare_pool

@@ -92,8 +92,8 @@ Ended = tuple[Playing, Ending]
 class EpisodeSlot:
     """A place in a batch: a player and the episode on it, if any.
 
-    The attribute `following` is the row that its player starts when the episode ends, while the model infers for
-    others.
+    Attributes:
+        following: The row that its player starts when the episode ends, while the model infers for others.
     """
 
     def __init__(self, player: AskablePlayer) -> None:

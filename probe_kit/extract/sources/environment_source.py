@@ -260,9 +260,12 @@ SUCCEEDED, FAILED, ENDED = "success", "failure", "ended"
 class EnvironmentSource(Source[EnvSource]):
     """The names and chosen episodes of an environment, read once.
 
-    Further attributes exist once it is checked against a policy. `seen` is the first observation, and `cameras`
-    has the cameras by the model's names. `columns` has the facts, and `truths` those that are truth values.
-    `chunk` is the number of actions that the policy predicts at a time.
+    Attributes:
+        seen: The first observation; None before a model is checked.
+        cameras: The cameras by the model's names; empty before.
+        columns: The facts; empty before.
+        truths: The facts that are truth values; empty before.
+        chunk: The number of actions that the policy predicts at a time; 0 before.
     """
 
     def __init__(
@@ -365,9 +368,9 @@ class EnvironmentSource(Source[EnvSource]):
         self.truths = [name for name in self.columns if isinstance(step.facts[name], bool | np.bool_)]
 
     def shown_cameras(self, declared: Sequence[str] | None = None) -> tuple[str, ...] | None:
-        """Return the first camera, and those that the first observation names.
+        """Return the first camera, and those that the first observation names; None if they are unknown.
 
-        The first episode is set up for this, unless one was before.
+        The first episode is set up for this if no model was checked and `declared` has the cameras of one.
         """
         if not self.cameras and declared is not None:
             self.watched(declared)

@@ -266,7 +266,7 @@ class LeRobotFrames:
         return values
 
     def check(self, episodes: Sequence[int], cameras: Sequence[str]) -> None:
-        """Raise RecordingError for numbers or files of these episodes because of which they cannot be shown.
+        """Raise RecordingError unless the numbers and files of these episodes can be shown.
 
         Every video must be as long as its episodes say. Two pictures of the first episode are decoded.
         """

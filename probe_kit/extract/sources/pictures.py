@@ -119,7 +119,8 @@ class Line:
 class PictureSource(Source[PictureFolder]):
     """The lines of a table, whose pictures were all read once.
 
-    The attribute `prediction` is the shape (chunk, D) of a prediction of the checked policy.
+    Attributes:
+        prediction: The shape (chunk, D) of a prediction of the checked policy.
     """
 
     executes = False

@@ -55,10 +55,11 @@ _TASK = "task_index"
 class RecordingSource(Source[LeRobotSource]):
     """A data set on this machine, and what was chosen of it.
 
-    The attribute `prediction` is the shape (chunk, D) of a prediction of the policy that was checked. The
-    attribute `unusual` (D,) has for each number of the state the share of the chosen frames in which it is
-    unusual. It is empty where the policy normalizes no state. The attribute `other_actions` says why recorded
-    actions are not what the policy predicts; None if they are.
+    Attributes:
+        prediction: The shape (chunk, D) of a prediction of the policy that was checked.
+        unusual: (D,) share of the chosen frames whose number of the state is unusual; empty where the policy
+            normalizes none.
+        other_actions: The reason why recorded actions are not what the policy predicts; None if they are.
 
     Args:
         settings: The chosen episodes, frames and cameras.

@@ -1,4 +1,4 @@
-"""The class `Source`: the observations of a run come from it. A source is one class and its settings.
+"""The class `Source`, from which the observations of a run come. A source is one class and its settings.
 
 A source knows neither what a model does with its observations nor how runs are stored.
 """
@@ -361,7 +361,7 @@ def predicted_once(policy: "Policy", observation: Observation) -> NDArray[np.flo
 
 
 def check_predictions(chunks: Any, count: int, width: int | None = None) -> None:
-    """Raise PolicyFailedError unless these are chunks of actions (count, chunk, D) float32, of D `width` if known.
+    """Raise PolicyFailedError unless `chunks` are actions (count, chunk, D) float32, with D `width` if known.
 
     Actions that are NaN cost their own episode only; the environment raises the error for them.
     """
