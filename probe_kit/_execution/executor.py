@@ -1,4 +1,4 @@
-"""The executor: hands tasks to workers, here or elsewhere, and tries again what a lost worker held."""
+"""The executor, which hands tasks to workers, here or elsewhere, and tries again what a lost worker held."""
 
 import warnings
 from collections import Counter, defaultdict
@@ -73,7 +73,7 @@ _NAMED_TASKS = 3
 
 
 class WorkerLostWarning(UserWarning):
-    """A worker died in mid-run; what it had not finished is tried again. No number changes."""
+    """A warning that a worker died in mid-run; what it had not finished is tried again. No number changes."""
 
 
 class Pool(Protocol):

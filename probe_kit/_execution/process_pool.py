@@ -20,7 +20,7 @@ from probe_kit._execution.executor import Lost, Work
 from probe_kit._system.machine import CORES, cores_here
 
 GRACE_S = 10.0
-"""Time in which a child ends after its parent hung up."""
+"""The time in which a child ends after its parent hung up."""
 
 
 class Child:

@@ -18,13 +18,13 @@ AUTO = "auto"
 KNOCK_TIMEOUT_S = 10.0
 """The time in which the head of a cluster has to accept a connection."""
 PATIENCE_S = 300.0
-"""Time without any worker before a warning."""
+"""The time without any worker before a warning."""
 _THREADS = 3
 """The threads of an actor: one works, one takes tasks, one delivers reports."""
 
 
 class ClusterFullWarning(UserWarning):
-    """No node of the cluster has room for a worker; the work waits for one."""
+    """A warning that no node of the cluster has room for a worker; the work waits for one."""
 
 
 class RayWorker:

@@ -7,7 +7,7 @@ from pydantic import ValidationError
 
 _BOUNDS = {"ge": "at least", "le": "at most", "gt": "more than", "lt": "less than"}
 _LONGEST = 60
-"""Characters of a name or value that a message quotes."""
+"""The characters of a name or value that a message quotes."""
 MISSING, UNKNOWN = "is missing", "is unknown"
 
 Complaint = tuple[tuple[int | str, ...], str]

@@ -43,7 +43,7 @@ def plain_cell(text: str) -> str:
 
 
 def is_missing(cell: str) -> bool:
-    """Return whether a cell that `plain_cell` gave means "no value"."""
+    """Whether a cell that `plain_cell` returned means "no value"."""
     return cell in MISSING
 
 
@@ -165,7 +165,7 @@ _QUANTITY = re.compile(
 _FRACTION = re.compile(r"[+-]?\d+\s*[/⁄]\s*\d+|\d*[½¼¾⅓⅔⅛]|\d+:\d\d(?::\d\d)?(?:[.,]\d+)?")
 """A fraction, or a time such as `1:30`."""
 _DECIMAL_AND_WORD = re.compile(r"[+-]?(?:\d+[.,]\d+|[.,]\d+)\s*[^\W\d].*")
-"""Any word is a unit behind a decimal number: names count in whole ones, such as `2 cups`."""
+"""A decimal number and any word, which is a unit: names count in whole numbers, such as `2 cups`."""
 _NUMBER_AND_WORD = re.compile(r"[+-]?\d+\s*([^\W\d_].*)")
 """A whole number and a word, which is a unit where all cells have the same one and other numbers."""
 

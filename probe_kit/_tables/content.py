@@ -47,7 +47,7 @@ class Cell:
 
     @property
     def value(self) -> str:
-        """The text without that interval."""
+        """The text without the interval."""
         return _LIMITS.sub("", self.text, count=1)
 
 
@@ -200,7 +200,7 @@ class Content:
         )
 
     def details(self, are_details: bool) -> Self | None:
-        """Return the columns that need room, or those that do not; None where there are none of them."""
+        """Return the columns that need room, or those that do not; None where the table has none of them."""
         columns = [
             at for at, heading in enumerate(self.headings) if at >= self.names and heading.is_detail == are_details
         ]

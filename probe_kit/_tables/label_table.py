@@ -1,4 +1,4 @@
-"""Columns of labels that people wrote or a program gave, as values of one type, with the place of every cell."""
+"""Columns of labels that people wrote or a program made, as values of one type, with the place of every cell."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace

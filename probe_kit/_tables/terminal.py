@@ -39,13 +39,13 @@ def lines(table: Content, width: int) -> "Iterator[RenderableType]":
 
 
 def _is_unbroken(table: Content, at: int) -> bool:
-    """Return whether the texts of a column are names or numbers, which are never broken."""
+    """Whether the texts of a column are names or numbers, which are never broken."""
     has_letters = any(map(str.isalpha, "".join(text[at] for text in table.texts)))
     return at < table.names or (table.are_numeric[at] and not has_letters)
 
 
 def _can_wrap(table: Content, width: int) -> bool:
-    """Return whether texts have room beside names and numbers, which rich would cut off without a sign."""
+    """Whether texts have room beside names and numbers, which rich would cut off without a sign."""
     needed = _column_widths(table)
     unbroken = [_is_unbroken(table, at) for at in range(len(needed))]
     least = (full if keep else min(full, GAP + LEAST_TEXT) for full, keep in zip(needed, unbroken, strict=True))

@@ -297,7 +297,7 @@ class AskTask(Part):
     ] = "target"
 
     def model_post_init(self, _: Any) -> None:
-        """Raise UsageError for an absent object that the prompt gives no answer for."""
+        """Raise UsageError for an absent object if the prompt cannot be answered with "no"."""
         if self.query == "absent" and not self.prompt.yes_or_no:
             raise UsageError(
                 f"--query absent needs a prompt that can be answered no; {self.prompt.name} does not ask "

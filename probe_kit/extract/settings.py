@@ -412,7 +412,7 @@ class AskSettings(Settings):
     machine: AskMachine
 
     def model_post_init(self, context: Any) -> None:
-        """Raise UsageError for a question about objects or sides, of a source that has none."""
+        """Raise UsageError for a question about objects or sides if the source has none."""
         super().model_post_init(context)
         source = self.source
         if not source.command:

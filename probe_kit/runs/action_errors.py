@@ -1,4 +1,4 @@
-"""Predicted actions beside the recorded ones, of every shown frame of a run on recordings."""
+"""Predicted actions compared with the recorded ones, at every shown frame of a run on recordings."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING

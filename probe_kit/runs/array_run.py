@@ -1,4 +1,4 @@
-"""`ArrayRun`: a run made of arrays in memory, for activations that were not recorded by probe_kit."""
+"""`ArrayRun`, a run made of arrays in memory, for activations that were not recorded by probe_kit."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field

@@ -62,7 +62,7 @@ class Commit(Record):
 
 
 class Failure(Record):
-    """Reason and traceback of an episode that was given up; removed when it is tried again."""
+    """The reason and traceback of an episode that was given up; removed when it is tried again."""
 
     kind: ClassVar[str] = "failure"
     run: str

@@ -164,7 +164,7 @@ def _contents(path: Path) -> tuple[dict[str, NDArray[Any]], Mapping[str, Mapping
 
 
 def _as_numpy(tensor: Any) -> NDArray[Any]:
-    """Return a tensor of any float type, integers as they are."""
+    """Return a tensor of any float type as float32, and one of integers as it is."""
     return np.asarray((tensor.float() if tensor.is_floating_point() else tensor).numpy())
 
 

@@ -205,7 +205,7 @@ class _SafeFile(io.RawIOBase):
             raise self.error
 
     def write(self, content: Any) -> int:
-        """Write all of it; after an error nothing is written."""
+        """Write all of `content`; after an error nothing is written."""
         unwritten = memoryview(content).cast("B")
         length = len(unwritten)
         try:

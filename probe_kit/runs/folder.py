@@ -177,7 +177,7 @@ class Folder:
         return True
 
     def write(self, key: str, content: bytes, durable: bool = True) -> None:
-        """Write an object over any former one. Complete or not at all; durable unless it can be made again."""
+        """Write an object over any former one, complete or not at all; durable unless it can be made again."""
         self._put(key, content, os.replace, durable)
 
     def _put(

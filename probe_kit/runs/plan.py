@@ -27,7 +27,7 @@ RowColumns = Mapping[str, Any]
 """A row as flat columns."""
 _NUMBERED = re.compile(rf"{PLANS}/[0-9]{{8}}\.json")
 _NUMBER, _CONTENT = "episode", "content_blake2b"
-"""The part of a row that depends on when it was added; of recordings, the hash of the files that hold it."""
+"""The part of a row that depends on when it was added, and of recordings the hash of the files that hold it."""
 
 
 @dataclass(frozen=True)

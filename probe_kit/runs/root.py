@@ -71,7 +71,7 @@ class _Settings(TypedDict):
 _OF_SCENES = ("layout", "side_correct", "item_content_sha256")
 _OF_RECORDINGS = ("instruction", "content_blake2b", "source_episode", "first_frame", "frame_step", "frames")
 _OF_ENVIRONMENTS = ("instruction", "env_episode", "env_seed")
-"""The columns that every planned row of a source has."""
+"""The columns that every planned row of an environment has; those above are of scenes and of recordings."""
 _CHUNKS = "/c/"
 """The part between the name of an array and the position of a chunk in a key of Zarr v3."""
 
@@ -150,7 +150,7 @@ class Root:
 
     @cached_property
     def metadata(self) -> dict[str, Sum]:
-        """Length and hash of the metadata of all arrays, by key in `data.zarr`."""
+        """The length and hash of the metadata of all arrays, by key in `data.zarr`."""
         return {key.removeprefix(f"{DATA}/"): stored for key, stored in self.card.objects.items()}
 
     @property

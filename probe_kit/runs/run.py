@@ -627,7 +627,7 @@ class Run:
         return {name: stored.stream for name, stored in self._streams.items()}
 
     def stored(self, stream: str) -> StoredStream:
-        """Return the storage of one stream. Raises UnknownSiteError."""
+        """Return the storage of one stream. Raises UnknownSiteError for a stream that is not stored."""
         if stream not in self._streams:
             streams = ", ".join(self._streams) or "none (a scripted run has no activations)"
             raise UnknownSiteError(f"{self.location} has no stream {stream!r}; stored: {streams}")

@@ -83,7 +83,7 @@ class Bucket:
 
     @property
     def address(self) -> str:
-        """The URL."""
+        """The URL of the prefix."""
         return self._url
 
     def path_of_export(self, name: str) -> Path:

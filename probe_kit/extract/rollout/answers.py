@@ -313,7 +313,7 @@ def side_said(meaning: Said) -> Placed:
 
 
 def side_expected(query: Query, side_correct: Side) -> Side | None:
-    """Return the side of the object that is asked for; None for an object that is not there."""
+    """Return the side of the object that is asked for; None for an object that neither picture shows."""
     if query == "absent":
         return None
     return side_correct if query == "target" else other_side(side_correct)

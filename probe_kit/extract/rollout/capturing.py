@@ -87,7 +87,7 @@ class EpisodeBuffers:
         )  # fmt: skip
 
     def keep_roles(self, roles: "dict[str, Roles]") -> None:
-        """Begin the next captured inference."""
+        """Begin the next captured inference with its spans of roles."""
         self.roles.append(
             {name: [(s.role, s.start, s.stop) for s in stream_roles.spans] for name, stream_roles in roles.items()}
         )
@@ -124,7 +124,7 @@ class EpisodeBuffers:
             self._copies.append(arrival)
 
     def wait(self) -> None:
-        """Return when every copy has arrived."""
+        """Wait until every copy has arrived."""
         while self._copies:
             self._copies.pop().synchronize()
 

@@ -38,7 +38,7 @@ def task_of(settings: Settings) -> Any:
 
 
 def load_of[Loaded: "Model"](load_by_name: Callable[..., Loaded], settings: Settings) -> Loaded:
-    """Load a model by its name as the settings say. Raises what `load_by_name` raises."""
+    """Load a model by its name as the settings say. Errors are those of `load_by_name`."""
     model = settings.model
     return load_by_name(
         model.family,
@@ -111,7 +111,7 @@ class Act(_Task):
     """The task in which a policy acts, or is captured once per row; a script acts and has no activations."""
 
     def check_meaningless(self, settings: ExtractSettings) -> None:
-        """Raise UsageError for what a script, or a policy that does not act, has no use for."""
+        """Raise UsageError for settings that a script, or a policy that does not act, has no use for."""
         name, source = settings.model.family, settings.source
         if name in SCRIPTED and source.command:
             raise UsageError(f"{name} is scripted and looks at nothing; choose a model with weights")
@@ -123,7 +123,7 @@ class Act(_Task):
             settings.refuse(_SCRIPT_REFUSES, f"does not apply: {why}")
 
     def check_family(self, settings: ExtractSettings, family: "Family | None") -> None:
-        """Raise UsageError for a model that answers, and what `Family.check_acting` raises in a scene."""
+        """Raise UsageError for a model that answers, and in a scene the errors of `Family.check_acting`."""
         if family is None:
             return
         if not family.acts:

@@ -1,4 +1,4 @@
-"""The check of an environment of the user's own: what the rest of probe_kit relies on, promise by promise."""
+"""The check of an environment of the user's own against what probe_kit relies on, promise by promise."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass

@@ -176,7 +176,7 @@ class PictureSource(Source[PictureFolder]):
         return cls(settings, names, coded_names, lines, digest)
 
     def decided(self) -> Mapping[str, Any]:
-        """Return that the only inference of a picture is captured and nothing acts."""
+        """Return settings by which the only inference of a picture is captured and nothing acts."""
         return {"captured_calls": 1, "capture_only": True, "frames": "none"}
 
     def rows(self, seed: int) -> tuple[Row, ...]:

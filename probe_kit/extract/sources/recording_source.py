@@ -107,7 +107,10 @@ class RecordingSource(Source[LeRobotSource]):
         return mapped
 
     def decided(self) -> Mapping[str, Any]:
-        """Return that every frame of a row is captured and nothing acts; a revision of the hub is its commit."""
+        """Return settings by which every frame of a row is captured and nothing acts.
+
+        A revision of the hub becomes its commit.
+        """
         calls = self.most_frames
         return {"source": self.settings, "captured_calls": calls, "capture_only": True, "frames": "none"}
 
