@@ -159,7 +159,7 @@ def make_problem(
 
 
 def smallest_p_of_labels(labels: NDArray[Any], permuted_labels: NDArray[Any]) -> float:
-    """Return the share of (E, P) labelings, the real one (E,) included, that equal it: no p can be lower."""
+    """Return the share of (E, P) labellings, the real one (E,) included, that equal it: no p can be lower."""
     same = (permuted_labels == labels[:, None]).all(axis=0)
     return float((1 + same.sum()) / (1 + same.size))
 

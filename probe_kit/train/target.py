@@ -353,7 +353,7 @@ def side_labels(episodes: "pd.DataFrame", name: str, seed: int) -> NDArray[np.in
 
 
 def _source_frames(run: RunReader, by_frame: bool) -> dict[tuple[str, int], list[tuple[str, int]]]:
-    """Return episode ids and inferences of a run by source episode and frame; the frame of whole episodes is -1."""
+    """Return episode ids and inferences of a run by source episode and frame; a whole episode has frame -1."""
     keys_of: dict[tuple[str, int], list[tuple[str, int]]] = {}
     steps = run.control_steps
     for row, (name, source) in enumerate(zip(run.episodes[EPISODE], run.episodes[SOURCE], strict=True)):

@@ -14,9 +14,10 @@ if TYPE_CHECKING:
 
 
 def best_sites_findings(results: ProbeResults) -> list[str]:
-    """Return what was left out, then where the target can be decoded: a line per category and view.
+    """Return samples and controls that were left out, then where the target can be decoded: a line per category and view.
 
-    Of a side the first view alone, and whether the pictures alone decode it: no model has to know it then.
+    For a side it covers the first view alone, and whether the pictures alone decode it: no model has to know it
+    then.
     """
     settings = results.settings
     lines = []
