@@ -1,4 +1,4 @@
-"""Limits on the numbers of a checkpoint: sizes, and scales of actions. Imports no torch."""
+"""Limits on the numbers of a checkpoint: sizes, and scales of actions. Importing them loads no torch."""
 
 from collections.abc import Mapping
 from typing import Any

@@ -75,7 +75,7 @@ class ProbeCurve:
 
     @property
     def correct(self) -> NDArray[np.bool_]:
-        """Whether each episode's held-out decision about its side is right, (S, E)."""
+        """The correctness of each episode's held-out decision about its side, (S, E)."""
         return correctness(self.decisions, self.labels[None, :])
 
     @cached_property
