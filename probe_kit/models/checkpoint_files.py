@@ -17,7 +17,7 @@ LANGUAGE_FIRST: Renames = (
     (r"^language_model\.model\.", "model.language_model."),
     (r"^(vision_tower|multi_modal_projector)\.", r"model.\1."),
 )
-"""Where files hold a whole language model; files saved by today's transformers stay as they are."""
+"""Renames for files that hold a whole language model; files saved by today's transformers stay as they are."""
 
 
 def renamed(name: str, renames: Sequence[tuple[str, str]]) -> str:

@@ -11,9 +11,9 @@ from probe_kit._system.complaints import in_words
 from probe_kit.errors import CheckpointError
 
 Count = Annotated[int, Field(ge=1, lt=1 << 31)]
-"""Blocks, heads, widths, pixels."""
+"""Number of blocks, heads, features or pixels."""
 Index = Annotated[int, Field(ge=0, lt=1 << 31)]
-"""Ids of tokens, and positions."""
+"""Id of a token, or a position."""
 
 
 class ConfigFile(BaseModel):

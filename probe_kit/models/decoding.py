@@ -41,7 +41,7 @@ class PromptKV(nn.Module):
 # -- decoding -------------------------------------------------------------------------------------------------
 
 Choose = Callable[[Tensor], Tensor]
-"""(B,) ids of the next tokens from their logits (B, V)."""
+"""Function that chooses ids (B,) of the next tokens from their logits (B, V)."""
 
 
 def greedy(logits: Tensor) -> Tensor:
@@ -102,7 +102,7 @@ class TokenNetwork(nn.Module):
 
     language_model: Any
     prompt_kv: PromptKV
-    """Where what is kept of the prompt passes once."""
+    """Passages through which the kept keys and values of the prompt pass once."""
 
     def whole_pass(self, embeddings: Tensor, mask: Tensor) -> Any:
         """Return the output of transformers for one pass over (B, S, D).

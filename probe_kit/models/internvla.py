@@ -35,7 +35,7 @@ from probe_kit.models.qwen import IMAGE, QwenInputs, qwen2_5_vl_config
 
 RUN_FILE, DIMS_FILE = "config.yaml", "dims.json"
 JSON_FILE = "config.json"
-"""What a run may have instead of its `config.yaml`; the file of a vision-language model has the same name."""
+"""File that a run may have instead of its `config.yaml`; that of a vision-language model has the same name."""
 FRAMEWORKS = ("InternVLA-M1", "InternVLA_M1")
 # Per name: width, blocks, heads.
 _DINO = {"dinov2_vits14": (384, 12, 6), "dinov2_vitb14": (768, 12, 12), "dinov2_vitl14": (1024, 24, 16)}
@@ -252,7 +252,7 @@ class Attention(nn.Module):
 
 
 class MLP(nn.Module):
-    """Two layers with GELU between them, of which `approximate` is torch's name of its approximation."""
+    """A pair of layers with GELU between them, of which `approximate` is torch's name of its approximation."""
 
     def __init__(self, width: int, approximate: Literal["none", "tanh"]) -> None:
         super().__init__()
@@ -269,7 +269,7 @@ class MLP(nn.Module):
 
 _DINO_EPSILON = 1e-6
 _OFFSET = 0.1
-"""Added to the number of patches before dividing, in the original, against rounding down."""
+"""Number that the original adds to the number of patches before dividing, against rounding down."""
 
 
 class _Scale(nn.Module):
@@ -461,7 +461,7 @@ class DiffusionTransformer(nn.Module):
         Args:
             actions: (B, A, action numbers) noisy actions.
             steps: (B,) diffusion steps.
-            condition: (B, C, width of the queries).
+            condition: (B, C, width of the queries) condition that `InternVLANetwork.read` returns.
         """
         conditions = self.t_embedder(steps)[:, None] + self.z_embedder(condition)
         stream = torch.cat([conditions, self.x_embedder(actions)], dim=1) + self.positional_embedding
@@ -550,7 +550,7 @@ class _Head(nn.Module):
 
 
 class InternVLANetwork(nn.Module):
-    """InternVLA-M1 under the parameter names of its released files."""
+    """The network InternVLA-M1 under the parameter names of its released files."""
 
     def __init__(self, config: InternVLAConfig) -> None:
         super().__init__()
@@ -636,7 +636,7 @@ def full_size_internvla() -> InternVLANetwork:
 # -- inputs ---------------------------------------------------------------------------------------------------
 
 SIDE = 224
-"""Of the picture that the released evaluation sends."""
+"""Side in pixels of the picture that the released evaluation sends."""
 _SLOT = "{instruction}"
 # ImageNet's.
 _MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
@@ -657,7 +657,7 @@ def look(picture: NDArray[np.uint8], size: tuple[int, int] | None) -> NDArray[np
 
 
 def dino_pixels(picture: NDArray[np.uint8], side: int) -> Tensor:
-    """Return a picture (H, W, 3) uint8 as (3, h, w) float32, with the shorter side `side` and normalised colours."""
+    """Return a picture (H, W, 3) uint8 as (3, h, w) float32, the shorter side `side`, with normalised colours."""
     image = Image.fromarray(picture)
     width, height = image.size
     shorter = min(width, height)

@@ -122,7 +122,7 @@ class Embeddings(nn.Module):
 
 
 class Attention(nn.Module):
-    """Attention of a picture's patches to each other."""
+    """The attention of a picture's patches to each other."""
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
@@ -156,7 +156,7 @@ def _rotated(heads: Tensor, rotation: tuple[Tensor, Tensor]) -> Tensor:
 
 
 class Perceptron(nn.Module):
-    """Two layers around a GELU."""
+    """A pair of layers around a GELU."""
 
     def __init__(self, width: int, hidden: int) -> None:
         super().__init__()
@@ -240,7 +240,7 @@ def word_order(maps: Tensor, stride: int) -> Tensor:
 # -- the network ----------------------------------------------------------------------------------------------
 
 PICTURE, PICTURE_BEGINS, PICTURE_ENDS = -300, -301, -302
-"""What stands in the ids of a prompt where no text does."""
+"""Ids of a prompt at places without text."""
 _MARKS = 4
 """Words that mark where pictures and videos begin and end; no patch ever becomes one."""
 

@@ -6,7 +6,7 @@ actions are in the adapters `prismatic` and `openvla` in `probe_kit.hooks.famili
 `config.json` names parts of a fixed table (Karamcheti et al. 2024, and OpenVLA's `PrismaticConfig`); explicit
 fields win over the table. The language model's part is short: fields that it leaves out have transformers'
 defaults, which include rms_norm_eps 1e-6 for Llama, not Llama-2's own 1e-5. A training run's file, as TRI-ML
-releases it, has these fields under `model` and no part for the language model; that is then the published one,
+releases it, has these fields under `model` and no part for the language model. That is then the published one,
 with its own 1e-5.
 
 Images become pixel values bit-identical to the original processor's, with PIL and numpy only. Tower k reads

@@ -31,7 +31,7 @@ QWEN2_5_NAMES: Renames = (
     (r"^visual\.", "model.visual."),
     (r"^model\.(?!language_model\.|visual\.)", "model.language_model."),
 )
-"""Qwen2.5-VL was released under names that transformers has changed since."""
+"""Renames of Qwen2.5-VL, which was released under names that transformers has changed since."""
 
 _QWEN2_5: dict[str, dict[str, Any]] = {
     "7B": {"hidden_size": 3584, "num_hidden_layers": 28, "num_attention_heads": 28, "num_key_value_heads": 4,
@@ -130,7 +130,7 @@ def full_size_qwen3_vl(size: str) -> Any:
 # -- batches of prompts ---------------------------------------------------------------------------------------
 
 IMAGE = "<|vision_start|><|image_pad|><|vision_end|>"
-"""Where a picture goes in a prompt; `image_slots` repeats the middle token."""
+"""The place of a picture in a prompt; `image_slots` repeats the middle token."""
 
 
 @dataclass(frozen=True)
@@ -299,7 +299,7 @@ class QwenPictures:
         return tall // self.patch, wide // self.patch
 
     def patches(self, pictures: list[NDArray[np.uint8]]) -> tuple[Tensor, Tensor]:
-        """Return the patches (N, channels x time x patch x patch) float32 of pictures, and their grid (I, 3) int64.
+        """Return the patches (N, channels x time x patch x patch) float32 and the grid (I, 3) int64 of pictures.
 
         The pictures are (H, W, 3) uint8.
 

@@ -119,7 +119,7 @@ class SpatialVLAConfig(ConfigFile):
 MARGIN = 31
 """Pixels of mirrored picture on every side, so that the map has no border effects."""
 DEPTH_SIDE = 384
-"""Side of what ZoeDepth sees, in pixels."""
+"""Side of the picture that ZoeDepth sees, in pixels."""
 
 
 @dataclass(frozen=True)

@@ -94,7 +94,7 @@ class ActionBins:
         return [self.first, [edges.tolist() for edges in self.edges], self.spherical]
 
     def is_action(self, ids: Ids) -> NDArray[np.bool_]:
-        """Return, per id of (…, 3), whether it names an action in its slot."""
+        """Return whether each id of (…, 3) names an action in its slot."""
         starts, stops = np.array([[slot.start, slot.stop] for slot in self.slots]).T
         return np.asarray((ids >= starts) & (ids < stops))
 

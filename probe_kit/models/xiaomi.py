@@ -256,7 +256,7 @@ class Prompt:
 
 
 class XiaomiNetwork(nn.Module):
-    """Xiaomi-Robotics-R0 under the parameter names of its released files."""
+    """The network Xiaomi-Robotics-R0 under the parameter names of its released files."""
 
     def __init__(self, config: XiaomiConfig) -> None:
         super().__init__()
@@ -287,7 +287,7 @@ class XiaomiNetwork(nn.Module):
 
         Args:
             prompt: Kept parts of the prompt.
-            state: (B, states, state numbers).
+            state: (B, states, state numbers) normalised state.
             actions: (B, A, action numbers) moving actions.
             moment: (B,) moment of the flow in [0, 1].
         """
@@ -311,7 +311,7 @@ class XiaomiNetwork(nn.Module):
 
         Args:
             inputs: Prompts with their pictures.
-            state: (B, states, state numbers).
+            state: (B, states, state numbers) state of the robot.
             used: (B, A, action numbers), 1 where the robot has the number. It masks the moving actions that the
                 network reads, not its output.
             noise: (B, A, action numbers) float32.
@@ -352,7 +352,7 @@ def full_size_xiaomi() -> XiaomiNetwork:
 DEFAULT_ROBOT = "bridge_delta"
 STATISTICS_FILE = "preprocessor_config.json"
 _UNUSED = 1e-5
-"""A number that varies less than this is none the robot has."""
+"""Deviation below which a number is none that the robot has."""
 # A hand that points down, as turns of the base frame's axes.
 _POINTING_DOWN = Rotation.from_matrix([[0, 0, 1], [0, 1, 0], [-1, 0, 0]])
 

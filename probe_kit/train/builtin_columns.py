@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 
 SIM, ITEM, RECORDED, PLAYED = "sim.", "item.", "dataset.", "env."
 ACTION_ERROR = "action_error"
-"""Of a shown frame: root mean square of predicted minus recorded first action, in recorded deviations."""
+"""Column of a shown frame: root mean square of predicted minus recorded first action, in recorded deviations."""
 OUTCOME = "env.outcome"
-"""Whether an episode in an environment of one's own succeeded, once per episode."""
+"""Column that says once per episode whether an episode in an environment of one's own succeeded."""
 PHASES = ("before grasp", "holding", "after release")
 
 

@@ -2,8 +2,8 @@
 
 The control `random-features` is an untrained conjunction of picture and word features. Concepts recur in other
 groups of pictures, so a probe can itself learn which pixels answer which word, as soon as its features hold
-products of both. Any random nonlinear layer does. The control is such a layer, as wide as the site it is compared
-with, on the pictures and the words alone; a model that knows more than that must be better.
+products of both. Any random nonlinear layer does. The control is such a layer on the pictures and the words alone,
+as wide as the site it is compared with. A model that knows more than that must be better.
 """
 
 from collections.abc import Callable, Sequence
@@ -34,7 +34,7 @@ THUMBNAIL, SIDE = 32, 12
 LAYERS = 5
 """Random layers, whose mean is the reference: one alone is lucky or not, and the best of them is lucky."""
 MOST_BINS = 50
-"""Columns that the step has at most: neighbouring inferences of long windows share one."""
+"""The most columns of the step: neighbouring inferences of long windows share one."""
 
 Features = NDArray[np.float32]
 

@@ -278,7 +278,7 @@ def check_untrained(
 ) -> None:
     """Raise UsageError unless `untrained` is another run of the same episodes, instructions, frames and labels.
 
-    For a target other than a side, also raise it for inferences after the first of a network that acted: the
+    For a target other than a side, also raise it for inferences after the first of a network that acted. The
     frames it was shown then follow from its own actions.
 
     Args:

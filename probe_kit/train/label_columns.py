@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 EPISODE, INFERENCE = "episode_id", "inference"
 """Key columns of a table: one label per episode, or with both one per captured inference."""
 SOURCE, FRAME = "source_episode", "frame"
-"""The same of recordings, by the numbers of the data set; read where a table has no `episode_id`."""
+"""The key columns of recordings, by the numbers of the data set; read where a table has no `episode_id`."""
 
 
 def read_table(table: "Path | str | pd.DataFrame", requested: Sequence[str]) -> LabelTable:
@@ -156,9 +156,9 @@ def _plain(cell: Any, table: LabelTable, row: int, column: str) -> Cell:
 # -- values of a column under a task -------------------------------------------------------------------------
 
 MOST_DOUBTFUL = 20
-"""Integers of 3 to so many values can be classes or quantities; only the user knows."""
+"""The most values of integers that can be classes or quantities, from 3 values on; only the user knows."""
 LARGEST = 1e100
-"""Quantities are squared and summed in float64, which ends at 1e308."""
+"""The largest quantity: they are squared and summed in float64, which ends at 1e308."""
 
 
 @dataclass(frozen=True)

@@ -20,9 +20,9 @@ from probe_kit.train.control_features import LAYERS
 NEIGHBOURS, ALIKE = 0.9, 0.3
 """Assumed correlation of neighbouring sites, and of the episodes of one group."""
 ITEMS_PER_GROUP, LAYOUTS = 2, 2
-"""Of the built suites: an item and its counterpart share pictures, and each is played in both layouts."""
+"""Numbers of the built suites: an item and its counterpart share pictures, and each is played in both layouts."""
 FEWEST_ITEMS, MOST_ITEMS = OUTER_FOLDS * ITEMS_PER_GROUP, 1000
-"""Between these the number of items is searched."""
+"""Limits between which the number of items is searched."""
 SEEDS = 5
 """Parts of a simulation, each with a limit of chance of its own; their spread is the error of the whole."""
 NULL_DRAWS, POOL = 4000, 40_000

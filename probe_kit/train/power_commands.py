@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from probe_kit.train.power import Power
 
 MOST_ITEMS = 100_000
-"""Of a category that is simulated on request; a search for a goal stops at fewer, `train.power.MOST_ITEMS`."""
+"""The most items that are simulated on request; a search for a goal stops at fewer, `train.power.MOST_ITEMS`."""
 INVERSE = "Number of items for a goal"
 ITEMS = "24,60,150,300"
 

@@ -113,7 +113,7 @@ TOKEN_PERMUTATIONS = 59
 The smallest p is then 1/60; a site with one permutation that does as well as the labels is still below 0.05.
 """
 Progress = Callable[[int, int, str], None]
-"""Called with (sites done, sites in all, what was just done)."""
+"""Function that is called with (sites done, sites in all, name of the site just done)."""
 
 
 def train_probes(
@@ -168,7 +168,7 @@ def train_probes(
         suite: Folder of the run's suite; the embedded one is found or drawn again without it.
         untrained: A run of the same episodes, usually by random weights, to compare with. A site that does not
             exceed `random-features` and the untrained network shows no signal, whatever its p-value.
-        seed: Seed of folds, permutations and controls.
+        seed: Seed of folds, permutations and controls, and of the flips of the target `side.shuffled`.
         jobs: Processes that probe, this one alone by default; with more than one, a script needs `if __name__ ==
             "__main__":`.
         device: Device on which torch solves logistic probes, such as `cuda`; numpy without one.

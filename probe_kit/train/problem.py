@@ -165,7 +165,7 @@ def smallest_p_of_labels(labels: NDArray[Any], permuted_labels: NDArray[Any]) ->
 
 
 Drawn = tuple[list[NestedFold], NDArray[Any]]
-"""Folds, and (E, P) permuted labels."""
+"""The folds, and permuted labels (E, P)."""
 
 
 # -- the side of a picture -------------------------------------------------------------------------------------

@@ -19,11 +19,13 @@ _GIVE = "Give the folder of that suite (--suite, suite=…)"
 def suite_of(run: RunReader, folder: Path | None = None) -> "Suite":
     """Return the run's suite, from a folder that may hold more than the run's items.
 
+    Without `folder` it is read from the folder that the run was extracted with, if that still holds the suite.
+    Else the run's part of the embedded suite is found in the cache or drawn again. These are the same items
+    whatever else the cache holds.
+
     Args:
         run: Run whose pictures are needed.
-        folder: Folder of the suite. Without one it is the folder that the run was extracted with, if that still
-            holds the suite; else the run's part of the embedded suite is found in the cache or drawn again, the
-            same items whatever else the cache holds.
+        folder: Folder of the suite.
 
     Raises:
         SuiteError: For another suite in `folder`, or a damaged one.

@@ -30,11 +30,11 @@ if TYPE_CHECKING:
 
 
 Null = Literal["flip_groups", "exchange_groups", "exchange_blocks"]
-"""How label permutations are drawn.
+"""The way in which label permutations are drawn.
 
-flip_groups: groups flip all their labels; of the correct side, which a suite draws freely.
-exchange_groups: groups exchange their labels layout by layout; of the chosen side.
-exchange_blocks: groups exchange their labels as blocks, inference by inference; of every other target.
+flip_groups: groups flip all their labels; for the correct side, which a suite draws freely.
+exchange_groups: groups exchange their labels layout by layout; for the chosen side.
+exchange_blocks: groups exchange their labels as blocks, inference by inference; for every other target.
 """
 _MOST_CLASSES = 20
 """Classes that a line about a target lists; probes take any number."""

@@ -62,7 +62,7 @@ def targets(
 DOUBTFUL = "classes or continuous"
 """The task of a few integers, which `--task` decides."""
 CONSTANT = "one value"
-"""In place of a task, of a column in which there is nothing to decode."""
+"""Text in place of a task, for a column in which there is nothing to decode."""
 
 
 class ListedTarget(NamedTuple):

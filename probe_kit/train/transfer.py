@@ -154,7 +154,7 @@ class TransferResults:
 # -- the transfer --------------------------------------------------------------------------------------------
 
 _DIGITS = 12
-"""Of a suite's hash, in its identity."""
+"""Number of a suite hash's digits in its identity."""
 
 
 def transfer_probes(
@@ -176,9 +176,9 @@ def transfer_probes(
     """Fit every site's probe on all of `run`, and score it on `other`; nothing is stored.
 
     C or λ is chosen by five folds of the groups of `run`; no label of `other` takes part in a fit. Groups of
-    `other` that `run` has too are left out, see `shared_groups`. The null permutes the labels of `other`. Two
-    further scores are of the same probe after the features of `other` are moved to the mean of `run`, and the
-    cross-validated score of `other` itself on the same samples. Raises as `train_probes` too.
+    `other` that `run` has too are left out, see `shared_groups`. The null permutes the labels of `other`. There
+    are two further scores. One is of the same probe after the features of `other` are moved to the mean of `run`.
+    The other is the cross-validated score of `other` itself on the same samples. Raises as `train_probes` too.
 
     Args:
         run: Run on which the probes are fitted.
@@ -255,9 +255,9 @@ def shared_groups(
 ) -> NDArray[np.str_]:
     """Return the names of the groups of `other_samples` that `samples` has too.
 
-    Groups are compared by name where names mean the same: with `group_by`, or if both runs are of one suite, data
-    set or environment, or of selections of one suite. A group is also shared if it has an item whose id and
-    content are in both.
+    Groups are compared by name where names mean the same. This is so with `group_by`, or if both runs are of one
+    suite, data set or environment, or of selections of one suite. A group is also shared if it has an item whose
+    id and content are in both.
     """
     names = np.unique(other_samples.groups)
     in_both = np.zeros(names.size, bool)
@@ -353,7 +353,7 @@ def _codes(classes: Sequence[str], other_classes: Sequence[str]) -> Matrix | Non
 
 
 _Transferred = tuple[tuple[SiteProbe, SiteProbe], Matrix]
-"""One site: its probe as fitted and recentred, scored on the other run; and held-out scores of the other's own."""
+"""The probe of one site as fitted and recentred, scored on the other run; and scores of the other's own."""
 
 
 def _transfer(

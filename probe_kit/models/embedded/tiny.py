@@ -35,9 +35,9 @@ CHUNK = 16
 TEXT_TOKENS = 16
 CAMERA = "observation.images.base"
 LOOKED_AT = (70, 20, 310, 620)
-"""Of the 480 x 640 camera picture, the part that holds both tiles of every preset: top, left, height, width."""
+"""The part of the 480 x 640 camera picture that holds both tiles of every preset: top, left, height, width."""
 ACTION_DIMS = (0, 1, 2, 6)
-"""What the policy decides: x, y, z and the gripper. It never turns the hand."""
+"""Action dimensions that the policy decides: x, y, z and the gripper. It never turns the hand."""
 IDLE_DIMS = (3, 4, 5)
 
 Statistics = Mapping[str, tuple[ArrayLike, ArrayLike]]
@@ -47,13 +47,13 @@ GUESSED: Statistics = {
     "action": ([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.5], [0.02, 0.02, 0.02, 0.0, 0.0, 0.0, 0.5]),
     "observation.state": ([0.32, 0.03, 0.1, 0.0, 0.0, 0.0, 0.0, 0.5], [0.06, 0.09, 0.05, 0.1, 0.1, 0.1, 1.0, 0.5]),
 }
-"""About what the scripted expert does; for policies with random weights."""
+"""Statistics of about the actions of the scripted expert; for policies with random weights."""
 
 
 def new_pi0_tiny(seed: int) -> PI0Policy:
     """Return the policy with seeded random weights, which are 0 in the action dimensions it does not decide.
 
-    A dimension whose statistics have no spread is restored to its mean, whatever the network says; without weights
+    A dimension whose statistics have no spread is restored to its mean, whatever the network says. Without weights
     into and out of it, its flow noise disturbs nothing.
     """
     policy = build_pi0(_config(), SIZE)
@@ -142,7 +142,7 @@ def _window() -> dict[str, Any]:
 # -- vlm-tiny -------------------------------------------------------------------------------------------------
 
 MOST_TOKENS = 128
-"""Of a whole prompt, the picture's 36 included."""
+"""The most tokens of a whole prompt, the picture's 36 included."""
 CAMERA_PICTURE = (480, 640)
 
 

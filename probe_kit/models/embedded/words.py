@@ -15,12 +15,12 @@ _OF_QUESTIONS = (
     *("given", "if", "is", "left", "letter", "no", "option's", "or", "right", "see", "specify", "state", "there"),
     *("traffic", "what", "where", "with", "yes", "you"),
 )
-"""Of the prompts of `probe-kit ask` and of the questions that `vlm-tiny` was trained on besides."""
+"""Words of the prompts of `probe-kit ask` and of the questions that `vlm-tiny` was trained on besides."""
 WORDS = tuple(dict.fromkeys((*SPECIAL, *_OF_QUESTIONS, *vocabulary())))
 VOCABULARY = -(-len(WORDS) // 64) * 64
-"""Rows of an embedding table for them."""
+"""Rows of an embedding table for the words."""
 _ISOLATED = r'\n|"|[.,:?](?=\s|$)'
-"""What is a word of its own wherever it stands; not the colon in 7:30."""
+"""Pattern of characters that are words of their own wherever they stand; not the colon in 7:30."""
 
 
 def known_words() -> Collection[str]:

@@ -24,7 +24,7 @@ from probe_kit.train.solver.design_matrix import narrow_axes
 # -- the site ------------------------------------------------------------------------------------------------
 
 ROWS_PER_BLOCK = 512
-"""8 MB of float64 at a width of 2,048: a block is used twice, so it should stay in the processor's cache."""
+"""Rows of a block: 8 MB of float64 at a width of 2,048. It is used twice, so it should stay in the cache."""
 
 ROWS_PER_PRODUCT = 8192
 """Rows multiplied with themselves at once: products of fewer are slower, float32 sums over more less exact."""
@@ -35,7 +35,7 @@ LEAST_SCALE = 0.1
 
 @dataclass(frozen=True)
 class Block:
-    """Consecutive rows of a site, all of episodes that the same outer fold tests.
+    """A slice of consecutive rows of a site, all of episodes that the same outer fold tests.
 
     Attributes:
         rows: B rows of the site, as a slice.
@@ -174,7 +174,7 @@ def _sorted(samples: Samples, folds: Sequence[NestedFold]) -> tuple[RowSubset, t
 # -- the objective -------------------------------------------------------------------------------------------
 
 TOLERANCE = 1e-9
-"""A solution is accepted when ‖gradient‖ ≤ TOLERANCE · ‖w‖, in float64."""
+"""Relative gradient of a solution: it is accepted when ‖gradient‖ ≤ TOLERANCE · ‖w‖, in float64."""
 NEAR = 0.1
 """Relative gradient, in float32, after which one more step is made and gradients are float64. A smaller one saves
 none of these: with 1e-3, solving took a sixth longer."""
@@ -224,13 +224,14 @@ class NewtonState:
 
 
 Inside = Callable[[Array, Block, NDArray[np.intp]], Array]
-"""What stands between a product with the samples and one with their transpose: from (k, B) decisions, their block,
-and which of the problems they are of, (k, B)."""
+"""Function between a product with the samples and one with their transpose, (k, B).
+
+It takes decisions (k, B), their block, and the problems that they belong to."""
 
 
 @dataclass(frozen=True)
 class JointProblems:
-    """K problems on one site: (K,) training set of each, (K, E) labels −1/+1 of the episodes, and (K,) C.
+    """The K logistic problems on one site.
 
     Weights are rows (D + 1): v on features as the site standardises them, and the intercept b. Decisions are f =
     x·v − mean·v + b for a sample x. The penalty is ½‖scale ∘ v‖²: scale ∘ v are the weights on features as the
@@ -242,6 +243,12 @@ class JointProblems:
 
     Rows that the outer fold of a set tests are left out of its products. Rows that only an inner fold tests are
     masked, which wastes a quarter of the products.
+
+    Attributes:
+        site: Samples and training sets.
+        set_of: (K,) training set of every problem.
+        signs: (K, E) labels −1/+1 of the episodes.
+        strength: (K,) C of every problem.
     """
 
     site: JointSite

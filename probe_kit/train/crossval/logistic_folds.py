@@ -101,11 +101,11 @@ def _fit_fold(
 # -- small problems, stacked --------------------------------------------------------------------------------------
 
 STACKED_COLUMNS, SMALL_HESSIAN = 32, 2**20
-"""Up to so many label columns, each of so many multiplications (N · R²), whole Hessians cost less than the many
-small products of conjugate gradients."""
+"""Label columns, and multiplications of each (N · R²), up to which whole Hessians cost less than the many small
+products of conjugate gradients."""
 
 COLUMNS_AT_ONCE = 128
-"""Of all folds together: more of them do not fit into a processor's cache."""
+"""Label columns of all folds together: more of them do not fit into a processor's cache."""
 
 
 def is_small(samples: Samples, labels: NDArray[np.bool_]) -> bool:
@@ -222,7 +222,7 @@ class _Together:
 # -- many samples, whose products are shared ----------------------------------------------------------------------
 
 COLUMN_MEMORY = 2**29
-"""Bytes that problems solved at once may take, beyond the samples and what is made of them once."""
+"""Bytes that problems solved at once may take, beyond the samples and the arrays made of them once."""
 
 SHARED_COLUMNS, FEATURES_PER_COLUMN = 10, 50
 """Label columns up to which sharing pays, and features for one more. Axes of a training set's own cost as much as
@@ -285,7 +285,7 @@ def _times_at_once(site: JointSite, folds: Sequence[NestedFold]) -> int:
 
 @dataclass(frozen=True)
 class _SharedColumns:
-    """Label columns (E, L), on all training sets of a site."""
+    """The label columns (E, L), on all training sets of a site."""
 
     site: JointSite
     samples: Samples
@@ -313,10 +313,12 @@ class _SharedColumns:
     def _select_strengths(self) -> tuple[NDArray[np.intp], Array, list[InnerQuality]]:
         """Return the chosen C, weights to start from, and the inner quality of every outer fold.
 
+        The weights are the mean of the inner folds' weights.
+
         Returns:
-            (F, L) position of the chosen C by outer fold and column; (C, F, L, D + 1) weights to start from, the
-                mean of the
-            inner folds' weights; and the inner quality of every outer fold.
+            Position (F, L) of the chosen C by outer fold and column; weights (C, F, L, D + 1) to start from; and
+                the quality
+            of every outer fold.
         """
         sets = [(number, inner) for number, nested in enumerate(self.folds) for inner in nested.inner]
         of_fold = np.array([number for number, _ in sets])

@@ -28,7 +28,7 @@ from probe_kit.train.solver.arrays import Standardiser, to_numpy
 # -- ridge ---------------------------------------------------------------------------------------------------
 
 PENALTIES: Matrix = np.array([*10.0 ** np.arange(-2, 6), np.inf])
-"""λ of the grid; at infinity the prediction is the mean of the training labels."""
+"""The grid of λ; at infinity the prediction is the mean of the training labels."""
 
 
 @dataclass(frozen=True)
@@ -91,8 +91,8 @@ class Predictions:
 def _predict_by_ridge(samples: Samples, labels: Matrix, task: Task, folds: list[NestedFold]) -> Predictions:
     """Return quantities within the range of the training labels, or the best class by ridge on class indicators.
 
-    Each column of an outer fold is predicted at the λ that is best in its inner folds: by squared error of
-    quantities, by balanced accuracy of classes; the larger λ on ties.
+    Each column of an outer fold is predicted at the λ that is best in its inner folds. The best λ has the least
+    squared error of quantities, or the largest balanced accuracy of classes; the larger λ on ties.
     """
     classes = 0 if task == "continuous" else int(labels.max()) + 1
     predictions, penalties, qualities = np.empty_like(labels), [], []

@@ -88,7 +88,7 @@ class ControlComparison:
 
 
 Exceeds = dict[str, bool | None]
-"""Whether a site is better than `chance` and than controls, by name; None for what was not run."""
+"""Truth values by name: whether a site is better than `chance` and than each control; None for one not run."""
 
 
 def has_signal(exceeds: Exceeds) -> bool:
@@ -142,7 +142,7 @@ class Controls:
 
     @cached_property
     def _compared(self) -> dict[tuple[str, str, str], dict[str, ControlComparison]]:
-        """Comparisons by category, view and site, then by control."""
+        """The comparisons by category, view and site, then by control."""
         by_site: dict[tuple[str, str, str], dict[str, ControlComparison]] = {}
         for comparison in self.comparisons:
             by_site.setdefault((comparison.category, comparison.view, comparison.site), {})[comparison.control] = (

@@ -316,8 +316,8 @@ def best_sites(scores: "pd.DataFrame", is_side: bool) -> "list[pd.Series]":
     """Return the best site of every category, view and stream: a row of `ProbeResults.scores`, by category.
 
     The best site of a side has the largest accuracy, of other targets the largest excess over its own chance; the
-    first on ties. There are two columns besides those of `scores`: `ties`, how many other sites are as good, and
-    `first`, the best score at the stream's first iteration, NaN where it runs once.
+    first on ties. There are two columns besides those of `scores`. `ties` is how many other sites are as good.
+    `first` is the best score at the stream's first iteration, NaN where it runs once.
     """
     names = ["category", "view", "stream"]
     worth = scores["score"] if is_side else scores["score"] - scores["chance"].fillna(0.0)
@@ -425,10 +425,11 @@ class ProbeResults:
         `signal`: better than chance, family-wise, and than every control that sites were compared with. `n`:
         samples.
 
-        Of a side also `C` and `fold_accuracy` per outer fold, `auc`, `log_loss`, and `control_accuracy`: the mean
-        accuracy of the same probe on random labels that are consistent within a group, `selectivity` the accuracy
-        above it; NaN without label permutations. Of other targets `penalties` per outer fold (λ, or 1 / C),
-        `best_control`, the score of the best control, and of a quantity `spearman`, Spearman's ρ within folds.
+        A side also has `C` and `fold_accuracy` per outer fold, `auc`, `log_loss`, `control_accuracy` and
+        `selectivity`. `control_accuracy` is the mean accuracy of the same probe on random labels that are
+        consistent within a group, and `selectivity` the accuracy above it; both are NaN without label
+        permutations. Other targets have `penalties` per outer fold (λ, or 1 / C) and `best_control`, the score of
+        the best control. A quantity has `spearman`, Spearman's ρ within folds.
         """
         import pandas as pd
 

@@ -79,7 +79,7 @@ def keep_freed_memory() -> None:
 # -- rows of large arrays ------------------------------------------------------------------------------------
 
 ROWS_PER_BLOCK = 2048
-"""32 MB of float64 at a width of 2,048."""
+"""Rows of a block: 32 MB of float64 at a width of 2,048."""
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ class RowSubset:
 
 
 Features = Array | RowSubset
-"""(N, D) in memory, or rows that are visited block by block."""
+"""Features (N, D) in memory, or rows that are visited block by block."""
 
 
 def blocks_of(features: Features) -> Iterator[Array]:

@@ -26,7 +26,7 @@ WORTH_NARROWING = 1024
 """Features from which on eigenvectors in float32, made orthogonal again, take less time than in float64."""
 
 LEADING, POWERS, SETTLED = 64, 4, 1e-3
-"""Axes looked for first, by so many products with a block of vectors, and the share of their variance that they
+"""Axes computed first, by so many products with a block of vectors, and the share of their variance that they
 may miss to be kept. They are the steepest, and would blur the others: float32 knows eigenvectors up to a part of
 the largest eigenvalue, which may be 10,000 times the hundredth."""
 
@@ -299,7 +299,7 @@ class StreamedDesign(_OfAllColumns):
 
 
 Design = DenseDesign | StackedDesign | StreamedDesign
-"""N samples Z in R orthogonal coordinates, the last one all ones for the intercept."""
+"""A matrix of N samples Z in R orthogonal coordinates, the last one all ones for the intercept."""
 
 
 # -- a training fold -----------------------------------------------------------------------------------------

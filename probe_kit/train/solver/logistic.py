@@ -25,7 +25,7 @@ from probe_kit.train.solver.design_matrix import Design
 # -- one Newton step, by conjugate gradients -----------------------------------------------------------------
 
 MAX_CG_STEPS = 100
-"""Columns that need more are solved by factorising; another number changes times, not optima."""
+"""Steps beyond which a column is solved by factorising; another number changes times, not optima."""
 
 
 def newton_steps(
@@ -98,19 +98,19 @@ def _dots(first: Array, second: Array) -> Array:
 # -- the solver ----------------------------------------------------------------------------------------------
 
 MAX_NEWTON_STEPS = 100
-"""After these `ProbeNotConvergedError` is raised: no probe is used that is not at its optimum."""
+"""Bound after which `ProbeNotConvergedError` is raised: no probe is used that is not at its optimum."""
 MAX_STEPS_BETWEEN = 10
 """Newton steps by products in float32 from one exact point to the next."""
 COARSEST, FINEST = 0.1, 1e-5
-"""Relative precision of a step: what any is worth, and what is rounding in float32."""
+"""Relative precision of a step: the coarsest that is useful, and the finest before rounding in float32."""
 NEAR = 2e-2
-"""Relative gradient after which one more step in float32 is made, before a point is looked at exactly."""
+"""Relative gradient after which one more step in float32 is made, before a point is computed exactly."""
 GAIN = 1e-5
 """Share of an exact point's gradient that steps in float32 leave: less would be their rounding."""
 EXACT = 1e-12
 """Share of an objective that is rounding in float64."""
 SAFETY = 0.3
-"""Share of the tolerance that they aim at, so that the exact gradient is below it."""
+"""Share of the tolerance at which steps aim, so that the exact gradient is below it."""
 
 
 @dataclass(frozen=True)
