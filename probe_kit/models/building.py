@@ -69,7 +69,7 @@ def initialise(network: nn.Module, seed: int) -> None:
 
 
 def frequencies(count: int, longest: float) -> Tensor:
-    """Return `count` float32 angular frequencies on the CPU, geometrically from 1 down to nearly 1 / `longest`.
+    """Return angular frequencies (count,) float32 on the CPU, geometrically from 1 down to nearly 1 / `longest`.
 
     The exponents are float32, as in the original implementations. Their exponential is rounded correctly: that of
     torch differs in the last bit between versions and processors, and a time of 600 multiplies this error by 600.

@@ -46,6 +46,9 @@ class DinoConfig(ConfigFile):
     """The sizes of DINOv2.
 
     Attributes:
+        width: Width of the stream.
+        blocks: Number of blocks.
+        heads: Attention heads of a block.
         trained_side: Side in pixels of the pictures that its positions were trained for.
         patch: Side of a patch in pixels.
         side: Side of its pictures in pixels.
@@ -60,14 +63,15 @@ class DinoConfig(ConfigFile):
 
 
 class QueryConfig(ConfigFile):
-    """The sizes of the querying transformer.
+    """The sizes of the querying transformer, which reads hidden states from `first` up to, not including, `last`.
 
     Attributes:
         first: First hidden state that it reads.
-        last: End of the hidden states that it reads; this one is not read.
+        last: End of the hidden states that it reads.
         queries: Number of queries.
         inputs: Width of the hidden states.
         width: Width of the queries.
+        heads: Attention heads of a layer.
     """
 
     first: Index = Field(validation_alias="qformer_start_layer")
@@ -83,6 +87,9 @@ class HeadConfig(ConfigFile):
     """The sizes of the diffusion head.
 
     Attributes:
+        width: Width of the stream.
+        blocks: Number of blocks.
+        heads: Attention heads of a block.
         action_dim: Numbers per action.
         future: Actions of a chunk behind the next one.
         past: Actions before the next one; no other number than 0 is implemented.
@@ -375,7 +382,11 @@ class QueryTransformer(nn.Module):
         self.layers = nn.ModuleList(Layer(config.width, config.heads) for _ in range(config.last - config.first))
 
     def forward(self, states: list[Tensor]) -> Tensor:
-        """Return the queries (B, Q, D) from hidden states (B, S, width of the language model), one per layer."""
+        """Return the queries (B, Q, D) that have read one hidden state per layer.
+
+        Args:
+            states: One (B, S, width of the vision-language model) per layer.
+        """
         # A copy: what an edit writes into the stream must not land in the parameter.
         queries = self.query_tokens.expand(len(states[0]), -1, -1).clone()
         for layer, state in zip(self.layers, states, strict=True):
@@ -643,7 +654,7 @@ _MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
 def look(picture: NDArray[np.uint8], size: tuple[int, int] | None) -> NDArray[np.uint8]:
-    """Return a picture (H, W, 3) uint8 squeezed to a square by area, as the evaluation does it.
+    """Return a picture squeezed to a square by area, as the evaluation does it: (height, width, 3) uint8.
 
     Args:
         picture: (H, W, 3) uint8 picture.

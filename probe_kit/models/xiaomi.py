@@ -287,7 +287,7 @@ class XiaomiNetwork(nn.Module):
 
         Args:
             prompt: Kept parts of the prompt.
-            state: (B, states, state numbers) normalised state.
+            state: (B, states, state numbers) state of the robot.
             actions: (B, A, action numbers) moving actions.
             moment: (B,) moment of the flow in [0, 1].
         """

@@ -112,7 +112,7 @@ class ControlInputs:
     def _frames(self) -> NDArray[np.intp] | None:
         """Return the place (n,) of every recorded frame in the order of frames.
 
-        None for scenes, and where windows begin at an event.
+        It is None for scenes, and where windows begin at an event.
         """
         if self.recorded is None or self.samples.aligned is not None:
             return None
@@ -221,7 +221,7 @@ def step_features(samples: TargetSamples, places: NDArray[np.intp] | None = None
     Args:
         samples: The n samples, of which `steps` and `window` are read.
         places: (n,) places of recorded frames in the order of their numbers; used instead of the inferences. None
-            for scenes.
+            for scenes, and where windows begin at an event.
     """
     steps, count = samples.steps, samples.window
     if places is not None:

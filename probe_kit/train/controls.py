@@ -55,7 +55,7 @@ class PreparedControls:
     """The controls that are still to be run.
 
     Attributes:
-        names: In the order in which they run.
+        names: Names of the controls, in the order in which they run.
         inputs: Source of their features.
         left_out: Reasons why default controls cannot run, by name.
     """

@@ -156,9 +156,9 @@ def _plain(cell: Any, table: LabelTable, row: int, column: str) -> Cell:
 # -- values of a column under a task -------------------------------------------------------------------------
 
 MOST_DOUBTFUL = 20
-"""The most values of integers that can be classes or quantities, from 3 values on; only the user knows."""
+"""Largest number of different integers, from 3 on, that can be classes or quantities; only the user knows."""
 LARGEST = 1e100
-"""The largest quantity: they are squared and summed in float64, which ends at 1e308."""
+"""The largest quantity, because quantities are squared and summed in float64, which ends at 1e308."""
 
 
 @dataclass(frozen=True)

@@ -227,7 +227,7 @@ class Target:
         return cls(name, coded, column.episodes, column.inferences, table, group_by, exchange_within, builtin=True)
 
     def equal_to(self, value: str) -> "Target":
-        """Return the binary label whether this label is the class `value`, such as an event where windows begin.
+        """Return a binary label: whether this one is the class `value`, such as an event where windows begin.
 
         Raises:
             UsageError: For a value that is no class.

@@ -73,7 +73,7 @@ class ListedTarget(NamedTuple):
         per: `episode` or `inference`.
         values: Classes or range, or why the run has none.
         options: Options of the command that trains probes on it; None where `train` refuses every one.
-        refused: Reason why `train` refuses it; empty where `options` are given.
+        refused: Reason why `train` refuses every one; empty where it does not.
     """
 
     target: str

@@ -47,7 +47,7 @@ GUESSED: Statistics = {
     "action": ([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.5], [0.02, 0.02, 0.02, 0.0, 0.0, 0.0, 0.5]),
     "observation.state": ([0.32, 0.03, 0.1, 0.0, 0.0, 0.0, 0.0, 0.5], [0.06, 0.09, 0.05, 0.1, 0.1, 0.1, 1.0, 0.5]),
 }
-"""Statistics of about the actions of the scripted expert; for policies with random weights."""
+"""Approximate statistics of the scripted expert; for policies with random weights."""
 
 
 def new_pi0_tiny(seed: int) -> PI0Policy:

@@ -233,12 +233,12 @@ It takes decisions (k, B), their block, and the problems that they belong to."""
 class JointProblems:
     """The K logistic problems on one site.
 
-    Weights are rows (D + 1): v on features as the site standardises them, and the intercept b. Decisions are f =
-    x·v − mean·v + b for a sample x. The penalty is ½‖scale ∘ v‖²: scale ∘ v are the weights on features as the
+    Weights are rows (D + 1): v on features as the site standardises them, and the intercept b. The decision about
+    a sample x is f = x·v − mean·v + b. The penalty is ½‖scale ∘ v‖²: scale ∘ v are the weights on features as the
     training set standardises them.
 
     Steps, and rough weights, are rows (D + 1) along the site's axes: u with v = axes · u, and b. Exact weights are
-    never turned. A turn's rounding in float64 would return times the curvature along the first axis; with 80,000
+    never turned. A turn's rounding in float64 would return times the curvature along the first axis. With 80,000
     samples that is more than a gradient of 1e-9 of the weights.
 
     Rows that the outer fold of a set tests are left out of its products. Rows that only an inner fold tests are

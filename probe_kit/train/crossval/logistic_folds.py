@@ -185,8 +185,7 @@ class _Together:
 
         Returns:
             (C, F, K) log-losses of the test episodes, summed; (C, F, E) log-losses of the first column, which are
-                0 outside of
-            a fold's test episodes.
+            0 outside of a fold's test episodes.
         """
         loss = np.empty((STRENGTHS.size, len(self.folds), self.labels.shape[1]))
         by_episode = np.zeros((STRENGTHS.size, len(self.folds), len(self.labels)))
@@ -317,8 +316,7 @@ class _SharedColumns:
 
         Returns:
             Position (F, L) of the chosen C by outer fold and column; weights (C, F, L, D + 1) to start from; and
-                the quality
-            of every outer fold.
+            the quality of every outer fold.
         """
         sets = [(number, inner) for number, nested in enumerate(self.folds) for inner in nested.inner]
         of_fold = np.array([number for number, _ in sets])

@@ -27,7 +27,7 @@ class ProbeCurve:
     it.
 
     Attributes:
-        sites: S sites.
+        sites: S probed sites, in order.
         labels: (E,) bool of a side (true: left), else coded: class numbers or quantities.
         episodes: (E,) ids of the episodes.
         items: (E,) ids of the items.

@@ -40,8 +40,9 @@ class ProbeSettings:
     """The settings that decide the numbers; their hash is the results' key.
 
     Attributes:
-        weights: sha256 of the network's weights; None where a run has none.
-        seed_text: Text that seeds the run, see `RunReader`; scores on equal groups of one text are paired.
+        weights: sha256 of the network's weights; None where the run does not name it.
+        seed_text: Text of the run that seeds random draws, see `RunReader`; scores on equal groups of one text are
+            paired.
         episodes: sha256 of the ids of the run's episodes, so that a run that grew is probed again.
         token_permutations: Number of permutations of token views; 0 where none is probed.
         call: Captured inference that a label of a whole episode is decoded from.
@@ -416,12 +417,12 @@ class ProbeResults:
     def scores(self) -> "pd.DataFrame":
         """The scores with one row per category, view and site.
 
-        `score` is named by the column `metric`, with its 95 % interval over groups (`ci_low`, `ci_high`); that of
-        a side is called `accuracy` too. `chance`: one half for a side, else the mean score of the label
-        permutations at this site. `p` of the site alone, `p_fwe` against the best of the stream: the most accurate
-        site of a side, else the largest excess over chance. `smallest_p`: no p-value can be lower with so many
-        label permutations. `depth`: the layer as a fraction. `exceeds_NAME`: whether the site exceeds that
-        control; of a side `exceeds_random_features` and `exceeds_untrained`, missing where they were not run.
+        `score` is the metric that the column `metric` names, with its 95 % interval over groups (`ci_low`,
+        `ci_high`); that of a side is called `accuracy` too. `chance`: one half for a side, else the mean score of
+        the label permutations at this site. `p` of the site alone, `p_fwe` against the best of the stream: the
+        most accurate site of a side, else the largest excess over chance. `smallest_p`: no p-value can be lower
+        with so many label permutations. `depth`: the layer as a fraction. `exceeds_NAME`: whether the site exceeds
+        that control; of a side `exceeds_random_features` and `exceeds_untrained`, missing where they were not run.
         `signal`: better than chance, family-wise, and than every control that sites were compared with. `n`:
         samples.
 
