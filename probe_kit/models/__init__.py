@@ -1,1 +1,1 @@
-"""Networks: lerobot's pi0 and pi0.5 at any size, and families without a maintained package. No capture logic."""
+"""Networks: pi0 and pi0.5 of lerobot at any size, and families without a maintained package. No capture logic."""

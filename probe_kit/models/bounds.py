@@ -1,4 +1,4 @@
-"""Limits on the numbers of a checkpoint: sizes, and scales of actions. Imports no torch."""
+"""Limits on the numbers of a checkpoint: sizes, and scales of actions. Importing them loads no torch."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from probe_kit.errors import CheckpointError
 
 MOST_STEPS = 1000
-"""Flow or diffusion steps, actions of a chunk, layers: far beyond any model, and no loop without end."""
+"""Limit of flow or diffusion steps, actions of a chunk, layers: far beyond any model, and no loop without end."""
 LARGEST_SIZE = 1 << 24
 _DEEPEST = 50
 _STEPS = (

@@ -1,4 +1,4 @@
-"""Construction of empty networks: by size, without numbers, with initial weights; parts that networks share."""
+"""The construction of networks: empty ones, sizes without numbers, initial weights, parts that networks share."""
 
 import math
 from collections.abc import Callable, Iterator, Mapping
@@ -17,7 +17,7 @@ _SIZES_ONLY = ContextVar("sizes_only", default=False)
 
 @contextmanager
 def sizes_only() -> Iterator[None]:
-    """A context in which networks are built on the meta device, and neither filled nor read."""
+    """Build networks on the meta device inside this context, and neither fill nor read them."""
     token = _SIZES_ONLY.set(True)
     try:
         with torch.device("meta"):
@@ -43,9 +43,9 @@ def building_device(device: str = "cpu") -> str:
 def initialise(network: nn.Module, seed: int) -> None:
     """Fill every parameter with random numbers of a scale that keeps activations of order one.
 
-    Matrices N(0, 1/fan_in), residual outputs half of that, embeddings 1/sqrt(width), position embeddings
-    0.5, biases zero, norms untouched. Drawn by numpy in name order, so that a seed means the same bits
-    on every machine.
+    Matrices are N(0, 1/fan_in), residual outputs half of that, embeddings 1/sqrt(width), position embeddings 0.5,
+    biases zero, norms untouched. Numbers are drawn by numpy in name order, so that a seed means the same bits on
+    every machine.
     """
     if builds_sizes_only():
         return
@@ -69,10 +69,10 @@ def initialise(network: nn.Module, seed: int) -> None:
 
 
 def frequencies(count: int, longest: float) -> Tensor:
-    """(count,) float32 angular frequencies on the CPU, geometrically from 1 down to nearly 1 / `longest`.
+    """Return angular frequencies (count,) float32 on the CPU, geometrically from 1 down to nearly 1 / `longest`.
 
-    The exponents are float32, as in the original implementations, and their exponential is rounded correctly: that
-    of torch differs in the last bit between versions and processors, and a time of 600 makes 600 times that of it.
+    The exponents are float32, as in the original implementations. Their exponential is rounded correctly: that of
+    torch differs in the last bit between versions and processors, and a time of 600 multiplies this error by 600.
     """
     exponents = -math.log(longest) * torch.arange(count, dtype=torch.float32) / count
     return torch.exp(exponents.double()).float()
@@ -82,7 +82,7 @@ _SINUSOID, _LONGEST_PERIOD = 256, 10000
 
 
 class TimeEmbedder(nn.Module):
-    """A moment of a flow, or a step of a diffusion, as a vector."""
+    """The embedding of a moment of a flow, or of a step of a diffusion, as a vector."""
 
     def __init__(self, width: int, bias: bool) -> None:
         super().__init__()
@@ -91,7 +91,7 @@ class TimeEmbedder(nn.Module):
         )
 
     def forward(self, moments: Tensor) -> Tensor:
-        """(B, D) of (B,) numbers; cosines stand before sines."""
+        """Return the embeddings (B, D) of (B,) numbers; cosines stand before sines."""
         angles = moments[:, None].float() * frequencies(_SINUSOID // 2, _LONGEST_PERIOD).to(moments.device)
         sinusoid = torch.cat([angles.cos(), angles.sin()], dim=-1)
         # The released models round the sinusoid to the precision of their weights.
@@ -99,15 +99,15 @@ class TimeEmbedder(nn.Module):
 
 
 class Gate(nn.Module):
-    """Scales what half a block adds to the stream; a module, so that hooks can capture what is added."""
+    """A factor on the output of half a block; a module, so that hooks can capture what is added to the stream."""
 
     def forward(self, computed: Tensor, gate: Tensor) -> Tensor:
-        """(B, T, D) of (B, T, D) and (B, 1, D)."""
+        """Return `computed` (B, T, D) times `gate` (B, 1, D)."""
         return computed * gate
 
 
 def without_precision(values: Mapping[str, Any]) -> dict[str, Any]:
-    """A configuration's values without the precision its files are stored in, in its parts too.
+    """Return a configuration's values without the precision in which its files are stored, also in its parts.
 
     transformers builds every part in the precision its own configuration names, whatever is asked for around it.
     """
@@ -142,6 +142,8 @@ def build_empty[Network: nn.Module](
     """Return the network of `make` in eval mode, with parameters of `dtype`; without memory where sizes suffice.
 
     Args:
+        make: Function that builds the network.
+        dtype: Type of the parameters.
         device: `meta` for parameters that have names and shapes but no memory, to be filled with `load_weights(…,
             assign=True)`; `cpu` for uninitialised weights. The rotary frequencies, which no checkpoint holds, are
             then to be computed, with `fill_decoder_rotary`, for Qwen's with `fill_rotary`.
@@ -181,7 +183,10 @@ def fill_rotary(vlm: Any) -> None:
 
 @contextmanager
 def replaced(module: ModuleType, values: Mapping[str, Any]) -> Iterator[None]:
-    """Inside, `module` has `values` under these names; afterwards what it had before, also on an exception."""
+    """Give `module` these values under their names inside the context, and restore its own ones afterwards.
+
+    They are restored also on an exception.
+    """
     originals = {name: getattr(module, name) for name in values}
     try:
         for name, value in values.items():

@@ -1,4 +1,4 @@
-"""Small files of checkpoints: names of tensors, processors, statistics. Imports no torch."""
+"""Small files of checkpoints: names of tensors, processors, statistics. Importing them loads no torch."""
 
 import re
 from collections.abc import Collection, Mapping, Sequence
@@ -17,11 +17,11 @@ LANGUAGE_FIRST: Renames = (
     (r"^language_model\.model\.", "model.language_model."),
     (r"^(vision_tower|multi_modal_projector)\.", r"model.\1."),
 )
-"""Where files hold a whole language model; files saved by today's transformers stay as they are."""
+"""Renames for files that hold a whole language model; files saved by today's transformers stay as they are."""
 
 
 def renamed(name: str, renames: Sequence[tuple[str, str]]) -> str:
-    """The module's name of a tensor that a file calls `name`."""
+    """Return the module's name of a tensor that a file calls `name`."""
     for pattern, replacement in renames:
         name = re.sub(pattern, replacement, name)
     return name
@@ -33,10 +33,10 @@ PROCESSOR_FILE = "preprocessor_config.json"
 
 
 def processor_settings(folder: Path, needed: Sequence[str], optional: Sequence[str] = ()) -> dict[str, Any]:
-    """The named values of the file in `folder`; `optional` ones only where they are set.
+    """Return the named values of `preprocessor_config.json` in `folder`; `optional` ones only where they are set.
 
     Raises:
-        CheckpointError: If the file is missing, is not JSON or lacks a needed one.
+        CheckpointError: If the file is missing, is not JSON or lacks a needed value.
     """
     file = folder / PROCESSOR_FILE
     if not file.is_file():
@@ -54,7 +54,11 @@ def processor_settings(folder: Path, needed: Sequence[str], optional: Sequence[s
 
 
 def square_side(values: dict[str, Any], folder: Path) -> int:
-    """Pixels of the side of the square that `size` names. Raises CheckpointError if it names none."""
+    """Return the side in pixels of the square that `size` names.
+
+    Raises:
+        CheckpointError: If it names none.
+    """
     size = values["size"]
     height, width = (size.get(side) if isinstance(size, dict) else size for side in ("height", "width"))
     if not isinstance(height, int) or height != width:
@@ -74,12 +78,14 @@ def load_pretrained(loader: Any, source: Path | str, **options: Any) -> Any:
     the terminal whether to run it.
 
     Args:
+        loader: Class of transformers, such as a tokenizer's.
         source: A folder or a hub id.
+        **options: Further keyword arguments of `from_pretrained`.
 
     Raises:
-        CheckpointError: Where the object needs such code.
+        CheckpointError: If the object needs such code.
         OSError: For missing files.
-        ValueError: For others.
+        ValueError: For other files that transformers cannot read.
     """
     try:
         return loader.from_pretrained(str(source), trust_remote_code=False, **options)
@@ -100,7 +106,7 @@ _SHOWN = 40
 
 
 def read_statistics(file: Path) -> dict[str, Any]:
-    """Per data set `{"action": {"q01": …, "q99": …, "mask": …}}`; in the file `action` may be left out.
+    """Return per data set `{"action": {"q01": …, "q99": …, "mask": …}}`; in the file `action` may be left out.
 
     Raises:
         CheckpointError: For a file that is missing or holds something else.
@@ -115,13 +121,15 @@ def read_statistics(file: Path) -> dict[str, Any]:
 def stored_statistics(
     folders: Sequence[Path], otherwise: Mapping[str, Any], source: str
 ) -> tuple[Mapping[str, Any], str]:
-    """The statistics that count for a checkpoint, and the name of their source, for messages.
+    """Return the statistics that count for a checkpoint, and the name of their source, for messages.
 
     `dataset_statistics.json` of the first folder that has one stands alone: fine-tuning wrote it, and a
     configuration still lists the data sets of the base.
 
     Args:
-        otherwise: Those that count without the file, and `source` where they stand.
+        folders: Folders that may hold the file, in order of preference.
+        otherwise: Statistics that count without the file.
+        source: Name of the place of `otherwise`.
 
     Raises:
         CheckpointError: For a file that cannot be read.
@@ -133,10 +141,12 @@ def stored_statistics(
 
 
 def chosen_name(available: Collection[str], requested: str | None, option: str, source: str) -> str:
-    """The data set, or robot, whose statistics are used: as chosen, or the only one.
+    """Return the data set, or robot, whose statistics are used: as chosen, or the only one.
 
     Args:
-        option: Of `-M`, for messages.
+        available: Names that have statistics.
+        requested: Chosen name; None for the only one.
+        option: Name of the `-M` option that chooses, for messages.
         source: The file that holds them.
 
     Raises:

@@ -11,19 +11,19 @@ from probe_kit._system.complaints import in_words
 from probe_kit.errors import CheckpointError
 
 Count = Annotated[int, Field(ge=1, lt=1 << 31)]
-"""Blocks, heads, widths, pixels."""
+"""Number of blocks, heads, features or pixels."""
 Index = Annotated[int, Field(ge=0, lt=1 << 31)]
-"""Ids of tokens, and positions."""
+"""Id of a token, or a position."""
 
 
 class ConfigFile(BaseModel):
     """The content of a configuration file that describes a network, each field under the file's own name.
 
-    null is as if a field were missing. Further fields of the file are not read.
+    A field that is null counts as missing. Further fields of the file are not read.
 
     Attributes:
-        model_types: What it may hold.
-        network: For messages.
+        model_types: Values of `model_type` that the file may hold.
+        network: Name of the network, for messages.
     """
 
     model_config = ConfigDict(
@@ -41,7 +41,11 @@ class ConfigFile(BaseModel):
 
     @classmethod
     def from_folder(cls, folder: Path) -> Self:
-        """Read `folder/config.json`. Raises CheckpointError if it is missing or describes another model."""
+        """Read `folder/config.json`.
+
+        Raises:
+            CheckpointError: If it is missing or describes another model.
+        """
         file = folder / "config.json"
         if not file.is_file():
             raise CheckpointError(f"{file} is missing; {folder} is not a {cls.network} checkpoint")
@@ -49,7 +53,11 @@ class ConfigFile(BaseModel):
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any], source: str = "config") -> Self:
-        """Read the content of a `config.json`. Raises CheckpointError naming `source`."""
+        """Read the content of a `config.json`.
+
+        Raises:
+            CheckpointError: For another model, and for fields that `read` refuses; the message names `source`.
+        """
         if (model_type := values.get("model_type")) not in cls.model_types:
             raise CheckpointError(
                 f"{source} holds a {model_type!r} model; expected {' or '.join(cls.model_types)} ({cls.network}). "
@@ -59,7 +67,11 @@ class ConfigFile(BaseModel):
 
     @classmethod
     def read(cls, values: Mapping[str, Any], source: str) -> Self:
-        """Read the fields. Raises CheckpointError for what is missing, of another type, or out of bounds."""
+        """Read the fields.
+
+        Raises:
+            CheckpointError: For a field that is missing, of another type, or out of bounds.
+        """
         try:
             return cls.model_validate(values)
         except ValidationError as error:
@@ -73,10 +85,13 @@ STORED_TYPE = Field(default=None, validation_alias=AliasChoices("torch_dtype", "
 
 
 def part(make: Callable[[dict[str, Any]], Any], model_type: str = "") -> BeforeValidator:
-    """A part that transformers describes, from its values in the file; one that is made already is taken as it is.
+    """Return the validator of a part that transformers describes, made from its values in the file.
+
+    A part that is made already is taken as it is.
 
     Args:
-        model_type: What it has to be; empty for any.
+        make: Function that makes the part from its values.
+        model_type: `model_type` that the values must have; empty for any.
     """
 
     def checked(values: Any) -> Any:

@@ -10,18 +10,21 @@ from transformers import DynamicCache
 
 
 class Passage(nn.Module):
-    """Hands on what it is given, the same tensor: a place for hooks, without weights and without arithmetic."""
+    """A module that returns its input, the same tensor.
+
+    It is a place for hooks, without weights and without arithmetic.
+    """
 
     def forward(self, passing: Tensor) -> Tensor:
-        """`passing`."""
+        """Return `passing`."""
         return passing
 
 
 class PromptKV(nn.Module):
-    """One passage for the keys and one for the values of every block.
+    """The passages for keys and values: one each for every block.
 
-    An inference sends what it keeps of the prompt through once: when the prompt is read, and before the part that
-    acts reads it.
+    An inference sends the keys and values of the prompt through them once: after the prompt is read, and before
+    the part that acts reads them.
     """
 
     def __init__(self, blocks: int) -> None:
@@ -38,30 +41,32 @@ class PromptKV(nn.Module):
 # -- decoding -------------------------------------------------------------------------------------------------
 
 Choose = Callable[[Tensor], Tensor]
-"""(B,) ids of the next tokens from their logits (B, V)."""
+"""Function that chooses ids (B,) of the next tokens from their logits (B, V)."""
 
 
 def greedy(logits: Tensor) -> Tensor:
-    """(B,) the likeliest ids."""
+    """Return the likeliest ids, (B,)."""
     return logits.argmax(dim=-1)
 
 
 def positions(mask: Tensor) -> Tensor:
-    """(B, S) positions that count tokens, not padding."""
+    """Return positions (B, S) that count tokens, not padding."""
     return (mask.long().cumsum(dim=1) - 1).clamp(min=0)
 
 
 def needed(mask: Tensor) -> Tensor | None:
-    """The mask where there is padding: without one, attention takes its exact causal path."""
+    """Return the mask where there is padding: without one, attention takes its exact causal path."""
     return None if bool(mask.all()) else mask
 
 
 def last_logits(language_model: Any, embeddings: Tensor, mask: Tensor, cache: DynamicCache) -> Tensor:
-    """(B, V) logits behind the last position, in one pass of a language model.
+    """Return the logits (B, V) behind the last position, in one pass of a language model.
 
     Args:
-        embeddings: (B, T, D) of what is new.
+        language_model: Causal language model of transformers.
+        embeddings: (B, T, D) embeddings of the new tokens.
         mask: (B, past + T) bool, False at padding.
+        cache: Keys and values of the past, to which those of the new tokens are added.
     """
     output = language_model(
         inputs_embeds=embeddings,
@@ -77,9 +82,11 @@ def last_logits(language_model: Any, embeddings: Tensor, mask: Tensor, cache: Dy
 
 @dataclass(frozen=True)
 class Decoded:
-    """Tokens behind a prompt: ids (B, N) int64, and the logits (B, N, V) that chose them.
+    """The tokens behind a prompt.
 
     Attributes:
+        ids: (B, N) int64 ids.
+        logits: (B, N, V) logits that chose them.
         mask: (B, S) bool of the prompt.
         cache: Keys and values of the prompt and of all ids but the last.
     """
@@ -95,10 +102,13 @@ class TokenNetwork(nn.Module):
 
     language_model: Any
     prompt_kv: PromptKV
-    """Where what is kept of the prompt passes once."""
+    """Passages through which the kept keys and values of the prompt pass once."""
 
     def whole_pass(self, embeddings: Tensor, mask: Tensor) -> Any:
-        """transformers' output of one pass over (B, S, D), with logits (B, S, V) and all hidden states."""
+        """Return the output of transformers for one pass over (B, S, D).
+
+        It holds logits (B, S, V) and all hidden states.
+        """
         return self.language_model(
             inputs_embeds=embeddings,
             position_ids=positions(mask),
@@ -107,18 +117,22 @@ class TokenNetwork(nn.Module):
         )
 
     def next_logits(self, embeddings: Tensor, mask: Tensor, cache: DynamicCache) -> Tensor:
-        """(B, V) logits behind the last position; see `last_logits`."""
+        """Return the logits (B, V) behind the last position; see `last_logits`."""
         return last_logits(self.language_model, embeddings, mask, cache)
 
     def decode_behind(
         self, embeddings: Tensor, mask: Tensor, steps: int, choose: Choose = greedy, fed: Tensor | None = None
     ) -> Decoded:
-        """Exactly `steps` tokens behind the prompt, whatever they are.
+        """Return exactly `steps` tokens behind the prompt, whatever they are.
+
+        The language model is called once with the prompt and `steps - 1` times with one token.
 
         Args:
+            embeddings: (B, S, D) embeddings of the prompt.
             mask: (B, S) bool, True at the end of every row.
-            fed: (B, steps - 1) ids to feed back instead of those chosen. The language model is called once with
-                the prompt and `steps - 1` times with one token.
+            steps: Number N of tokens.
+            choose: Function from logits (B, V) to the next ids (B,); the likeliest by default.
+            fed: (B, steps - 1) ids to feed back instead of those chosen.
         """
         prompt, cache = mask, DynamicCache(config=self.language_model.config)
         ids: list[Tensor] = []
@@ -139,7 +153,7 @@ class TokenNetwork(nn.Module):
 
 
 def packed(rows: Sequence[Tensor], padding: int = 0) -> tuple[Tensor, Tensor]:
-    """Rows (T, …) as one batch (B, S, …), and its mask (B, S) bool, False at padding.
+    """Return rows (T, …) as one batch (B, S, …), and its mask (B, S) bool, False at padding.
 
     Padding stands before the last token of a row: the last tokens line up, and no other token moves, whatever else
     is in the batch. Positions count tokens only, so the network computes the same numbers as without padding.
@@ -155,7 +169,7 @@ def packed(rows: Sequence[Tensor], padding: int = 0) -> tuple[Tensor, Tensor]:
 
 @dataclass(frozen=True)
 class Packed:
-    """Prompts as one batch: ids (B, T) int64 and mask (B, T) bool, see `packed`."""
+    """The prompts as one batch: ids (B, T) int64 and mask (B, T) bool, see `packed`."""
 
     ids: Tensor
     mask: Tensor
@@ -168,7 +182,10 @@ class Packed:
 
 @dataclass(frozen=True)
 class LeftPacked:
-    """Prompts as one batch: ids (B, T) int64 and mask (B, T) int64, 0 at padding, which stands before each row."""
+    """The prompts as one batch: ids (B, T) int64 and mask (B, T) int64.
+
+    The mask is 0 at padding, which stands before each row.
+    """
 
     ids: Tensor
     mask: Tensor
@@ -185,5 +202,5 @@ class LeftPacked:
         return cls(ids.to(device), mask.to(device))
 
     def positions(self, first: int = 0) -> Tensor:
-        """(B, T) positions that count tokens, not padding, from `first`."""
+        """Return positions (B, T) that count tokens, not padding, from `first`."""
         return positions(self.mask) + first

@@ -30,7 +30,7 @@ _VISION: dict[str, dict[str, Any]] = {
 
 
 def build_internvl(config: Any, dtype: torch.dtype, device: str = "meta") -> Any:
-    """The network in eval mode; see `build_empty`. Rotary frequencies, which no checkpoint holds, are computed."""
+    """Return the network in eval mode, see `build_empty`, with the rotary frequencies that no checkpoint holds."""
     network: Any = build_empty(lambda: InternVLForConditionalGeneration(config), dtype, device)
     fill_decoder_rotary(network.model.language_model)
     network.tie_weights()
@@ -38,7 +38,7 @@ def build_internvl(config: Any, dtype: torch.dtype, device: str = "meta") -> Any
 
 
 def full_size_internvl(size: str) -> Any:
-    """A released size on the meta device."""
+    """Return a released size on the meta device."""
     text = {**_TEXT[size], "model_type": "qwen3", "num_key_value_heads": 8, "head_dim": 128, "vocab_size": 151936}
     vision = {
         **_VISION[size],
@@ -63,8 +63,8 @@ class TiledPictures:
 
     Attributes:
         settings: The part of the checkpoint's file that the processor reads.
-        tiled: Cut into a grid, as the released processor does whatever its file says; False shows the whole
-            picture as one tile.
+        tiled: Whether to cut pictures into a grid, as the released processor does whatever its file says; False
+            shows the whole picture as one tile.
     """
 
     settings: dict[str, Any]
@@ -72,7 +72,16 @@ class TiledPictures:
 
     @classmethod
     def from_folder(cls, folder: Path, side: int, tiled: bool = True) -> "TiledPictures":
-        """Read `preprocessor_config.json`. side: pixels the network expects. Raises CheckpointError."""
+        """Read `preprocessor_config.json`.
+
+        Args:
+            folder: Folder of the checkpoint.
+            side: Side in pixels of the tiles that the network expects.
+            tiled: As in `TiledPictures`.
+
+        Raises:
+            CheckpointError: If the file is missing, lacks a value, or makes tiles of another side.
+        """
         values = processor_settings(folder, _NEEDED, _OPTIONAL)
         if (stored_side := square_side(values, folder)) != side:
             raise CheckpointError(f"{folder} makes tiles of {stored_side} pixels; config.json expects {side}")
@@ -83,14 +92,15 @@ class TiledPictures:
         return GotOcr2ImageProcessor(**self.settings, crop_to_patches=self.tiled)
 
     def tiles(self, height: int, width: int) -> int:
-        """Tiles of a picture of that size, the whole picture included where there are several.
+        """Return the number of tiles of a picture of that size.
 
-        The nearest shape of a grid hangs on the last bit: 560 x 480 makes 4 x 3 tiles and not one, by 2e-16.
+        The whole picture is included where there are several. The nearest shape of a grid depends on the last bit:
+        560 x 480 makes 4 x 3 tiles and not one, by 2e-16.
         """
         return int(self._processor.get_number_of_image_patches(height, width))
 
     def pixels(self, pictures: list[NDArray[np.uint8]]) -> Tensor:
-        """(tiles of all pictures, 3, S, S) float32 of (H, W, 3) uint8 pictures."""
+        """Return the tiles of all (H, W, 3) uint8 pictures, (tiles, 3, S, S) float32."""
         processed = self._processor(images=pictures, input_data_format="channels_last", return_tensors="pt")
         pixels: Tensor = processed["pixel_values"]
         return pixels

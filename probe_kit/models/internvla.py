@@ -1,14 +1,14 @@
 """InternVLA-M1: Qwen2.5-VL and DINOv2, a querying transformer, a guided diffusion head, in torch and transformers.
 
-Names of modules and parameters are those of the released files, so that a checkpoint loads as it is. Capture
-and actions are in its adapter in `probe_kit.hooks`.
+Names of modules and parameters are those of the released files, so that a checkpoint loads as it is. Capture and
+actions are in its adapter in `probe_kit.hooks`.
 
-The run's `config.yaml` names parts of a fixed table (`dinov2_vits14`, `DiT-B`); sizes of other parts, as
-development checkpoints have them, stand in a file `dims.json` beside or above it, under the names of those
+The run's `config.yaml` names parts of a fixed table (`dinov2_vits14`, `DiT-B`). Sizes of other parts, as
+development checkpoints have them, are in a file `dims.json` beside or above it, under the names of those
 checkpoints.
 
-B batch, V views, P prompt positions or patches, Q queries, S positions that are read, C conditions, A actions
-of a chunk, N denoising steps, D width.
+B batch, V views, P prompt positions or patches, Q queries, S positions that are read, C conditions, A actions of a
+chunk, N denoising steps, D width.
 """
 
 import math
@@ -35,7 +35,7 @@ from probe_kit.models.qwen import IMAGE, QwenInputs, qwen2_5_vl_config
 
 RUN_FILE, DIMS_FILE = "config.yaml", "dims.json"
 JSON_FILE = "config.json"
-"""What a run may have instead of its `config.yaml`; the file of a vision-language model has the same name."""
+"""File that a run may have instead of its `config.yaml`; that of a vision-language model has the same name."""
 FRAMEWORKS = ("InternVLA-M1", "InternVLA_M1")
 # Per name: width, blocks, heads.
 _DINO = {"dinov2_vits14": (384, 12, 6), "dinov2_vitb14": (768, 12, 12), "dinov2_vitl14": (1024, 24, 16)}
@@ -43,7 +43,16 @@ _DIT = {"DiT-S": (384, 6, 4), "DiT-B": (768, 12, 12), "DiT-L": (1024, 24, 16)}
 
 
 class DinoConfig(ConfigFile):
-    """DINOv2: width, blocks, heads; the side its positions were trained for, of a patch, of its pictures."""
+    """The sizes of DINOv2.
+
+    Attributes:
+        width: Width of the stream.
+        blocks: Number of blocks.
+        heads: Attention heads of a block.
+        trained_side: Side in pixels of the pictures that its positions were trained for.
+        patch: Side of a patch in pixels.
+        side: Side of its pictures in pixels.
+    """
 
     width: Count = Field(validation_alias="embed_dim")
     blocks: Count = Field(validation_alias="depth")
@@ -54,7 +63,16 @@ class DinoConfig(ConfigFile):
 
 
 class QueryConfig(ConfigFile):
-    """The querying transformer: hidden states `first` up to, not including, `last`; queries; widths; heads."""
+    """The sizes of the querying transformer, which reads hidden states from `first` up to, not including, `last`.
+
+    Attributes:
+        first: First hidden state that it reads.
+        last: End of the hidden states that it reads.
+        queries: Number of queries.
+        inputs: Width of the hidden states.
+        width: Width of the queries.
+        heads: Attention heads of a layer.
+    """
 
     first: Index = Field(validation_alias="qformer_start_layer")
     last: Count = Field(validation_alias="qformer_end_layer")
@@ -66,7 +84,18 @@ class QueryConfig(ConfigFile):
 
 
 class HeadConfig(ConfigFile):
-    """The diffusion head: width, blocks, heads, numbers and length of a chunk, training steps, noise schedule."""
+    """The sizes of the diffusion head.
+
+    Attributes:
+        width: Width of the stream.
+        blocks: Number of blocks.
+        heads: Attention heads of a block.
+        action_dim: Numbers per action.
+        future: Actions of a chunk behind the next one.
+        past: Actions before the next one; no other number than 0 is implemented.
+        steps: Diffusion steps of the training.
+        schedule: Name of the noise schedule.
+    """
 
     width: Count = Field(validation_alias="token_size")
     blocks: Count = Field(validation_alias="depth")
@@ -79,7 +108,7 @@ class HeadConfig(ConfigFile):
 
     @property
     def length(self) -> int:
-        """Actions of a chunk: the next, and those behind it."""
+        """The number of actions in a chunk: the next, and those behind it."""
         return self.future + 1
 
 
@@ -89,7 +118,7 @@ class InternVLAConfig(ConfigFile):
     Attributes:
         base: The vision-language model the run was made of, as its file names it.
         cot: The prompt around the instruction, None for the instruction alone.
-        picture: (width, height) the model resizes pictures to, if any.
+        picture: (width, height) in pixels to which the model resizes pictures, if any.
     """
 
     network = "InternVLA-M1"
@@ -106,7 +135,16 @@ class InternVLAConfig(ConfigFile):
 
     @classmethod
     def from_values(cls, values: Mapping[str, Any], vlm: Mapping[str, Any], source: str) -> Self:
-        """Read the content of the files; vlm: of Qwen2.5-VL's config.json. Raises CheckpointError."""
+        """Read the content of the files.
+
+        Args:
+            values: Content of the run's configuration.
+            vlm: Content of Qwen2.5-VL's config.json.
+            source: Name of the file, for messages.
+
+        Raises:
+            CheckpointError: For another framework, an unknown part, and fields that `read` refuses.
+        """
         framework = values.get("framework") or {}
         if (framework_name := framework.get("framework_py")) not in FRAMEWORKS:
             raise CheckpointError(
@@ -155,7 +193,7 @@ class InternVLAConfig(ConfigFile):
 
 
 def find_config(folder: Path) -> tuple[dict[str, Any], Path]:
-    """The run's values and the folder they stand in: `folder` itself, or the one above its `checkpoints/`.
+    """Return the run's values and their folder: `folder` itself, or the one above its `checkpoints/`.
 
     Raises:
         CheckpointError: If neither has a `config.yaml`, a `config.json` of a run, or `dims.json`.
@@ -187,7 +225,11 @@ def _read(file: Path) -> dict[str, Any]:
 
 
 def _sizes_of(name: str, table: Mapping[str, tuple[int, int, int]], field: str, source: str) -> dict[str, int]:
-    """The sizes of a released part, under the names that `dims.json` has."""
+    """Return the sizes of a released part, under the names that `dims.json` has.
+
+    Raises:
+        CheckpointError: For a part that is not in the table.
+    """
     if name not in table:
         raise CheckpointError(
             f"{source}: {field} {name!r} is not one of {', '.join(table)}; "
@@ -201,7 +243,7 @@ def _sizes_of(name: str, table: Mapping[str, tuple[int, int, int]], field: str, 
 
 
 class Attention(nn.Module):
-    """Self-attention of (B, T, D) without a mask."""
+    """The self-attention of (B, T, D) without a mask."""
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
@@ -210,14 +252,14 @@ class Attention(nn.Module):
         self.proj = nn.Linear(width, width)
 
     def forward(self, stream: Tensor) -> Tensor:
-        """(B, T, D)."""
+        """Return the mixed positions, (B, T, D) from (B, T, D)."""
         query, key, value = self.qkv(stream).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
         read = functional.scaled_dot_product_attention(query, key, value)
         return cast(Tensor, self.proj(read.transpose(1, 2).flatten(2)))
 
 
 class MLP(nn.Module):
-    """Two layers with GELU between them. approximate: torch's name of its approximation."""
+    """A pair of layers with GELU between them, of which `approximate` is torch's name of its approximation."""
 
     def __init__(self, width: int, approximate: Literal["none", "tanh"]) -> None:
         super().__init__()
@@ -226,7 +268,7 @@ class MLP(nn.Module):
         self.approximate = approximate
 
     def forward(self, stream: Tensor) -> Tensor:
-        """(B, T, D)."""
+        """Return the output of the layers, (B, T, D) from (B, T, D)."""
         return cast(Tensor, self.fc2(functional.gelu(self.fc1(stream), approximate=self.approximate)))
 
 
@@ -234,7 +276,7 @@ class MLP(nn.Module):
 
 _DINO_EPSILON = 1e-6
 _OFFSET = 0.1
-"""Added to the number of patches before dividing, in the original, against rounding down."""
+"""Number that the original adds to the number of patches before dividing, against rounding down."""
 
 
 class _Scale(nn.Module):
@@ -259,7 +301,7 @@ class _DinoBlock(nn.Module):
         self.ls2 = _Scale(width)
 
     def forward(self, stream: Tensor) -> Tensor:
-        """(B, 1 + P, D) from (B, 1 + P, D)."""
+        """Return the stream behind the block, (B, 1 + P, D) from (B, 1 + P, D)."""
         stream = stream + self.ls1(self.attn(self.norm1(stream)))
         return cast(Tensor, stream + self.ls2(self.mlp(self.norm2(stream))))
 
@@ -274,7 +316,7 @@ class _PatchEmbedding(nn.Module):
 
 
 class DinoV2(nn.Module):
-    """The vision transformer; patch features come behind its final norm, the class token stays behind."""
+    """The vision transformer, which returns patch features behind its final norm, without the class token."""
 
     def __init__(self, config: DinoConfig) -> None:
         super().__init__()
@@ -287,7 +329,7 @@ class DinoV2(nn.Module):
         self.norm = nn.LayerNorm(config.width, eps=_DINO_EPSILON)
 
     def forward(self, pixels: Tensor) -> Tensor:
-        """(B, P, D) from (B, 3, H, W), both sides multiples of the patch."""
+        """Return patch features (B, P, D) of pictures (B, 3, H, W), whose sides are multiples of the patch."""
         patches = self.patch_embed(pixels)
         stream = torch.cat([self.cls_token.expand(len(pixels), -1, -1), patches], dim=1)
         rows, columns = (side // self.patch for side in pixels.shape[-2:])
@@ -297,7 +339,7 @@ class DinoV2(nn.Module):
         return cast(Tensor, self.norm(stream)[:, 1:])
 
     def _positions(self, rows: int, columns: int) -> Tensor:
-        """(1, 1 + rows x columns, D): the learned grid, stretched where the picture has another one."""
+        """Return the learned grid, (1, 1 + rows x columns, D), stretched where the picture has another grid."""
         trained = round((self.pos_embed.shape[1] - 1) ** 0.5)
         if rows == columns == trained:
             return self.pos_embed
@@ -312,7 +354,7 @@ class DinoV2(nn.Module):
 
 
 class Layer(nn.Module):
-    """Queries read one hidden state, then pass an MLP."""
+    """A layer in which queries read one hidden state, then pass an MLP."""
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
@@ -322,13 +364,16 @@ class Layer(nn.Module):
         self.mlp = nn.Sequential(nn.Linear(width, 4 * width), nn.GELU(), nn.Linear(4 * width, width))
 
     def forward(self, queries: Tensor, read: Tensor) -> Tensor:
-        """(B, Q, D) from (B, Q, D) and (B, S, D)."""
+        """Return the queries (B, Q, D) after they read (B, S, D)."""
         queries = queries + self.cross_attn(self.norm1(queries), read, read, need_weights=False)[0]
         return cast(Tensor, queries + self.mlp(self.norm2(queries)))
 
 
 class QueryTransformer(nn.Module):
-    """One layer per hidden state. No mask hides padding: a padded prompt changes what the queries find."""
+    """The querying transformer, with one layer per hidden state.
+
+    No mask hides padding: a padded prompt changes what the queries find.
+    """
 
     def __init__(self, config: QueryConfig) -> None:
         super().__init__()
@@ -337,7 +382,11 @@ class QueryTransformer(nn.Module):
         self.layers = nn.ModuleList(Layer(config.width, config.heads) for _ in range(config.last - config.first))
 
     def forward(self, states: list[Tensor]) -> Tensor:
-        """(B, Q, D) from one (B, S, width of the vision-language model) per layer."""
+        """Return the queries (B, Q, D) that have read one hidden state per layer.
+
+        Args:
+            states: One (B, S, width of the vision-language model) per layer.
+        """
         # A copy: what an edit writes into the stream must not land in the parameter.
         queries = self.query_tokens.expand(len(states[0]), -1, -1).clone()
         for layer, state in zip(self.layers, states, strict=True):
@@ -364,7 +413,7 @@ class _Embedder(nn.Module):
 
 
 class _ConditionEmbedder(_Embedder):
-    """Also holds the condition that stands for none."""
+    """An embedding of the conditions, which also holds the condition that stands for none."""
 
     def __init__(self, inputs: int, width: int, conditions: int) -> None:
         super().__init__(inputs, width)
@@ -381,7 +430,7 @@ class Block(nn.Module):
         self.mlp = MLP(width, "tanh")
 
     def forward(self, stream: Tensor) -> Tensor:
-        """(B, C + A, D) from (B, C + A, D)."""
+        """Return the stream behind the block, (B, C + A, D) from (B, C + A, D)."""
         stream = stream + self.attn(self.norm1(stream))
         return cast(Tensor, stream + self.mlp(self.norm2(stream)))
 
@@ -395,12 +444,15 @@ class FinalLayer(nn.Module):
         self.linear = nn.Linear(width, outputs)
 
     def forward(self, stream: Tensor) -> Tensor:
-        """(B, C + A, action numbers) from (B, C + A, D)."""
+        """Return the noise in every position, (B, C + A, action numbers) from (B, C + A, D)."""
         return cast(Tensor, self.linear(self.norm_final(stream)))
 
 
 class DiffusionTransformer(nn.Module):
-    """Conditions, each with the step added, stand before the noisy actions; everything sees everything."""
+    """The diffusion transformer: conditions, each with the step added, stand before the noisy actions.
+
+    Every position attends to every other one.
+    """
 
     def __init__(self, config: HeadConfig, query: QueryConfig) -> None:
         super().__init__()
@@ -415,7 +467,13 @@ class DiffusionTransformer(nn.Module):
         self.final_layer = FinalLayer(config.width, config.action_dim)
 
     def forward(self, actions: Tensor, steps: Tensor, condition: Tensor) -> Tensor:
-        """(B, A, action numbers) of noise in actions of that shape. condition: (B, C, width of the queries)."""
+        """Return the noise in the actions, (B, A, action numbers).
+
+        Args:
+            actions: (B, A, action numbers) noisy actions.
+            steps: (B,) diffusion steps.
+            condition: (B, C, width of the queries) condition that `InternVLANetwork.read` returns.
+        """
         conditions = self.t_embedder(steps)[:, None] + self.z_embedder(condition)
         stream = torch.cat([conditions, self.x_embedder(actions)], dim=1) + self.positional_embedding
         for block in self.blocks:
@@ -430,18 +488,23 @@ def guided(scale: float) -> bool:
 
 @dataclass(frozen=True)
 class Schedule:
-    """DDIM's steps: what each tells the network, ascending, and the share of signal left there, (N,) float64."""
+    """The steps of DDIM.
+
+    Attributes:
+        moments: (N,) numbers of the steps that the network is given, ascending.
+        signal: (N,) float64 share of signal at each step.
+    """
 
     moments: NDArray[np.int64]
     signal: NDArray[np.float64]
 
     @classmethod
     def of(cls, steps: int, trained: int, name: str = "squaredcos_cap_v2") -> "Schedule":
-        """`steps` of the `trained` ones at a whole distance.
+        """Return `steps` of the `trained` steps at a whole distance.
 
         Raises:
             CheckpointError: For another noise schedule.
-            UsageError: Where no whole distance gives that number.
+            UsageError: If no whole distance gives that number.
         """
         if name != "squaredcos_cap_v2":
             raise CheckpointError(f"noise schedule {name!r} is not implemented here; only squaredcos_cap_v2 is")
@@ -465,7 +528,10 @@ class Schedule:
 
 
 def _added_noise(steps: int) -> NDArray[np.float64]:
-    """(steps,) variance each step adds; the signal falls as a squared cosine (Nichol and Dhariwal 2021)."""
+    """Return the variance that each step adds, (steps,).
+
+    The signal falls as a squared cosine (Nichol and Dhariwal 2021).
+    """
 
     def left(share: float) -> float:
         return math.cos((share + 0.008) / 1.008 * math.pi / 2) ** 2
@@ -495,7 +561,7 @@ class _Head(nn.Module):
 
 
 class InternVLANetwork(nn.Module):
-    """InternVLA-M1 under the parameter names of its released files."""
+    """The network InternVLA-M1 under the parameter names of its released files."""
 
     def __init__(self, config: InternVLAConfig) -> None:
         super().__init__()
@@ -508,7 +574,7 @@ class InternVLANetwork(nn.Module):
 
     @property
     def vlm(self) -> Any:
-        """Qwen2.5-VL with its output head, which nothing calls."""
+        """The network Qwen2.5-VL with its output head, which nothing calls."""
         return self.qwen_vl_interface.model
 
     @property
@@ -517,11 +583,14 @@ class InternVLANetwork(nn.Module):
         return self.action_model.net
 
     def read(self, inputs: QwenInputs, views: Tensor) -> Tensor:
-        """(B, Q, width of the queries): the condition of the actions.
+        """Return the condition of the actions, (B, Q, width of the queries).
+
+        The queries read hidden states of the vision-language model, of which the last is normed, with DINOv2's
+        features behind each.
 
         Args:
-            views: (B x V, 3, H, W) for DINOv2. The queries read hidden states of the vision-language model, of
-                which the last is normed, with DINOv2's features behind each.
+            inputs: Prompts with their pictures, for the vision-language model.
+            views: (B x V, 3, H, W) pictures for DINOv2.
         """
         keywords = inputs.keywords(self.vlm.model)
         states = self.vlm.model(**keywords, output_hidden_states=True, use_cache=False).hidden_states
@@ -532,11 +601,14 @@ class InternVLANetwork(nn.Module):
         return condition
 
     def denoise(self, condition: Tensor, noise: Tensor, schedule: Schedule, scale: float) -> Tensor:
-        """(B, A, action numbers) float32 normalised actions.
+        """Return the normalised actions, (B, A, action numbers) float32.
 
         Args:
-            noise: Of that shape, float32; the path is kept in float32 whatever the weights are.
-            scale: Of guidance; above 1 the head runs 2 B rows, first those with the condition, then those without.
+            condition: (B, Q, width of the queries), see `read`.
+            noise: (B, A, action numbers) float32; the path is kept in float32 whatever the weights are.
+            schedule: Steps of DDIM.
+            scale: Scale of the guidance; above 1 the head runs 2 B rows, first those with the condition, then
+                those without.
         """
         rows = condition
         if guided(scale):
@@ -555,14 +627,14 @@ class InternVLANetwork(nn.Module):
 
 
 def build_internvla(config: InternVLAConfig, dtype: torch.dtype, device: str = "meta") -> InternVLANetwork:
-    """The network in eval mode; see `build_empty`."""
+    """Return the network in eval mode; see `build_empty`."""
     network = build_empty(lambda: InternVLANetwork(config), dtype, device)
     fill_rotary(network.vlm)
     return network
 
 
 def full_size_internvla() -> InternVLANetwork:
-    """The released size on the meta device: Qwen2.5-VL-3B, DINOv2 ViT-S, 64 queries, DiT-B."""
+    """Return the released size on the meta device: Qwen2.5-VL-3B, DINOv2 ViT-S, 64 queries, DiT-B."""
     queries = {
         "qformer_start_layer": 36, "qformer_end_layer": 37, "num_query_tokens": 64, "input_dim": 2048,
         "output_dim": 768,
@@ -575,17 +647,19 @@ def full_size_internvla() -> InternVLANetwork:
 # -- inputs ---------------------------------------------------------------------------------------------------
 
 SIDE = 224
-"""Of the picture that the released evaluation sends."""
+"""Side in pixels of the picture that the released evaluation sends."""
 _SLOT = "{instruction}"
 # ImageNet's.
 _MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
 def look(picture: NDArray[np.uint8], size: tuple[int, int] | None) -> NDArray[np.uint8]:
-    """(height, width, 3) uint8 of (H, W, 3) uint8: squeezed to a square as the evaluation does it, by area.
+    """Return a picture squeezed to a square by area, as the evaluation does it: (height, width, 3) uint8.
 
     Args:
-        size: (width, height) the checkpoint then resizes to itself, with PIL's default filter; None for none.
+        picture: (H, W, 3) uint8 picture.
+        size: (width, height) to which the checkpoint itself resizes the square, with PIL's default filter; None
+            for none.
     """
     squeezed = cv2.resize(picture, (SIDE, SIDE), interpolation=cv2.INTER_AREA)
     if size is None or size == (SIDE, SIDE):
@@ -594,7 +668,7 @@ def look(picture: NDArray[np.uint8], size: tuple[int, int] | None) -> NDArray[np
 
 
 def dino_pixels(picture: NDArray[np.uint8], side: int) -> Tensor:
-    """(3, h, w) float32 of (H, W, 3) uint8: the shorter side brought to `side`, colours normalised."""
+    """Return a picture (H, W, 3) uint8 as (3, h, w) float32, the shorter side `side`, with normalised colours."""
     image = Image.fromarray(picture)
     width, height = image.size
     shorter = min(width, height)
@@ -607,9 +681,10 @@ def dino_pixels(picture: NDArray[np.uint8], side: int) -> Tensor:
 
 
 def prompt(instruction: str, cot: str | None) -> str:
-    """The whole text, with one image slot.
+    """Return the whole text, with one image slot.
 
     Args:
+        instruction: Instruction, which is written in small letters.
         cot: The text around the instruction, with {instruction} in it; None for the instruction alone.
     """
     text = instruction.lower() if cot is None else cot.replace(_SLOT, instruction.lower())

@@ -1,10 +1,10 @@
-"""Magma, in plain torch, timm and transformers.
+"""The model Magma, in plain torch, timm and transformers.
 
-Names of modules and parameters are those of the released files, so that a checkpoint loads as it is.
-Capture and actions are in its adapter in `probe_kit.hooks`.
+Names of modules and parameters are those of the released files, so that a checkpoint loads as it is. Capture and
+actions are in its adapter in `probe_kit.hooks`.
 
 In `config.json`, `text_config` is the language model's; where the file has none, its top level repeats the same
-fields. `vision_config` is a plain dictionary; what it leaves out is the trunk's own.
+fields. `vision_config` is a plain dictionary; for fields that it leaves out the trunk's own values count.
 
 Pictures become crops bit-identical to the original processor's. Colours are normalised first; then the picture is
 stretched, aspect not kept, to the grid of square crops that shows most of its pixels, without antialiasing.
@@ -46,12 +46,12 @@ class VisionConfig(ConfigFile):
     """The trunk, its projector, and how crops are put together.
 
     Attributes:
-        trunk: Timm's name.
-        head_width: Of the contrastive head that the forward pass never reads.
+        trunk: Name of the trunk in timm.
+        head_width: Width of the contrastive head that the forward pass never reads.
         strategy: `crop` runs the trunk on every crop, `global` on the whole picture that the crops make up.
         base: Side of a crop in pixels.
         crops: The most crops of one picture.
-        width: Of the language model, None where only that one says.
+        width: Width of the language model; None where only its own configuration says.
         separators: Whether the projector holds vectors for the begin and end of a picture, which the forward pass
             never reads.
     """
@@ -73,7 +73,7 @@ class VisionConfig(ConfigFile):
 
     @property
     def projector_layers(self) -> int:
-        """Linear layers of the projector."""
+        """The number of linear layers of the projector."""
         match = _PROJECTOR.fullmatch(self.projector)
         assert match is not None
         return int(match["layers"])
@@ -122,7 +122,7 @@ class MagmaConfig(ConfigFile):
 
 
 def shipped_statistics() -> dict[str, Any]:
-    """Per data set, the quantiles that un-normalise its actions; `magma_statistics.json` names their source.
+    """Return the quantiles that un-normalise actions, per data set; `magma_statistics.json` names their source.
 
     No checkpoint holds them: the evaluation's client has them in its code.
     """
@@ -147,7 +147,7 @@ class Grid:
 
 @dataclass(frozen=True)
 class Picture:
-    """One prepared picture: crops (rows · columns, 3, S, S) float32 in raster order."""
+    """A prepared picture: crops (rows · columns, 3, S, S) float32 in raster order."""
 
     crops: Tensor
     grid: Grid
@@ -155,7 +155,14 @@ class Picture:
 
 @dataclass(frozen=True)
 class PictureSettings:
-    """The preparation of pictures. base: side S of a crop in pixels; crops: the most crops of one picture."""
+    """The preparation of pictures.
+
+    Attributes:
+        base: Side S of a crop in pixels.
+        crops: The most crops of one picture.
+        mean: Mean of every colour.
+        deviation: Deviation of every colour.
+    """
 
     base: int
     crops: int
@@ -179,7 +186,11 @@ class PictureSettings:
 
     @classmethod
     def from_json(cls, values: dict[str, object], source: str) -> "PictureSettings":
-        """Read the content of a `preprocessor_config.json`. Raises CheckpointError naming `source`."""
+        """Read the content of a `preprocessor_config.json`.
+
+        Raises:
+            CheckpointError: For a file that lacks a field; the message names `source`.
+        """
         missing = [name for name in ("base_img_size", "num_crops") if name not in values]
         if missing:
             raise CheckpointError(f"{source} lacks {' and '.join(missing)}; it does not belong to Magma")
@@ -199,7 +210,10 @@ def _colour(values: object, source: str) -> Colour:
 
 
 def choose_grid(width: int, height: int, settings: PictureSettings) -> Grid:
-    """The grid that keeps most of the picture's pixels and, among equals, wastes fewest; narrow ones first."""
+    """Return the grid that keeps most of the picture's pixels.
+
+    Among equals it wastes fewest; narrow ones come first.
+    """
     grids = [
         Grid(rows, columns)
         for columns in range(1, settings.crops + 1)
@@ -216,12 +230,12 @@ def choose_grid(width: int, height: int, settings: PictureSettings) -> Grid:
 
 
 def shrink_picture(picture: NDArray[np.uint8], side: int) -> NDArray[np.uint8]:
-    """(side, side, 3) uint8 from (H, W, 3) uint8, bicubic: what the evaluation client does first."""
+    """Return a picture (H, W, 3) uint8 as (side, side, 3) uint8, bicubic: the evaluation client's first step."""
     return np.asarray(Image.fromarray(picture).resize((side, side), Image.Resampling.BICUBIC))
 
 
 def prepare_picture(picture: NDArray[np.uint8], settings: PictureSettings) -> Picture:
-    """Crops of a (H, W, 3) uint8 picture."""
+    """Return the crops of a (H, W, 3) uint8 picture."""
     height, width = picture.shape[:2]
     grid, side = choose_grid(width, height, settings), settings.base
     pixels = torch.from_numpy(np.ascontiguousarray(picture.transpose(2, 0, 1))).float().div(255)
@@ -240,7 +254,7 @@ def prepare_picture(picture: NDArray[np.uint8], settings: PictureSettings) -> Pi
 
 
 class ClipVisionModel(nn.Module):
-    """Holds the trunk under the name it has in the released files."""
+    """A module that holds the trunk under the name it has in the released files."""
 
     def __init__(self, trunk: Any) -> None:
         super().__init__()
@@ -275,14 +289,14 @@ class VisionTower(nn.Module):
         return self.clip_vision_model.trunk.stem
 
     def forward(self, pixels: Tensor) -> Tensor:
-        """(N, features, S / reduction, S / reduction) from (N, 3, S, S)."""
+        """Return the maps (N, features, S / reduction, S / reduction) of pictures (N, 3, S, S)."""
         trunk = self.clip_vision_model.trunk
         maps: Tensor = trunk.stages(trunk.stem(pixels))
         return maps
 
 
 class Projector(nn.Module):
-    """Map features to the language model's width, place by place, and the vector that ends every row of a map."""
+    """The map of features to the language model's width, place by place, and the vector that ends every row."""
 
     def __init__(self, config: VisionConfig, features: int, width: int) -> None:
         super().__init__()
@@ -296,30 +310,30 @@ class Projector(nn.Module):
             self.img_end_seperator = nn.Parameter(torch.zeros(1, width))
 
     def forward(self, maps: Tensor) -> Tensor:
-        """(…, D) from (…, features)."""
+        """Return the features in the language model's width, (…, D) from (…, features)."""
         projected: Tensor = self.proj(maps)
         return projected
 
     def tokens(self, projected: Tensor) -> Tensor:
-        """(h · (w + 1), D) from (h, w, D): row by row, a separator behind each."""
+        """Return tokens (h · (w + 1), D) from a map (h, w, D): row by row, a separator behind each."""
         separators = self.row_seperator.expand(projected.shape[0], 1, -1)
         return torch.cat([projected, separators], dim=1).flatten(0, 1)
 
 
 def stitched(crops: Tensor, grid: Grid) -> Tensor:
-    """(rows · a, columns · b, C) from crops (rows · columns, a, b, C) in raster order."""
+    """Return the map (rows · a, columns · b, C) of crops (rows · columns, a, b, C) in raster order."""
     high, wide, channels = crops.shape[1:]
     places = crops.reshape(grid.rows, grid.columns, high, wide, channels).transpose(1, 2)
     return places.reshape(grid.rows * high, grid.columns * wide, channels)
 
 
 def whole_picture(picture: Picture) -> Tensor:
-    """(1, 3, rows · S, columns · S): the picture that the crops were cut from."""
+    """Return the picture that the crops were cut from, (1, 3, rows · S, columns · S)."""
     return stitched(picture.crops.permute(0, 2, 3, 1), picture.grid).permute(2, 0, 1)[None]
 
 
 def map_size(grid: Grid, side: int, reduction: int, strategy: str) -> tuple[int, int]:
-    """(h, w) of a picture's map; crops that the reduction does not divide lose their rest one by one."""
+    """Return the size (h, w) of a picture's map; crops that the reduction does not divide each lose their rest."""
     if strategy == "global":
         return grid.rows * side // reduction, grid.columns * side // reduction
     return grid.rows * (side // reduction), grid.columns * (side // reduction)
@@ -338,12 +352,16 @@ class PictureSpan:
 
     @property
     def length(self) -> int:
-        """Tokens, separators included."""
+        """The number of tokens, separators included."""
         return self.rows * (self.columns + 1)
 
 
 def placeholder(ids: Sequence[int], image_token: int) -> int:
-    """The position of the placeholder. Raises CheckpointError unless there is exactly one."""
+    """Return the position of the placeholder.
+
+    Raises:
+        CheckpointError: Unless there is exactly one.
+    """
     places = [position for position, number in enumerate(ids) if number == image_token]
     if len(places) != 1:
         raise CheckpointError(
@@ -364,7 +382,7 @@ UNUSED_WEIGHTS = (
 
 
 class MagmaNetwork(TokenNetwork):
-    """Magma under the parameter names of its released files."""
+    """The network Magma under the parameter names of its released files."""
 
     def __init__(self, config: MagmaConfig) -> None:
         super().__init__()
@@ -379,16 +397,20 @@ class MagmaNetwork(TokenNetwork):
     # -- pictures ----------------------------------------------------------------------------------------
 
     def span(self, ids: Sequence[int], grid: Grid, side: int) -> PictureSpan:
-        """The positions of the tokens of a picture of `grid` crops of `side` pixels. Raises CheckpointError."""
+        """Return the positions of the tokens of a picture of `grid` crops of `side` pixels.
+
+        Raises:
+            CheckpointError: Unless the prompt has exactly one placeholder.
+        """
         rows, columns = map_size(grid, side, self.vision_tower.reduction, self.config.vision.strategy)
         return PictureSpan(placeholder(ids, self.config.image_token), rows, columns)
 
     def trunk_input(self, picture: Picture) -> Tensor:
-        """The trunk's input of a picture: its crops (N, 3, S, S), or all of it (1, 3, H, W)."""
+        """Return the trunk's input of a picture: its crops (N, 3, S, S), or all of it (1, 3, H, W)."""
         return whole_picture(picture) if self.config.vision.strategy == "global" else picture.crops
 
     def look(self, pictures: Sequence[Picture]) -> list[Tensor]:
-        """Per picture its tokens (h · (w + 1), D), separators at the end of every row of its map."""
+        """Return the tokens (h · (w + 1), D) of every picture, a separator at the end of every row of its map."""
         reference = self.multi_modal_projector.row_seperator
         if self.config.vision.strategy == "global":
             maps = [self._projected(self.trunk_input(picture).to(reference))[0] for picture in pictures]
@@ -399,16 +421,17 @@ class MagmaNetwork(TokenNetwork):
         return [self.multi_modal_projector.tokens(projected) for projected in maps]
 
     def _projected(self, pixels: Tensor) -> Tensor:
-        """(N, a, b, D)."""
+        """Return the projected maps (N, a, b, D) of pictures or crops."""
         maps: Tensor = self.multi_modal_projector(self.vision_tower(pixels).permute(0, 2, 3, 1))
         return maps
 
     # -- text --------------------------------------------------------------------------------------------
 
     def embed(self, prompts: Sequence[Sequence[int]], pictures: Sequence[Picture] | None) -> tuple[Tensor, Tensor]:
-        """Embeddings (B, S, D) and mask (B, S) of prompts, each with one placeholder where it has a picture.
+        """Return embeddings (B, S, D) and mask (B, S) of prompts, with one placeholder where there is a picture.
 
-        Raises CheckpointError.
+        Raises:
+            CheckpointError: For a prompt with a picture that has not exactly one placeholder.
         """
         embedding = self.language_model.get_input_embeddings()
         device = embedding.weight.device
@@ -422,7 +445,7 @@ class MagmaNetwork(TokenNetwork):
         return packed(rows)
 
     def forward(self, prompts: Sequence[Sequence[int]], pictures: Sequence[Picture] | None) -> Any:
-        """transformers' output of one pass, with logits (B, S, V) and all hidden states."""
+        """Return the output of transformers for one pass, with logits (B, S, V) and all hidden states."""
         return self.whole_pass(*self.embed(prompts, pictures))
 
     def decode(
@@ -432,11 +455,11 @@ class MagmaNetwork(TokenNetwork):
         steps: int,
         choose: Choose = greedy,
     ) -> Decoded:
-        """Exactly `steps` tokens behind the prompts; see `decode_behind`."""
+        """Return exactly `steps` tokens behind the prompts; see `decode_behind`."""
         return self.decode_behind(*self.embed(prompts, pictures), steps, choose)
 
     def unhooked(self) -> Any:
-        """A second language model with the same weights and without hooks, so that nothing is captured."""
+        """Return a second language model with the same weights and without hooks, so that nothing is captured."""
         with torch.device("meta"):
             twin = LlamaForCausalLM(self.config.text).requires_grad_(False)
         twin.load_state_dict(self.language_model.state_dict(keep_vars=True), strict=True, assign=True)
@@ -445,7 +468,7 @@ class MagmaNetwork(TokenNetwork):
 
     @staticmethod
     def logits_behind(decoded: Decoded, language_model: Any) -> Tensor:
-        """(B, V) logits behind the last id, through another language model with the same weights.
+        """Return the logits (B, V) behind the last id, through another language model with the same weights.
 
         `decoded` cannot be continued afterwards: its cache has grown.
         """
@@ -455,7 +478,7 @@ class MagmaNetwork(TokenNetwork):
 
 
 def build_magma(config: MagmaConfig, dtype: torch.dtype, device: str = "meta") -> MagmaNetwork:
-    """The network in eval mode; see `build_empty`.
+    """Return the network in eval mode; see `build_empty`.
 
     Raises:
         CheckpointError: If the parts do not fit together.
@@ -467,7 +490,7 @@ def build_magma(config: MagmaConfig, dtype: torch.dtype, device: str = "meta") -
 
 
 def full_size_magma() -> MagmaNetwork:
-    """Magma-8B on the meta device."""
+    """Return Magma-8B on the meta device."""
     config = MagmaConfig.from_json(
         {
             "model_type": "magma",
@@ -502,33 +525,36 @@ _HEADER = "<|start_header_id|>{role}<|end_header_id|>\n\n"
 
 
 class Message(NamedTuple):
-    """One turn: `system`, `user` or `assistant`, and what it says."""
+    """A turn of a conversation: `system`, `user` or `assistant`, and its text."""
 
     role: str
     content: str
 
 
 def picture_question(text: str, image_start_end: bool) -> str:
-    """A user's turn: the picture's placeholder, then `text`."""
+    """Return a user's turn: the picture's placeholder, then `text`."""
     picture = IMAGE_START + IMAGE + IMAGE_END if image_start_end else IMAGE
     return f"{picture}\n{text}"
 
 
 def conversation(question: str, user_first: bool = False) -> tuple[Message, ...]:
-    """The system's and the user's turn.
+    """Return the system's and the user's turn.
 
     Args:
-        user_first: In the order in which Act2Answer's release puts them when it asks for several actions at once.
+        question: Text of the user's turn.
+        user_first: Whether the user's turn stands first, as in Act2Answer's release when it asks for several
+            actions at once.
     """
     turns = (Message("system", SYSTEM), Message("user", question))
     return turns[::-1] if user_first else turns
 
 
 def chat_text(messages: Sequence[Message], template: str | None = None, beginning: str = BEGINNING) -> str:
-    """The text of a conversation, open for the assistant's turn.
+    """Return the text of a conversation, open for the assistant's turn.
 
     Args:
-        template: The checkpoint's own, in Jinja; without one the frames of Llama 3.
+        messages: Turns in order.
+        template: The checkpoint's own template, in Jinja; without one the frames of Llama 3.
         beginning: The tokenizer's first token, which is written out here; the released tokenizer adds another in
             front, as for the original.
     """

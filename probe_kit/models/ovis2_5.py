@@ -1,4 +1,4 @@
-"""Ovis2.5: patches become distributions over visual words, whose embeddings join those of the text.
+"""The model Ovis2.5: patches become distributions over visual words, whose embeddings join those of the text.
 
 The vision tower takes patches of any grid, with interpolated and rotary positions and full attention. The patches
 of a visual word follow each other.
@@ -28,14 +28,14 @@ from probe_kit.models.config_file import ConfigFile, Count, part
 
 
 class VisionConfig(ConfigFile):
-    """The vision tower, of which only what every released checkpoint has is implemented.
+    """The vision tower; only features that every released checkpoint has are implemented.
 
     Attributes:
         patch: Pixels of a patch's side.
         stride: Patches of a visual word's side.
         side: Pixels of a side of the square from whose table position embeddings are interpolated.
-        window: Pixels of a side of the windows in whose order the authors' code goes through the patches; it
-            changes no number but in the last bits.
+        window: Pixels of a side of the windows in whose order the authors' code processes the patches; it changes
+            no number but in the last bits.
     """
 
     width: Count = Field(validation_alias="hidden_size")
@@ -56,7 +56,7 @@ class VisionConfig(ConfigFile):
 
     @property
     def table(self) -> int:
-        """Positions of a side of the square table."""
+        """The number of positions along a side of the square table."""
         return self.side // self.patch
 
     @model_validator(mode="after")
@@ -70,7 +70,11 @@ class VisionConfig(ConfigFile):
 
 
 class OvisConfig(ConfigFile):
-    """A checkpoint's configuration. words: visual words, those that mark where pictures begin and end included."""
+    """A checkpoint's configuration.
+
+    Attributes:
+        words: Number of visual words, those that mark where pictures begin and end included.
+    """
 
     network = "Ovis2.5"
 
@@ -82,7 +86,11 @@ class OvisConfig(ConfigFile):
 
     @classmethod
     def from_values(cls, values: Mapping[str, Any]) -> Self:
-        """Read the content of config.json. Raises CheckpointError."""
+        """Read the content of config.json.
+
+        Raises:
+            CheckpointError: For fields that `read` refuses.
+        """
         return cls.read(values, "config.json")
 
 
@@ -92,7 +100,7 @@ _THETA = 10000.0
 
 
 class Embeddings(nn.Module):
-    """Patches and where they stand, to width D."""
+    """The embedding of patches and of their places, in width D."""
 
     def __init__(self, config: VisionConfig) -> None:
         super().__init__()
@@ -101,7 +109,7 @@ class Embeddings(nn.Module):
         self.position_embedding = nn.Embedding(config.table**2, config.width)
 
     def forward(self, patches: Tensor, grid: Tensor) -> Tensor:
-        """(N, D) of (N, 3 · patch · patch)."""
+        """Return the embeddings (N, D) of patches (N, 3 · patch · patch)."""
         weight = self.patch_embedding.weight
         embedded = functional.linear(patches.to(weight.dtype), weight.flatten(1), self.patch_embedding.bias)
         return embedded + torch.cat([self._places(int(h), int(w)) for _, h, w in grid.tolist()])
@@ -114,7 +122,7 @@ class Embeddings(nn.Module):
 
 
 class Attention(nn.Module):
-    """Attention of a picture's patches to each other."""
+    """The attention of a picture's patches to each other."""
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
@@ -123,7 +131,13 @@ class Attention(nn.Module):
         self.q_proj, self.out_proj = nn.Linear(width, width), nn.Linear(width, width)
 
     def forward(self, stream: Tensor, rotation: tuple[Tensor, Tensor], lengths: list[int]) -> Tensor:
-        """(N, D). rotation: cosines and sines (N, 1, D / heads). lengths: patches of every picture."""
+        """Return the mixed patches (N, D).
+
+        Args:
+            stream: (N, D) patches.
+            rotation: Cosines and sines (N, 1, D / heads).
+            lengths: Number of patches of every picture.
+        """
         query, key, value = (
             project(stream).unflatten(-1, (self.heads, -1)) for project in (self.q_proj, self.k_proj, self.v_proj)
         )
@@ -142,20 +156,20 @@ def _rotated(heads: Tensor, rotation: tuple[Tensor, Tensor]) -> Tensor:
 
 
 class Perceptron(nn.Module):
-    """Two layers around a GELU."""
+    """A pair of layers around a GELU."""
 
     def __init__(self, width: int, hidden: int) -> None:
         super().__init__()
         self.fc1, self.fc2 = nn.Linear(width, hidden), nn.Linear(hidden, width)
 
     def forward(self, stream: Tensor) -> Tensor:
-        """(N, D)."""
+        """Return the output of the layers, (N, D) from (N, D)."""
         out: Tensor = self.fc2(functional.gelu(self.fc1(stream), approximate="tanh"))
         return out
 
 
 class Block(nn.Module):
-    """One layer, normed before each half."""
+    """A layer, normed before each half."""
 
     def __init__(self, config: VisionConfig) -> None:
         super().__init__()
@@ -165,14 +179,14 @@ class Block(nn.Module):
         self.mlp = Perceptron(config.width, config.mlp)
 
     def forward(self, stream: Tensor, rotation: tuple[Tensor, Tensor], lengths: list[int]) -> Tensor:
-        """(N, D)."""
+        """Return the stream behind the layer, (N, D); the arguments are those of `Attention.forward`."""
         stream = stream + self.self_attn(self.layer_norm1(stream), rotation, lengths)
         out: Tensor = stream + self.mlp(self.layer_norm2(stream))
         return out
 
 
 class Encoder(nn.Module):
-    """The blocks."""
+    """The blocks of the vision tower."""
 
     def __init__(self, config: VisionConfig) -> None:
         super().__init__()
@@ -180,7 +194,10 @@ class Encoder(nn.Module):
 
 
 class VisionModel(nn.Module):
-    """The tower. `post_layernorm` is in the released files and never applied: what is read is the last stream."""
+    """The vision tower, whose output is the last stream.
+
+    `post_layernorm` is in the released files and never applied.
+    """
 
     def __init__(self, config: VisionConfig) -> None:
         super().__init__()
@@ -190,7 +207,7 @@ class VisionModel(nn.Module):
         self.post_layernorm = nn.LayerNorm(config.width, eps=config.epsilon)
 
     def forward(self, patches: Tensor, grid: Tensor) -> Tensor:
-        """(N, D) of (N, 3 · patch · patch) and the grid (pictures, 3) they were cut in."""
+        """Return the features (N, D) of patches (N, 3 · patch · patch), cut in the grid (pictures, 3)."""
         stream: Tensor = self.embeddings(patches, grid)
         rotation = self._rotation(grid, stream.device)
         lengths = grid.prod(dim=1).tolist()
@@ -199,7 +216,7 @@ class VisionModel(nn.Module):
         return stream
 
     def _rotation(self, grid: Tensor, device: torch.device) -> tuple[Tensor, Tensor]:
-        """Cosines and sines (N, 1, D / heads): of half the angles by row, of the other half by column."""
+        """Return cosines and sines (N, 1, D / heads): of half the angles by row, of the other half by column."""
         quarter = self.config.width // self.config.heads // 4
         exponents = torch.arange(0, 2 * quarter, 2, dtype=torch.float32, device=device) / (2 * quarter)
         frequencies = 1.0 / _THETA**exponents
@@ -214,7 +231,7 @@ class VisionModel(nn.Module):
 
 
 def word_order(maps: Tensor, stride: int) -> Tensor:
-    """(rows · columns, …) of (rows, columns, …): the patches of one visual word follow each other."""
+    """Return maps (rows, columns, …) as (rows · columns, …): the patches of one visual word follow each other."""
     rows, columns = maps.shape[:2]
     cut = maps.reshape(rows // stride, stride, columns // stride, stride, *maps.shape[2:])
     return cut.transpose(1, 2).reshape(rows * columns, *maps.shape[2:])
@@ -223,13 +240,13 @@ def word_order(maps: Tensor, stride: int) -> Tensor:
 # -- the network ----------------------------------------------------------------------------------------------
 
 PICTURE, PICTURE_BEGINS, PICTURE_ENDS = -300, -301, -302
-"""What stands in the ids of a prompt where no text does."""
+"""Ids of a prompt at places without text."""
 _MARKS = 4
 """Words that mark where pictures and videos begin and end; no patch ever becomes one."""
 
 
 class Tower(nn.Module):
-    """Holds the vision model under the name of released files."""
+    """A module that holds the vision model under the name it has in the released files."""
 
     def __init__(self, config: OvisConfig) -> None:
         super().__init__()
@@ -249,14 +266,14 @@ class VisualTokenizer(nn.Module):
         )
 
     def forward(self, patches: Tensor, grid: Tensor) -> Tensor:
-        """(W, words without marks) float32 probabilities."""
+        """Return the probabilities (W, words without marks) float32 of the patches."""
         features = self.vit.vision_model(patches, grid)
         logits = self.head(features.reshape(len(features) // self.joined, -1))
         return torch.softmax(logits, dim=-1, dtype=torch.float32)
 
 
 class OvisNetwork(nn.Module):
-    """Ovis2.5 under the parameter names of its released files."""
+    """The network Ovis2.5 under the parameter names of its released files."""
 
     def __init__(self, config: OvisConfig) -> None:
         super().__init__()
@@ -270,7 +287,7 @@ class OvisNetwork(nn.Module):
         self.llm.tie_weights()
 
     def embed(self, ids: Tensor, pixel_values: Tensor | None, grid: Tensor | None) -> Tensor:
-        """(B, T, D) of ids (B, T), negative where a picture stands."""
+        """Return the embeddings (B, T, D) of ids (B, T), which are negative where a picture stands."""
         embeddings: Tensor = self.llm.get_input_embeddings()(ids.clamp(min=0))
         if pixel_values is None or grid is None:
             return embeddings
@@ -289,12 +306,19 @@ class OvisNetwork(nn.Module):
         image_grid_thw: Tensor | None = None,
         **keywords: Any,
     ) -> Any:
-        """transformers' output of the language model. keywords: its own, such as masks and positions."""
+        """Return the output of the language model, as transformers returns it.
+
+        Args:
+            input_ids: (B, T) ids, negative where a picture stands.
+            pixel_values: (N, 3 · patch · patch) patches of all pictures; None without pictures.
+            image_grid_thw: (pictures, 3) grid of every picture; None without pictures.
+            **keywords: Arguments of the language model, such as masks and positions.
+        """
         return self.llm(inputs_embeds=self.embed(input_ids, pixel_values, image_grid_thw), **keywords)
 
 
 def build_ovis2_5(config: OvisConfig, dtype: torch.dtype, device: str = "meta") -> OvisNetwork:
-    """The network in eval mode; see `build_empty`. Rotary frequencies, which no checkpoint holds, are computed."""
+    """Return the network in eval mode, see `build_empty`, with the rotary frequencies that no checkpoint holds."""
     network = build_empty(lambda: OvisNetwork(config), dtype, device)
     fill_decoder_rotary(network.llm.model)
     network.tie_weights()
@@ -302,7 +326,7 @@ def build_ovis2_5(config: OvisConfig, dtype: torch.dtype, device: str = "meta") 
 
 
 def full_size_ovis2_5() -> OvisNetwork:
-    """Ovis2.5-9B on the meta device."""
+    """Return Ovis2.5-9B on the meta device."""
     text = {
         "model_type": "qwen3",
         "hidden_size": 4096,
@@ -344,7 +368,13 @@ _NEEDED = ("image_mean", "image_std", "resample", "rescale_factor")
 
 @dataclass(frozen=True)
 class OvisPictures:
-    """The processor of pictures into patches. patch, stride: see `VisionConfig`."""
+    """The processor of pictures into patches.
+
+    Attributes:
+        settings: Values of `preprocessor_config.json`.
+        patch: Pixels of a patch's side.
+        stride: Patches of a visual word's side.
+    """
 
     settings: dict[str, Any]
     patch: int
@@ -352,23 +382,31 @@ class OvisPictures:
 
     @classmethod
     def from_folder(cls, folder: Path, vision: VisionConfig) -> "OvisPictures":
-        """Read `preprocessor_config.json`. Raises CheckpointError."""
+        """Read `preprocessor_config.json`.
+
+        Raises:
+            CheckpointError: If the file is missing or lacks a value.
+        """
         return cls(processor_settings(folder, _NEEDED), vision.patch, vision.stride)
 
     def grid(self, height: int, width: int) -> tuple[int, int]:
-        """Rows and columns of patches of a picture of that size. Raises ObservationError if too long."""
+        """Return the rows and columns of patches of a picture of that size.
+
+        Raises:
+            ObservationError: For a picture whose longer side is more than 200 times the shorter one.
+        """
         if max(height, width) > _LONGEST_RATIO * min(height, width):
             raise ObservationError(f"the picture is {height} x {width}: too long for this model's patches")
         tall, wide = smart_resize(height, width, self.patch * self.stride, SMALLEST, LARGEST)
         return tall // self.patch, wide // self.patch
 
     def tokens(self, height: int, width: int) -> int:
-        """Visual words of a picture of that size."""
+        """Return the number of visual words of a picture of that size."""
         rows, columns = self.grid(height, width)
         return rows * columns // self.stride**2
 
     def patches(self, pictures: list[NDArray[np.uint8]]) -> tuple[Tensor, Tensor]:
-        """(N, 3 x patch x patch) float32 and grid (B, 3) int64 of (H, W, 3) uint8 pictures.
+        """Return patches (N, 3 x patch x patch) float32 and grid (B, 3) int64 of (H, W, 3) uint8 pictures.
 
         The patches of one visual word follow each other.
         """

@@ -1,4 +1,4 @@
-"""PaliGemma on transformers' own network: construction and pictures."""
+"""The network PaliGemma as transformers implements it: construction and pictures."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,7 +20,10 @@ FILE_NAMES = LANGUAGE_FIRST
 
 
 def build_paligemma(config: Any, dtype: torch.dtype, device: str = "meta") -> Any:
-    """The network in eval mode; see `build_empty`. What no checkpoint holds is computed on the CPU."""
+    """Return the network in eval mode; see `build_empty`.
+
+    Buffers that no checkpoint holds are computed on the CPU.
+    """
     network: Any = build_empty(lambda: PaliGemmaForConditionalGeneration(config), dtype, device)
     language = network.model.language_model
     fill_decoder_rotary(language)
@@ -33,7 +36,7 @@ def build_paligemma(config: Any, dtype: torch.dtype, device: str = "meta") -> An
 
 
 def full_size_paligemma() -> Any:
-    """PaliGemma 3B for pictures of 224 pixels, on the meta device."""
+    """Return PaliGemma 3B for pictures of 224 pixels, on the meta device."""
     text = {
         "model_type": "gemma",
         "hidden_size": 2048,
@@ -72,8 +75,8 @@ class SquarePictures:
 
     Attributes:
         settings: The part of the checkpoint's file that the processor reads.
-        crop: What is looked at, as shares of the picture: top, left, height, width; None for all of it. It is
-            `CROP` in the file, which the processor skips.
+        crop: Part of the picture that is used, as shares of it: top, left, height, width; None for all of it. It
+            is `CROP` in the file, which the processor skips.
     """
 
     settings: dict[str, Any]
@@ -81,14 +84,22 @@ class SquarePictures:
 
     @classmethod
     def from_folder(cls, folder: Path, side: int) -> "SquarePictures":
-        """Read `preprocessor_config.json`. side: pixels the network expects. Raises CheckpointError."""
+        """Read `preprocessor_config.json`.
+
+        Args:
+            folder: Folder of the checkpoint.
+            side: Side in pixels of the pictures that the network expects.
+
+        Raises:
+            CheckpointError: If the file is missing, lacks a value, or makes pictures of another side.
+        """
         values = processor_settings(folder, _NEEDED, (*_OPTIONAL, CROP))
         if (stored_side := square_side(values, folder)) != side:
             raise CheckpointError(f"{folder} makes pictures of {stored_side} pixels; config.json expects {side}")
         return cls({name: value for name, value in values.items() if name != CROP}, _crop(values, folder))
 
     def pixels(self, pictures: list[NDArray[np.uint8]]) -> Tensor:
-        """(B, 3, S, S) float32 of (H, W, 3) uint8 pictures."""
+        """Return (H, W, 3) uint8 pictures as (B, 3, S, S) float32."""
         parts = [self._window(picture) for picture in pictures]
         processed = SiglipImageProcessor(**self.settings)(
             images=parts, input_data_format="channels_last", return_tensors="pt"
@@ -106,7 +117,11 @@ class SquarePictures:
 
 
 def _crop(values: Mapping[str, Any], folder: Path) -> tuple[float, float, float, float] | None:
-    """Raises CheckpointError for what is no part of a picture."""
+    """Return the part of the picture that is used, None for all of it.
+
+    Raises:
+        CheckpointError: For numbers that are no part of a picture.
+    """
     stored = values.get(CROP)
     if stored is None:
         return None

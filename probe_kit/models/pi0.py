@@ -1,11 +1,11 @@
-"""lerobot's own `PI0Policy` and `PI05Policy`, built at the size a checkpoint has, and names in their files.
+"""The policies `PI0Policy` and `PI05Policy` of lerobot, built at a checkpoint's size, and names in their files.
 
 lerobot knows two sizes by name and reads no width from `config.json`. Checkpoints of another size carry a
 `dims.json`; while such a policy is built, three names inside lerobot's module are replaced, then restored.
 
 The norms of pi0.5's expert are adaptive: the time of the flow step gives each norm a scale, a shift and a gate.
-What half a block computes is multiplied by that gate before it is added. lerobot multiplies in a function, so no
-module ever holds what is added; here one does. Parameters and results stay lerobot's, bit for bit.
+The output of half a block is multiplied by that gate before it is added. lerobot multiplies in a function, so no
+module ever holds the product; here one does. Parameters and results stay lerobot's, bit for bit.
 """
 
 import sys
@@ -44,7 +44,7 @@ EMBEDDING = f"model.{_VLM}.model.language_model.embed_tokens.weight"
 
 
 def current_keys(tensors: Mapping[str, Tensor], names: Sequence[tuple[str, str]] = _MOVED) -> dict[str, Tensor]:
-    """The same tensors under the names lerobot 0.6 uses; by default those of a pi0-FAST."""
+    """Return the same tensors under the names lerobot 0.6 uses; by default those of a pi0-FAST."""
     return {_current(name, names): tensor for name, tensor in tensors.items() if not name.startswith(STATISTICS)}
 
 
@@ -64,7 +64,7 @@ def _current(name: str, names: Sequence[tuple[str, str]]) -> str:
 
 
 class GemmaSize(ConfigFile, extra="forbid"):
-    """One Gemma stack. Backbone and expert must agree in depth, KV heads and head size."""
+    """The sizes of a Gemma stack. Backbone and expert must agree in depth, KV heads and head size."""
 
     width: Count
     depth: Count
@@ -75,7 +75,7 @@ class GemmaSize(ConfigFile, extra="forbid"):
 
 
 class SiglipSize(ConfigFile, extra="forbid"):
-    """The vision tower; `patch` in pixels."""
+    """The sizes of the vision tower; `patch` in pixels."""
 
     hidden: Count
     layers: Count
@@ -85,7 +85,7 @@ class SiglipSize(ConfigFile, extra="forbid"):
 
 
 class PaliGemmaSize(ConfigFile):
-    """Every dimension that the `config.json` of a policy on PaliGemma cannot express."""
+    """The dimensions that the `config.json` of a policy on PaliGemma cannot express."""
 
     network = "pi0-FAST"
 
@@ -95,16 +95,20 @@ class PaliGemmaSize(ConfigFile):
 
     @classmethod
     def from_file(cls, path: Path) -> Self:
-        """Read `dims.json`. Raises CheckpointError if a dimension is missing, unknown or out of bounds."""
+        """Read `dims.json`.
+
+        Raises:
+            CheckpointError: If a dimension is missing, unknown or out of bounds.
+        """
         return cls.read(load_json(path), str(path))
 
     def to_json(self) -> dict[str, Any]:
-        """The content of `dims.json`."""
+        """Return the content of `dims.json`."""
         return self.model_dump()
 
 
 class Pi0Size(PaliGemmaSize):
-    """The same of a policy with an expert beside it."""
+    """The same dimensions of a policy with an expert beside it."""
 
     network = "pi0"
 
@@ -114,10 +118,12 @@ class Pi0Size(PaliGemmaSize):
 def build_resized[Policy: nn.Module](
     policy: Callable[[Any], Policy], config: Any, size: PaliGemmaSize | None, device: str
 ) -> Policy:
-    """One of lerobot's policies on PaliGemma in eval mode with uninitialised weights.
+    """Return one of lerobot's policies on PaliGemma in eval mode with uninitialised weights.
 
     Args:
-        size: None for the released dimensions (Gemma 2B, an expert of 300M, SigLIP So400m).
+        policy: Class of the policy.
+        config: Its configuration, whose `device` is set.
+        size: Dimensions; None for the released ones (Gemma 2B, an expert of 300M, SigLIP So400m).
         device: `meta` serves to look at names and shapes. A policy that will act is built on the CPU, because the
             embedding scale and the rotary frequencies are buffers no checkpoint holds.
     """
@@ -127,18 +133,21 @@ def build_resized[Policy: nn.Module](
 
 
 def build_pi0(config: PI0Config, size: Pi0Size | None = None, device: str = "cpu") -> PI0Policy:
-    """A `PI0Policy`; see `build_resized`."""
+    """Return a `PI0Policy`; see `build_resized`."""
     return cast(PI0Policy, build_resized(PI0Policy, config, size, device))
 
 
 def full_size_pi0() -> PI0Policy:
-    """The released size, on the meta device."""
+    """Return the released size, on the meta device."""
     return build_pi0(PI0Config(device="cpu"), device="meta")
 
 
 @contextmanager
 def resized(module: Any, size: PaliGemmaSize | None, policy_config: Any) -> Iterator[None]:
-    """Inside, lerobot's module of such a policy builds networks of this size; None for the released one."""
+    """Let lerobot's module of such a policy build networks of this size inside the context.
+
+    None stands for the released size.
+    """
     if size is None:
         yield
         return
@@ -177,7 +186,7 @@ def resized(module: Any, size: PaliGemmaSize | None, policy_config: Any) -> Iter
 
 
 def build_pi05(config: PI05Config, size: Pi0Size | None = None, device: str = "cpu") -> PI05Policy:
-    """A `PI05Policy`; see `build_resized`."""
+    """Return a `PI05Policy`; see `build_resized`."""
     policy = build_resized(PI05Policy, config, size, device)
     for block in policy.model.paligemma_with_expert.gemma_expert.model.layers:
         _attach_gates(block)
@@ -185,7 +194,7 @@ def build_pi05(config: PI05Config, size: Pi0Size | None = None, device: str = "c
 
 
 def full_size_pi05() -> PI05Policy:
-    """The released size, on the meta device."""
+    """Return the released size, on the meta device."""
     return build_pi05(PI05Config(device="cpu"), device="meta")
 
 
@@ -196,7 +205,10 @@ def _attach_gates(block: Any) -> None:
 
 
 def _gated_forward(block: Any, hidden_states: Tensor, adarms_cond: Tensor, **attention: Any) -> Tensor:
-    """(B, T, D): the block's attention, then its MLP, each gated as it is added (arXiv 2504.16054, section IV)."""
+    """Return the stream (B, T, D) after the block's attention and its MLP.
+
+    The output of each is gated as it is added (arXiv 2504.16054, section IV).
+    """
     normed, gate = block.input_layernorm(hidden_states, cond=adarms_cond)
     attended, _ = block.self_attn(normed, **attention)
     between = hidden_states + block.attention_gate(attended, gate)

@@ -1,16 +1,16 @@
 """Prismatic vision-language models and OpenVLA, in plain torch, timm and transformers.
 
-Names of modules and parameters are those of the released files, so that a checkpoint loads as it is. Capture
-and actions are in the adapters `prismatic` and `openvla` in `probe_kit.hooks.families`.
+Names of modules and parameters are those of the released files, so that a checkpoint loads as it is. Capture and
+actions are in the adapters `prismatic` and `openvla` in `probe_kit.hooks.families`.
 
 `config.json` names parts of a fixed table (Karamcheti et al. 2024, and OpenVLA's `PrismaticConfig`); explicit
-fields win over the table. The language model's part is short: what it leaves out is transformers' default,
-which has rms_norm_eps 1e-6 for Llama, not Llama-2's own 1e-5. A training run's file, as TRI-ML releases it, has
-these fields under `model` and no part for the language model; that is then the published one, with its own
-1e-5.
+fields win over the table. The language model's part is short: fields that it leaves out have transformers'
+defaults, which include rms_norm_eps 1e-6 for Llama, not Llama-2's own 1e-5. A training run's file, as TRI-ML
+releases it, has these fields under `model` and no part for the language model. That is then the published one,
+with its own 1e-5.
 
-Images become pixel values bit-identical to the original processor's, with PIL and numpy only. Channels 3k …
-3k+2 are what tower k reads: the same pixels, resized to its side and normalised with its own means.
+Images become pixel values bit-identical to the original processor's, with PIL and numpy only. Tower k reads
+channels 3k … 3k+2: the same pixels, resized to its side and normalised with its own means.
 
 B batch, P patches, T text tokens, S = P + T positions, D width of the language model, V its vocabulary. Image
 patches follow the first token.
@@ -98,7 +98,7 @@ RESIZE_STRATEGIES = ("resize-naive", "letterbox", "resize-crop")
 
 
 class TowerConfig(ConfigFile):
-    """One vision tower: a timm id, the side of its square input in pixels, and changes to timm's constructor."""
+    """A vision tower: a timm id, the side of its square input in pixels, and changes to timm's constructor."""
 
     timm_id: str
     image_size: Count
@@ -110,12 +110,12 @@ class PrismaticConfig(ConfigFile):
     """A checkpoint's configuration.
 
     Attributes:
-        towers: One, or two whose patch features are joined (`fused`).
+        towers: One tower, or two whose patch features are joined (`fused`).
         text: Transformers' configuration of the language model.
         padded: Rows of the embedding without a text id.
         empty_token: The id that ends every OpenVLA prompt.
-        dtype: As stored, None if the file does not say.
-        statistics: Per data set, what un-normalises its actions.
+        dtype: Type in which weights are stored; None if the file does not say.
+        statistics: Statistics that un-normalise actions, per data set.
         tokenizer_id: Hub id of the tokenizer's files, of a training run, whose folder has none; None for
             checkpoints that come with theirs.
     """
@@ -138,7 +138,7 @@ class PrismaticConfig(ConfigFile):
 
     @property
     def action_vocabulary(self) -> int:
-        """Text ids below the embedding's padding; the last ones name action bins."""
+        """The number of text ids below the embedding's padding; the last ones name action bins."""
         return int(self.text.vocab_size) - self.padded
 
     @property
@@ -148,7 +148,11 @@ class PrismaticConfig(ConfigFile):
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any], source: str = "config") -> Self:
-        """Read the content of a `config.json`. Raises CheckpointError naming `source`."""
+        """Read the content of a `config.json`.
+
+        Raises:
+            CheckpointError: For another model, and for fields that `read` refuses; the message names `source`.
+        """
         if (run := values.get("model")) is not None:
             if not isinstance(run, Mapping):
                 raise CheckpointError(f"{source} has no fields under `model`; download the checkpoint again")
@@ -158,7 +162,12 @@ class PrismaticConfig(ConfigFile):
 
     @classmethod
     def read(cls, values: Mapping[str, Any], source: str) -> Self:
-        """Read the fields, and those of the table. Raises CheckpointError."""
+        """Read the fields, and those of the table.
+
+        Raises:
+            CheckpointError: For a name that is not in the table, for parts that contradict it, and for a field
+                that is missing, of another type, or out of bounds.
+        """
         vision = values.get("vision_backbone_id", "siglip-vit-so400m")
         language = values.get("llm_backbone_id", "vicuna-v15-7b")
         resize = values.get("image_resize_strategy", "letterbox")
@@ -187,7 +196,11 @@ class PrismaticConfig(ConfigFile):
 
 
 def _of_run(run: Mapping[str, Any], source: str) -> dict[str, Any]:
-    """The fields of a training run in the words of a checkpoint. Raises CheckpointError for another projector."""
+    """Return the fields of a training run under the names of a checkpoint.
+
+    Raises:
+        CheckpointError: For another projector.
+    """
     vision, language = str(run.get("vision_backbone_id")), str(run.get("llm_backbone_id"))
     projector = str(run.get("arch_specifier", "gelu-mlp")).removeprefix("no-align+")
     expected = "fused-gelu-mlp" if len(_TOWERS.get(vision, ())) == 2 else "gelu-mlp"
@@ -238,19 +251,19 @@ def _text_config(values: Mapping[str, Any], model_type: str, source: str) -> Any
 
 
 class LayerScale(nn.Module):
-    """timm's layer scale under the name the released files have: `scale_factor` instead of `gamma`."""
+    """The layer scale of timm under the name the released files have: `scale_factor` instead of `gamma`."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
         self.scale_factor = nn.Parameter(torch.ones(width))
 
     def forward(self, features: Tensor) -> Tensor:
-        """(…, width), scaled per feature."""
+        """Return the features (…, width), scaled per feature."""
         return features * self.scale_factor
 
 
 class VisionBackbone(nn.Module):
-    """One tower, or two whose features stand side by side."""
+    """The vision tower, or two towers whose features are joined."""
 
     def __init__(self, towers: tuple[TowerConfig, ...]) -> None:
         super().__init__()
@@ -266,11 +279,14 @@ class VisionBackbone(nn.Module):
 
     @property
     def width(self) -> int:
-        """Features per patch."""
+        """The number of features per patch."""
         return sum(int(tower.embed_dim) for tower in self.towers)
 
     def forward(self, pixel_values: Tensor) -> Tensor:
-        """(B, P, width) patch features from (B, 3 per tower, S, S); neither class nor register tokens, no norm."""
+        """Return the patch features (B, P, width) of pictures (B, 3 per tower, S, S).
+
+        They hold neither class nor register tokens, and pass no norm.
+        """
         parts = torch.split(pixel_values, 3, dim=1)
         features = [
             tower.get_intermediate_layers(part, n=[len(tower.blocks) - 2])[0]
@@ -300,7 +316,7 @@ def _tower(config: TowerConfig) -> Any:
 
 
 class Projector(nn.Module):
-    """Patch features to the language model's width: two layers for one tower, three for two."""
+    """The map of patch features to the language model's width: two layers for one tower, three for two."""
 
     def __init__(self, vision_width: int, width: int, fused: bool) -> None:
         super().__init__()
@@ -310,7 +326,7 @@ class Projector(nn.Module):
         self.fc3 = nn.Linear(width, width) if fused else None
 
     def forward(self, patches: Tensor) -> Tensor:
-        """(B, P, D) from (B, P, vision width)."""
+        """Return the patches in the language model's width, (B, P, D) from (B, P, vision width)."""
         projected: Tensor = self.fc2(nn.functional.gelu(self.fc1(patches)))
         return projected if self.fc3 is None else self.fc3(nn.functional.gelu(projected))
 
@@ -328,11 +344,11 @@ class PrismaticNetwork(TokenNetwork):
 
     @property
     def patches(self) -> int:
-        """P."""
+        """The number P of patches."""
         return int(self.vision_backbone.featurizer.patch_embed.num_patches)
 
     def embed(self, ids: Tensor, mask: Tensor, pixel_values: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Embeddings (B, S, D) and mask (B, S); without a picture S is T."""
+        """Return embeddings (B, S, D) and mask (B, S); without a picture S is T."""
         embeddings: Tensor = self.language_model.get_input_embeddings()(ids)
         if pixel_values is None:
             return embeddings, mask
@@ -344,29 +360,32 @@ class PrismaticNetwork(TokenNetwork):
         )
 
     def forward(self, ids: Tensor, mask: Tensor, pixel_values: Tensor | None) -> Any:
-        """transformers' output of one pass, with logits (B, S, V) and all hidden states.
+        """Return the output of transformers for one pass, with logits (B, S, V) and all hidden states.
 
         Args:
-            ids: (B, T).
+            ids: (B, T) text ids.
             mask: (B, T) bool, False at padding, which may stand anywhere behind the first token.
+            pixel_values: (B, 3 per tower, S, S) pictures; None without.
         """
         return self.whole_pass(*self.embed(ids, mask, pixel_values))
 
     def decode(
         self, ids: Tensor, mask: Tensor, pixel_values: Tensor | None, steps: int, choose: Choose = greedy
     ) -> Decoded:
-        """Exactly `steps` tokens behind the prompt; see `decode_behind`.
+        """Return exactly `steps` tokens behind the prompt; see `decode_behind`.
 
         Args:
-            ids: As for `forward`, with a token, not padding, at the end of every row.
-            mask: As `ids`.
-            choose: The next ids; the likeliest by default.
+            ids: (B, T) text ids.
+            mask: (B, T) bool, False at padding; every row ends with a token, not padding.
+            pixel_values: (B, 3 per tower, S, S) pictures; None without.
+            steps: Number of tokens.
+            choose: Function from logits (B, V) to the next ids (B,); the likeliest by default.
         """
         return self.decode_behind(*self.embed(ids, mask, pixel_values), steps, choose)
 
 
 def build_prismatic(config: PrismaticConfig, dtype: torch.dtype, device: str = "meta") -> PrismaticNetwork:
-    """The network in eval mode; see `build_empty`."""
+    """Return the network in eval mode; see `build_empty`."""
     network = build_empty(lambda: PrismaticNetwork(config), dtype, device)
     fill_decoder_rotary(network.language_model.model)
     network.language_model.tie_weights()
@@ -374,12 +393,12 @@ def build_prismatic(config: PrismaticConfig, dtype: torch.dtype, device: str = "
 
 
 def full_size_openvla() -> PrismaticNetwork:
-    """OpenVLA-7B on the meta device."""
+    """Return OpenVLA-7B on the meta device."""
     return _full_size("openvla", "dinosiglip-vit-so-224px", "llama2-7b-pure")
 
 
 def full_size_prismatic() -> PrismaticNetwork:
-    """Prismatic 7B with the fused towers on the meta device."""
+    """Return Prismatic 7B with the fused towers on the meta device."""
     return _full_size("prismatic", "dinosiglip-vit-so-224px", "llama2-7b-pure")
 
 
@@ -418,7 +437,7 @@ class PictureSettings:
         """Read `folder/preprocessor_config.json`, or where there is none the settings of timm's towers.
 
         Raises:
-            CheckpointError: For what is not known here.
+            CheckpointError: For a preparation that is not known here, or that contradicts the configuration.
         """
         file = folder / "preprocessor_config.json"
         settings = cls._from_file(file) if file.is_file() else cls._from_timm(config)
@@ -458,7 +477,7 @@ def _colour(values: list[float]) -> Colour:
 
 
 def prepare_picture(picture: NDArray[np.uint8], settings: PictureSettings) -> NDArray[np.float32]:
-    """(3 per tower, S, S) float32 from (H, W, 3) uint8."""
+    """Return a picture (H, W, 3) uint8 as (3 per tower, S, S) float32."""
     image = Image.fromarray(picture)
     if settings.strategy == "letterbox":
         # The original loops over the towers and keeps the last one's colour; the padding is the same for all.
@@ -486,7 +505,7 @@ def _squeezed(image: Image.Image, side: int, resampling: Image.Resampling) -> Im
 
 
 def _scaled_and_cropped(image: Image.Image, side: int, resampling: Image.Resampling) -> Image.Image:
-    """The shorter side becomes `side`, the middle of the longer one is kept; rounding as torchvision does it."""
+    """Scale the shorter side to `side` and keep the middle of the longer one, with the rounding of torchvision."""
     width, height = image.size
     if width <= height:
         width, height = side, int(side * height / width)
@@ -498,7 +517,7 @@ def _scaled_and_cropped(image: Image.Image, side: int, resampling: Image.Resampl
 
 
 def _padded_to_square(image: Image.Image, mean: Colour) -> Image.Image:
-    """Centred on the mean colour; a pixel short of square where the sides differ by an odd number."""
+    """Centre the image on the mean colour; a pixel short of square where the sides differ by an odd number."""
     longer = max(image.size)
     column, top = ((longer - side) // 2 for side in image.size)
     red, green, blue = (int(255 * value) for value in mean)
@@ -508,9 +527,9 @@ def _padded_to_square(image: Image.Image, mean: Colour) -> Image.Image:
 
 
 def centre_crop(picture: NDArray[np.uint8], side: int, area: float = CROP_AREA) -> NDArray[np.uint8]:
-    """(side, side, 3) uint8: the middle `area` of (H, W, 3) uint8, both sides scaled by √area.
+    """Return the middle `area` of a picture (H, W, 3) uint8 as (side, side, 3) uint8, both sides scaled by √area.
 
-    Bilinear between pixel centres, corners on corners, as TensorFlow's `crop_and_resize` samples.
+    Sampling is bilinear between pixel centres, corners on corners, as in TensorFlow's `crop_and_resize`.
     """
     factor = np.float32(np.sqrt(area))
     rows, columns = (_samples(extent, side, factor) for extent in picture.shape[:2])
@@ -520,7 +539,7 @@ def centre_crop(picture: NDArray[np.uint8], side: int, area: float = CROP_AREA) 
 
 
 def _samples(extent: int, side: int, factor: np.float32) -> NDArray[np.float32]:
-    """(side,) where to sample an axis of `extent` pixels."""
+    """Return the places (side,) at which to sample an axis of `extent` pixels."""
     start = (1 - factor) / 2 * (extent - 1)
     step = factor * (extent - 1) / max(1, side - 1)
     return np.asarray(start + np.arange(side) * step, np.float32)
@@ -542,7 +561,9 @@ _MODES = {"bicubic": InterpolationMode.BICUBIC, "bilinear": InterpolationMode.BI
 
 
 def prepare_tensor(picture: NDArray[np.uint8], settings: PictureSettings) -> NDArray[np.float32]:
-    """(3 per tower, S, S) float32 from (H, W, 3) uint8: bfloat16 up to the end, antialiased, normalised there.
+    """Return a picture (H, W, 3) uint8 as (3 per tower, S, S) float32.
+
+    It is computed in bfloat16 up to the end: resized with antialiasing, then normalised.
 
     Raises:
         CheckpointError: For a checkpoint that does not squeeze its pictures.

@@ -31,7 +31,7 @@ QWEN2_5_NAMES: Renames = (
     (r"^visual\.", "model.visual."),
     (r"^model\.(?!language_model\.|visual\.)", "model.language_model."),
 )
-"""Qwen2.5-VL was released under names that transformers has changed since."""
+"""Renames of Qwen2.5-VL, which was released under names that transformers has changed since."""
 
 _QWEN2_5: dict[str, dict[str, Any]] = {
     "7B": {"hidden_size": 3584, "num_hidden_layers": 28, "num_attention_heads": 28, "num_key_value_heads": 4,
@@ -65,12 +65,12 @@ _QWEN3_SMALL_VISION: dict[str, Any] = {
 
 
 def build_qwen2_5_vl(config: Any, dtype: torch.dtype, device: str = "meta") -> Any:
-    """The network in eval mode; see `build_empty`."""
+    """Return the network in eval mode; see `build_empty`."""
     return _built(lambda: Qwen2_5_VLForConditionalGeneration(config), dtype, device)
 
 
 def build_qwen3_vl(config: Any, dtype: torch.dtype, device: str = "meta") -> Any:
-    """The network in eval mode; see `build_empty`."""
+    """Return the network in eval mode; see `build_empty`."""
     return _built(lambda: Qwen3VLForConditionalGeneration(config), dtype, device)
 
 
@@ -98,7 +98,7 @@ def qwen2_5_vl_config(size: str) -> Qwen2_5_VLConfig:
 
 
 def full_size_qwen2_5_vl(size: str) -> Any:
-    """A released size on the meta device."""
+    """Return a released size on the meta device."""
     return build_qwen2_5_vl(qwen2_5_vl_config(size), torch.float32)
 
 
@@ -123,14 +123,14 @@ def qwen3_vl_config(size: str) -> Qwen3VLConfig:
 
 
 def full_size_qwen3_vl(size: str) -> Any:
-    """A released size on the meta device."""
+    """Return a released size on the meta device."""
     return build_qwen3_vl(qwen3_vl_config(size), torch.float32)
 
 
 # -- batches of prompts ---------------------------------------------------------------------------------------
 
 IMAGE = "<|vision_start|><|image_pad|><|vision_end|>"
-"""Where a picture goes in a prompt; `image_slots` repeats the middle token."""
+"""The place of a picture in a prompt; `image_slots` repeats the middle token."""
 
 
 @dataclass(frozen=True)
@@ -138,9 +138,9 @@ class QwenInputs:
     """A batch of prompts with their pictures.
 
     Attributes:
-        ids: (B, P) int64.
+        ids: (B, P) int64 ids.
         mask: (B, P) int64, 0 at padding.
-        pixel_values: (N, channels x time x patch x patch) float32.
+        pixel_values: (N, channels x time x patch x patch) float32 patches.
         grid: (I, 3) int64, per picture its patches over time, height and width.
         image_token: The id that stands for a picture's tokens.
     """
@@ -152,7 +152,7 @@ class QwenInputs:
     image_token: int
 
     def to(self, device: str) -> "QwenInputs":
-        """The same on another device."""
+        """Return the same on another device."""
         return replace(
             self,
             ids=self.ids.to(device),
@@ -162,11 +162,12 @@ class QwenInputs:
         )
 
     def positions(self, model: Any) -> Tensor:
-        """(3, B, P) positions over time, height and width, as the native class counts them.
+        """Return positions (3, B, P) over time, height and width, as the native class counts them.
+
+        Padding counts 1, as in the transformers of these models' authors; nothing reads it.
 
         Args:
-            model: Transformers' `Qwen…VLModel`. Padding counts 1, as in the transformers of these models' authors;
-                nothing reads it.
+            model: Transformers' `Qwen…VLModel`.
         """
         counted, _ = model.get_rope_index(
             self.ids, mm_token_type_ids=self._kinds(), image_grid_thw=self.grid, attention_mask=self.mask
@@ -175,7 +176,7 @@ class QwenInputs:
         return positions
 
     def keywords(self, model: Any) -> dict[str, Tensor]:
-        """Keyword arguments of the native model's `forward`; never its cache of position offsets."""
+        """Return the keyword arguments of the native model's `forward`; never its cache of position offsets."""
         return {
             "input_ids": self.ids,
             "attention_mask": self.mask,
@@ -186,19 +187,21 @@ class QwenInputs:
         }
 
     def _kinds(self) -> Tensor:
-        """(B, P) int64: 1 at positions of pictures, 0 at text."""
+        """Return (B, P) int64: 1 at positions of pictures, 0 at text."""
         return (self.ids == self.image_token).long()
 
 
 def image_slots(ids: Sequence[int], image_token: int, counts: Sequence[int]) -> list[int]:
-    """Ids of a prompt in which the k-th image token is repeated `counts[k]` times.
+    """Return the ids of a prompt in which the k-th image token is repeated `counts[k]` times.
 
     Args:
-        ids: Of a prompt with one image token per picture.
+        ids: Ids of a prompt with one image token per picture.
+        image_token: The id that stands for a picture's tokens.
+        counts: Number of tokens of every picture.
 
     Raises:
-        CheckpointError: Where their number differs: the tokenizer then does not know the token, or is another
-            model's.
+        CheckpointError: If the numbers of image tokens and pictures differ: the tokenizer then does not know the
+            token, or is another model's.
     """
     slots = [position for position, number in enumerate(ids) if number == image_token]
     if len(slots) != len(counts):
@@ -217,11 +220,13 @@ def image_slots(ids: Sequence[int], image_token: int, counts: Sequence[int]) -> 
 def pack_inputs(
     rows: Sequence[Sequence[int]], pixel_values: Tensor, grid: Tensor, image_token: int, padding: int
 ) -> QwenInputs:
-    """Prompts of ids as one batch; padding stands behind each row.
+    """Return prompts of ids as one batch; padding stands behind each row.
 
     Args:
-        pixel_values: Of all pictures, in the order of the rows.
-        grid: As `pixel_values`.
+        rows: Ids of every prompt, with its image slots.
+        pixel_values: (N, channels x time x patch x patch) patches of all pictures, in the order of the rows.
+        grid: (I, 3) grids of all pictures, in the order of the rows.
+        image_token: The id that stands for a picture's tokens.
         padding: An id that pads; it is masked.
     """
     longest = max(map(len, rows))
@@ -247,10 +252,10 @@ class QwenPictures:
     Attributes:
         settings: The part of the checkpoint's file that transformers' Qwen image processor reads, with the
             smallest and the largest number of pixels as `size`.
-        patch: Pixels per patch side, patches per token side.
-        merge: As `patch`.
-        fast: Which of the two processors the model's authors ran: the one on torchvision, or the one on PIL and
-            numpy. They differ in a picture's last bits, and by a few grey levels where they resize.
+        patch: Pixels per patch side.
+        merge: Patches per token side.
+        fast: Whether the model's authors ran the processor on torchvision; else they ran the one on PIL and numpy.
+            They differ in a picture's last bits, and by a few grey levels where they resize.
     """
 
     settings: dict[str, Any]
@@ -265,9 +270,11 @@ class QwenPictures:
         """Read `preprocessor_config.json`.
 
         Args:
-            patch: What the network was built with.
-            temporal: As `patch`.
-            merge: As `patch`.
+            folder: Folder of the checkpoint.
+            patch: Pixels per patch side with which the network was built.
+            temporal: Frames per patch with which the network was built.
+            merge: Patches per token side with which the network was built.
+            fast: As in `QwenPictures`.
 
         Raises:
             CheckpointError: If the file is missing, lacks a number, or was made for another network.
@@ -284,7 +291,7 @@ class QwenPictures:
         return cls({**settings, "size": _size(values, file)}, patch, merge, fast)
 
     def grid(self, height: int, width: int) -> tuple[int, int]:
-        """Rows and columns of patches of a picture of that size."""
+        """Return the rows and columns of patches of a picture of that size."""
         if not self.settings.get("do_resize", True):
             return height // self.patch, width // self.patch
         low, high = (self.settings["size"][edge] for edge in ("shortest_edge", "longest_edge"))
@@ -292,10 +299,12 @@ class QwenPictures:
         return tall // self.patch, wide // self.patch
 
     def patches(self, pictures: list[NDArray[np.uint8]]) -> tuple[Tensor, Tensor]:
-        """(N, channels x time x patch x patch) float32 and grid (I, 3) int64 of (H, W, 3) uint8 pictures.
+        """Return the patches (N, channels x time x patch x patch) float32 and the grid (I, 3) int64 of pictures.
+
+        The pictures are (H, W, 3) uint8.
 
         Raises:
-            ObservationError: For a picture two hundred times as long as wide.
+            ObservationError: For a picture whose longer side is more than two hundred times the shorter one.
         """
         for picture in pictures:
             if max(picture.shape[:2]) > _LONGEST_RATIO * min(picture.shape[:2]):
@@ -306,12 +315,12 @@ class QwenPictures:
 
 
 def merged_tokens(grid: tuple[int, int], merge: int) -> int:
-    """Positions a picture of that many rows and columns of patches takes in the prompt."""
+    """Return the number of prompt positions of a picture of that many rows and columns of patches."""
     return grid[0] * grid[1] // merge**2
 
 
 def _size(values: dict[str, Any], file: Path) -> dict[str, int]:
-    """Smallest and largest number of pixels; the older files name them apart."""
+    """Return the smallest and largest number of pixels; the older files name them apart."""
     size = values.get("size") or {}
     low = values.get("min_pixels") or size.get("shortest_edge") or size.get("min_pixels")
     high = values.get("max_pixels") or size.get("longest_edge") or size.get("max_pixels")

@@ -1,11 +1,11 @@
 """SpatialVLA in plain torch and transformers: SigLIP, ZoeDepth, a 3-D position, Gemma-2, actions as tokens.
 
-Names of modules and parameters are those of the released files, so that a checkpoint loads as it is. Capture
-and actions are in its adapter in `probe_kit.hooks`. The three networks inside are described as transformers
-describes them; what their parts leave out is transformers' default, as it was when the file was written.
+Names of modules and parameters are those of the released files, so that a checkpoint loads as it is. Capture and
+actions are in its adapter in `probe_kit.hooks`. The three networks inside are described as transformers describes
+them. Fields that their parts leave out have the defaults that transformers had when the file was written.
 
-B batch, P patches, R points per patch and direction, T prompt tokens with the picture's, D width of the
-language model, V its vocabulary.
+B batch, P patches, R points per patch and direction, T prompt tokens with the picture's, D width of the language
+model, V its vocabulary.
 """
 
 from collections.abc import Mapping, Sequence
@@ -43,17 +43,16 @@ class SpatialVLAConfig(ConfigFile):
     """A checkpoint's configuration.
 
     Attributes:
-        text: Transformers' configurations of Gemma-2, SigLIP and ZoeDepth; depth is None for a model that sees
-            none.
-        vision: As `text`.
-        depth: As `text`.
+        text: Transformers' configuration of Gemma-2.
+        vision: Transformers' configuration of SigLIP.
+        depth: Transformers' configuration of ZoeDepth; None for a model that sees no depth.
         projected: The width of a patch for the language model.
         image_token: The id whose positions the picture takes.
-        first_action: The ids that name actions; they end the vocabulary.
-        actions: As `first_action`.
+        first_action: The first id that names an action; these ids end the vocabulary.
+        actions: Number of ids that name actions.
         own_action_embeddings: Whether those ids have a table of embeddings to themselves.
         points: 3-D points per patch and direction.
-        frequencies: Of their code.
+        frequencies: Frequencies of the points' code.
     """
 
     model_types = (MODEL_TYPE,)
@@ -81,12 +80,12 @@ class SpatialVLAConfig(ConfigFile):
 
     @property
     def side(self) -> int:
-        """Side of the square picture the model sees, in pixels."""
+        """The side of the square picture that the model sees, in pixels."""
         return int(self.vision.image_size)
 
     @property
     def patches(self) -> int:
-        """Patches of one picture."""
+        """The number of patches of one picture."""
         return (self.side // int(self.vision.patch_size)) ** 2
 
     @model_validator(mode="before")
@@ -120,7 +119,7 @@ class SpatialVLAConfig(ConfigFile):
 MARGIN = 31
 """Pixels of mirrored picture on every side, so that the map has no border effects."""
 DEPTH_SIDE = 384
-"""Side of what ZoeDepth sees, in pixels."""
+"""Side of the picture that ZoeDepth sees, in pixels."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +127,7 @@ class Depth:
     """The depth of pictures by ZoeDepth, float32.
 
     Attributes:
-        metres: (B, 1, S, S).
+        metres: (B, 1, S, S) depth in metres.
         raw: (B, H, W) as predicted, with the margin.
         domains: (B, 2) logits for indoor and outdoor scenes, which choose the head that measures; None for a
             ZoeDepth of one head.
@@ -140,16 +139,18 @@ class Depth:
 
 
 def depth_input(pictures: Tensor) -> Tensor:
-    """(B, 3, 384, 384) in [-1, 1] from (B, 3, S, S) in [0, 1]."""
+    """Return pictures (B, 3, S, S) in [0, 1] as (B, 3, 384, 384) in [-1, 1]."""
     padded = nn.functional.pad(pictures, (MARGIN, MARGIN, MARGIN, MARGIN), mode="reflect")
     resized = nn.functional.interpolate(padded, size=(DEPTH_SIDE, DEPTH_SIDE), mode="bicubic", align_corners=True)
     return (resized - 0.5) / 0.5
 
 
 def estimate_depth(network: Any, pictures: Tensor, vote: bool = False) -> Depth:
-    """Depth of (B, 3, S, S) float32 pictures in [0, 1]; `network` is a `ZoeDepthForDepthEstimation`.
+    """Return the depth of pictures.
 
     Args:
+        network: A `ZoeDepthForDepthEstimation`.
+        pictures: (B, 3, S, S) float32 in [0, 1].
         vote: Let the batch choose one head for all its pictures, as the original does. Without it every picture
             has the head it would have alone, so that a row does not depend on the others in its batch.
     """
@@ -188,7 +189,7 @@ _CENTRE, _HALF = (0.0, 0.0, 2.0), 2.0
 
 
 def point_places(side: int, patch: int, points: int) -> Tensor:
-    """(3, N) float32 pixel places u, v and 1 of the middles of a patch's `points`² parts, row by row."""
+    """Return pixel places u, v and 1 of the middles of a patch's `points`² parts, row by row, (3, N) float32."""
     step = patch // points
     middles = torch.arange(0, side, step) + patch / points / 2
     v, u = torch.meshgrid(middles, middles, indexing="ij")
@@ -196,11 +197,13 @@ def point_places(side: int, patch: int, points: int) -> Tensor:
 
 
 def back_project(metres: Tensor, intrinsics: Tensor, patch: int, points: int) -> Tensor:
-    """(B, P, 3R²) metres in the camera's frame: per patch, x, y, z of its points, row by row.
+    """Return points (B, P, 3R²) in metres in the camera's frame: per patch, x, y, z of its points, row by row.
 
     Args:
-        metres: (B, 1, S, S) depth.
+        metres: (B, 1, S, S) depth in metres.
         intrinsics: (3, 3) or (B, 3, 3) for a picture of side S.
+        patch: Side of a patch in pixels.
+        points: Number R of points per patch and direction.
     """
     side = metres.shape[-1]
     along = side // patch
@@ -212,7 +215,7 @@ def back_project(metres: Tensor, intrinsics: Tensor, patch: int, points: int) ->
 
 
 class PositionEmbedding3D(nn.Module):
-    """Points as sines and cosines of rising frequency, through two layers, to the width of the vision tower."""
+    """The embedding of points: sines and cosines of rising frequency, then two layers to the tower's width."""
 
     def __init__(self, coordinates: int, width: int, frequencies: int) -> None:
         super().__init__()
@@ -225,14 +228,14 @@ class PositionEmbedding3D(nn.Module):
         )
 
     def code(self, points: Tensor) -> Tensor:
-        """(B, P, C · (2F + 1)) from coordinates (B, P, C): of each its value, F sines, F cosines."""
+        """Return the code (B, P, C · (2F + 1)) of coordinates (B, P, C): of each its value, F sines, F cosines."""
         centre = torch.tensor(_CENTRE, device=points.device).repeat(points.shape[-1] // 3)
         placed = ((points - centre) / _HALF).unsqueeze(-1)
         angles = placed * 2.0 ** torch.arange(self.frequencies, device=points.device)
         return torch.cat([placed, angles.sin(), angles.cos()], dim=-1).flatten(2)
 
     def forward(self, points: Tensor) -> Tensor:
-        """(B, P, width) in the dtype of the weights from (B, P, C) float32 metres."""
+        """Return the embeddings (B, P, width), in the dtype of the weights, of (B, P, C) float32 metres."""
         dtype = next(self.parameters()).dtype
         embedded: Tensor = self.position_embedding_head(self.code(points).to(dtype))
         return embedded
@@ -245,27 +248,27 @@ EAGER = "eager"
 
 
 class Projector(nn.Module):
-    """Patch features to the language model's width."""
+    """The map of patch features to the language model's width."""
 
     def __init__(self, vision_width: int, width: int) -> None:
         super().__init__()
         self.linear = nn.Linear(vision_width, width)
 
     def forward(self, patches: Tensor) -> Tensor:
-        """(B, P, D) from (B, P, vision width)."""
+        """Return the patches in the language model's width, (B, P, D) from (B, P, vision width)."""
         projected: Tensor = self.linear(patches)
         return projected
 
 
 @dataclass(frozen=True)
 class Sight:
-    """The stages of looking at pictures; depth and what follows from it is None without depth.
+    """The stages of looking at pictures; depth and the stages after it are None without depth.
 
     Attributes:
         tower: (B, P, vision width) SigLIP's normed patches.
         points: (B, P, 3R²) metres in the camera's frame.
-        positions: (B, P, vision width) their embedding.
-        features: (B, P, D) as the language model reads them.
+        positions: (B, P, vision width) embedding of the points.
+        features: (B, P, D) features that the language model reads.
     """
 
     tower: Tensor
@@ -306,11 +309,14 @@ class SpatialVLANetwork(TokenNetwork):
             table[self.config.first_action :] = self.spatial_embed_tokens.weight
 
     def look(self, pictures: Tensor, intrinsics: Tensor, vote: bool = False) -> Sight:
-        """The features of (B, 3, S, S) float32 pictures in [0, 1], stage by stage.
+        """Return the features of pictures, stage by stage.
+
+        Pictures, depth and points are float32 whatever the weights are.
 
         Args:
+            pictures: (B, 3, S, S) float32 in [0, 1].
             intrinsics: (3, 3) or (B, 3, 3) of cameras that take pictures of side S.
-            vote: See `estimate_depth`. Pictures, depth and points are float32 whatever the weights are.
+            vote: As in `estimate_depth`.
         """
         dtype = self.multi_modal_projector.linear.weight.dtype
         tower: Tensor = self.vision_tower(((pictures - 0.5) / 0.5).to(dtype)).last_hidden_state
@@ -323,7 +329,7 @@ class SpatialVLANetwork(TokenNetwork):
         return Sight(tower, depth, points, positions, self.multi_modal_projector(tower + positions))
 
     def embed(self, ids: Tensor, features: Tensor | None = None) -> Tensor:
-        """(B, T, D) embeddings of ids (B, T), with `features` (B, P, D) at the picture's positions.
+        """Return the embeddings (B, T, D) of ids (B, T), with `features` (B, P, D) at the picture's positions.
 
         Gemma-2 multiplies its embeddings by √D inside the table; the original divides features by as much before
         it multiplies them, so they stay as they are.
@@ -342,13 +348,15 @@ class SpatialVLANetwork(TokenNetwork):
         return embeddings.masked_scatter(places.unsqueeze(-1), features.to(embeddings.dtype))
 
     def forward(self, embeddings: Tensor, mask: Tensor, past: DynamicCache | None = None, keep: int = 0) -> Any:
-        """transformers' output of one pass, with all hidden states if there is no `past`.
+        """Return the output of transformers for one pass, with all hidden states if there is no `past`.
+
+        Every new token sees every new token and all of the past, in both directions; no token sees padding.
 
         Args:
-            embeddings: (B, T, D) of what is new.
-            mask: (B, past + T) bool, False at padding. Everything given sees everything given and everything past,
-                in both directions; padding is seen by nothing.
-            keep: For how many of the last positions logits are made, 0 for all.
+            embeddings: (B, T, D) embeddings of the new tokens.
+            mask: (B, past + T) bool, False at padding.
+            past: Keys and values of earlier tokens; None without any.
+            keep: Number of last positions for which logits are made, 0 for all.
 
         Raises:
             UsageError: For an attention without the soft cap.
@@ -370,7 +378,7 @@ class SpatialVLANetwork(TokenNetwork):
         )
 
     def next_logits(self, embeddings: Tensor, mask: Tensor, cache: DynamicCache) -> Tensor:
-        """See the base; its language model's mask is another one."""
+        """Return the logits (B, V) behind the last position, with the mask of `forward`."""
         logits: Tensor = self(embeddings, mask, cache, keep=1).logits[:, -1]
         return logits
 
@@ -383,12 +391,15 @@ class SpatialVLANetwork(TokenNetwork):
         slots: Sequence[range] | None = None,
         fed: Tensor | None = None,
     ) -> Decoded:
-        """Exactly `steps` greedy tokens behind the prompt; see `decode_behind`.
+        """Return exactly `steps` greedy tokens behind the prompt; see `decode_behind`.
 
         Args:
-            ids: (B, T), with a token, not padding, at the end of every row.
-            mask: As `ids`.
-            slots: Per step the only ids that may be chosen.
+            ids: (B, T) ids, with the picture's.
+            mask: (B, T) bool, False at padding; every row ends with a token, not padding.
+            features: (B, P, D) features of the pictures.
+            steps: Number of tokens.
+            slots: Ids that may be chosen at each step; None for all.
+            fed: (B, steps - 1) ids to feed back instead of those chosen.
         """
         turns = iter(slots or ())
         choose = greedy if slots is None else lambda logits: _best(logits, next(turns))
@@ -396,17 +407,17 @@ class SpatialVLANetwork(TokenNetwork):
 
 
 def _best(logits: Tensor, allowed: range) -> Tensor:
-    """(B,) the id of the largest logit of (B, V) among `allowed` ones."""
+    """Return the id (B,) of the largest logit of (B, V) among `allowed` ones."""
     return logits[:, allowed.start : allowed.stop].argmax(dim=-1) + allowed.start
 
 
 def _positions(mask: Tensor) -> Tensor:
-    """(B, T) positions from 1 that count tokens, not padding."""
+    """Return positions (B, T) from 1 that count tokens, not padding."""
     return mask.long().cumsum(dim=1).clamp(min=1)
 
 
 def _additive(mask: Tensor, embeddings: Tensor) -> Tensor | None:
-    """(B, 1, T, S) to be added to attention logits; None where nothing is hidden."""
+    """Return the mask (B, 1, T, S) that is added to attention logits; None where nothing is hidden."""
     if bool(mask.all()):
         return None
     hidden = torch.zeros(mask.shape, dtype=embeddings.dtype, device=mask.device)
@@ -415,7 +426,7 @@ def _additive(mask: Tensor, embeddings: Tensor) -> Tensor | None:
 
 
 def build_spatialvla(config: SpatialVLAConfig, dtype: torch.dtype, device: str = "meta") -> SpatialVLANetwork:
-    """The network in eval mode; see `build_empty`. `embed_actions` comes after the weights.
+    """Return the network in eval mode; see `build_empty`. `embed_actions` comes after the weights.
 
     Raises:
         WeightsError: If a part of transformers has a constant that would stay without memory.
@@ -427,7 +438,11 @@ def build_spatialvla(config: SpatialVLAConfig, dtype: torch.dtype, device: str =
 
 
 def _fill_buffers(network: SpatialVLANetwork) -> None:
-    """Fill in constants that no file holds."""
+    """Fill in constants that no file holds.
+
+    Raises:
+        WeightsError: If a constant is unknown here.
+    """
     decoder, tower = network.language_model.model, network.vision_tower.vision_model.embeddings
     fill_decoder_rotary(decoder)
     decoder.embed_tokens.embed_scale = torch.tensor(decoder.embed_tokens.scalar_embed_scale)
@@ -493,7 +508,7 @@ _VALUES: dict[str, Any] = {
 
 
 def full_size_spatialvla() -> SpatialVLANetwork:
-    """SpatialVLA-4B on the meta device."""
+    """Return SpatialVLA-4B on the meta device."""
     return build_spatialvla(SpatialVLAConfig.from_json(_VALUES), torch.bfloat16)
 
 
@@ -508,11 +523,11 @@ class PictureSettings:
     """The preparation of pictures.
 
     Attributes:
-        side: In pixels, of the square they are squeezed into.
-        resampling: PIL's number.
-        scale: What the bytes are multiplied with.
-        mean: Of a normalisation, None for the released models, which normalise inside.
-        deviation: As `mean`.
+        side: Side in pixels of the square they are squeezed into.
+        resampling: Number of the filter in PIL.
+        scale: Factor of the bytes.
+        mean: Mean of every colour; None for the released models, which normalise inside.
+        deviation: Deviation of every colour; None for the released models.
     """
 
     side: int
@@ -526,7 +541,7 @@ class PictureSettings:
         """Read `folder/preprocessor_config.json`, or where there is none take the released models' settings.
 
         Raises:
-            CheckpointError: For what contradicts the model or is not known here.
+            CheckpointError: For a setting that contradicts the model or is not known here.
         """
         file = folder / PREPROCESSOR_FILE
         values = load_json(file) if file.is_file() else None
@@ -559,7 +574,10 @@ def _colour(values: Any) -> Colour:
 
 
 def prepare_picture(picture: NDArray[np.uint8], settings: PictureSettings) -> NDArray[np.float32]:
-    """(3, S, S) float32 in [0, 1] from (H, W, 3) uint8; proportions are not kept."""
+    """Return a picture (H, W, 3) uint8 as (3, S, S) float32; proportions are not kept.
+
+    The values are in [0, 1] unless the settings normalise them.
+    """
     square = Image.fromarray(picture).resize((settings.side, settings.side), Image.Resampling(settings.resampling))
     pixels = np.asarray(np.asarray(square, np.float64) * settings.scale, np.float32).transpose(2, 0, 1)
     if settings.mean is not None and settings.deviation is not None:
@@ -577,7 +595,7 @@ class Intrinsics:
     height: int
 
     def at(self, side: int) -> NDArray[np.float32]:
-        """(3, 3) float32 of the same camera for a picture squeezed into a square of `side` pixels."""
+        """Return the same camera's matrix (3, 3) float32 for a picture squeezed into a square of `side` pixels."""
         scaled = self.matrix.astype(np.float32)
         scaled[0] *= np.float32(side / self.width)
         scaled[1] *= np.float32(side / self.height)
@@ -590,7 +608,7 @@ def is_camera(matrix: NDArray[np.floating[Any]]) -> bool:
 
 
 def known_cameras(values: Mapping[str, Any], source: str) -> dict[str, Intrinsics]:
-    """The cameras of the data sets that `intrinsic_config` of a `processor_config.json` names.
+    """Return the cameras of the data sets that `intrinsic_config` of a `processor_config.json` names.
 
     Raises:
         CheckpointError: For a matrix that is not a camera's.

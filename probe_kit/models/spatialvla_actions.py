@@ -26,11 +26,11 @@ Ids = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class ActionBins:
-    """The ids that name actions, and what they mean.
+    """The ids that name actions, and their meaning.
 
     Attributes:
         first: The lowest id.
-        edges: Of theta, phi, r, roll, pitch, yaw.
+        edges: Edges of the bins of theta, phi, r, roll, pitch, yaw.
         spherical: False for a checkpoint whose three movement axes are Cartesian.
     """
 
@@ -42,13 +42,17 @@ class ActionBins:
     def of(cls, values: Mapping[str, Any], first: int, actions: int, source: str) -> "ActionBins":
         """Read the content of a `processor_config.json`.
 
+        Edges come from `bin_policy`, where that is missing from the Gaussians in `gs_params`, or are even if
+        `action_config` says that the distribution is uniform.
+
         Args:
-            first: The ids the model has for actions. Edges come from `bin_policy`, where that is missing from the
-                Gaussians in `gs_params`, or are even if `action_config` says that the distribution is uniform.
-            actions: As `first`.
+            values: Content of the file.
+            first: The lowest id that the model has for actions.
+            actions: Number of ids that the model has for actions.
+            source: Name of the file, for messages.
 
         Raises:
-            CheckpointError: Naming `source` for what is missing or contradicts itself or the model.
+            CheckpointError: If a part is missing or contradicts itself or the model; the message names `source`.
         """
         settings = values.get("action_config") or {}
         counts = settings.get("num_bins") or {}
@@ -70,7 +74,7 @@ class ActionBins:
 
     @cached_property
     def counts(self) -> tuple[int, ...]:
-        """Bins per axis."""
+        """The number of bins per axis."""
         return tuple(len(edges) - 1 for edges in self.edges)
 
     @cached_property
@@ -90,14 +94,14 @@ class ActionBins:
         return [self.first, [edges.tolist() for edges in self.edges], self.spherical]
 
     def is_action(self, ids: Ids) -> NDArray[np.bool_]:
-        """Return, per id of (…, 3), True where it names something in its slot."""
+        """Return whether each id of (…, 3) names an action in its slot."""
         starts, stops = np.array([[slot.start, slot.stop] for slot in self.slots]).T
         return np.asarray((ids >= starts) & (ids < stops))
 
     def values(self, ids: Ids) -> Floats:
-        """(…, 7) normalised actions of ids (…, 3); an id outside its slot counts as the nearest one inside.
+        """Return normalised actions (…, 7) of ids (…, 3); an id outside its slot counts as the nearest one inside.
 
-        xyz and roll-pitch-yaw in [-1, 1] from the middles of their bins, gripper 0 or 1.
+        Movement and roll-pitch-yaw are in [-1, 1] from the middles of their bins, the gripper is 0 or 1.
         """
         movement, rotation, gripper = (
             np.clip(ids[..., k], slot.start, slot.stop - 1) - slot.start for k, slot in enumerate(self.slots)
@@ -107,7 +111,7 @@ class ActionBins:
         return np.concatenate([xyz, axes[1], (gripper[..., None] != 0).astype(np.float64)], axis=-1)
 
     def ids(self, values: Floats) -> Ids:
-        """(…, 3) ids of normalised actions (…, 7); what lies outside of [-1, 1] is clipped."""
+        """Return the ids (…, 3) of normalised actions (…, 7); values outside of [-1, 1] are clipped."""
         clipped = np.clip(values, -1, 1)
         axes = _spherical(clipped[..., :3]) if self.spherical else clipped[..., :3]
         parts = [
@@ -118,7 +122,7 @@ class ActionBins:
         return np.stack(parts, axis=-1).astype(np.int64)
 
     def _middles(self, index: Ids, axis: int) -> Floats:
-        """(…, 3) middles of the bins that `index` counts through, the last of the three axes fastest."""
+        """Return middles (…, 3) of the bins that `index` counts through, the last of the three axes fastest."""
         places = np.unravel_index(index, self.counts[axis : axis + 3])
         edges = self.edges[axis : axis + 3]
         return np.stack([(e[p] + e[p + 1]) / 2 for e, p in zip(edges, places, strict=True)], axis=-1)
@@ -163,7 +167,7 @@ def _edges(values: Mapping[str, Any], group: str, axis: str, count: int, source:
 
 
 def equal_mass_edges(mean: float, deviation: float, low: float, high: float, count: int) -> Floats:
-    """(count + 1,) edges between `low` and `high` of bins in which a Gaussian is equally often."""
+    """Return edges (count + 1,) between `low` and `high` of bins with equal mass under a Gaussian."""
     from scipy.special import ndtr, ndtri  # type: ignore[import-untyped]
 
     below, above = (float(ndtr((limit - mean) / deviation)) for limit in (low, high))

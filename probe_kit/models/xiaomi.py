@@ -1,8 +1,8 @@
 """Xiaomi-Robotics-R0: Qwen3-VL and a flow transformer that reads its keys and values, in torch and transformers.
 
-Names of modules and parameters are those of the released files, so that a checkpoint loads as it is.
-Capture and actions are in its adapter in `probe_kit.hooks`. One pass of Qwen3-VL reads the prompt, then several
-passes of the flow transformer read its cache; their output is a velocity of the actions.
+Names of modules and parameters are those of the released files, so that a checkpoint loads as it is. Capture and
+actions are in its adapter in `probe_kit.hooks`. One pass of Qwen3-VL reads the prompt, then several passes of the
+flow transformer read its cache; their output is a velocity of the actions.
 
 B batch, P prompt positions, A actions of a chunk, T = 1 + states + A positions of the flow transformer, D width, H
 heads of size E, K cached heads.
@@ -38,7 +38,7 @@ MODEL_TYPE = "mibot"
 
 
 class FlowConfig(ConfigFile):
-    """The flow transformer: layers, width, size of a head, and heads in the cache it reads."""
+    """The sizes of the flow transformer: layers, width, size of a head, and heads in the cache it reads."""
 
     layers: Count = Field(default=16, validation_alias="num_hidden_layers")
     width: Count = Field(default=1024, validation_alias="hidden_size")
@@ -51,8 +51,10 @@ class XiaomiConfig(ConfigFile):
 
     Attributes:
         vlm: Transformers' configuration of Qwen3-VL.
-        state_length: Positions the state takes. state_dim, action_dim: numbers per position.
-        action_length: Of a chunk where no robot's statistics say otherwise.
+        state_length: Number of positions of the state.
+        state_dim: Numbers per position of the state.
+        action_length: Actions of a chunk, where no robot's statistics say otherwise.
+        action_dim: Numbers per action.
     """
 
     model_types = (MODEL_TYPE,)
@@ -70,7 +72,7 @@ class XiaomiConfig(ConfigFile):
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
-        """The flow transformer reads the cache of the VLM's last layers, head by head."""
+        """Check that the flow transformer can read the cache of the VLM's last layers, head by head."""
         flow, text = self.flow, self.vlm.text_config
         pairs = (
             ("head_dim", flow.head_dim, text.head_dim),
@@ -99,7 +101,7 @@ _MODULATIONS = 6
 
 
 class Projector(nn.Module):
-    """One linear layer, or several with tanh-GELUs between them."""
+    """A linear layer, or several with tanh-GELUs between them."""
 
     def __init__(self, inputs: int, outputs: int, layers: int = 2, bias: bool = False) -> None:
         super().__init__()
@@ -109,12 +111,12 @@ class Projector(nn.Module):
         self.layers = nn.Sequential(*stack)
 
     def forward(self, features: Tensor) -> Tensor:
-        """(…, outputs) from (…, inputs)."""
+        """Return the output of the layers, (…, outputs) from (…, inputs)."""
         return cast(Tensor, self.layers(features))
 
 
 class Attention(nn.Module):
-    """Attention over the prompt's cached keys and values and the own ones behind them."""
+    """The attention over the prompt's cached keys and values and the own ones behind them."""
 
     def __init__(self, width: int, head_dim: int, cached_heads: int) -> None:
         super().__init__()
@@ -126,19 +128,26 @@ class Attention(nn.Module):
         self.k_norm = Qwen3VLTextRMSNorm(head_dim)
 
     def forward(self, stream: Tensor, cache: Cache, rotation: Angles, mask: Tensor) -> Tensor:
-        """(B, T, D) from (B, T, D). mask: (B, 1, T, P + T) bool, True where a position is seen."""
+        """Return the mixed positions (B, T, D).
+
+        Args:
+            stream: (B, T, D) stream of the flow transformer.
+            cache: Keys and values of the prompt.
+            rotation: Cosines and sines of the own positions.
+            mask: (B, 1, T, P + T) bool, True where a position is seen.
+        """
         query, key, value = self._parts(stream, cache, rotation)
         read = functional.scaled_dot_product_attention(query, key, value, attn_mask=mask)
         return cast(Tensor, self.o_proj(read.transpose(1, 2).flatten(2)))
 
     def weights(self, stream: Tensor, cache: Cache, rotation: Angles, mask: Tensor) -> Tensor:
-        """(B, H, T, P + T) float32: what `forward` weighs with, computed once more."""
+        """Return the attention weights of `forward`, (B, H, T, P + T) float32, computed once more."""
         query, key, _ = self._parts(stream, cache, rotation)
         logits = query.float() @ key.float().transpose(2, 3) * self.head_dim**-0.5
         return functional.softmax(logits.masked_fill(~mask, -torch.inf), dim=-1)
 
     def _parts(self, stream: Tensor, cache: Cache, rotation: Angles) -> tuple[Tensor, Tensor, Tensor]:
-        """Queries (B, H, T, E); keys and values (B, H, P + T, E), the prompt's first."""
+        """Return queries (B, H, T, E), and keys and values (B, H, P + T, E), the prompt's first."""
         batch, length, _ = stream.shape
         parts = self.qkv_proj(stream).view(batch, length, 3, self.heads, self.head_dim)
         query, key, value = parts.unbind(2)
@@ -150,7 +159,7 @@ class Attention(nn.Module):
 
 
 class GatedMLP(nn.Module):
-    """SwiGLU, four times as wide inside."""
+    """A SwiGLU, four times as wide inside."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -159,14 +168,15 @@ class GatedMLP(nn.Module):
         self.down_proj = nn.Linear(4 * width, width, bias=False)
 
     def forward(self, stream: Tensor) -> Tensor:
-        """(B, T, D) from (B, T, D)."""
+        """Return the output of the layers, (B, T, D) from (B, T, D)."""
         return cast(Tensor, self.down_proj(functional.silu(self.gate_proj(stream)) * self.up_proj(stream)))
 
 
 class Layer(nn.Module):
-    """Attention, then an MLP. Each writes into the stream through a gate, and the sum is normalised at once.
+    """A layer: attention, then an MLP.
 
-    There is therefore no stream that only adds: what leaves a layer has passed two norms in it.
+    Each writes into the stream through a gate, and the sum is normalised at once. There is therefore no stream
+    that only adds: the output of a layer has passed two norms in it.
     """
 
     def __init__(self, width: int, head_dim: int, cached_heads: int) -> None:
@@ -181,7 +191,15 @@ class Layer(nn.Module):
         self.adaln_table = nn.Parameter(torch.zeros(_MODULATIONS, width))
 
     def forward(self, stream: Tensor, cache: Cache, rotation: Angles, moment: Tensor, mask: Tensor) -> Tensor:
-        """(B, T, D) from (B, T, D). moment: (B, 6, D), the same for all layers."""
+        """Return the stream behind the layer, (B, T, D).
+
+        Args:
+            stream: (B, T, D) stream before the layer.
+            cache: Keys and values of the prompt.
+            rotation: Cosines and sines of the own positions.
+            moment: (B, 6, D) code of the moment, the same for all layers.
+            mask: (B, 1, T, P + T) bool, True where a position is seen.
+        """
         modulation = (self.adaln_table + moment).chunk(_MODULATIONS, dim=1)
         shift, scale, gate = modulation[:3]
         read = self.attn(self.input_layernorm(stream) * (1 + scale) + shift, cache, rotation, mask)
@@ -201,7 +219,15 @@ class FlowTransformer(nn.Module):
     def forward(
         self, stream: Tensor, caches: list[Cache], rotation: Angles, moment: Tensor, mask: Tensor
     ) -> Tensor:
-        """(B, T, D) from (B, T, D). caches: one per layer."""
+        """Return the stream behind the last layer, (B, T, D).
+
+        Args:
+            stream: (B, T, D) stream before the first layer.
+            caches: Keys and values of the prompt, one pair per layer.
+            rotation: Cosines and sines of the own positions.
+            moment: (B, 6, D) code of the moment.
+            mask: (B, 1, T, P + T) bool, True where a position is seen.
+        """
         for layer, cache in zip(self.layers, caches, strict=True):
             stream = layer(stream, cache, rotation, moment, mask)
         return stream
@@ -219,8 +245,8 @@ class Prompt:
     """The parts of the prompt that the flow transformer keeps.
 
     Attributes:
-        caches: Per layer it reads, keys and values.
-        mask: (B, P) bool.
+        caches: Keys and values of every layer that it reads.
+        mask: (B, P) bool, False at padding.
         ends: (3, B, 1) int64, the last position along time, height and width.
     """
 
@@ -230,7 +256,7 @@ class Prompt:
 
 
 class XiaomiNetwork(nn.Module):
-    """Xiaomi-Robotics-R0 under the parameter names of its released files."""
+    """The network Xiaomi-Robotics-R0 under the parameter names of its released files."""
 
     def __init__(self, config: XiaomiConfig) -> None:
         super().__init__()
@@ -246,7 +272,10 @@ class XiaomiNetwork(nn.Module):
         self.prompt_kv = PromptKV(int(config.vlm.text_config.num_hidden_layers))
 
     def read(self, inputs: QwenInputs) -> Prompt:
-        """One pass of the vision-language model; its output head is not called, nothing reads it."""
+        """Read the prompt in one pass of the vision-language model, whose output head is not called.
+
+        Nothing reads the head's output.
+        """
         keywords = inputs.keywords(self.vlm.model)
         cache = self.vlm.model(**keywords, use_cache=True).past_key_values
         self.prompt_kv(cache.layers)
@@ -254,10 +283,13 @@ class XiaomiNetwork(nn.Module):
         return Prompt(caches, inputs.mask.bool(), keywords["position_ids"].amax(dim=-1, keepdim=True))
 
     def velocity(self, prompt: Prompt, state: Tensor, actions: Tensor, moment: Tensor) -> Tensor:
-        """(B, A, action numbers): where the actions of (B, A, action numbers) move at moment (B,) in [0, 1].
+        """Return the velocity of the actions, (B, A, action numbers).
 
         Args:
-            state: (B, states, state numbers).
+            prompt: Kept parts of the prompt.
+            state: (B, states, state numbers) state of the robot.
+            actions: (B, A, action numbers) moving actions.
+            moment: (B,) moment of the flow in [0, 1].
         """
         states, moving = self.state_projector(state), self.action_projector(actions)
         stream = torch.cat([self.sink.weight.expand(len(moving), -1, -1), states, moving], dim=1)
@@ -272,12 +304,18 @@ class XiaomiNetwork(nn.Module):
     def forward(
         self, inputs: QwenInputs, state: Tensor, used: Tensor, noise: Tensor, steps: int = STEPS
     ) -> Tensor:
-        """(B, A, action numbers) float32 normalised actions: Euler steps from noise at moment 0 to moment 1.
+        """Return the normalised actions, (B, A, action numbers) float32.
+
+        They result from Euler steps from noise at moment 0 to moment 1. The path is summed in float32 whatever the
+        weights are.
 
         Args:
-            used: (B, A, action numbers), 1 where the robot has the number; it masks what the network reads of the
-                moving actions, not what it puts out.
-            noise: (B, A, action numbers) float32. The path is summed in float32 whatever the weights are.
+            inputs: Prompts with their pictures.
+            state: (B, states, state numbers) state of the robot.
+            used: (B, A, action numbers), 1 where the robot has the number. It masks the moving actions that the
+                network reads, not its output.
+            noise: (B, A, action numbers) float32.
+            steps: Number of Euler steps.
         """
         prompt = self.read(inputs)
         dtype = self.sink.weight.dtype
@@ -290,21 +328,21 @@ class XiaomiNetwork(nn.Module):
 
 
 def _mask(prompt: Tensor, length: int) -> Tensor:
-    """(B, 1, T, P + T) bool: every own position sees the whole prompt, and of its own kind what stands before."""
+    """Return the mask (B, 1, T, P + T) bool: own positions see the prompt and own positions up to themselves."""
     causal = torch.ones(length, length, dtype=torch.bool, device=prompt.device).tril()
     before = prompt[:, None, :].expand(-1, length, -1)
     return torch.cat([before, causal.expand(len(prompt), -1, -1)], dim=-1)[:, None]
 
 
 def build_xiaomi(config: XiaomiConfig, dtype: torch.dtype, device: str = "meta") -> XiaomiNetwork:
-    """The network in eval mode; see `build_empty`."""
+    """Return the network in eval mode; see `build_empty`."""
     network = build_empty(lambda: XiaomiNetwork(config), dtype, device)
     fill_rotary(network.vlm)
     return network
 
 
 def full_size_xiaomi() -> XiaomiNetwork:
-    """The released size on the meta device: Qwen3-VL-4B and 16 layers of flow transformer."""
+    """Return the released size on the meta device: Qwen3-VL-4B and 16 layers of flow transformer."""
     values = {"vlm_config": qwen3_vl_config("4B"), "state_dim": 32, "action_dim": 32}
     return build_xiaomi(XiaomiConfig.read(values, "released"), torch.float32)
 
@@ -314,14 +352,20 @@ def full_size_xiaomi() -> XiaomiNetwork:
 DEFAULT_ROBOT = "bridge_delta"
 STATISTICS_FILE = "preprocessor_config.json"
 _UNUSED = 1e-5
-"""A number that varies less than this is none the robot has."""
+"""Deviation below which a number is none that the robot has."""
 # A hand that points down, as turns of the base frame's axes.
 _POINTING_DOWN = Rotation.from_matrix([[0, 0, 1], [0, 1, 0], [-1, 0, 0]])
 
 
 @dataclass(frozen=True)
 class ActionUnits:
-    """Per step of a chunk and number of an action its mean and deviation, (A, D) float64 each, of one robot."""
+    """The units of one robot: per step of a chunk and number of an action its mean and deviation.
+
+    Attributes:
+        robot: Name of the robot in the file.
+        mean: (A, D) float64 mean.
+        deviation: (A, D) float64 deviation.
+    """
 
     robot: str
     mean: NDArray[np.float64]
@@ -329,7 +373,7 @@ class ActionUnits:
 
     @property
     def used(self) -> NDArray[np.float32]:
-        """(A, D) 1 where the robot has the number, 0 where it only fills up."""
+        """The mask (A, D): 1 where the robot has the number, 0 where it only fills up."""
         return (self.deviation > _UNUSED).astype(np.float32)
 
     @property
@@ -338,19 +382,20 @@ class ActionUnits:
         return sha256_json([self.mean.tolist(), self.deviation.tolist()])
 
     def restore(self, actions: NDArray[np.float32]) -> NDArray[np.float64]:
-        """(…, A, D) normalised actions in the robot's units."""
+        """Return normalised actions (…, A, D) in the robot's units."""
         return np.asarray(actions * self.deviation + self.mean, np.float64)
 
 
 def read_units(folder: Path, robot: str | None, numbers: int) -> ActionUnits:
-    """Statistics of one robot from `preprocessor_config.json`; without a name, of the only one.
+    """Return the statistics of one robot from `preprocessor_config.json`; without a name, of the only one.
 
     Args:
+        folder: Folder of the checkpoint.
         robot: A name of the file, or the beginning of just one.
-        numbers: Per action, as config.json has it.
+        numbers: Numbers per action, as config.json has it.
 
     Raises:
-        CheckpointError: Where there are none or they do not fit.
+        CheckpointError: If there are none or they do not fit.
         UsageError: For an unknown robot, and for several without a choice.
     """
     file = folder / STATISTICS_FILE
@@ -383,10 +428,11 @@ class Robot:
     """A robot's way of showing its scene and writing its state.
 
     Attributes:
-        heading: What its camera is called in the prompt.
-        width: Of its picture, in pixels.
-        height: As `width`.
-        state: From the observation's eight numbers to its own.
+        name: Beginning of the names of its statistics.
+        heading: Name of its camera in the prompt.
+        width: Width of its picture in pixels.
+        height: Height of its picture in pixels.
+        state: Function from the observation's eight numbers to its own.
     """
 
     name: str
@@ -397,12 +443,15 @@ class Robot:
 
 
 def _bridge_state(state: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Position, roll-pitch-yaw against a hand that points down, 0, openness: the observation's own layout."""
+    """Return the observation's own layout.
+
+    It is position, roll-pitch-yaw against a hand that points down, 0, openness.
+    """
     return np.asarray(state, np.float32)
 
 
 def _fractal_state(state: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Position, orientation of the hand as a quaternion x y z w, closedness."""
+    """Return position, orientation of the hand as a quaternion x y z w, closedness."""
     turned = Rotation.from_euler("xyz", state[3:6]) * _POINTING_DOWN
     return np.asarray(np.concatenate([state[:3], turned.as_quat(), 1 - state[7:8]]), np.float32)
 
@@ -414,7 +463,7 @@ _ROBOTS = (
 
 
 def robot_of(name: str) -> Robot:
-    """The robot whose statistics are called `name`, such as bridge_delta.
+    """Return the robot whose statistics are called `name`, such as bridge_delta.
 
     Raises:
         UsageError: For robots with other cameras and other states than Act2Answer's arm can have.
@@ -435,9 +484,9 @@ CROP = 0.95
 
 
 def look(picture: NDArray[np.uint8], robot: Robot) -> NDArray[np.uint8]:
-    """(height, width, 3) uint8: the middle of (H, W, 3) uint8, at the size the robot's pictures have.
+    """Return the middle of a picture (H, W, 3) uint8, (height, width, 3) uint8 as the robot's pictures are.
 
-    Resized with PIL's bicubic filter, cropped, and brought back to that size with its bilinear one.
+    It is resized with PIL's bicubic filter, cropped, and enlarged to that size again with PIL's bilinear filter.
     """
     size = (robot.width, robot.height)
     scaled = Image.fromarray(picture).resize(size, Image.Resampling.BICUBIC)
@@ -448,7 +497,10 @@ def look(picture: NDArray[np.uint8], robot: Robot) -> NDArray[np.uint8]:
 
 
 def prompt(instruction: str, heading: str) -> str:
-    """The whole text, with one image slot; the model answers with actions, so its words are given and empty."""
+    """Return the whole text, with one image slot.
+
+    The model answers with actions, so its words are given and empty.
+    """
     return (
         "<|im_start|>user\nThe following observations are captured from multiple views.\n"
         f"# {heading}\n{IMAGE}\n"

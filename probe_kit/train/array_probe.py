@@ -1,4 +1,4 @@
-"""`probe`: probes of plain arrays, without a run, a model or a folder."""
+"""Probes of plain arrays, without a run, a model or a folder: `probe`."""
 
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -38,11 +38,13 @@ _OF_RUNS = (
 
 @dataclass(frozen=True, repr=False)
 class ArrayProbes:
-    """Probes of plain arrays. names: of the S sites, in order. results: as `train_probes` gives them.
+    """The probes of plain arrays, as `probe` returns them.
 
     Attributes:
+        names: Names of the S sites, in order.
+        results: The scores, controls and directions, as `train_probes` returns them.
         order: (N,) the row of X that each sample of `results` is.
-        classes: Values of y in the order of their codes, empty for quantities.
+        classes: Values of y in the order of their codes; empty for quantities.
     """
 
     names: tuple[str, ...]
@@ -52,7 +54,7 @@ class ArrayProbes:
 
     @cached_property
     def scores(self) -> "pd.DataFrame":
-        """One row per site, by name; the columns are those of `ProbeResults.scores`."""
+        """Return one row per site, by name; the columns are those of `ProbeResults.scores`."""
         scores = self.results.scores.drop(columns=list(_OF_RUNS))
         scores.index = list(self.names)
         return scores.rename_axis("site")
@@ -68,21 +70,21 @@ class ArrayProbes:
 
     @property
     def predictions(self) -> NDArray[Any]:
-        """(S, N) held-out predictions in the order of X: values of y, or quantities."""
+        """The held-out predictions (S, N) in the order of X: values of y, or quantities."""
         codes = np.empty_like(self._curve.decisions)
         codes[:, self.order] = self._curve.decisions
         return self.classes[codes.astype(int)] if self.classes.size else codes
 
     @property
     def fold_of(self) -> NDArray[np.int64]:
-        """(N,) number of the outer fold in which a row of X was held out."""
+        """The number of the outer fold in which each row of X was held out, (N,)."""
         fold_of = np.empty_like(self._curve.fold_of)
         fold_of[self.order] = self._curve.fold_of
         return fold_of
 
     @property
     def null(self) -> NDArray[np.float64]:
-        """(S, P) score of every site with every permutation of the labels."""
+        """The scores (S, P) of every site with every permutation of the labels."""
         return self._curve.null
 
     def __repr__(self) -> str:
@@ -120,20 +122,21 @@ def probe(
     Args:
         X: (N, D) features of one site, (S, N, D) of several, or a dictionary from names to (N, D).
         y: (N,) labels: two values, classes as texts, or quantities.
-        groups: (N,) what folds, intervals and label permutations keep together, such as a subject or a picture; by
-            default every sample is a group.
-        task: `binary`, `classes` or `continuous`, where the values leave a doubt.
+        groups: (N,) units that folds, intervals and label permutations keep together, such as a subject or a
+            picture; by default every sample is a group.
+        task: `binary`, `classes` or `continuous`; needed only where the values leave a doubt.
         controls: Features (N, D) by name that never saw the model; a signal must exceed each of them.
         untrained: The same sites of an untrained network; a signal must exceed the best of them.
-        strata: (N,) within which label permutations exchange groups.
+        strata: (N,) values within which label permutations exchange groups; by default groups exchange everywhere.
         ordered: Whether the samples of every group come in an order that corresponds between groups, such as time;
             permutations then keep it.
-        permutations: As in `train_probes`, which does the work.
-        seed: As `permutations`.
-        jobs: As `permutations`.
+        permutations: Number of label permutations behind the p-values, as in `train_probes`, which fits the
+            probes.
+        seed: Seed of folds and permutations, as in `train_probes`, and of the order of the samples.
+        jobs: Number of processes, as in `train_probes`; None for this process alone.
 
     Raises:
-        UsageError: For arrays that do not fit together, hold NaN or infinity, or for labels without a task.
+        UsageError: For arrays that do not fit together or hold NaN or infinity, and for labels without a task.
         TooFewGroupsError: For fewer than five groups with each class.
     """
     import pandas as pd
@@ -191,7 +194,7 @@ def probe(
 
 
 def _sites(arrays: Sites, what: str, count: int | None = None) -> dict[str, NDArray[np.float32]]:
-    """Features (N, D) by the name of their site."""
+    """Return the features (N, D) by the name of their site."""
     if isinstance(arrays, Mapping):
         by_name = {str(name): array for name, array in arrays.items()}
     else:
@@ -213,7 +216,11 @@ def _sites(arrays: Sites, what: str, count: int | None = None) -> dict[str, NDAr
 
 
 def _matrix(features: ArrayLike, what: str, count: int | None) -> NDArray[np.float32]:
-    """(N, D) finite numbers. Raises UsageError."""
+    """Return the features as (N, D) finite float32.
+
+    Raises:
+        UsageError: For no numbers, another shape than (N, D) or (`count`, D), NaN and infinity.
+    """
     try:
         array = np.asarray(features, np.float32)
     except (TypeError, ValueError) as error:
@@ -228,7 +235,11 @@ def _matrix(features: ArrayLike, what: str, count: int | None) -> NDArray[np.flo
 
 
 def _column(column: ArrayLike | Sequence[Any], count: int, what: str) -> list[Any]:
-    """N values. Raises UsageError for another number of them, and for missing ones."""
+    """Return a column as a list of `count` values.
+
+    Raises:
+        UsageError: For another number of values, and for missing ones.
+    """
     array = np.asarray(column)
     if array.shape != (count,):
         raise UsageError(f"{what} has the shape {array.shape}; expected ({count},), one value per row of X")

@@ -1,4 +1,4 @@
-"""Built-in label columns of a run: `sim.*` of its trajectories, `item.*` of its plan."""
+"""The built-in label columns of a run: `sim.*` of its trajectories, `item.*` of its plan."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -21,18 +21,21 @@ if TYPE_CHECKING:
 
 SIM, ITEM, RECORDED, PLAYED = "sim.", "item.", "dataset.", "env."
 ACTION_ERROR = "action_error"
-"""Of a shown frame: root mean square of predicted minus recorded first action, in recorded deviations."""
+"""Column of a shown frame: root mean square of predicted minus recorded first action, in recorded deviations."""
 OUTCOME = "env.outcome"
-"""Whether an episode in an environment of one's own succeeded, once per episode."""
+"""Column that says once per episode whether an episode in an environment of one's own succeeded."""
 PHASES = ("before grasp", "holding", "after release")
 
 
 @dataclass(frozen=True)
 class BuiltinColumn:
-    """A built-in column. episodes: (n,) ids. inferences: (n,), None for one label per episode. cells: (n,).
+    """A built-in column, with the keys and values of its n labels.
 
     Attributes:
         task: None where the values decide it.
+        episodes: (n,) ids of episodes.
+        inferences: (n,) numbers of captured inferences; None for one label per episode.
+        cells: (n,) values, None where a label is missing.
     """
 
     task: Task | None
@@ -70,13 +73,13 @@ class Instant:
 
     @property
     def steps_to_grasp(self) -> float | None:
-        """Control steps to the first grasp, negative behind it; None if there is none."""
+        """The number of control steps to the first grasp, negative behind it; None if there is none."""
         held_frames = self._frames_of_grasp
         return float(held_frames[0] - self.frame) if held_frames.size else None
 
     @property
     def phase(self) -> str:
-        """One of PHASES; the release is the last one of the episode."""
+        """A phase of `PHASES`; the release is the last one of the episode."""
         held_frames = self._frames_of_grasp
         if not held_frames.size or self.frame < held_frames[0]:
             return PHASES[0]
@@ -84,7 +87,7 @@ class Instant:
 
     @property
     def _frames_of_grasp(self) -> NDArray[np.intp]:
-        """Frames in which both fingers touch the cube."""
+        """The frames in which both fingers touch the cube."""
         return np.flatnonzero(self.trajectory.held)
 
 
@@ -112,14 +115,14 @@ ITEM_COLUMNS = {
 
 
 class BuiltinColumns:
-    """The built-in columns of a run; what several of them are made of is read once."""
+    """The built-in columns of a run; data that several of them need are read once."""
 
     def __init__(self, run: RunReader) -> None:
         self._run = run
 
     @property
     def names(self) -> list[str]:
-        """Names of the columns of a run of this kind; it may lack some still."""
+        """The names of the columns of a run of this kind; this run may still lack some."""
         if self._run.inputs is None:
             return builtin_names()
         return [*(prefix_of(self._run) + name for name in self._recorded), *outcome_column(self._run)]
@@ -128,8 +131,8 @@ class BuiltinColumns:
         """Return a column by its name, for every episode or captured inference that the run has.
 
         Raises:
-            UsageError: For another name and for a run of which nothing such is stored.
-            NoTrajectoryError: Without trajectories.
+            UsageError: For another name, and for a run that does not store the data of the column.
+            NoTrajectoryError: For a `sim.*` column of a run without trajectories.
         """
         run = self._run
         if name.startswith(SIM) and name.removeprefix(SIM) in SIM_COLUMNS:
@@ -155,7 +158,14 @@ class BuiltinColumns:
         return _sim_columns(self._run)
 
     def _of_source(self, name: str) -> BuiltinColumn:
-        """A column of data set or environment for every shown frame, such as `dataset.state.x` or `env.held`."""
+        """Return a column of data set or environment for every shown frame, such as `dataset.state.x`.
+
+        An environment's column is called `env.held`, for example.
+
+        Raises:
+            UsageError: For a column that the run lacks, and for facts of an environment of which no value was
+                captured.
+        """
         run, columns = self._run, self._recorded
         prefix = prefix_of(run)
         column = name.removeprefix(prefix)
@@ -181,7 +191,10 @@ class BuiltinColumns:
 
 
 def _cells(run: RunReader, name: str, values: NDArray[np.float64]) -> tuple[Cell, ...]:
-    """The values (n,) of a column of a run's own source: numbers; truth values or texts where that says so."""
+    """Return the values (n,) of a column of a run's own source.
+
+    They are numbers, or truth values or texts where the source says so.
+    """
     assert run.inputs is not None, "a run with such columns stores inputs"
     return tuple(run.inputs.cell(name, float(value)) for value in values)
 
@@ -192,14 +205,14 @@ def prefix_of(run: RunReader) -> str:
 
 
 def outcome_column(run: RunReader) -> dict[str, list[str]]:
-    """The column `env.outcome`, a text per episode; empty for a run in which all episodes end alike."""
+    """Return the column `env.outcome`, a text per episode; empty for a run in which all episodes end alike."""
     if not run.in_own_environment or run.episodes["outcome"].nunique() < 2:
         return {}
     return {OUTCOME: run.episodes["outcome"].astype(str).tolist()}
 
 
 def recorded_columns(run: RunReader) -> dict[str, Callable[[], NDArray[np.float64]]]:
-    """Return by name what reads a column of data set or environment; none for a run of scenes.
+    """Return the functions that read the columns of data set or environment, by name; none for a run of scenes.
 
     Each returns (E, C) values, of every shown frame; columns of one kind of input read it once.
     """
@@ -224,22 +237,23 @@ def recorded_columns(run: RunReader) -> dict[str, Callable[[], NDArray[np.float6
 
 
 def is_builtin(name: str) -> bool:
-    """Whether a name is that of a built-in column by its prefix; a run may lack it still."""
+    """Whether a name is that of a built-in column by its prefix; a run may still lack the column."""
     return name.startswith((SIM, ITEM, RECORDED, PLAYED))
 
 
 def builtin_names() -> list[str]:
-    """Names of all built-in columns."""
+    """Return the names of all `sim.*` and `item.*` columns."""
     return [*(SIM + name for name in SIM_COLUMNS), *(ITEM + name for name in ITEM_COLUMNS)]
 
 
 def label_frame(run: RunReader) -> "pd.DataFrame":
-    """Keys and built-in columns of a run: a row per episode and captured inference, to be extended by columns.
+    """Return the keys and built-in columns of a run, to which columns can be added.
 
-    Besides the keys `episode_id` and `inference` there are `control_step`, `group_id`, `category` and the built-in
-    columns that the run has; one without trajectories or control steps has no `sim.*`, see `why_no_sim`. Of
-    recordings there are `source_episode`, `frame`, `instruction` and the columns `dataset.*` instead, of pictures
-    the file as `picture` too, of an environment of one's own `instruction` and `env.*`.
+    There is a row per episode and captured inference. Besides the keys `episode_id` and `inference` there are
+    `control_step`, `group_id`, `category` and the built-in columns that the run has. A run without trajectories or
+    control steps has no `sim.*`, see `why_no_sim`. Recordings have `source_episode`, `frame`, `instruction` and
+    the columns `dataset.*` instead. Pictures have the file as `picture` too, and an environment of one's own has
+    `instruction` and `env.*`.
     """
     import pandas as pd
 
@@ -276,7 +290,7 @@ def label_frame(run: RunReader) -> "pd.DataFrame":
 
 
 def why_no_sim(run: RunReader) -> str | None:
-    """Why a run has no `sim.*` columns; None if it has them."""
+    """Return why a run has no `sim.*` columns; None if it has them."""
     try:
         next(frames_of_inferences(run), None)
     except UsageError as error:
@@ -290,20 +304,20 @@ def _rows(run: RunReader, ids: Sequence[str]) -> NDArray[np.intp]:
 
 
 def _inferences(run: RunReader) -> Iterator[tuple[str, int]]:
-    """Episode and number of every captured inference, in the order of the episodes."""
+    """Yield episode and number of every captured inference, in the order of the episodes."""
     counts = reached_calls(run).sum(axis=1).tolist()
     for name, count in zip(run.episodes[EPISODE].astype(str), counts, strict=True):
         yield from ((name, call) for call in range(count))
 
 
 def frames_of_inferences(run: RunReader) -> Iterator[tuple[Any, int, list[int]]]:
-    """Trajectory, row and frames of the captured inferences of every episode.
+    """Yield trajectory, row and frames of the captured inferences of every episode.
 
     The frame of an inference is its control step: the state after so many actions.
 
     Raises:
         UsageError: For a run that stores no control steps.
-        NoTrajectoryError: For one without trajectories.
+        NoTrajectoryError: For a run without trajectories.
     """
     if not hasattr(run, "trajectories") or not hasattr(run, "control_steps"):
         raise UsageError(f"{run.location} has no trajectories; `sim.*` and the state need them")
@@ -313,7 +327,7 @@ def frames_of_inferences(run: RunReader) -> Iterator[tuple[Any, int, list[int]]]
 
 
 def _sim_columns(run: RunReader) -> dict[str, tuple[Cell, ...]]:
-    """The cells of all `sim.*` columns for every captured inference, without the prefix."""
+    """Return the cells of all `sim.*` columns for every captured inference; the names have no prefix."""
     rows: list[list[Cell]] = []
     for trajectory, row, frames in frames_of_inferences(run):
         side = str(run.episodes["side_correct"].iloc[row])
@@ -323,12 +337,12 @@ def _sim_columns(run: RunReader) -> dict[str, tuple[Cell, ...]]:
 
 
 def _finite(value: Cell) -> Cell:
-    """A cell that is a number or nothing: a broken simulation leaves NaN."""
+    """Return a cell that is a number or nothing: a broken simulation leaves NaN."""
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def _needed(name: str) -> tuple[str, ...]:
-    """Columns of the episodes that an `item.*` column is made of."""
+    """Return the columns of the episodes that an `item.*` column is made of."""
     if name == "category":
         return ("category",)
     return "target_concept", "distractor_concept", "side_correct"

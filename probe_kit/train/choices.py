@@ -1,4 +1,4 @@
-"""Choices of a probe sweep: sides, tasks, controls and incomplete items. Importing them loads no library."""
+"""The choices of a probe sweep: sides, tasks, controls and incomplete items. Importing them loads no library."""
 
 from typing import Literal
 

@@ -1,4 +1,4 @@
-"""Options of `probe-kit train`, by help panel, and the target and the transfer that they name."""
+"""The options of `probe-kit train`, by help panel, and the target and the transfer that they name."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -214,7 +214,7 @@ SolverDevice = Annotated[
 
 @dataclass(frozen=True)
 class TargetOptions:
-    """Options that name a target: a side, a built-in column, or a column of a table."""
+    """The options that name a target: a side, a built-in column, or a column of a table."""
 
     name: str
     file: Path | None
@@ -224,7 +224,7 @@ class TargetOptions:
     align_to: str | None = None
 
     def check(self, window: int | None) -> None:
-        """Raise UsageError for a target that nothing names, and for a side with options that no side has."""
+        """Raise UsageError for a target that has no source, and for a side with options that no side has."""
         from probe_kit.train.builtin_columns import builtin_names, is_builtin
 
         is_side, sides = self.name in SIDES, ", ".join(map(repr, SIDES))
@@ -256,7 +256,7 @@ class TargetOptions:
         return self.name in SIDES
 
     def read(self, run: "RunReader", file: Path | None = None, seed: int = 0) -> "Target":
-        """Return the target for a run: of the table, of another `file`, or built in."""
+        """Return the target for a run: from the table, from another `file`, or built in."""
         from probe_kit.train import Target
 
         options = self.task, self.group_by, self.exchange_within
@@ -265,7 +265,7 @@ class TargetOptions:
         return Target.read(table, self.name, *options)
 
     def event(self, run: "RunReader") -> "Target | None":
-        """Return the column where windows begin; of `COLUMN=VALUE` whether it has the value."""
+        """Return the column that says where windows begin; for `COLUMN=VALUE` whether the column has the value."""
         from probe_kit.train import Target
         from probe_kit.train.builtin_columns import is_builtin
 

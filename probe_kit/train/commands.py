@@ -1,4 +1,4 @@
-"""`probe-kit train`, and how `probe-kit run show` lists what it stored."""
+"""The command `probe-kit train`, and how `probe-kit run show` lists what it stored."""
 
 import shlex
 from collections.abc import Mapping
@@ -191,7 +191,12 @@ def _transfer(
 
 
 def facts_table(inventory: "Inventory", more_lines: Mapping[str, str]) -> "Table":
-    """A run and what is stored with it. more_lines: those below, by name."""
+    """Return a table of a run and of what is stored with it.
+
+    Args:
+        inventory: The run's facts and stored probes.
+        more_lines: Texts of the lines below the facts, by name.
+    """
     from rich.table import Table
 
     from probe_kit.runs.reader import full_name
@@ -249,7 +254,7 @@ def _probes_in_words(probes: "StoredProbes", inventory: "Inventory") -> str:
 
 
 def _calls(text: str, run: "RunReader") -> list[int]:
-    """The captured inferences that were asked for, each once."""
+    """Return the requested captured inferences, each once."""
     if text == "all":
         return list(range(run.captured_calls))
     parts = split(text) or ()
@@ -259,7 +264,11 @@ def _calls(text: str, run: "RunReader") -> list[int]:
 
 
 def _only_call(text: str, run: "RunReader", subject: str) -> int:
-    """Return the captured inference of what is made of one alone. Raises UsageError for several."""
+    """Return the number of the captured inference for a `subject` that is made from exactly one.
+
+    Raises:
+        UsageError: For several inferences.
+    """
     numbers = _calls(text, run)
     if len(numbers) != 1:
         raise UsageError(f"--call {text!r} with {subject}; expected one number")

@@ -1,9 +1,9 @@
-"""Features of controls: layout, step, state, action, words and pictures of the samples, without a model.
+"""The features of controls: layout, step, state, action, words and pictures of the samples, without a model.
 
 The control `random-features` is an untrained conjunction of picture and word features. Concepts recur in other
 groups of pictures, so a probe can itself learn which pixels answer which word, as soon as its features hold
-products of both. Any random nonlinear layer does. The control is such a layer, as wide as the site it is compared
-with, on the pictures and the words alone; a model that knows more than that must be better.
+products of both. Any random nonlinear layer does. The control is such a layer on the pictures and the words alone,
+as wide as the site it is compared with. A model that knows more than that must be better.
 """
 
 from collections.abc import Callable, Sequence
@@ -34,19 +34,22 @@ THUMBNAIL, SIDE = 32, 12
 LAYERS = 5
 """Random layers, whose mean is the reference: one alone is lucky or not, and the best of them is lucky."""
 MOST_BINS = 50
-"""Columns that the step has at most: neighbouring inferences of long windows share one."""
+"""The most columns of the step: neighbouring inferences of long windows share one."""
 
 Features = NDArray[np.float32]
 
 
 class ControlInputs:
-    """The features of controls for n samples of a run. suite: None where no control needs its pictures."""
+    """The features of controls for n samples of a run.
+
+    They need a suite only where a control reads its pictures; it is None elsewhere.
+    """
 
     def __init__(self, run: RunReader, samples: TargetSamples, is_side: bool, suite: "Suite | None") -> None:
         self.run, self.samples, self.is_side, self.suite = run, samples, is_side, suite
 
     def features(self, name: str) -> Features:
-        """(n, D) features of a control but `random-features`."""
+        """Return the features (n, D) of a control other than `random-features`."""
         if name in (array_features := self.run.control_features):
             return array_features[name][self.samples.rows].astype(np.float32)
         if name == "instruction":
@@ -61,26 +64,30 @@ class ControlInputs:
         return makers[name]()
 
     def layer(self, positions: NDArray[np.intp], width: int, seed: int) -> Features:
-        """(E, width) outputs of a random tanh layer for the samples at some positions."""
+        """Return the outputs (E, width) of a random tanh layer for the E samples at `positions`."""
         return random_layer([part[positions] for part in self._layer_inputs], width, seed)
 
     @cached_property
     def _layer_inputs(self) -> list[Features]:
-        """Pictures, words and, for targets but a side, the state where there is one; read once for all layers."""
+        """Return pictures, words and, for targets other than a side, the state where there is one.
+
+        They are read once for all layers.
+        """
         parts = [self._pixels(SIDE), word_counts(self.run)[self.samples.rows]]
         if not self.is_side and why_no_state(self.run) is None:
             parts.append(self._state())
         return parts
 
     def _layout(self) -> Features:
-        """(n, 1): +1 in the original layout, −1 in the swapped one."""
+        """Return (n, 1): +1 in the original layout, −1 in the swapped one."""
         original = (self.run.episodes["layout"] == "original").to_numpy()[self.samples.rows]
         return np.where(original, np.float32(1), np.float32(-1))[:, None]
 
     def _words(self) -> Features:
-        """(n, W) word counts; of a side (n, 2 W), with the same times the layout's sign.
+        """Return the word counts (n, W); of a side (n, 2 W).
 
-        The second half shows a word whose picture always lies on one side.
+        The second half is the same counts times the layout's sign. It shows a word whose picture always lies on
+        one side.
         """
         counts = word_counts(self.run)[self.samples.rows]
         return np.hstack([counts, counts * self._layout()]) if self.is_side else counts
@@ -97,13 +104,16 @@ class ControlInputs:
         return inputs
 
     def _recorded(self, kind: str) -> NDArray[Any]:
-        """(n, …) stored inputs of the samples."""
+        """Return the stored inputs (n, …) of the samples, of one kind."""
         assert self.recorded is not None
         values: NDArray[Any] = self.recorded.read(kind)[self.samples.rows, self.samples.inferences]
         return values
 
     def _frames(self) -> NDArray[np.intp] | None:
-        """(n,) place of every recorded frame in the order of frames; None for scenes, and from an event on."""
+        """Return the place (n,) of every recorded frame in the order of frames.
+
+        It is None for scenes, and where windows begin at an event.
+        """
         if self.recorded is None or self.samples.aligned is not None:
             return None
         steps = self.run.control_steps[self.samples.rows, self.samples.inferences]
@@ -118,7 +128,7 @@ class ControlInputs:
 
 
 def why_impossible(run: RunReader, samples: TargetSamples) -> dict[str, str]:
-    """Return why the run or the target does not allow a control, by name."""
+    """Return the reasons why the run or the target does not allow a control, by its name."""
     reasons = {}
     inputs = run.inputs
     if "layout" not in run.episodes:
@@ -145,7 +155,11 @@ def why_no_state(run: RunReader) -> str | None:
 
 
 def word_counts(run: RunReader) -> Features:
-    """(E, W): how often each word occurs in the instruction. Raises UsageError without instructions."""
+    """Return how often each word occurs in the instruction, (E, W).
+
+    Raises:
+        UsageError: For a run without instructions.
+    """
     if "instruction" not in run.episodes:
         raise UsageError(f"the episodes of {run.location} have no column 'instruction'; leave that control out")
     words = [str(text).lower().split() for text in run.episodes["instruction"]]
@@ -158,7 +172,10 @@ def word_counts(run: RunReader) -> Features:
 
 
 def tile_pixels(episodes: "pd.DataFrame", suite: "Suite", side: int) -> Features:
-    """(E, 6 side²): the left and the right picture of every episode, RGB from 0 to 1, `side` pixels wide."""
+    """Return the left and the right picture of every episode, (E, 6 side²).
+
+    The values are RGB from 0 to 1; each picture is `side` pixels wide.
+    """
     from probe_kit.suite import Episode
 
     items = {item.item_id: item for item in suite.items}
@@ -182,7 +199,10 @@ def _thumbnail(path: Path, side: int) -> Features:
 
 
 def small_pictures(pixels: NDArray[np.uint8], side: int) -> Features:
-    """(n, cameras · side² · 3) of (n, cameras, 32, 32, 3): RGB from 0 to 1, each pixel the mean of its part."""
+    """Return pictures (n, cameras, 32, 32, 3) as (n, cameras · side² · 3): RGB from 0 to 1.
+
+    Each pixel is the mean of its part of the picture.
+    """
     from PIL import Image
 
     box = Image.Resampling.BOX
@@ -196,10 +216,12 @@ def small_pictures(pixels: NDArray[np.uint8], side: int) -> Features:
 
 
 def step_features(samples: TargetSamples, places: NDArray[np.intp] | None = None) -> Features:
-    """(n, at most 50): which part of the window an inference is in, one-hot.
+    """Return the part of the window that an inference is in, one-hot (n, at most 50).
 
     Args:
-        places: (n,) of recorded frames in the order of their numbers, which take the place of inferences.
+        samples: The n samples, of which `steps` and `window` are read.
+        places: (n,) places of recorded frames in the order of their numbers; used instead of the inferences. None
+            for scenes, and where windows begin at an event.
     """
     steps, count = samples.steps, samples.window
     if places is not None:
@@ -210,10 +232,11 @@ def step_features(samples: TargetSamples, places: NDArray[np.intp] | None = None
 
 
 def state_features(run: RunReader, samples: TargetSamples) -> Features:
-    """(n, 7): position and angles of the hand and the opening of the gripper at the step of every inference.
+    """Return position and angles of the hand and the opening of the gripper at every inference's step, (n, 7).
 
     Raises:
-        UsageError: For a run without trajectories or control steps.
+        UsageError: For a run without control steps.
+        NoTrajectoryError: For a run without trajectories.
     """
     of_row: dict[int, list[int]] = {}
     for position, row in enumerate(samples.rows.tolist()):
@@ -227,7 +250,7 @@ def state_features(run: RunReader, samples: TargetSamples) -> Features:
 
 
 def random_layer(parts: Sequence[Features], width: int, seed: int) -> Features:
-    """(N, width) outputs of a random tanh layer, to which every part (N, D) gives an equal share.
+    """Return the outputs (N, width) of a random tanh layer, to which every part (N, D) gives an equal share.
 
     A part that is the same for all samples, such as the state at the first frame, gives nothing.
     """

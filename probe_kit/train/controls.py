@@ -1,4 +1,4 @@
-"""Controls that probes must exceed: features that never saw the model, and an untrained network."""
+"""The controls that probes must exceed: features that never saw the model, and an untrained network."""
 
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
@@ -52,7 +52,13 @@ Numbers depend on them: another word would draw other exchanges.
 
 @dataclass(frozen=True)
 class PreparedControls:
-    """Controls that are still to be run. left_out: why a default one cannot be, by name."""
+    """The controls that are still to be run.
+
+    Attributes:
+        names: Names of the controls, in the order in which they run.
+        inputs: Source of their features.
+        left_out: Reasons why default controls cannot run, by name.
+    """
 
     names: tuple[str, ...]
     inputs: ControlInputs
@@ -70,13 +76,20 @@ def prepare_controls(
 ) -> PreparedControls:
     """Return the controls `names` that `stored` does not have yet, before anything is probed.
 
+    Raises as `suite_of` where pictures of the suite are needed.
+
     Args:
-        names: None for those that are run by default; of them what is not possible is left out, with a warning
-            where pictures are missing.
-        folder: Of the run's suite, see `suite_of`.
+        run: Run that is probed.
+        samples: Its samples of the target.
+        is_side: Whether the target is a side, which has other default controls.
+        names: None for the default ones. Those that are not possible are then left out, with a warning where
+            pictures are missing.
+        folder: Folder of the run's suite, see `suite_of`.
+        stored: Controls of the stored results.
+        categories: Categories for which a control must be stored.
 
     Raises:
-        UsageError: For a control that was asked for and is unknown or not possible, and what `suite_of` raises.
+        UsageError: For a control in `names` that is unknown or not possible.
     """
     array_features = run.control_features
     available = (*array_features, *(name for name in CONTROLS if name not in array_features))
@@ -114,9 +127,16 @@ def prepare_controls(
 def add_controls(
     results: ProbeResults, problems: Mapping[str, Problem], widths: Mapping[str, int], prepared: PreparedControls
 ) -> ProbeResults:
-    """Return `results` with these controls for every category. widths: of every stream, for `random-features`.
+    """Return `results` with these controls for every category.
 
-    Every site is compared with `random-features`, and of targets but a side with every control.
+    Every site is compared with `random-features`. Sites of a target other than a side are compared with every
+    control.
+
+    Args:
+        results: Results without these controls.
+        problems: Probing problems, by category.
+        widths: Width of every stream, which the layers of `random-features` take.
+        prepared: Controls to fit.
     """
     before = results.controls
     missing = {**before.left_out, **prepared.left_out}
@@ -152,7 +172,7 @@ def add_controls(
 
 
 def _layer_probes(inputs: ControlInputs, problem: Problem, width: int, seed: int) -> list[SiteProbe]:
-    """Probes of the random layers, without label permutations."""
+    """Return the probes of the random layers, without label permutations."""
     # Words of seeds, which numbers depend on: another word would draw other layers.
     kind = "binding" if problem.is_side else "label random features"
     layers = (inputs.layer(problem.positions, width, derive_seed(kind, seed, number)) for number in range(LAYERS))
@@ -187,6 +207,10 @@ def _compared(
     """Yield every site of a stream against the mean of a control's scores, or the best untrained site.
 
     Args:
+        results: Probes whose sites are compared.
+        name: Name of the control; `UNTRAINED` compares with the best site of `references`.
+        key: Category and view.
+        stream: Stream of the sites.
         references: (S', E) scores of the control's S' sites on the E samples.
     """
     curve, settings = results.curves[key], results.settings
@@ -214,10 +238,15 @@ _SHOWN = (DATASET, "suite", "scene", "seed")
 
 
 def check_same_source(run: RunReader, untrained: RunReader, samples: TargetSamples, is_side: bool) -> None:
-    """Raise UsageError for the run itself; of a target that is no side also for other frames or missing episodes.
+    """Raise UsageError if `untrained` is the run itself.
+
+    For a target other than a side, also raise it for other frames and for missing episodes.
 
     Args:
-        samples: Of the run.
+        run: Run that is probed.
+        untrained: Run to compare with.
+        samples: Samples of `run`.
+        is_side: Whether the target is a side.
     """
     if run.location.address == untrained.location.address:
         raise UsageError(
@@ -249,10 +278,16 @@ def check_untrained(
 ) -> None:
     """Raise UsageError unless `untrained` is another run of the same episodes, instructions, frames and labels.
 
+    For a target other than a side, also raise it for inferences after the first of a network that acted. The
+    frames it was shown then follow from its own actions.
+
     Args:
-        samples: Of the two runs. Of a target that is no side also for inferences after the first of a network that
-            acted: the frames it was shown then follow from its own actions.
-        untrained_samples: As `samples`.
+        run: Run that is probed.
+        untrained: Run to compare with.
+        samples: Samples of `run`.
+        untrained_samples: Samples of `untrained`.
+        is_side: Whether the target is a side.
+        call: Captured inference that is probed, counted from 0; it appears in the advice of the error.
     """
     identities, untrained_identities = (
         _identities(*pair) for pair in ((run, samples), (untrained, untrained_samples))
@@ -294,7 +329,7 @@ def check_untrained(
 
 
 def _identities(run: RunReader, samples: TargetSamples) -> list[tuple[str, str, int, float]]:
-    """Id, instruction, inference and label of every sample: what two runs must have in common."""
+    """Return id, instruction, inference and label of every sample, which two runs must have in common."""
     names = run.episodes["episode_id"].to_numpy(str)[samples.rows].tolist()
     texts = [""] * len(names)
     if "instruction" in run.episodes:

@@ -1,4 +1,4 @@
-"""Tables of labels: CSV, Parquet or a DataFrame, with the line of every cell; values of a column under a task."""
+"""Tables of labels (CSV, Parquet, DataFrame) with the line of every cell, and values of a column under a task."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,14 +29,15 @@ if TYPE_CHECKING:
 EPISODE, INFERENCE = "episode_id", "inference"
 """Key columns of a table: one label per episode, or with both one per captured inference."""
 SOURCE, FRAME = "source_episode", "frame"
-"""The same of recordings, by the numbers of the data set; read where a table has no `episode_id`."""
+"""The key columns of recordings, by the numbers of the data set; read where a table has no `episode_id`."""
 
 
 def read_table(table: "Path | str | pd.DataFrame", requested: Sequence[str]) -> LabelTable:
-    """The key columns and the columns `requested` of a table. requested: those that it lacks are left out.
+    """Return the key columns and the columns `requested` of a table.
 
     Args:
         table: A CSV file (see `open_table`), a Parquet file (`.parquet`), or a DataFrame.
+        requested: Names of columns; those that the table lacks are left out.
 
     Raises:
         UsageError: For a file that is no such table, or has no column `episode_id`.
@@ -61,7 +62,11 @@ def read_table(table: "Path | str | pd.DataFrame", requested: Sequence[str]) -> 
 
 
 def _places(names: Sequence[str], requested: Sequence[str], source: str, line: int = 1) -> dict[str, int]:
-    """Position of every column to read. Raises UsageError without the key, and for a name used twice."""
+    """Return the position of every column to read.
+
+    Raises:
+        UsageError: For a table without the key, a name used twice, and a control character in a name.
+    """
     if EPISODE not in names and SOURCE not in names:
         listed = ", ".join(terminal_safe(name) for name in names[:12]) or "no column"
         raise UsageError(
@@ -92,7 +97,7 @@ def _other_delimiter(names: Sequence[str]) -> str:
 
 
 def _of_parquet(path: Path, requested: Sequence[str]) -> LabelTable:
-    """Cells by arrow, because pandas rounds large integers beside empty cells."""
+    """Read the cells by arrow, because pandas rounds large integers beside empty cells."""
     require("pyarrow.parquet", "export")
     try:
         with open_parquet(path, "export") as file:
@@ -119,7 +124,9 @@ def _of_cells(cells: dict[str, list[Any]], names: tuple[str, ...], count: int, s
 
 
 def _plain(cell: Any, table: LabelTable, row: int, column: str) -> Cell:
-    """A cell of a frame or Parquet file as a Python type; whatever means "missing" is None. Dates are texts.
+    """Return a cell of a frame or Parquet file as a Python type.
+
+    None stands for every kind of missing value. Dates are texts.
 
     Raises:
         UsageError: For other objects, such as lists.
@@ -149,9 +156,9 @@ def _plain(cell: Any, table: LabelTable, row: int, column: str) -> Cell:
 # -- values of a column under a task -------------------------------------------------------------------------
 
 MOST_DOUBTFUL = 20
-"""Integers of 3 to so many values can be classes or quantities; only the user knows."""
+"""Largest number of different integers, from 3 on, that can be classes or quantities; only the user knows."""
 LARGEST = 1e100
-"""Quantities are squared and summed in float64, which ends at 1e308."""
+"""The largest quantity, because quantities are squared and summed in float64, which ends at 1e308."""
 
 
 @dataclass(frozen=True)
@@ -168,7 +175,7 @@ class LabelValues:
     values: NDArray[np.float64]
 
     def of(self, at: Sequence[int]) -> "LabelValues":
-        """Return the values at some places, with the classes that occur there."""
+        """Return the values at some positions, with the classes that occur there."""
         return self.of_values(self.values[list(at)])
 
     def of_values(self, values: NDArray[np.float64]) -> "LabelValues":
@@ -181,7 +188,7 @@ class LabelValues:
 
 
 def code_labels(cells: Sequence[Cell], task: Task | None, target: str) -> LabelValues:
-    """Code the cells of one kind of the column `target` for `task`, or for the only task that fits.
+    """Code the cells of the column `target`, all of one kind, for `task`, or for the only task that fits.
 
     Booleans and two values are binary, other texts classes, other numbers continuous.
 
@@ -213,7 +220,7 @@ def code_labels(cells: Sequence[Cell], task: Task | None, target: str) -> LabelV
 
 
 def _integer_if_whole(cell: Cell) -> Cell:
-    """A number without decimals as an integer: tables with empty cells store integers as decimals."""
+    """Return a number without decimals as an integer: tables with empty cells store integers as decimals."""
     return int(cell) if isinstance(cell, float) and cell.is_integer() else cell
 
 

@@ -1,4 +1,4 @@
-"""Power of probes and controls for a number of items, for planning and for results."""
+"""The power of probes and controls for a number of items, for planning and for results."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,9 +20,9 @@ from probe_kit.train.control_features import LAYERS
 NEIGHBOURS, ALIKE = 0.9, 0.3
 """Assumed correlation of neighbouring sites, and of the episodes of one group."""
 ITEMS_PER_GROUP, LAYOUTS = 2, 2
-"""Of the built suites: an item and its counterpart share pictures, and each is played in both layouts."""
+"""Numbers of the built suites: an item and its counterpart share pictures, and each is played in both layouts."""
 FEWEST_ITEMS, MOST_ITEMS = OUTER_FOLDS * ITEMS_PER_GROUP, 1000
-"""Between these the number of items is searched."""
+"""Limits between which the number of items is searched."""
 SEEDS = 5
 """Parts of a simulation, each with a limit of chance of its own; their spread is the error of the whole."""
 NULL_DRAWS, POOL = 4000, 40_000
@@ -33,13 +33,16 @@ _NUMBERS = 200_000
 
 @dataclass(frozen=True)
 class Power:
-    """Share of experiments in which a signal of `above` over chance is seen, family-wise, with so many items.
+    """The share of experiments that detect a signal of `above` over chance, family-wise, with so many items.
 
     Attributes:
-        chance: Against label permutations.
-        random_features: Against a control that is right half of the time; it takes more if the control is better
-            than that.
-        untrained: As `random_features`.
+        items: Number of items per category.
+        above: Accuracy of the sites with signal minus 0.5.
+        chance: Share that detects it against label permutations.
+        random_features: Share that detects it against a control that is right half of the time; a better control
+            takes more items.
+        untrained: Share that detects it against an untrained network that is right half of the time; a better one
+            takes more items.
         absent: Share of experiments in which a stream without any signal is called absent.
         spread: Standard error of the four, the largest, measured over `SEEDS` seeds.
     """
@@ -54,12 +57,12 @@ class Power:
 
     @property
     def least(self) -> float:
-        """The share of experiments in which the weakest of the three tests sees the signal."""
+        """The share of experiments in which the weakest of the three tests detects the signal."""
         return min(self.chance, self.random_features, self.untrained)
 
 
 def simulate(items: int, above: float, sites: int = 19, draws: int = 400, seed: int = 0) -> Power:
-    """Power by simulated correctness of `draws` experiments.
+    """Return the power by the simulated correctness of `draws` experiments.
 
     A third of the sites carry the signal, at least one.
 
@@ -86,12 +89,10 @@ def simulate(items: int, above: float, sites: int = 19, draws: int = 400, seed: 
 def items_needed(
     above: float, power: float, sites: int = 19, draws: int = 400, seed: int = 0
 ) -> tuple[Power, int] | None:
-    """The power of the fewest items at which all three tests reach `power`; None if `MOST_ITEMS` are too few.
+    """Return the power of the fewest items at which all three tests reach `power`; None beyond `MOST_ITEMS`.
 
     The second value is the resolution: so many items fewer were tried, and reach it less often; see `fewest`.
-
-    Raises:
-        UsageError: As `simulate` does.
+    Raises as `simulate`.
     """
     tried: dict[int, Power] = {}
 
@@ -104,11 +105,11 @@ def items_needed(
 
 
 def fewest(reaches: Callable[[int], bool], low: int, high: int) -> tuple[int, int] | None:
-    """The smallest even number from `low` to `high` that reaches a goal, and the resolution; None if none does.
+    """Return the smallest even number from `low` to `high` that reaches a goal, and the resolution.
 
-    The range is halved until it is as wide as the resolution: a group of items, and above 200 of them 2 %. A
-    simulated power is noisy and goes in steps: where one of the next two larger numbers fails, the search resumes
-    above it, so that the goal is reached at three numbers in a row.
+    None if no number does. The range is halved until it is as wide as the resolution: a group of items, and above
+    200 of them 2 %. A simulated power is noisy and rises in steps. Where one of the next two larger numbers fails,
+    the search resumes above it, so that the goal is reached at three numbers in a row.
     """
     answers: dict[int, bool] = {}
 
@@ -139,21 +140,22 @@ def fewest(reaches: Callable[[int], bool], low: int, high: int) -> tuple[int, in
 
 
 def _resolution(items: int) -> int:
-    """A group of items, and above 200 of them about 2 %."""
+    """Return the size of a group of items, and above 200 items about 2 % of them."""
     return max(1, items // 50 // ITEMS_PER_GROUP) * ITEMS_PER_GROUP
 
 
 def _carriers(sites: int) -> slice:
-    """A third of the sites, at least one, around 0.6 of the depth."""
+    """Return a third of the sites, at least one, around 0.6 of the depth."""
     count = max(1, round(sites / 3))
     first = min(max(0, round(0.6 * (sites - 1) - (count - 1) / 2)), sites - count)
     return slice(first, first + count)
 
 
 def _part(items: int, signal: NDArray[np.float64], draws: int, seed: int) -> tuple[float, float, float, float]:
-    """Shares of `draws` experiments with a limit of chance of their own.
+    """Return the shares of `draws` experiments with a limit of chance of their own.
 
-    In how many each test sees the signal, and in how many a untrained without signal is called absent.
+    The first three are the shares in which each test detects the signal. The last is the share in which an
+    untrained network without signal is called absent.
     """
     generator = np.random.default_rng([seed, items, signal.size])
     groups = np.repeat(np.arange(items // ITEMS_PER_GROUP), ITEMS_PER_GROUP * LAYOUTS)
@@ -203,7 +205,7 @@ def _limit(groups: int, sites: int, seed: int) -> float:
 
 @lru_cache(maxsize=SEEDS)
 def _pool(sites: int, seed: int) -> NDArray[np.int8]:
-    """(2 POOL, S) episodes that each site gets right in groups without signal."""
+    """Return the number of episodes that each site gets right in groups without signal, (2 POOL, S)."""
     size = ITEMS_PER_GROUP * LAYOUTS
     generator = np.random.default_rng([seed, sites, 2])
     drawn = []
@@ -217,7 +219,7 @@ def _pool(sites: int, seed: int) -> NDArray[np.int8]:
 def _right(
     generator: np.random.Generator, above: NDArray[np.float64], groups: NDArray[np.intp]
 ) -> NDArray[np.bool_]:
-    """(S, E) correctness of sites that are right in a share 0.5 + `above` of the episodes."""
+    """Return the correctness (S, E) of sites that are right in a share 0.5 + `above` of the episodes."""
     of_group = generator.standard_normal((above.size, int(groups[-1]) + 1))[:, groups]
     of_episode = generator.standard_normal((above.size, groups.size))
     values = sqrt(ALIKE) * of_group + sqrt(1 - ALIKE) * of_episode

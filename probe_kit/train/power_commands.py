@@ -1,4 +1,4 @@
-"""`probe-kit power`: how many items are needed, and what a number of items can detect."""
+"""The command `probe-kit power`: how many items are needed, and what a number of items can detect."""
 
 from dataclasses import asdict
 from math import isfinite, nan
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from probe_kit.train.power import Power
 
 MOST_ITEMS = 100_000
-"""Of a category that is simulated on request; a search for a goal stops at fewer, `train.power.MOST_ITEMS`."""
+"""The most items that are simulated on request; a search for a goal stops at fewer, `train.power.MOST_ITEMS`."""
 INVERSE = "Number of items for a goal"
 ITEMS = "24,60,150,300"
 
@@ -93,7 +93,7 @@ def power(
 
 
 def _as_json(above: float, power: float, needed: "tuple[Power, int] | None") -> dict[str, float | None]:
-    """One answer as plain values. reached: the least share of the three tests; spread: its error."""
+    """Return one answer as plain values: `reached` is the least share of the three tests, `spread` its error."""
     head: dict[str, float | None] = {"above": above, "power": power}
     if needed is None:
         return head | dict.fromkeys(("items", "resolution", "reached", "spread"))

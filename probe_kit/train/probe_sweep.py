@@ -48,17 +48,21 @@ def probe_columns(
     device: str | None = None,
     ray: str | None = None,
 ) -> Iterator[tuple[Key, Probed]]:
-    """The probes of every column by category, as they are done; who probes them changes no number.
+    """Yield the probes of every column by category, as they are finished; the workers change no number.
+
+    A worker's own error is raised here too.
 
     Args:
+        columns: Samples of every view and site.
+        problems: Probing problems, by category.
         jobs: Columns at once, 1 by default.
-        device: Where torch solves them; numpy does without one.
-        ray: Address of a cluster that solves them, `auto` for the one this process belongs to or a new one on this
-            machine; `jobs` is then by default as many as it has cores.
+        device: Device on which torch solves them; numpy does without one.
+        ray: Address of a cluster that solves them; `auto` for the one this process belongs to, or a new one on
+            this machine. `jobs` is then by default as many as it has cores.
 
     Raises:
         MissingExtraError: If Ray is asked for and not installed.
-        WorkerDiedError: If workers die with the same column or before they begin, and what a worker raises.
+        WorkerDiedError: If workers die with the same column or before they begin.
     """
     if ray is None and (jobs or 1) == 1:
         for key, samples in columns:
@@ -84,7 +88,7 @@ def probe_columns(
 def fit_columns(
     problems: Problems, take: Callable[[], tuple[Key, Samples]], report: Callable[[tuple[Key, Probed]], None]
 ) -> None:
-    """The work of a worker elsewhere: one column after the other, with one BLAS thread.
+    """Fit one column after the other in a worker elsewhere, with one BLAS thread.
 
     With more threads each, the workers would wait for the same cores.
     """
@@ -109,7 +113,7 @@ TOKEN_PERMUTATIONS = 59
 The smallest p is then 1/60; a site with one permutation that does as well as the labels is still below 0.05.
 """
 Progress = Callable[[int, int, str], None]
-"""Called with (sites done, sites in all, what was just done)."""
+"""Function that is called with (sites done, sites in all, name of the site just done)."""
 
 
 def train_probes(
@@ -136,50 +140,56 @@ def train_probes(
 ) -> ProbeResults:
     """Probe every site of every stream for `target`, per category and view, and store the results in the run.
 
-    With the same settings and episodes the stored results are returned, whatever jobs and device; an interrupted
-    sweep continues after the last finished site; controls are added to what is stored. Nothing is stored before
-    all of it is fitted: where this raises, `load_results` finds what it found before.
+    With the same settings and episodes the stored results are returned, whatever jobs and device. An interrupted
+    sweep continues after the last finished site. Controls are added to what is stored. Nothing is stored before
+    all of it is fitted: where this raises, `load_results` still returns the earlier results.
 
     Args:
-        categories: Each one by itself, by default of a side; `all` pools every episode, by default of every other
-            target.
-        views: Pooled ones, and `tokens` or `tokens:ROLE`, where every token is a sample and the decision about a
-            sample the mean of its tokens'.
+        run: Run whose activations are probed.
+        categories: Categories, each one by itself; by default all of the run for a side. `all` pools every
+            episode; it is the default of every other target.
+        views: Pooled views, and `tokens` or `tokens:ROLE`. In these every token is a sample, and the decision
+            about a sample is the mean of its tokens' decisions.
         target: A side, such as `side.correct`, a built-in column, such as `sim.tool_y`, or a `Target` of a table
             of one's own.
         window: With a label for every inference, how many of each episode take part; by default as many as 90 % of
             the episodes reach.
-        align_to: Where windows begin: at the first inference at which this target is true.
-        call: Which captured inference, counted from 0, a label of whole episodes is decoded from; episodes that
+        align_to: Target that decides where windows begin: at the first inference at which it is true.
+        call: Captured inference, counted from 0, that a label of whole episodes is decoded from; episodes that
             ended before it are left out.
-        permutations: Label permutations behind the p-values, of which token views, many times as dear, take the
-            first `token_permutations`.
-        folds: `concepts` also keeps items about the same two concepts together.
-        incomplete: `drop` leaves out items of which an episode is missing.
+        permutations: Number of label permutations behind the p-values.
+        token_permutations: Number of these, the first ones, that token views take, which cost many times as much.
+        folds: `groups` keeps items that share a picture together; `concepts` also items about the same two
+            concepts.
+        incomplete: `drop` leaves out items of which an episode is missing; `keep` uses their other episode.
         controls: Features that never see the model, see `CONTROLS`; () for none. By default of a side
-            `random-features` and `pixels`, of other targets all that the run allows but `action` and `position`;
-            where pictures cannot be found a warning says that they were left out.
+            `random-features` and `pixels`, of other targets all that the run allows but `action` and `position`.
+            Where pictures cannot be found, a warning says that they were left out.
         suite: Folder of the run's suite; the embedded one is found or drawn again without it.
-        untrained: A run of the same episodes, usually by random weights, to compare with. What is no better than
-            `random-features` and the untrained network is no signal, whatever its p-value.
+        untrained: A run of the same episodes, usually by random weights, to compare with. A site that does not
+            exceed `random-features` and the untrained network shows no signal, whatever its p-value.
+        seed: Seed of folds, permutations and controls, and of the flips of the target `side.shuffled`.
         jobs: Processes that probe, this one alone by default; with more than one, a script needs `if __name__ ==
             "__main__":`.
-        device: Where torch solves logistic probes, such as `cuda`; numpy without one.
-        ray: Address of a Ray cluster that probes, `auto` for the one this process belongs to or a new one on this
-            machine; `jobs` is then how many sites at once, by default as many as it has cores.
-        progress: By default a bar in a notebook, nothing elsewhere.
+        device: Device on which torch solves logistic probes, such as `cuda`; numpy without one.
+        ray: Address of a Ray cluster that probes; `auto` for the one this process belongs to, or a new one on this
+            machine. `jobs` is then how many sites at once, by default as many as it has cores.
+        progress: Called after every site; by default a bar in a notebook, nothing elsewhere.
 
     Raises:
         RunIncompleteError: For a run without episodes.
-        NoProbesError: For one without activations.
-        UnknownCategoryError: For a view no stream has.
-        UnknownSiteError: For a view no stream has.
-        TooFewGroupsError: For another suite.
-        UnbalancedEpisodesError: For another suite.
-        ProbeNotConvergedError: For another suite.
-        UsageError: For another suite.
-        SuiteError: For another suite.
-        SuiteNotFoundError: For a control that was asked for and whose pictures cannot be found.
+        NoProbesError: For a run without activations.
+        UnknownCategoryError: For a category that the run does not have.
+        UnknownSiteError: For a view that no stream has.
+        TooFewGroupsError: For fewer independent groups than folds, and for a class in too few of them.
+        UnbalancedEpisodesError: If so many episodes of one side are missing that the other is right without
+            knowledge.
+        NonFiniteActivationError: For features that hold NaN or infinity.
+        ProbeNotConvergedError: If a logistic probe stops before its optimum.
+        UsageError: For options that are wrong or that the target or run does not allow, and for an `untrained` run
+            of other episodes.
+        SuiteError: For another suite in the folder `suite`, or a damaged one.
+        SuiteNotFoundError: For a control in `controls` whose pictures cannot be found.
     """
     check_options(views, permutations, token_permutations, jobs, device, ray)
     options: dict[str, Any] = {
@@ -242,7 +252,13 @@ def check_options(
 
 
 def check_run(run: RunReader, categories: Sequence[str] | None) -> None:
-    """Raise for a run without episodes or the categories, and for one in several wordings."""
+    """Raise an error for a run that cannot be probed with these categories.
+
+    Raises:
+        RunIncompleteError: For a run without episodes.
+        UnknownCategoryError: For a category that the run does not have.
+        UsageError: For episodes in several wordings.
+    """
     if len(run.episodes) == 0:
         raise RunIncompleteError(f"{run.location} has no finished episode to probe. Finish it first")
     names = list(dict.fromkeys(run.episodes["category"]))
@@ -344,7 +360,7 @@ class Sweep:
 
     @cached_property
     def stored(self) -> ProbeResults | None:
-        """The results, if the same was probed before."""
+        """The stored results of the same settings; None if nothing was probed with them."""
         key = self.settings.key
         return load_results(self.run, key) if is_stored(self.run.location, key) else None
 
@@ -358,23 +374,28 @@ class Sweep:
 
     @cached_property
     def keys(self) -> tuple[Key, ...]:
-        """Views and sites, in order."""
+        """The pairs of view and site, in order."""
         return tuple((view, site) for view in self.settings.views for site in sites_of(self.run, view))
 
     @property
     def widths(self) -> dict[str, int]:
-        """Width of every stream, of a target that is no side of those that are probed."""
+        """The width of every stream; for a target other than a side, of the probed streams only."""
         streams = self.run.streams
         names = streams if self.target.is_side else dict.fromkeys(site.stream for _, site in self.keys)
         return {name: streams[name].width for name in names}
 
     def check(self) -> None:
-        """Raise for everything that can be wrong before anything is probed."""
+        """Raise an error for everything that can be wrong before anything is probed."""
         if self.stored is None:
             _ = self.keys, self.problems
 
     def results(self, *, progress: Progress | None, **crew: Any) -> ProbeResults:
-        """Return those that are stored, or new ones that are not stored yet. crew: of `probe_columns`."""
+        """Return the stored results, or new ones that are not stored yet.
+
+        Args:
+            progress: Called after every site; None for a bar in a notebook and nothing elsewhere.
+            **crew: The options `jobs`, `device` and `ray` of `probe_columns`.
+        """
         if self.stored is not None:
             return self.stored
         probes = self._probe_all(progress or notebook_progress("sites probed"), crew)

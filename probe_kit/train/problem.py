@@ -45,11 +45,11 @@ class Problem:
     """The samples, labels, folds and label permutations that all sites of a category share.
 
     Attributes:
-        classes: Their names, empty for a quantity.
+        classes: Names of the classes, empty for a quantity.
         positions: (E,) places of the category's samples among those of the target.
         labels: (E,) bool of a side (true: left), else coded.
-        permuted_labels: (E, P).
-        token_permutations: How many of them are fitted where every token is a sample.
+        permuted_labels: (E, P) labels under P permutations.
+        token_permutations: Number of permutations that are fitted where every token is a sample.
     """
 
     task: Task
@@ -66,12 +66,12 @@ class Problem:
 
     @property
     def groups(self) -> NDArray[np.str_]:
-        """(E,) group of every sample."""
+        """The group of every sample, (E,)."""
         return self.samples.groups
 
     @cached_property
     def fold_of(self) -> NDArray[np.int64]:
-        """(E,) outer fold that tests a sample."""
+        """The outer fold that tests each sample, (E,)."""
         return fold_numbers([fold.outer for fold in self.folds])
 
     def probe(self, samples: Samples) -> SiteProbe:
@@ -79,7 +79,7 @@ class Problem:
         return self.fit(samples.of(self.positions), self.permuted_for(samples))
 
     def permuted_for(self, samples: Samples) -> NDArray[Any]:
-        """(E, P) permuted labels that a view is probed with: fewer where every token is a sample."""
+        """Return the permuted labels (E, P) that a view is probed with: fewer where every token is a sample."""
         return self.permuted_labels if samples.pools else self.permuted_labels[:, : self.token_permutations]
 
     def fit(self, samples: Samples, permuted_labels: NDArray[Any] | None = None) -> SiteProbe:
@@ -115,7 +115,7 @@ class Problem:
         )
 
     def control_curve(self, probes: Sequence[SiteProbe]) -> ProbeCurve:
-        """Return the curve of the probes of a control, at sites that stand for none."""
+        """Return the curve of the probes of a control, at placeholder sites of the stream `control`."""
         return self.curve({Site("control", number): probe for number, probe in enumerate(probes)})
 
 
@@ -124,8 +124,12 @@ def make_problem(
 ) -> Problem:
     """Return the probing problem of one category, or of all samples for `all`.
 
-    Raises TooFewGroupsError, UnbalancedEpisodesError for a side and, for concept folds without concepts,
-    UsageError.
+    Raises:
+        TooFewGroupsError: For fewer independent groups than folds, a class in too few groups, or a constant
+            training fold.
+        UnbalancedEpisodesError: For a side of which one is correct in more than `MOST_OF_ONE_SIDE` of the
+            episodes.
+        UsageError: For concept folds of episodes without concepts.
     """
     of_category = run.episodes["category"].to_numpy(dtype=str)[samples.rows] == category
     positions = np.flatnonzero(of_category | (category == EVERYWHERE))
@@ -161,7 +165,7 @@ def smallest_p_of_labels(labels: NDArray[Any], permuted_labels: NDArray[Any]) ->
 
 
 Drawn = tuple[list[NestedFold], NDArray[Any]]
-"""Folds, and (E, P) permuted labels."""
+"""The folds, and permuted labels (E, P)."""
 
 
 # -- the side of a picture -------------------------------------------------------------------------------------
@@ -171,7 +175,14 @@ def _side_folds_and_permutations(
     run: RunReader, target: Target, samples: TargetSamples, labels: NDArray[Any], category: str,
     settings: ProbeSettings,
 ) -> Drawn:  # fmt: skip
-    """Groups flip sides, or exchange chosen ones; folds are balanced by side, for `side.chosen` by layout."""
+    """Return folds balanced by side, or by layout for `side.chosen`, and the permuted labels.
+
+    Groups flip their sides in a permutation; of `side.chosen` they exchange them.
+
+    Raises:
+        TooFewGroupsError: For too few groups, and for chosen sides of which a training fold holds one only.
+        UnbalancedEpisodesError: If one side is correct in more than `MOST_OF_ONE_SIDE` of the episodes.
+    """
     table, groups = run.episodes.iloc[samples.rows], samples.groups
     if settings.call > 0 and groups.size == 0:
         raise TooFewGroupsError(f"category {category!r}: {_why_fewer(0, settings.call)}")
@@ -218,7 +229,11 @@ def _side_folds_and_permutations(
 
 
 def _check_balance(labels: NDArray[np.bool_], category: str, call: int) -> None:
-    """Warn of sides that are not equally often correct; raise UnbalancedEpisodesError if one nearly always is."""
+    """Warn of sides that are not equally often correct.
+
+    Raises:
+        UnbalancedEpisodesError: If one side is correct in more than `MOST_OF_ONE_SIDE` of the episodes.
+    """
     share = chance_level(labels) if labels.size else 0.5
     if share == 0.5:
         return
@@ -237,7 +252,7 @@ def _check_balance(labels: NDArray[np.bool_], category: str, call: int) -> None:
 
 
 def _why_fewer(episodes: int, call: int) -> str:
-    """Return why there are no more of them at a later inference."""
+    """Return why there are no more episodes at a later inference."""
     number = {0: "no episode", 1: "only 1 episode"}.get(episodes, f"only {episodes} episodes")
     return f"{number} got as far as captured inference {call}, counted from 0, and the others ended before"
 
@@ -249,7 +264,7 @@ def _block_folds_and_permutations(
     run: RunReader, target: Target, samples: TargetSamples, labels: NDArray[Any], category: str,
     settings: ProbeSettings,
 ) -> Drawn:  # fmt: skip
-    """Groups exchange their labels as blocks.
+    """Return the folds, and the labels of groups that exchange them as blocks.
 
     Folds know strata and sizes of groups, not labels: only so is every exchange of labels as likely as the real
     ones.
@@ -335,9 +350,10 @@ def _check_groups(
 def _blocks(
     run: RunReader, samples: TargetSamples
 ) -> tuple[dict[str, NDArray[np.intp]], dict[str, tuple[Hashable, ...]]]:
-    """The samples of every group in an order that corresponds between groups, and what makes two groups alike.
+    """Return the samples of every group in an order that corresponds between groups, and each group's kind.
 
-    Episodes correspond by their layout and labelled inferences, then by item.
+    Groups of one kind can exchange labels. Episodes correspond by their layout and labelled inferences, then by
+    item.
     """
     positions_of: dict[int, list[int]] = {}
     for position, row in enumerate(samples.rows.tolist()):

@@ -17,15 +17,20 @@ _GIVE = "Give the folder of that suite (--suite, suite=…)"
 
 
 def suite_of(run: RunReader, folder: Path | None = None) -> "Suite":
-    """The run's suite, in a folder that may hold more than the run's items.
+    """Return the run's suite, from a folder that may hold more than the run's items.
 
-    Raises SuiteError for another suite in `folder` or a damaged one; without a folder SuiteNotFoundError if the
-    run's suite is neither in its folder nor the embedded one, or drawn differently here.
+    Without `folder` it is read from the folder that the run was extracted with, if that still holds the suite.
+    Else the run's part of the embedded suite is found in the cache or drawn again. These are the same items
+    whatever else the cache holds.
 
     Args:
-        folder: Where it lies. Without one it is the suite of the folder that the run was extracted with, if that
-            still holds it; else the run's part of the embedded suite is found in the cache or drawn again, the
-            same items whatever else the cache holds.
+        run: Run whose pictures are needed.
+        folder: Folder of the suite.
+
+    Raises:
+        SuiteError: For another suite in `folder`, or a damaged one.
+        SuiteNotFoundError: Without a folder, if the run's suite is neither in its folder nor the embedded one, or
+            is drawn differently here.
     """
     if folder is not None:
         return _in_folder(run, folder)
@@ -85,7 +90,7 @@ def _embedded(run: RunReader) -> "Suite":
 
 
 def _drawn(counts: Mapping[str, int]) -> Iterator["Suite"]:
-    """The embedded suites that a run with so many items per category can come from, the cheapest first."""
+    """Yield the embedded suites that a run with so many items per category can come from, the cheapest first."""
     from probe_kit.suite import load_suite
     from probe_kit.suite.build import ITEMS, default_folder, default_suite
 
@@ -103,6 +108,6 @@ def _holds(suite: "Suite", run: RunReader) -> bool:
 
 
 def _hash_of_part(suite: "Suite", run: RunReader) -> str:
-    """Hex sha256 that `suite` had with only those items that the run has."""
+    """Return the hex sha256 that `suite` had with only those items that the run has."""
     planned = run.planned_items
     return suite.content_sha256_of(item for item in suite.items if item.item_id in planned)

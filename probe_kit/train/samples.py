@@ -1,4 +1,4 @@
-"""Samples of a probe: one per episode (pooled views), or one per token."""
+"""The samples of a probe: one per episode (pooled views), or one per token."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -21,14 +21,14 @@ TOKENS = "tokens"
 
 @dataclass(frozen=True)
 class Samples:
-    """Features of M samples that belong to E episodes.
+    """The features of M samples that belong to E episodes.
 
     Attributes:
         features: (M, D), the samples of an episode in consecutive rows; tokens are not copied when some are
             chosen.
         counts: (E,) samples per episode.
-        means: (E, D) an episode's mean sample. A linear probe decides on it as it decides, on average, on the
-            samples.
+        means: (E, D) mean sample of every episode. A linear probe's decision on it is the mean of its decisions on
+            the samples.
     """
 
     features: Features
@@ -37,14 +37,14 @@ class Samples:
 
     @classmethod
     def pooled(cls, column: NDArray[np.floating]) -> "Samples":
-        """One sample per episode, from (E, D)."""
+        """Return one sample per episode, from (E, D)."""
         return cls(column, np.ones(len(column), np.intp), column)
 
     @classmethod
     def tokens(cls, blocks: "Iterable[TokenBlock]", mask: NDArray[np.bool_]) -> "Samples":
-        """One sample per token of `mask` (E, T), from blocks of positions; every episode has a token.
+        """Return one sample per token of `mask` (E, T), from blocks of positions; every episode has a token.
 
-        Holds one block and the tokens themselves, no padding.
+        Memory holds one block and the tokens themselves, no padding.
         """
         counts = mask.sum(axis=1)
         row_of = np.cumsum(mask).reshape(mask.shape) - 1
@@ -72,35 +72,39 @@ class Samples:
         return len(self.counts) == len(self.features)
 
     def broken(self) -> NDArray[np.intp]:
-        """Episodes with a feature that is NaN or infinite: such a sample shows in its episode's mean."""
+        """Return the episodes with a NaN or infinite feature: such a sample shows in its episode's mean."""
         means = to_numpy(self.means)
         return np.flatnonzero(~np.isfinite(means).all(axis=1))
 
     def of(self, episodes: NDArray[np.intp]) -> "Samples":
-        """The samples of some episodes, in this order."""
+        """Return the samples of some episodes, in this order."""
         counts = self.counts[episodes]
         shift = _starts(self.counts)[episodes] - _starts(counts)
         rows = np.repeat(shift, counts) + np.arange(counts.sum())
         return Samples(self.features[rows], counts, self.means[episodes])
 
     def read(self) -> NDArray[np.floating]:
-        """(M, D) features in memory."""
+        """Return the features (M, D) in memory."""
         features = self.features.read() if isinstance(self.features, RowSubset) else self.features
         return to_numpy(features)
 
     def repeat(self, of_episodes: NDArray[Any]) -> NDArray[Any]:
-        """(M, K): what is true of each episode (E, K), for each of its samples."""
+        """Return values of the samples (M, K) from values of their episodes (E, K)."""
         return np.repeat(of_episodes, self.counts, axis=0)
 
     def to(self, device: str | None) -> "Samples":
-        """The same with features and means as torch tensors on `device`; unchanged without one."""
+        """Return the same with features and means as torch tensors on `device`; unchanged without one."""
         if isinstance(self.features, RowSubset):
             return Samples(self.features.to(device), self.counts, to_device(self.means, device))
         return Samples(to_device(self.features, device), self.counts, to_device(self.means, device))
 
 
 def sites_of(run: "RunReader", view: str) -> list[Site]:
-    """Sites of probed streams that have `view`; a role's tokens are where its mean is. Raises UnknownSiteError."""
+    """Return the sites of probed streams that have `view`; a role's tokens are where its mean is.
+
+    Raises:
+        UnknownSiteError: For a view that no probed stream has.
+    """
     probed = [name for name, stream in run.streams.items() if stream.probed]
     if view == TOKENS:
         return [site for stream in probed for site in run.sites(stream)]
@@ -122,7 +126,7 @@ def is_token_view(view: str) -> bool:
 
 
 def role_of(view: str) -> str | None:
-    """The role whose tokens a token view takes, None for all but padding."""
+    """Return the role whose tokens a token view takes, None for all but padding."""
     return view.partition(":")[2] or None
 
 
@@ -132,7 +136,7 @@ def read_samples(
     """Return the samples of one site, in order: episode `rows` (n,) of the run at captured `inferences` (n,).
 
     Raises:
-        NonFiniteActivationError: Naming the first broken one.
+        NonFiniteActivationError: For NaN or infinity; the message names the first broken sample.
     """
     parts, order = [], []
     for call in np.unique(inferences).tolist():
@@ -151,7 +155,10 @@ def read_samples(
 
 
 def _read_call(run: "RunReader", view: str, site: Site, rows: NDArray[np.intp], call: int) -> Samples:
-    """Return one captured inference of some episodes. A reader without several inferences is asked for none."""
+    """Return one captured inference of some episodes.
+
+    The number of the inference is passed to the reader only from the second one on: a reader may have one alone.
+    """
     at = (call,) if call else ()
     if not is_token_view(view):
         return Samples.pooled(run.column(site, view, *at)[rows])

@@ -1,7 +1,7 @@
-"""`Target`: what probes decode, a label for every episode or captured inference.
+"""The labels that probes decode, one for every episode or captured inference: `Target`.
 
 A target is a side of a picture, another built-in column, or a column of a user's table. Its cells are read in
-`columns`; which samples of a run it names is decided in `target_samples`.
+`label_columns`; which samples of a run it names is decided in `target_samples`.
 """
 
 from collections.abc import Sequence
@@ -30,11 +30,11 @@ if TYPE_CHECKING:
 
 
 Null = Literal["flip_groups", "exchange_groups", "exchange_blocks"]
-"""How label permutations are drawn.
+"""The way in which label permutations are drawn.
 
-flip_groups: groups flip all their labels; of the correct side, which a suite draws freely.
-exchange_groups: groups exchange their labels layout by layout; of the chosen side.
-exchange_blocks: groups exchange their labels as blocks, inference by inference; of every other target.
+flip_groups: groups flip all their labels; for the correct side, which a suite draws freely.
+exchange_groups: groups exchange their labels layout by layout; for the chosen side.
+exchange_blocks: groups exchange their labels as blocks, inference by inference; for every other target.
 """
 _MOST_CLASSES = 20
 """Classes that a line about a target lists; probes take any number."""
@@ -44,22 +44,22 @@ _COUNTED = {INFERENCE: "a captured inference", FRAME: "a frame", SOURCE: "an epi
 
 @dataclass(frozen=True)
 class Target:
-    """One label per episode, or per captured inference of an episode, for `train_probes(run, target=target)`.
+    """The labels of episodes, or of captured inferences, for `train_probes(run, target=target)`.
 
     Made by `Target.read` from a table, or by `Target.of_run` from what a run stores.
 
     Attributes:
-        name: Of the column or side.
+        name: Name of the column or side.
         coded: Task, classes and values.
-        episodes: (n,) ids.
+        episodes: (n,) ids of the episodes.
         inferences: (n,) captured inference of every label, None where a label is of a whole episode.
-        table: Where errors point to.
+        table: Rows of the labels, to which errors point.
         group_by: Column whose values folds, intervals and nulls keep together; None for the groups of the run.
         exchange_within: Column within which label permutations exchange groups; None for everywhere.
-        groups: (n,) those columns, None where the run has them.
-        strata: As `groups`.
+        groups: (n,) values of `group_by`; None where they are read from the run.
+        strata: (n,) values of `exchange_within`; None where they are read from the run.
         of_source: Whether episodes and inferences are numbers of episodes and frames of a data set; see `on`.
-        unseen: How many labels name a frame or episode that the run of `on` does not show.
+        unseen: Number of labels that name a frame or episode that the run of `on` does not show.
         builtin: Whether probe_kit computed the column.
         null: How label permutations are drawn, see `Null`.
     """
@@ -94,13 +94,18 @@ class Target:
         out.
 
         Args:
+            table: Path of the file, or the DataFrame.
+            name: Column to decode.
             task: Binary, classes or continuous; None where the values leave no doubt.
-            group_by: Columns of the table or of the run's episodes.
-            exchange_within: As `group_by`.
+            group_by: Column of the table or of the run's episodes whose values folds, intervals and nulls keep
+                together; None for the groups of the run.
+            exchange_within: Column of the table or of the run's episodes within which label permutations exchange
+                groups; None for everywhere.
 
         Raises:
-            UsageError: Naming file and line, for a missing or mixed column, a key used twice, an integer beyond
-                2^53, an infinite number, a control character, or a task that the values cannot have.
+            UsageError: For a missing or mixed column, a key used twice, an integer beyond 2^53, an infinite
+                number, a control character, or a task that the values cannot have. The message names file and
+                line.
         """
         group_columns = [column for column in (group_by, exchange_within) if column is not None]
         label_table = read_table(table, [name, *group_columns])
@@ -184,11 +189,17 @@ class Target:
         """Return a side or built-in column of a run, such as `sim.tool_y`; `probe-kit targets RUN` lists them.
 
         Args:
+            run: Run that stores the column.
+            name: Name of a side or built-in column.
             task: The column's own by default.
-            seed: Of the target `side.shuffled`.
+            group_by: Column of the run's episodes that folds, intervals and nulls keep together; None for the
+                groups of the run. No side takes it.
+            exchange_within: Column of the run's episodes within which label permutations exchange groups; None for
+                everywhere. No side takes it.
+            seed: Seed of the flips of the target `side.shuffled`.
 
         Raises:
-            UsageError: For another name, for a run that lacks what the column needs.
+            UsageError: For another name, and for a run that lacks what the column needs.
             NoTrajectoryError: For `sim.*` of a run without trajectories.
         """
         if name in SIDES:
@@ -204,7 +215,11 @@ class Target:
         group_by: str | None = None,
         exchange_within: str | None = None,
     ) -> "Target":
-        """Return a built-in column that was read, as `of_run` does. Raises UsageError for a constant column."""
+        """Return a built-in column that was read, as `of_run` does.
+
+        Raises:
+            UsageError: For a constant column.
+        """
         keys: dict[str, list[Cell]] = {EPISODE: list(column.episodes), name: list(column.cells)}
         lines = list(range(1, len(column.episodes) + 1))
         table = LabelTable(f"the built-in column {name}", "sample", tuple(keys), keys, lines)
@@ -212,7 +227,7 @@ class Target:
         return cls(name, coded, column.episodes, column.inferences, table, group_by, exchange_within, builtin=True)
 
     def equal_to(self, value: str) -> "Target":
-        """Return whether labels are the class `value`, as a binary label, such as an event where windows begin.
+        """Return a binary label: whether this one is the class `value`, such as an event where windows begin.
 
         Raises:
             UsageError: For a value that is no class.
@@ -229,7 +244,7 @@ class Target:
 
     @property
     def task(self) -> Task:
-        """binary, classes or continuous."""
+        """The task: `binary`, `classes` or `continuous`."""
         return self.coded.task
 
     @property
@@ -244,7 +259,7 @@ class Target:
 
     @cached_property
     def sha256(self) -> str:
-        """Hash of the column: of every label with its episode and inference, in whatever order they were given."""
+        """The hash of the column: of every label with its episode and inference, independent of their order."""
         classes, values = self.coded.classes, self.coded.values.tolist()
         inferences: Sequence[int] = self.inferences or (-1,) * len(self.episodes)
         return sha256_json(
@@ -257,7 +272,7 @@ class Target:
 
     @property
     def definition(self) -> str:
-        """Hash of what the label is, not of its values: column, task, source, and per episode or inference.
+        """The hash of what the label is, not of its values: column, task, source, and per episode or inference.
 
         A built-in column is one formula in every run. Of a table only the name is known: one column name must mean
         one thing in both tables.
@@ -272,7 +287,7 @@ class Target:
 
     @property
     def contents(self) -> str:
-        """Name, task and values in one line."""
+        """The name, task and values in one line."""
         return f"{terminal_safe(self.name)} ({self.task}), {self.values_in_words}"
 
     @property
@@ -338,7 +353,7 @@ def side_labels(episodes: "pd.DataFrame", name: str, seed: int) -> NDArray[np.in
 
 
 def _source_frames(run: RunReader, by_frame: bool) -> dict[tuple[str, int], list[tuple[str, int]]]:
-    """Episode ids and inferences of a run by source episode and frame; of whole episodes the frame is -1."""
+    """Return episode ids and inferences of a run by source episode and frame; a whole episode has frame -1."""
     keys_of: dict[tuple[str, int], list[tuple[str, int]]] = {}
     steps = run.control_steps
     for row, (name, source) in enumerate(zip(run.episodes[EPISODE], run.episodes[SOURCE], strict=True)):
@@ -370,7 +385,11 @@ def _check_recorded(
 
 
 def _numbers(table: LabelTable, column: str) -> tuple[int, ...] | None:
-    """A key column of whole numbers; None where the table lacks it. Raises UsageError for other cells."""
+    """Return a key column of whole numbers; None where the table lacks it.
+
+    Raises:
+        UsageError: For a cell that is no whole number from 0.
+    """
     if column not in table.columns:
         return None
     cells = table.numbers(column)
@@ -387,7 +406,7 @@ def _numbers(table: LabelTable, column: str) -> tuple[int, ...] | None:
 def _once(
     table: LabelTable, episodes: Sequence[str], inferences: Sequence[int] | None, columns: Sequence[Sequence[Cell]]
 ) -> list[int]:
-    """The rows of a table, one per key: rows that are equal in all `columns` count once.
+    """Return the rows of a table, one per key: rows that are equal in all `columns` count once.
 
     Raises:
         UsageError: For two rows with one key and other values.

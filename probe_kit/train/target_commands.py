@@ -1,4 +1,4 @@
-"""`probe-kit targets` and `probe-kit labels`: what can be probed in a run, and a table to add to."""
+"""The commands `probe-kit targets` and `probe-kit labels`: what can be probed in a run, and a table to add to."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -62,16 +62,18 @@ def targets(
 DOUBTFUL = "classes or continuous"
 """The task of a few integers, which `--task` decides."""
 CONSTANT = "one value"
-"""In place of a task, of a column in which there is nothing to decode."""
+"""Text in place of a task, for a column in which there is nothing to decode."""
 
 
 class ListedTarget(NamedTuple):
-    """A target in words. per: `episode` or `inference`. values: classes or range, or why the run has none.
+    """A target in words.
 
     Attributes:
-        task: `CONSTANT` of a single value.
-        options: Of the command that trains probes on it, None where `train` refuses every one; `refused` is then
-            why.
+        task: `CONSTANT` for a column with a single value.
+        per: `episode` or `inference`.
+        values: Classes or range, or why the run has none.
+        options: Options of the command that trains probes on it; None where `train` refuses every one.
+        refused: Reason why `train` refuses every one; empty where it does not.
     """
 
     target: str
@@ -83,7 +85,7 @@ class ListedTarget(NamedTuple):
 
 
 def listed_targets(run: "RunReader") -> Iterator[ListedTarget]:
-    """Yield every target of a run, those too that it cannot give."""
+    """Yield every target of a run, including those that it cannot give."""
     from probe_kit.train.builtin_columns import BuiltinColumns
 
     columns = BuiltinColumns(run)
@@ -110,7 +112,7 @@ Trials = tuple["Target", str, dict[str, tuple["Target", Sequence[str] | None]]]
 
 
 def _trials_of_a_side(run: "RunReader", name: str) -> Trials:
-    """Return the options that train a side: of all categories, or of those with groups enough."""
+    """Return the options that train a side: of all categories, or of those with enough groups."""
     from probe_kit.statistics.sufficiency import GROUPS_FOR_PROBES
     from probe_kit.train.target import Target
 
@@ -144,7 +146,7 @@ def _trials_of_a_column(name: str, column: "BuiltinColumn") -> Trials:
 
 
 def _refusal(run: "RunReader", target: "Target", categories: Sequence[str] | None) -> str:
-    """Return why `train` refuses a target, by what it checks itself before any probe is fitted; empty if not."""
+    """Return why `train` refuses a target, by its own checks before any probe is fitted; empty if it does not."""
     from probe_kit.train.probe_sweep import Sweep
 
     try:

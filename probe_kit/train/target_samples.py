@@ -23,15 +23,16 @@ _TRUE_OR_FALSE = (("False", "True"), ("no", "yes"), ("0", "1"))
 
 @dataclass(frozen=True)
 class TargetSamples:
-    """n samples with a label, episode by episode and inference by inference.
+    """The n samples with a label, episode by episode and inference by inference.
 
     Attributes:
         rows: (n,) positions in the run's episodes.
         inferences: (n,) captured inference.
         values: (n,) coded labels.
-        groups: (n,) names of the group and of where it exchanges.
-        strata: As `groups`.
-        window: Inferences per episode. left_out: how many of what have no part in the probes, by reason.
+        groups: (n,) name of the group, which folds keep together.
+        strata: (n,) name of the stratum, within which groups exchange labels.
+        window: Inferences per episode.
+        left_out: Number of episodes, inferences and labels that have no part in the probes, by reason.
         aligned: (n,) place in a window that begins at an event, None where windows begin at the first inference.
     """
 
@@ -46,7 +47,7 @@ class TargetSamples:
 
     @property
     def steps(self) -> NDArray[np.intp]:
-        """(n,) the place in the window, or the inference: what corresponds between episodes."""
+        """The place in the window, or the inference, (n,): it corresponds between episodes."""
         return self.inferences if self.aligned is None else self.aligned
 
     def of(self, selection: NDArray[Any]) -> "TargetSamples":
@@ -67,8 +68,10 @@ def target_samples(
     """Return the samples of `run` that `target` names.
 
     Args:
-        categories: Only their episodes; None for all.
-        call: The captured inference that a label of whole episodes is decoded from.
+        run: Run with the episodes and captured inferences.
+        target: Labels, with keys of the run or of its data set.
+        categories: Categories whose episodes are used; None for all.
+        call: The captured inference that a label of whole episodes is decoded from, counted from 0.
         window: For labels of single inferences how many of each episode, from the first on; None for the most that
             90 % of the episodes reach. Episodes that end before are left out.
         align_to: True or false by inference; windows begin at the first inference where it is true, and episodes
@@ -138,7 +141,7 @@ def target_samples(
 
 
 def groups_of(run: RunReader, target: Target) -> tuple[NDArray[np.str_], NDArray[np.str_]]:
-    """Return (E,) group and stratum of every episode: those of the run, unless the target names columns."""
+    """Return group and stratum of every episode, each (E,): those of the run, unless the target names columns."""
     if target.group_by is None:
         groups: NDArray[np.str_] = run.episodes["group_id"].to_numpy(dtype=str)
     else:
@@ -147,7 +150,11 @@ def groups_of(run: RunReader, target: Target) -> tuple[NDArray[np.str_], NDArray
 
 
 def _complete(run: RunReader, reached: NDArray[np.bool_], incomplete: Incomplete) -> NDArray[np.bool_]:
-    """(E,) whether an episode's item has all layouts, among the episodes that are `reached`; all with `keep`."""
+    """Return whether an episode's item has all layouts, (E,), among the `reached` episodes; all with `keep`.
+
+    Raises:
+        UsageError: For `drop` with episodes that have no items or layouts.
+    """
     complete = np.ones(reached.size, bool)
     if incomplete == "drop":
         if lacking := [name for name in ("item_id", "layout") if name not in run.episodes]:
@@ -162,7 +169,12 @@ def _complete(run: RunReader, reached: NDArray[np.bool_], incomplete: Incomplete
 
 
 def _events(run: RunReader, target: Target, align_to: Target) -> NDArray[np.intp]:
-    """(E,) the first inference at which `align_to` is true, -1 without one. Raises UsageError."""
+    """Return the first inference (E,) at which `align_to` is true, -1 without one.
+
+    Raises:
+        UsageError: For labels or events that are not of single inferences, and for an event that is not true or
+            false.
+    """
     event = align_to.on(run)
     if not (target.per_step and event.per_step and event.coded.classes in _TRUE_OR_FALSE):
         raise UsageError(
@@ -176,7 +188,13 @@ def _events(run: RunReader, target: Target, align_to: Target) -> NDArray[np.intp
 
 
 def _window(counts: NDArray[np.intp], most: int, requested: int | None) -> int:
-    """Inferences per episode. counts: those of every episode from the start of its window on."""
+    """Return the number of inferences per episode.
+
+    Args:
+        counts: Number of inferences of every episode from the start of its window on.
+        most: Captured inferences of an episode.
+        requested: Number that the user asked for; None for the most that 90 % of the episodes reach.
+    """
     if requested is not None:
         if not 1 <= requested <= most:
             raise UsageError(f"window={requested}; expected 1 to {most}, the captured inferences of an episode")
@@ -186,7 +204,7 @@ def _window(counts: NDArray[np.intp], most: int, requested: int | None) -> int:
 
 
 def _label_grid(run: RunReader, target: Target) -> NDArray[np.float64]:
-    """(E, C) labels by episode and inference, or (E, 1) by episode; NaN where there are none.
+    """Return the labels (E, C) by episode and inference, or (E, 1) by episode; NaN where there are none.
 
     Raises:
         UsageError: For an episode or inference that the run does not have.
@@ -216,7 +234,7 @@ def _label_grid(run: RunReader, target: Target) -> NDArray[np.float64]:
 
 
 def _column(run: RunReader, target: Target, name: str | None, cells: Sequence[str] | None) -> NDArray[np.str_]:
-    """(E,) a column of the table, or else of the run's episodes; empty texts where the table has no line.
+    """Return a column (E,) of the table, or else of the run's episodes; empty texts where the table has no line.
 
     Without a name all episodes are alike.
     """

@@ -46,7 +46,7 @@ Matrix = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class TransferCurve:
-    """All S sites of one view on the m samples of the other run.
+    """The probes of all S sites of one view, on the m samples of the other run.
 
     Attributes:
         fitted: Probes as they were fitted.
@@ -61,19 +61,20 @@ class TransferCurve:
 
 @dataclass(frozen=True, repr=False)
 class TransferResults:
-    """Probes of one label, fitted on one run (`model`) and scored on another (`other_model`).
+    """The probes of one label, fitted on one run (`model`) and scored on another (`other_model`).
 
     Attributes:
-        definition: Hash of the label's definition, equal in both.
-        classes: Of the other run's labels.
-        labels: (m,) coded.
-        episodes: (m,) names.
-        inferences: (m,).
-        groups: As `episodes`.
-        curves: By view.
-        smallest_p: No p can be lower.
+        same_weights: Whether both runs are known to be of one network.
+        definition: Hash of the label's definition, equal in both runs.
+        classes: Classes of the other run's labels.
+        labels: (m,) coded labels of the other run.
+        episodes: (m,) names of its episodes.
+        inferences: (m,) its captured inferences.
+        groups: (m,) names of its groups.
+        curves: Curves by view.
+        smallest_p: Lower bound of every p.
         trained_on: Number of samples and groups of the first run.
-        left_out: Of the other run, by reason.
+        left_out: Number of samples or groups of the other run that were left out, by reason.
     """
 
     model: str
@@ -100,7 +101,7 @@ class TransferResults:
 
     @cached_property
     def scores(self) -> "pd.DataFrame":
-        """One row per view and site.
+        """Return one row per view and site.
 
         `score`, `ci_low`, `ci_high`, `chance`, `p`, `p_fwe`: as in `ProbeResults.scores`, on the other run.
         `recentred`, `recentred_chance`, `recentred_p_fwe`: the same on features moved to the first run's mean.
@@ -153,7 +154,7 @@ class TransferResults:
 # -- the transfer --------------------------------------------------------------------------------------------
 
 _DIGITS = 12
-"""Of a suite's hash, in its identity."""
+"""Number of a suite hash's digits in its identity."""
 
 
 def transfer_probes(
@@ -175,20 +176,29 @@ def transfer_probes(
     """Fit every site's probe on all of `run`, and score it on `other`; nothing is stored.
 
     C or λ is chosen by five folds of the groups of `run`; no label of `other` takes part in a fit. Groups of
-    `other` that `run` has too are left out, see `shared_groups`. The null permutes the labels of `other`. Besides:
-    the same probe after the features of `other` are moved to the mean of `run`, and the cross-validated score of
-    `other` itself on the same samples.
+    `other` that `run` has too are left out, see `shared_groups`. The null permutes the labels of `other`. There
+    are two further scores. One is of the same probe after the features of `other` are moved to the mean of `run`.
+    The other is the cross-validated score of `other` itself on the same samples. Raises as `train_probes` too.
 
     Args:
-        target: Of either run, of one `Target.definition`.
-        other_target: As `target`. By default the same side or built-in column.
-        categories: Pooled, by default all.
-        across_weights: Allow two networks; sites and widths must still be equal. Others: as in `train_probes`, for
-            both runs.
+        run: Run on which the probes are fitted.
+        other: Run on which they are scored.
+        target: Label of `run`: a side, a built-in column or a `Target`.
+        other_target: Label of `other`, of the same `Target.definition`; by default the same side or built-in
+            column.
+        categories: Categories that are pooled, by default all.
+        views: Views of the tokens, as in `train_probes`, for both runs.
+        window: Inferences per episode, as in `train_probes`; `other` takes the number that `run` has.
+        permutations: Number of label permutations behind the p-values.
+        token_permutations: Number of label permutations of token views.
+        call: Captured inference, counted from 0, that a label of whole episodes is decoded from, for both runs.
+        seed: Seed of folds and permutations, for both runs.
+        across_weights: Allow two networks; sites and widths must still be equal.
+        progress: Called after every site; by default a bar in a notebook, nothing elsewhere.
 
     Raises:
         SettingsMismatchError: For other weights, sites or definitions.
-        TooFewGroupsError: Where too few groups are not shared, and what `train_probes` raises.
+        TooFewGroupsError: If too few groups of `other` are not shared.
     """
     check_options(views, permutations, token_permutations)
     options: dict[str, Any] = {"views": views, "seed": seed, "call": call}
@@ -245,8 +255,9 @@ def shared_groups(
 ) -> NDArray[np.str_]:
     """Return the names of the groups of `other_samples` that `samples` has too.
 
-    By name, where names mean the same: with `group_by`, or if both runs are of one suite, data set or environment,
-    or of selections of one suite. Also those with an item whose id and content are in both.
+    Groups are compared by name where names mean the same. This is so with `group_by`, or if both runs are of one
+    suite, data set or environment, or of selections of one suite. A group is also shared if it has an item whose
+    id and content are in both.
     """
     names = np.unique(other_samples.groups)
     in_both = np.zeros(names.size, bool)
@@ -261,14 +272,14 @@ def shared_groups(
 
 
 def _sources(run: RunReader) -> set[str]:
-    """Names under which what a run shows is known."""
+    """Return the names under which the source of a run is known."""
     digest = run.suite.partition("#")[2]
     parent = run.suite_parent
     return {name for name in (run.suite, digest[:_DIGITS], (parent or "")[:_DIGITS]) if name}
 
 
 def _contents(run: RunReader, samples: TargetSamples) -> dict[int, tuple[str, str]]:
-    """Item id and content hash by row of the episodes; empty where the run has no items."""
+    """Return item id and content hash by row of the episodes; empty where the run has no items."""
     items = run.items
     if items is None or "item_id" not in run.episodes or "content_sha256" not in items:
         return {}
@@ -308,7 +319,11 @@ def _same_weights(run: RunReader, other: RunReader) -> bool:
 def _unshared(
     run: RunReader, samples: TargetSamples, other: RunReader, other_samples: TargetSamples, group_by: str | None
 ) -> tuple[TargetSamples, int]:
-    """The samples in groups that `run` does not have, and how many groups are left out."""
+    """Return the samples in groups that `run` does not have, and how many groups are left out.
+
+    Raises:
+        TooFewGroupsError: If fewer than five groups are left.
+    """
     shared = shared_groups(run, samples, other, other_samples, group_by)
     unshared = ~np.isin(other_samples.groups, shared)
     remaining = np.unique(other_samples.groups[unshared]).size
@@ -322,7 +337,11 @@ def _unshared(
 
 
 def _codes(classes: Sequence[str], other_classes: Sequence[str]) -> Matrix | None:
-    """(K,) code in the other run of every class; -1 where it has none, None for quantities."""
+    """Return the code in the other run of every class, (K,); -1 where it has none, None for quantities.
+
+    Raises:
+        UsageError: If the other run has a class that no probe was fitted to.
+    """
     if not classes:
         return None
     if unknown := [name for name in other_classes if name not in classes]:
@@ -334,7 +353,7 @@ def _codes(classes: Sequence[str], other_classes: Sequence[str]) -> Matrix | Non
 
 
 _Transferred = tuple[tuple[SiteProbe, SiteProbe], Matrix]
-"""One site: its probe as fitted and recentred, scored on the other run; and held-out scores of the other's own."""
+"""The probe of one site as fitted and recentred, scored on the other run; and scores of the other's own."""
 
 
 def _transfer(
@@ -412,7 +431,7 @@ _LEGEND = (
 
 
 def transfer_table(results: TransferResults, splits: bool = True) -> Table:
-    """A row per stream and view for its best site."""
+    """Return a table with a row per stream and view, for its best site."""
     several, metric = len(results.curves) > 1, METRICS[results.task]
     rows = [
         (
@@ -455,7 +474,7 @@ def transfer_sentences(results: TransferResults) -> list[str]:
 
 
 def _best(results: TransferResults) -> "list[pd.Series]":
-    """The row of `scores` of the best site of every view and stream: the largest excess over chance."""
+    """Return the row of `scores` of the best site of every view and stream: the largest excess over chance."""
     return best_sites(results.scores.assign(category=EVERYWHERE), is_side=False)
 
 

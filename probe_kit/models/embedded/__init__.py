@@ -4,5 +4,5 @@ from pathlib import Path
 
 
 def embedded_checkpoint(name: str) -> Path:
-    """Folder of a checkpoint that comes with the package: such as `pi0-tiny` or `vlm-tiny`."""
+    """Return the folder of a checkpoint that comes with the package, such as `pi0-tiny` or `vlm-tiny`."""
     return Path(__file__).parents[1] / "checkpoints" / name

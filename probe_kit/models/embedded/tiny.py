@@ -1,7 +1,7 @@
 """The embedded models as ordinary checkpoints: a pi0 of 0.84 million parameters, and a PaliGemma of its size.
 
-Their weights lie in `checkpoints/` beside this folder, with model cards; `scripts/train_vlm_tiny.py` makes
-those of the VLM, and `scripts/train_embedded_policy.py` those of the policy from it.
+Their weights are in `checkpoints/` beside this folder, with model cards; `scripts/train_vlm_tiny.py` makes those
+of the VLM, and `scripts/train_embedded_policy.py` those of the policy from it.
 """
 
 import json
@@ -35,9 +35,9 @@ CHUNK = 16
 TEXT_TOKENS = 16
 CAMERA = "observation.images.base"
 LOOKED_AT = (70, 20, 310, 620)
-"""Of the 480 x 640 camera picture, the part that holds both tiles of every preset: top, left, height, width."""
+"""The part of the 480 x 640 camera picture that holds both tiles of every preset: top, left, height, width."""
 ACTION_DIMS = (0, 1, 2, 6)
-"""What the policy decides: x, y, z and the gripper. It never turns the hand."""
+"""Action dimensions that the policy decides: x, y, z and the gripper. It never turns the hand."""
 IDLE_DIMS = (3, 4, 5)
 
 Statistics = Mapping[str, tuple[ArrayLike, ArrayLike]]
@@ -47,14 +47,14 @@ GUESSED: Statistics = {
     "action": ([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.5], [0.02, 0.02, 0.02, 0.0, 0.0, 0.0, 0.5]),
     "observation.state": ([0.32, 0.03, 0.1, 0.0, 0.0, 0.0, 0.0, 0.5], [0.06, 0.09, 0.05, 0.1, 0.1, 0.1, 1.0, 0.5]),
 }
-"""About what the scripted expert does; for policies with random weights."""
+"""Approximate statistics of the scripted expert; for policies with random weights."""
 
 
 def new_pi0_tiny(seed: int) -> PI0Policy:
-    """The policy with seeded random weights, deaf and dumb in the action dimensions it does not decide.
+    """Return the policy with seeded random weights, which are 0 in the action dimensions it does not decide.
 
-    A dimension whose statistics have no spread is restored to its mean, whatever the network says; without
-    weights into and out of it, its flow noise disturbs nothing.
+    A dimension whose statistics have no spread is restored to its mean, whatever the network says. Without weights
+    into and out of it, its flow noise disturbs nothing.
     """
     policy = build_pi0(_config(), SIZE)
     initialise(policy, seed)
@@ -72,8 +72,11 @@ def write_checkpoint(
     """Write config, dimensions, tokenizer, statistics and weights in lerobot's layout.
 
     Args:
-        note: What the weights are; it goes into the metadata of the file.
-        dtype: The weights are stored in.
+        folder: Folder to write, which is created.
+        policy: Policy with its weights.
+        statistics: Mean and deviation of state and action.
+        note: Description of the weights, which goes into the metadata of their file.
+        dtype: Type in which the weights are stored.
     """
     folder.mkdir(parents=True, exist_ok=True)
     policy.config.save_pretrained(folder)
@@ -139,12 +142,12 @@ def _window() -> dict[str, Any]:
 # -- vlm-tiny -------------------------------------------------------------------------------------------------
 
 MOST_TOKENS = 128
-"""Of a whole prompt, the picture's 36 included."""
+"""The most tokens of a whole prompt, the picture's 36 included."""
 CAMERA_PICTURE = (480, 640)
 
 
 def new_vlm_tiny(seed: int) -> Any:
-    """A `PaliGemmaForConditionalGeneration` with seeded random weights, on the CPU, in eval mode."""
+    """Return a `PaliGemmaForConditionalGeneration` with seeded random weights, on the CPU, in eval mode."""
     network = build_paligemma(_vlm_config(), torch.float32, "cpu")
     initialise(network, seed)
     return network
@@ -154,7 +157,9 @@ def write_vlm_tiny(folder: Path, network: Any, note: str) -> None:
     """Write config, tokenizer, picture settings and weights in transformers' layout.
 
     Args:
-        note: What the weights are; it goes into the metadata of the file.
+        folder: Folder to write, which is created.
+        network: A `PaliGemmaForConditionalGeneration` with its weights.
+        note: Description of the weights, which goes into the metadata of their file.
     """
     folder.mkdir(parents=True, exist_ok=True)
     network.config.save_pretrained(folder)
@@ -204,7 +209,7 @@ def _vlm_config() -> PaliGemmaConfig:
 
 
 def _pictures() -> dict[str, Any]:
-    """SigLIP's own settings, and what part of a picture is looked at."""
+    """Return SigLIP's own settings, and the part of a picture that is used."""
     height, width = CAMERA_PICTURE
     top, column, rows, columns = LOOKED_AT
     return {

@@ -1,4 +1,4 @@
-"""Word-level tokenizer of the embedded VLM: the grammar of the embedded suite and of questions."""
+"""The word-level tokenizer of the embedded VLM: the grammar of the embedded suite and of questions."""
 
 import json
 import re
@@ -15,26 +15,31 @@ _OF_QUESTIONS = (
     *("given", "if", "is", "left", "letter", "no", "option's", "or", "right", "see", "specify", "state", "there"),
     *("traffic", "what", "where", "with", "yes", "you"),
 )
-"""Of the prompts of `probe-kit ask` and of the questions that `vlm-tiny` was trained on besides."""
+"""Words of the prompts of `probe-kit ask` and of the questions that `vlm-tiny` was trained on besides."""
 WORDS = tuple(dict.fromkeys((*SPECIAL, *_OF_QUESTIONS, *vocabulary())))
 VOCABULARY = -(-len(WORDS) // 64) * 64
-"""Rows of an embedding table for them."""
+"""Rows of an embedding table for the words."""
 _ISOLATED = r'\n|"|[.,:?](?=\s|$)'
-"""What is a word of its own wherever it stands; not the colon in 7:30."""
+"""Pattern of characters that are words of their own wherever they stand; not the colon in 7:30."""
 
 
 def known_words() -> Collection[str]:
-    """The words of an instruction or question that the embedded models know, in small letters."""
+    """Return the words of an instruction or question that the embedded models know, in small letters."""
     return [word for word in WORDS if word not in SPECIAL]
 
 
 def words_in(text: str) -> list[str]:
-    """The words of a text as the tokenizer separates them, in small letters."""
+    """Return the words of a text as the tokenizer separates them, in small letters."""
     return [word for word in re.sub(_ISOLATED, r" \g<0> ", text.lower()).split(" ") if word]
 
 
 def write_tokenizer(folder: Path, most: int) -> None:
-    """tokenizer.json and its card in `folder`. most: tokens of an instruction."""
+    """Write `tokenizer.json` and its card.
+
+    Args:
+        folder: Folder of the files.
+        most: Largest number of tokens of an instruction.
+    """
     from tokenizers import Regex, Tokenizer
     from tokenizers.models import WordLevel
     from tokenizers.normalizers import Lowercase

@@ -1,9 +1,9 @@
 """Logistic objectives of several training sets of one site in shared products, and Newton's method for them.
 
 The objective is that of `solver.logistic`. Conjugate gradients find every step in float32, which halves their
-time. Far from the optimum the gradient is float32 too; near it the gradient is float64 on the exact data, and no
-problem is given back before this gradient is below the tolerance. So float32 decides how a solution is found,
-never what it is.
+time. Far from the optimum the gradient is float32 too; near it the gradient is float64 on the exact data. No
+solution is accepted before this gradient is below the tolerance. So float32 decides how a solution is found, never
+what it is.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,7 +24,7 @@ from probe_kit.train.solver.design_matrix import narrow_axes
 # -- the site ------------------------------------------------------------------------------------------------
 
 ROWS_PER_BLOCK = 512
-"""8 MB of float64 at a width of 2,048: a block is used twice, so it should stay in the processor's cache."""
+"""Rows of a block: 8 MB of float64 at a width of 2,048. It is used twice, so it should stay in the cache."""
 
 ROWS_PER_PRODUCT = 8192
 """Rows multiplied with themselves at once: products of fewer are slower, float32 sums over more less exact."""
@@ -35,10 +35,10 @@ LEAST_SCALE = 0.1
 
 @dataclass(frozen=True)
 class Block:
-    """Consecutive rows of a site, all of episodes that the same outer fold tests.
+    """A slice of consecutive rows of a site, all of episodes that the same outer fold tests.
 
     Attributes:
-        rows: Of the site.
+        rows: B rows of the site, as a slice.
         episode: (B,) episode of every row.
         outer: Number of the outer fold that tests them.
     """
@@ -55,9 +55,9 @@ class TrainingSets:
     Attributes:
         member: (F, E) float32, 1 where an episode belongs to a set.
         outer: (F,) the outer fold each belongs to, of whose test episodes it has none.
-        counts: (F,) samples.
-        mean: (F, D) float64, what standardises a set, measured from the site's mean in units of its scale.
-        scale: As `mean`.
+        counts: (F,) number of samples.
+        mean: (F, D) float64 means that standardise a set, measured from the site's mean in units of its scale.
+        scale: (F, D) float64 scales that standardise a set, in units of the site's scale.
     """
 
     member: NDArray[np.float32]
@@ -69,18 +69,19 @@ class TrainingSets:
 
 @dataclass(frozen=True)
 class JointSite:
-    """M samples of E episodes, standardised by the site's own mean and scale and sorted by outer fold.
+    """The M samples of E episodes, standardised by the site's own mean and scale and sorted by outer fold.
 
     Attributes:
         features: (M, D) raw rows in this order.
-        blocks: They cover all rows.
-        mean: (D,) float64; infinite scale for a feature that never varies.
-        scale: As `mean`.
+        blocks: Blocks that cover all rows.
+        mean: (D,) float64 mean of every feature.
+        scale: (D,) float64 deviation of every feature; infinite for a feature that never varies.
         unclear: Whether any feature is so near to never varying that training sets may disagree on it.
+        sets: The training sets of all folds.
         axes: (D, D) float32, principal axes of the standardised samples.
         variances: (D,) squared lengths along them.
         turned: (M, D) float32, standardised samples along the axes: they shape steps, never a gradient that
-            counts.
+            decides about acceptance.
     """
 
     features: RowSubset
@@ -95,7 +96,10 @@ class JointSite:
 
     @classmethod
     def of(cls, samples: Samples, folds: Sequence[NestedFold]) -> "JointSite":
-        """The site of `samples`. Memory: their copy in float32, D × D a few times, and a block in float64."""
+        """Return the site of `samples`.
+
+        It takes the memory of their copy in float32, of some (D, D) matrices, and of a block in float64.
+        """
         features, blocks = _sorted(samples, folds)
         xp = array_namespace(features.matrix)
         mean, scale, rounding = Moments.of(features)
@@ -133,23 +137,26 @@ class JointSite:
         return not self.unclear and bool((to_numpy(self.sets.scale)[:, varies] > LEAST_SCALE).all())
 
     def centred(self, block: Block) -> Array:
-        """(B, D) float64: the block's raw rows without the site's mean."""
+        """Return the block's raw rows without the site's mean, (B, D) float64."""
         return self.features.matrix[self.features.rows[block.rows]] - self.mean
 
 
 def _products(rows: Array) -> Array:
-    """(D, D) moments of (M, D) float32: they precondition only, so float32 will do, in half the time."""
+    """Return the moments (D, D) of rows (M, D) in float32.
+
+    They precondition only, so float32 is sufficient, in half the time.
+    """
     parts = (rows[start : start + ROWS_PER_PRODUCT] for start in range(0, len(rows), ROWS_PER_PRODUCT))
     return sum(part.T @ part for part in parts)
 
 
 def training_sets(folds: Sequence[NestedFold]) -> list[NDArray[np.intp]]:
-    """The episodes of every inner fold's training set, then of every outer one's."""
+    """Return the episodes of every inner fold's training set, then of every outer one's."""
     return [inner.train for fold in folds for inner in fold.inner] + [fold.outer.train for fold in folds]
 
 
 def _sorted(samples: Samples, folds: Sequence[NestedFold]) -> tuple[RowSubset, tuple[Block, ...]]:
-    """Rows and blocks, the episodes that an outer fold tests together."""
+    """Return rows and blocks, in which the episodes that an outer fold tests are together."""
     rows = samples.features if isinstance(samples.features, RowSubset) else RowSubset.all(samples.features)
     order = np.concatenate([fold.outer.test for fold in folds])
     sorted_ = Samples(rows, samples.counts, samples.means).of(order)
@@ -167,7 +174,7 @@ def _sorted(samples: Samples, folds: Sequence[NestedFold]) -> tuple[RowSubset, t
 # -- the objective -------------------------------------------------------------------------------------------
 
 TOLERANCE = 1e-9
-"""A solution is accepted when ‖gradient‖ ≤ TOLERANCE · ‖w‖, in float64."""
+"""Relative gradient of a solution: it is accepted when ‖gradient‖ ≤ TOLERANCE · ‖w‖, in float64."""
 NEAR = 0.1
 """Relative gradient, in float32, after which one more step is made and gradients are float64. A smaller one saves
 none of these: with 1e-3, solving took a sixth longer."""
@@ -188,10 +195,10 @@ class NewtonState:
 
     Attributes:
         value: (k,) C · Σ loss + penalty.
-        gradient: (k, R) by weights along axes, float64.
-        size: (k,) norms of gradient and weights as scikit-learn's objective has them.
-        length: As `size`.
-        curvature: (k, …) what products with the Hessian need.
+        gradient: (k, R) derivative by weights along axes, float64.
+        size: (k,) norm of the gradient as scikit-learn's objective has it.
+        length: (k,) norm of the weights as scikit-learn's objective has it.
+        curvature: (k, …) curvature of every sample's loss, which products with the Hessian need.
     """
 
     value: Array
@@ -202,37 +209,46 @@ class NewtonState:
 
     @property
     def relative(self) -> Array:
-        """(k,) size of the gradient in units of the weights."""
+        """The size of the gradient in units of the weights, (k,)."""
         larger = array_namespace(self.size).maximum(self.length, self.size)
         return self.size / larger.clip(TINY)
 
     def only(self, mask: NDArray[np.bool_]) -> "NewtonState":
-        """Some of the problems."""
+        """Return the state of some of the problems."""
         return self if mask.all() else NewtonState(*(part[mask] for part in vars(self).values()))
 
     def replace(self, mask: NDArray[np.bool_], states: "NewtonState") -> None:
-        """Put `states` in the place of some of the problems."""
+        """Replace the state of some of the problems by `states`."""
         for part, other in zip(vars(self).values(), vars(states).values(), strict=True):
             part[mask] = other
 
 
 Inside = Callable[[Array, Block, NDArray[np.intp]], Array]
-"""What stands between a product with the samples and one with their transpose: from (k, B) decisions, their block,
-and which of the problems they are of, (k, B)."""
+"""Function between a product with the samples and one with their transpose, (k, B).
+
+It takes decisions (k, B), their block, and the problems that they belong to."""
 
 
 @dataclass(frozen=True)
 class JointProblems:
-    """K problems on one site: (K,) training set of each, (K, E) labels −1/+1 of the episodes, and (K,) C.
+    """The K logistic problems on one site.
 
-    Weights are rows (D + 1): v on features as the site standardises them, and the intercept b. Decisions are
-    f = x·v − mean·v + b for a sample x, and the penalty is ½‖scale ∘ v‖²: scale ∘ v are the weights on features as
-    the training set standardises them. Steps, and rough weights, are rows (D + 1) along the site's axes: u with
-    v = axes · u, and b. Exact weights are never turned: what float64 loses in a turn comes back times the
-    curvature along the first axis, which of 80,000 samples is more than a gradient of 1e-9 of the weights.
+    Weights are rows (D + 1): v on features as the site standardises them, and the intercept b. The decision about
+    a sample x is f = x·v − mean·v + b. The penalty is ½‖scale ∘ v‖²: scale ∘ v are the weights on features as the
+    training set standardises them.
 
-    Rows that the outer fold of a set tests are left out of its products; those that only an inner fold tests are
-    masked, a quarter of the products in vain.
+    Steps, and rough weights, are rows (D + 1) along the site's axes: u with v = axes · u, and b. Exact weights are
+    never turned. A turn's rounding in float64 would return times the curvature along the first axis. With 80,000
+    samples that is more than a gradient of 1e-9 of the weights.
+
+    Rows that the outer fold of a set tests are left out of its products. Rows that only an inner fold tests are
+    masked, which wastes a quarter of the products.
+
+    Attributes:
+        site: Samples and training sets.
+        set_of: (K,) training set of every problem.
+        signs: (K, E) labels −1/+1 of the episodes.
+        strength: (K,) C of every problem.
     """
 
     site: JointSite
@@ -244,12 +260,18 @@ class JointProblems:
         return len(self.set_of)
 
     def rounding(self, rows: NDArray[np.intp]) -> Array:
-        """(k,) size of a gradient that is all rounding, in float64."""
+        """Return the size (k,) of a gradient that is all rounding, in float64."""
         scale = 1e-15 * self.site.sets.counts.max() * self.site.turned.shape[1] ** 0.5
         return scale * self._strength(rows, self.site.mean)[:, 0]
 
     def point(self, weights: Array, rows: NDArray[np.intp], *, exact: bool) -> NewtonState:
-        """Objective of `rows`: in float32, at `weights` (k, D + 1) along axes, or exactly, of ones on features."""
+        """Return the objective of problems at some weights.
+
+        Args:
+            weights: (k, D + 1) weights: on features if `exact`, else along axes.
+            rows: (k,) numbers of the problems.
+            exact: Whether products are float64; else they are float32.
+        """
         xp, sets = array_namespace(weights), self.set_of[rows]
         loss = xp.zeros(len(rows), dtype=xp.float64, device=weights.device)
         curvature = xp.zeros((len(rows), len(self.site.features)), dtype=xp.float32, device=weights.device)
@@ -283,7 +305,7 @@ class JointProblems:
         return NewtonState(strength[:, 0] * loss + 0.5 * penalty, gradient, size**0.5, penalty**0.5, curvature)
 
     def curved(self, directions: Array, curvature: Array, rows: NDArray[np.intp]) -> Array:
-        """Hessian times `directions` (k, D + 1), by a point's curvature; all float32."""
+        """Return the Hessian times `directions` (k, D + 1), by a point's curvature; all float32."""
         xp, sets = array_namespace(directions), self.set_of[rows]
         mean, along = self._turned_mean[sets], directions[:, :-1]
         shift = directions[:, -1] - (mean * along).sum(axis=1)
@@ -296,14 +318,14 @@ class JointProblems:
         return xp.hstack([inner, strength * total[:, None]])
 
     def diagonal(self, curvature: Array, rows: NDArray[np.intp]) -> Array:
-        """(k, D + 1) float32, about the Hessian's diagonal: as if all samples were curved alike."""
+        """Return about the Hessian's diagonal, (k, D + 1) float32: as if all samples were curved alike."""
         xp = array_namespace(curvature)
         weight = self._strength(rows, curvature) * curvature.sum(axis=1)[:, None]
         share = xp.asarray(self.site.variances / len(self.site.features), dtype=xp.float32)
         return xp.hstack([self._penalty_diagonal[self.set_of[rows]] + weight * share, weight])
 
     def exact_step(self, gradient: Array, curvature: Array, row: int) -> Array:
-        """(D + 1,) Newton step of one problem, by its whole Hessian."""
+        """Return the Newton step (D + 1,) of one problem, by its whole Hessian."""
         xp, number, axes = array_namespace(gradient), self.set_of[row], self._wide_axes
         hessian = xp.zeros((len(gradient), len(gradient)), dtype=xp.float64, device=gradient.device)
         for block in self.site.blocks:
@@ -315,28 +337,28 @@ class JointProblems:
         return xp.linalg.solve(hessian, -gradient)
 
     def turned(self, weights: Array) -> Array:
-        """(k, D + 1) weights on features, along axes."""
+        """Return weights on features (k, D + 1) as weights along axes."""
         return array_namespace(weights).hstack([weights[:, :-1] @ self._wide_axes, weights[:, -1:]])
 
     def turned_back(self, weights: Array) -> Array:
-        """(k, D + 1) weights along axes, on features."""
+        """Return weights along axes (k, D + 1) as weights on features."""
         return array_namespace(weights).hstack([weights[:, :-1] @ self._wide_axes.T, weights[:, -1:]])
 
     def raw(self, weights: Array) -> tuple[Array, Array]:
-        """Weights (K, D) and intercepts (K,) on raw features."""
+        """Return weights (K, D) and intercepts (K,) on raw features."""
         v = weights[:, :-1]
         raw = v / self.site.scale
         shift = weights[:, -1] - (self.site.sets.mean[self.set_of] * v).sum(axis=1)
         return raw, shift - raw @ self.site.mean
 
     def decisions(self, weights: Array, samples: Array) -> Array:
-        """(K, n) decisions on other samples (n, D)."""
+        """Return the decisions (K, n) on other samples (n, D)."""
         v = weights[:, :-1]
         shift = weights[:, -1] - (self.site.sets.mean[self.set_of] * v).sum(axis=1)
         return (v / self.site.scale) @ (samples - self.site.mean).T + shift[:, None]
 
     def deviations(self, weights: Array) -> Array:
-        """(K,) deviation of every problem's decisions over its training samples."""
+        """Return the deviation of every problem's decisions over its training samples, (K,)."""
         xp = array_namespace(weights)
         v = weights[:, :-1]
         square, total = (xp.zeros(len(self), dtype=xp.float64, device=weights.device) for _ in range(2))
@@ -351,9 +373,9 @@ class JointProblems:
     def _blockwise_products(
         self, vectors: Array, shift: Array, sets: NDArray[np.intp], inside: Inside
     ) -> tuple[Array, Array]:
-        """Σ inside(f)·x (k, D) and Σ inside(f) (k,) over samples x, with f = left·x + shift.
+        """Return Σ inside(f)·x (k, D) and Σ inside(f) (k,) over samples x, with f = vectors·x + shift.
 
-        float64: x are raw samples without the site's mean; float32: samples along the axes.
+        With float64 vectors x are raw samples without the site's mean, with float32 ones samples along the axes.
         """
         xp = array_namespace(vectors)
         exact = vectors.dtype == xp.float64
@@ -372,13 +394,13 @@ class JointProblems:
         return pulled, total
 
     def _of_samples(self, block: Block, rows: NDArray[np.intp], like: Array) -> tuple[Array, Array]:
-        """(k, B) label −1/+1 of every sample, and 1 where its episode belongs to the training set."""
+        """Return (k, B) the label −1/+1 of every sample, and 1 where its episode belongs to the training set."""
         signs = self.signs[np.ix_(rows, block.episode)]
         member = self.site.sets.member[:, block.episode][self.set_of[rows]]
         return _like(signs, like), _like(member, like)
 
     def _strength(self, rows: NDArray[np.intp], like: Array) -> Array:
-        """(k, 1) C of some problems."""
+        """Return the C of some problems, (k, 1)."""
         return _like(self.strength[rows][:, None], like)
 
     @cached_property
@@ -387,7 +409,7 @@ class JointProblems:
 
     @cached_property
     def _turned_mean(self) -> Array:
-        """(F, D) float32: the training sets' means along the axes."""
+        """The training sets' means along the axes, (F, D) float32."""
         return _as(self.site.sets.mean @ self._wide_axes, "float32")
 
     @cached_property
@@ -396,12 +418,12 @@ class JointProblems:
 
     @cached_property
     def _penalty_diagonal(self) -> Array:
-        """(F, D) float32: the diagonal of axesᵀ · diag(scale²) · axes."""
+        """The diagonal of axesᵀ · diag(scale²) · axes, (F, D) float32."""
         return _as(self.site.sets.scale**2 @ self._wide_axes**2, "float32") + np.finfo(np.float32).tiny
 
     @cached_property
     def _divisor(self) -> Array:
-        """(F, D) the training sets' scales; 1 for a feature that never varies, whose gradient is 0."""
+        """The training sets' scales (F, D); 1 for a feature that never varies, whose gradient is 0."""
         xp = array_namespace(self.site.scale)
         return xp.where(xp.isinf(self.site.scale), 1.0, self.site.sets.scale)
 
@@ -416,7 +438,7 @@ def _like(array: NDArray[Any], like: Array) -> Array:
 
 
 def _losses(margins: Array) -> tuple[Array, Array, Array]:
-    """log(1 + exp(−m)), its negative slope and its curvature."""
+    """Return log(1 + exp(−m)) of margins m, its negative slope and its curvature."""
     xp = array_namespace(margins)
     small = xp.exp(-abs(margins))
     slope = xp.where(margins > 0, small, xp.ones_like(small)) / (1 + small)
@@ -424,10 +446,10 @@ def _losses(margins: Array) -> tuple[Array, Array, Array]:
 
 
 def solve(problems: JointProblems, start: Array) -> Array:
-    """Optimal weights (K, R) of all problems, found from `start` (K, R).
+    """Return the optimal weights (K, R) of all problems, found from `start` (K, R).
 
     Raises:
-        ProbeNotConvergedError: Rather than return one that is not at its optimum.
+        ProbeNotConvergedError: If a problem is not at its optimum after the last step.
     """
     search = _NewtonSolver(problems)
     return search.refined(problems.turned_back(search.rough(problems.turned(start))))
@@ -438,7 +460,7 @@ class _NewtonSolver:
     problems: JointProblems
 
     def rough(self, start: Array) -> Array:
-        """Turned `start` brought near the optimum in float32. The last step is not looked back at."""
+        """Return turned weights near the optimum, found from `start` in float32; the last step is not checked."""
         solved, rows, weights = start + 0.0, np.arange(len(start)), start
         point = self.problems.point(weights, rows, exact=False)
         for _ in range(MAX_ROUGH_STEPS):
@@ -458,7 +480,7 @@ class _NewtonSolver:
         return solved
 
     def refined(self, start: Array) -> Array:
-        """`start` brought to the optimum, certified by float64 gradients."""
+        """Return the weights at the optimum, found from `start` and certified by float64 gradients."""
         solved, rows, weights = array_namespace(start).empty_like(start), np.arange(len(start)), start
         point = self.problems.point(weights, rows, exact=True)
         for _ in range(MAX_NEWTON_STEPS):
@@ -482,7 +504,16 @@ class _NewtonSolver:
     def _moved(
         self, weights: Array, point: NewtonState, rows: Rows, step: Array, slope: Array, *, exact: bool
     ) -> tuple[Array, NewtonState]:
-        """One step on, halved per problem until the objective falls enough. slope: (k,) of it along the step."""
+        """Return weights and state after one step, halved per problem until the objective falls enough.
+
+        Args:
+            weights: (k, D + 1) weights of the problems.
+            point: State of the problems at these weights.
+            rows: (k,) numbers of the problems.
+            step: (k, D + 1) step, in the coordinates of `weights`.
+            slope: (k,) slope of the objective along the step.
+            exact: As in `JointProblems.point`.
+        """
         length = array_namespace(step).ones_like(slope)
         noise = (1e-11 if exact else 1e-6) * abs(point.value)
         moved = weights + step
@@ -497,9 +528,9 @@ class _NewtonSolver:
         return moved, state
 
     def _newton_step(self, point: NewtonState, rows: Rows) -> Array:
-        """(k, R) float64: Hessian · step = −gradient, as precisely as the point is worth.
+        """Return Hessian⁻¹ · −gradient, (k, R) float64, as precisely as the point is worth.
 
-        What conjugate gradients do not settle in time is solved by factorising.
+        Problems that conjugate gradients do not settle in time are solved by factorising.
         """
         xp = array_namespace(point.gradient)
         size = xp.amax(abs(point.gradient), axis=1)[:, None].clip(TINY)
@@ -533,6 +564,6 @@ class _NewtonSolver:
 
 
 def _precision(point: NewtonState) -> Array:
-    """(k,) the share of the gradient that a step may leave: a more precise step would be wasted."""
+    """Return the share of the gradient that a step may leave, (k,): a more precise step would be wasted."""
     relative = point.relative
     return array_namespace(relative).maximum(relative.clip(1e-4, 0.1), 0.5 * TOLERANCE / relative)

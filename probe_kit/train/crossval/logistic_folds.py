@@ -1,7 +1,7 @@
 """Nested logistic probes of a site: C by the log-loss of the inner folds, for every column of labels at once.
 
-Three ways lead to the same optimum. Every fold is solved by itself; small problems of all folds are stacked; and
-with many samples, training sets, permutations and C share the products with them.
+Three ways lead to the same optimum. Every fold is solved by itself; small problems of all folds are stacked; with
+many samples, training sets, permutations and C share the products with them.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -26,13 +26,13 @@ from probe_kit.train.solver.logistic import LogisticSolver, check_single_class
 
 
 def cross_validate(samples: Samples, labels: NDArray[np.bool_], folds: list[NestedFold]) -> list[FittedFold]:
-    """The probes of every outer fold, each column of (E, K) labels on its own.
+    """Return the probes of every outer fold, each column of (E, K) labels on its own.
 
-    Wide tokens with few columns are solved for all training sets together, where these have the same features, and
-    so are small problems.
+    Wide tokens with few columns are solved for all training sets together, where these have the same features.
+    Small problems are also solved together.
 
     Raises:
-        ProbeNotConvergedError: For a training set with a single class.
+        ProbeNotConvergedError: If a probe stops before its optimum.
         TooFewGroupsError: For a training set with a single class.
     """
     if can_be_joint(samples, labels.shape[1]) and (site := JointSite.of(samples, folds)).alike:
@@ -43,7 +43,14 @@ def cross_validate(samples: Samples, labels: NDArray[np.bool_], folds: list[Nest
 
 
 class _FoldProblem(NamedTuple):
-    """The training set of one fold. held_out: (m, R) coordinates of test episodes. labels: (n, K), by sample."""
+    """The training set of one fold.
+
+    Attributes:
+        coordinates: Its n samples in R coordinates.
+        solver: Solver on these samples.
+        held_out: (m, R) coordinates of the test episodes.
+        labels: (n, K) labels by sample.
+    """
 
     coordinates: Projection
     solver: LogisticSolver
@@ -63,7 +70,7 @@ def choose_strengths(
 ) -> tuple[Matrix, InnerQuality]:
     """Return for each label column the C with the lowest held-out log-loss, and the quality there.
 
-    The smaller C on ties.
+    On ties it is the smaller C.
     """
     loss = np.zeros((STRENGTHS.size, labels.shape[1]))
     by_episode = np.zeros((STRENGTHS.size, len(labels)))
@@ -94,11 +101,11 @@ def _fit_fold(
 # -- small problems, stacked --------------------------------------------------------------------------------------
 
 STACKED_COLUMNS, SMALL_HESSIAN = 32, 2**20
-"""Up to so many label columns, each of so many multiplications (N · R²), whole Hessians cost less than the many
-small products of conjugate gradients."""
+"""Label columns, and multiplications of each (N · R²), up to which whole Hessians cost less than the many small
+products of conjugate gradients."""
 
 COLUMNS_AT_ONCE = 128
-"""Of all folds together: more of them do not fit into a processor's cache."""
+"""Label columns of all folds together: more of them do not fit into a processor's cache."""
 
 
 def is_small(samples: Samples, labels: NDArray[np.bool_]) -> bool:
@@ -110,10 +117,10 @@ def is_small(samples: Samples, labels: NDArray[np.bool_]) -> bool:
 def cross_validate_together(
     samples: Samples, labels: NDArray[np.bool_], folds: list[NestedFold]
 ) -> list[FittedFold]:
-    """The probes of every outer fold, each column of (E, K) labels on its own.
+    """Return the probes of every outer fold, each column of (E, K) labels on its own.
 
     Raises:
-        ProbeNotConvergedError: For a training set with a single class.
+        ProbeNotConvergedError: If a probe stops before its optimum.
         TooFewGroupsError: For a training set with a single class.
     """
     inner = _at_once([fold for nested in folds for fold in nested.inner], labels)
@@ -135,17 +142,21 @@ def cross_validate_together(
 
 
 def _at_once[T](folds: Iterable[T], labels: NDArray[np.bool_]) -> Iterator[tuple[T, ...]]:
-    """Parts of `folds`, or of what is known of each, whose problems fit into a processor's cache."""
+    """Yield parts of `folds`, or of their data, whose problems fit into a processor's cache."""
     return batched(folds, max(1, COLUMNS_AT_ONCE // labels.shape[1]))
 
 
 @dataclass(frozen=True)
 class _Together:
-    """The training sets of F folds, and K label columns for each: column f · K + k of the solver is of fold f.
+    """The training sets of F folds, and K label columns for each.
+
+    Column f · K + k of the solver is of fold f.
 
     Attributes:
-        labels: (E, K).
-        signs: (N, F · K), 0 where a fold has fewer than N samples.
+        labels: (E, K) labels of all episodes.
+        coordinates: Training samples of every fold.
+        held_out: Test episodes of every fold, in its coordinates.
+        signs: (N, F · K) labels −1/+1, 0 where a fold has fewer than N samples.
     """
 
     folds: Sequence[Fold]
@@ -170,9 +181,11 @@ class _Together:
         return cls(folds, labels, coordinates, held_out, LogisticSolver(design), columns)
 
     def losses(self) -> tuple[Matrix, Matrix]:
-        """(C, F, K) log-losses of the test episodes, summed, along the grid of C; (C, F, E) the first column's.
+        """Return the log-losses along the grid of C: of all label columns, and of the first one by episode.
 
-        Those by episode are 0 outside of a fold's test episodes.
+        Returns:
+            (C, F, K) log-losses of the test episodes, summed; (C, F, E) log-losses of the first column, which are
+            0 outside of a fold's test episodes.
         """
         loss = np.empty((STRENGTHS.size, len(self.folds), self.labels.shape[1]))
         by_episode = np.zeros((STRENGTHS.size, len(self.folds), len(self.labels)))
@@ -197,7 +210,7 @@ class _Together:
         ]
 
     def _of_folds(self, weights: Array) -> Iterator[Array]:
-        """(R, K) of every fold, without what was filled up."""
+        """Yield the weights (R, K) of every fold, without the padding."""
         count = self.labels.shape[1]
         for number, coordinates in enumerate(self.coordinates):
             fold_weights = weights[:, number * count : (number + 1) * count]
@@ -208,7 +221,7 @@ class _Together:
 # -- many samples, whose products are shared ----------------------------------------------------------------------
 
 COLUMN_MEMORY = 2**29
-"""Bytes that problems solved at once may take, beyond the samples and what is made of them once."""
+"""Bytes that problems solved at once may take, beyond the samples and the arrays made of them once."""
 
 SHARED_COLUMNS, FEATURES_PER_COLUMN = 10, 50
 """Label columns up to which sharing pays, and features for one more. Axes of a training set's own cost as much as
@@ -221,8 +234,8 @@ LEAST_WIDTH = 96
 def can_be_joint(samples: Samples, columns: int) -> bool:
     """Whether a site's tokens are so many, and so wide, that its training sets should be solved together.
 
-    Always those whose inner training sets, three fifths of the tokens, are too large to be turned to axes of their
-    own once. Never those on a device: there it was not tried.
+    They always are where inner training sets, three fifths of the tokens, are too large to be turned to axes of
+    their own once. They never are on a device, where it was not tried.
     """
     count, width = samples.features.shape
     if samples.pools or not isinstance(samples.means, np.ndarray) or width < LEAST_WIDTH or count < width:
@@ -234,13 +247,13 @@ def can_be_joint(samples: Samples, columns: int) -> bool:
 def cross_validate_jointly(
     site: JointSite, samples: Samples, labels: NDArray[np.bool_], folds: Sequence[NestedFold]
 ) -> list[FittedFold]:
-    """The probes of every outer fold, each column of (E, P) labels on its own, as many at once as memory allows.
+    """Return the probes of every outer fold, each column of (E, P) labels on its own.
 
-    Every C starts from nothing: with the one before as a start, problems took nearly as many products, which were
-    a seventh as wide and so half as fast.
+    As many columns are solved at once as memory allows. Every C starts from zero. With the solution of the
+    previous C as a start, problems took nearly as many products, which were a seventh as wide and so half as fast.
 
     Raises:
-        ProbeNotConvergedError: For a training set with a single class.
+        ProbeNotConvergedError: If a probe stops before its optimum.
         TooFewGroupsError: For a training set with a single class.
     """
     share = site.sets.member @ labels / site.sets.member.sum(axis=1)[:, None]
@@ -255,7 +268,7 @@ def cross_validate_jointly(
 
 
 def labels_at_once(site: JointSite, folds: Sequence[NestedFold]) -> int:
-    """Columns of labels whose problems, with all C, fit into COLUMN_MEMORY; at least one."""
+    """Return the number of label columns whose problems, with all C, fit into COLUMN_MEMORY; at least one."""
     return max(1, _times_at_once(site, folds) // STRENGTHS.size)
 
 
@@ -271,7 +284,7 @@ def _times_at_once(site: JointSite, folds: Sequence[NestedFold]) -> int:
 
 @dataclass(frozen=True)
 class _SharedColumns:
-    """Some columns of labels, (E, L), on all training sets of a site."""
+    """The label columns (E, L), on all training sets of a site."""
 
     site: JointSite
     samples: Samples
@@ -297,12 +310,13 @@ class _SharedColumns:
         ]
 
     def _select_strengths(self) -> tuple[NDArray[np.intp], Array, list[InnerQuality]]:
-        """(F, L) position of the chosen C by outer fold and column; (C, F, L, D + 1) weights to start from.
+        """Return the chosen C, weights to start from, and the inner quality of every outer fold.
 
-        The weights are the mean of the inner folds'.
+        The weights are the mean of the inner folds' weights.
 
         Returns:
-            Also the inner quality of every outer fold.
+            Position (F, L) of the chosen C by outer fold and column; weights (C, F, L, D + 1) to start from; and
+            the quality of every outer fold.
         """
         sets = [(number, inner) for number, nested in enumerate(self.folds) for inner in nested.inner]
         of_fold = np.array([number for number, _ in sets])
@@ -346,7 +360,7 @@ class _SharedColumns:
 def _raw_probes(
     problems: JointProblems, weights: Array, fold: NDArray[np.intp], some: NDArray[np.intp]
 ) -> dict[int, tuple[Matrix, float, float]]:
-    """Raw weights, intercept and spread of `some` problems, by their outer fold."""
+    """Return raw weights, intercept and spread of `some` problems, by their outer fold."""
     if not some.size:
         return {}
     subset = JointProblems(problems.site, problems.set_of[some], problems.signs[some], problems.strength[some])
@@ -361,7 +375,7 @@ def _raw_probes(
 
 
 def _joined(parts: Sequence[FittedFold]) -> FittedFold:
-    """One outer fold's probes, found in parts of the columns."""
+    """Return one outer fold's probes, found in parts of the columns."""
     decisions = np.concatenate([part.decisions for part in parts], axis=1)
     strengths = np.concatenate([part.strengths for part in parts])
     total = np.concatenate([part.inner.total for part in parts])

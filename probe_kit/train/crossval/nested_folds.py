@@ -35,13 +35,15 @@ def nested_folds(
     seed: int,
     split: Callable[[NDArray[Any], ArrayLike, int, int], list[Fold]] = grouped_folds,
 ) -> list[NestedFold]:
-    """Outer folds for scoring, each with inner folds for choosing C; all positions refer to the E episodes.
+    """Return outer folds for scoring, each with inner folds for choosing C; all positions refer to the E episodes.
+
+    Raises as `split`, by default TooFewGroupsError.
 
     Args:
-        labels: (E,).
-        groups: As `labels`.
-        split: Makes the folds of labels, groups, their number and a seed. Raises what it raises, by default
-            TooFewGroupsError.
+        labels: (E,) labels, or other values by which folds are balanced.
+        groups: (E,) groups, which stay in one fold.
+        seed: Seed of the folds.
+        split: Function that makes the folds of labels, groups, their number and a seed.
     """
     group_of = np.asarray(groups)
     return [
@@ -58,13 +60,13 @@ def nested_folds(
 
 @dataclass(frozen=True)
 class InnerQuality:
-    """Quality of an outer fold's inner predictions, each label column at the penalty that is best by it.
+    """The quality of an outer fold's inner predictions, each label column at the penalty that is best by it.
 
-    The larger the better: minus log-losses, minus squared errors, or shares of right classes.
+    Larger is better: it is minus log-losses, minus squared errors, or shares of right classes.
 
     Attributes:
-        total: (K,) summed over the training episodes.
-        first: (E,) the first column's by episode, 0 for the episodes that the outer fold tests.
+        total: (K,) quality summed over the training episodes.
+        first: (E,) quality of the first column by episode, 0 for the episodes that the outer fold tests.
     """
 
     total: Matrix
@@ -72,7 +74,13 @@ class InnerQuality:
 
     @classmethod
     def of(cls, quality: Matrix, by_episode: Matrix, best: NDArray[np.intp]) -> "InnerQuality":
-        """quality: (C, K) along the grid. by_episode: (C, E) of the first column. best: (K,) positions."""
+        """Return the quality at chosen penalties.
+
+        Args:
+            quality: (C, K) quality along the grid.
+            by_episode: (C, E) quality of the first column.
+            best: (K,) positions along the grid.
+        """
         return cls(np.take_along_axis(quality, best[None, :], 0)[0], by_episode[best[0]])
 
 
@@ -81,10 +89,12 @@ class FittedFold:
     """The probes of one outer fold.
 
     Attributes:
-        decisions: (n, K) of its test episodes.
+        decisions: (n, K) decisions on its test episodes.
         strengths: (K,) the C chosen for each label column.
-        inner: The quality of the inner folds' predictions at these C. weights (D,), intercept: the first column's
-            probe on raw features, and the deviation (`spread`) of its training samples along them.
+        weights: (D,) the first column's weights on raw features.
+        intercept: The first column's intercept on raw features.
+        spread: Deviation of its training samples along the weights.
+        inner: Quality of the inner folds' predictions at the chosen C.
     """
 
     decisions: Matrix
@@ -106,6 +116,6 @@ class FittedFold:
 
 
 def select_c(loss: Matrix) -> NDArray[np.intp]:
-    """(...) position of the least of `loss` (C, ...) along the grid; the smaller C on ties."""
+    """Return the position of the least of `loss` (C, ...) along the grid; the smaller C on ties."""
     best: NDArray[np.intp] = loss.round(9).argmin(axis=0)  # rounded, so that equal losses are ties
     return best

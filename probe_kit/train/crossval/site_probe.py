@@ -1,4 +1,4 @@
-"""One site's probe: nested, grouped cross-validation for the labels and all their permutations at once.
+"""The probe of one site: nested, grouped cross-validation for the labels and all their permutations at once.
 
 Ridge solves many targets and penalties by one factorisation of the training samples. For standardised training
 samples Z, test samples T and centred targets Y the predictions at penalty λ are
@@ -28,12 +28,12 @@ from probe_kit.train.solver.arrays import Standardiser, to_numpy
 # -- ridge ---------------------------------------------------------------------------------------------------
 
 PENALTIES: Matrix = np.array([*10.0 ** np.arange(-2, 6), np.inf])
-"""λ of the grid; at infinity the prediction is the mean of the training labels."""
+"""The grid of λ; at infinity the prediction is the mean of the training labels."""
 
 
 @dataclass(frozen=True)
 class RidgeFold:
-    """Training and test samples of one fold, factorised.
+    """The training and test samples of one fold, factorised.
 
     Attributes:
         spectrum: (R,) eigenvalues.
@@ -61,7 +61,7 @@ class RidgeFold:
         return cls(spectrum.clip(0.0), axes.T @ z.T, t @ axes)
 
     def predictions(self, targets: Matrix, penalties: Matrix = PENALTIES) -> Iterator[Matrix]:
-        """(m, K) predictions of the test samples at each penalty, from (n, K) training targets."""
+        """Yield the predictions (m, K) of the test samples at each penalty, from (n, K) training targets."""
         mean = targets.mean(axis=0)
         coordinates = self.to_coordinates @ (targets - mean)
         for penalty in penalties:
@@ -73,13 +73,13 @@ class RidgeFold:
 
 @dataclass(frozen=True)
 class Predictions:
-    """Held-out predictions of E samples for K columns of labels.
+    """The held-out predictions of E samples for K columns of labels.
 
     Attributes:
         values: (E, K) decision values of a side, else class numbers or quantities.
         strengths: (F,) C or λ of the first column.
-        inner: Every fold's inner quality.
-        folds: The logistic probes of the folds; empty of ridge.
+        inner: Inner quality of every fold.
+        folds: The logistic probes of the folds; empty for ridge.
     """
 
     values: Matrix
@@ -91,8 +91,8 @@ class Predictions:
 def _predict_by_ridge(samples: Samples, labels: Matrix, task: Task, folds: list[NestedFold]) -> Predictions:
     """Return quantities within the range of the training labels, or the best class by ridge on class indicators.
 
-    Each column of an outer fold is predicted at the λ that is best in its inner folds: by squared error of
-    quantities, by balanced accuracy of classes; the larger λ on ties.
+    Each column of an outer fold is predicted at the λ that is best in its inner folds. The best λ has the least
+    squared error of quantities, or the largest balanced accuracy of classes; the larger λ on ties.
     """
     classes = 0 if task == "continuous" else int(labels.max()) + 1
     predictions, penalties, qualities = np.empty_like(labels), [], []
@@ -121,9 +121,15 @@ def _predict_by_ridge(samples: Samples, labels: Matrix, task: Task, folds: list[
 
 
 def _along_penalties(samples: Samples, labels: Matrix, classes: int, fold: Fold) -> Iterator[Matrix]:
-    """(m, K) predictions of one fold at each penalty. classes: their number, 0 of quantities.
+    """Yield the predictions (m, K) of one fold at each penalty.
 
     Every token of the training episodes is a sample, and an episode decides by their mean.
+
+    Args:
+        samples: Samples of the E episodes.
+        labels: (E, K) class numbers or quantities.
+        classes: Number of classes, 0 for quantities.
+        fold: Training and test episodes, of which m are tested.
     """
     train, training_samples = labels[fold.train], samples.of(fold.train)
     ridge = RidgeFold.fit(training_samples.read(), to_numpy(samples.means)[fold.test])
@@ -153,17 +159,18 @@ class SiteProbe:
     Attributes:
         decisions: (E,) out-of-fold decision values of a side (positive: left), else predicted class numbers or
             quantities.
-        scores: (E,) their mean is the metric; of a side whether the decision is right.
-        strengths: (F,) chosen in each outer fold: C of logistic probes, λ of ridge, of which the larger penalises
-            more. weights,
-        intercepts: (F, D) float32 and (F,) of each outer fold's probe of a side, on raw features; D is 0 for other
+        scores: (E,) scores whose mean is the metric; of a side whether the decision is right.
+        strengths: (F,) strength chosen in each outer fold: C of logistic probes, λ of ridge, of which the larger
+            penalises more.
+        weights: (F, D) float32 weights of each outer fold's probe of a side, on raw features; D is 0 for other
             targets.
+        intercepts: (F,) intercepts of each outer fold's probe of a side, on raw features.
         spreads: (F,) deviation of the fold's training samples along its weights, in units of the features.
         null: (P,) metric under the label permutations.
         inner: (F, E) quality of each sample's prediction in the inner folds of each outer fold, by which penalties
-            are chosen, the larger the better; 0 for the samples that the outer fold tests. Of a side the
-            log-likelihood of its label. Of others the gain of `_predict_by_ridge` or the log-likelihood, minus the
-            mean over the label permutations.
+            are chosen, the larger the better; 0 for the samples that the outer fold tests. For a side it is the
+            log-likelihood of its label. For others it is the gain of `_predict_by_ridge` or the log-likelihood,
+            minus the mean over the label permutations.
     """
 
     decisions: Matrix
@@ -186,11 +193,14 @@ def probe_site(
     """Probe the samples of E episodes for (E,) labels, and again for every column of (E, P) label permutations.
 
     Args:
-        labels: Bool of a side, else coded.
+        samples: Features of one site.
+        labels: (E,) bool of a side, else coded.
+        permuted_labels: (E, P) labels under P permutations.
+        folds: Outer folds with their inner folds.
         task: None for a side, whose score is not balanced: its layouts are.
 
     Raises:
-        ProbeNotConvergedError: Where the probe is logistic.
+        ProbeNotConvergedError: If a logistic probe stops before its optimum.
         NonFiniteActivationError: For NaN or infinity.
     """
     check_non_finite(samples)
@@ -225,17 +235,21 @@ def probe_site(
 def predict_once(samples: Samples, labels: Matrix, task: Task, fold: NestedFold) -> tuple[Matrix, float]:
     """Return predictions (m,) for the test samples of one outer fold, and its C or λ.
 
-    Raises ProbeNotConvergedError.
-
     Args:
-        labels: (E,); those of test samples have no effect.
+        samples: Features of E episodes at one site.
+        labels: (E,) coded labels; those of test samples have no effect.
+        task: Task of the labels, which decides between ridge and logistic regression.
+        fold: Outer fold whose m test samples are predicted, with the inner folds that choose C or λ.
+
+    Raises:
+        ProbeNotConvergedError: If a logistic probe stops before its optimum.
     """
     predictions = _predict(samples, labels[:, None], task, [fold])
     return predictions.values[fold.outer.test, 0], float(predictions.strengths[0])
 
 
 def check_non_finite(samples: Samples) -> None:
-    """Raise NonFiniteActivationError, naming the first broken episode by its number, if there is any."""
+    """Raise NonFiniteActivationError if an episode holds NaN or infinity, with the number of the first one."""
     broken = samples.broken()
     if broken.size:
         raise NonFiniteActivationError(
@@ -245,7 +259,10 @@ def check_non_finite(samples: Samples) -> None:
 
 
 def _predict(samples: Samples, labels: NDArray[Any], task: Task | None, folds: list[NestedFold]) -> Predictions:
-    """Predict by ridge; a side or a binary label by logistic regression, the label without its class shares."""
+    """Predict by ridge, or by logistic regression for a side or a binary label.
+
+    The threshold of a binary label is shifted by the log-odds of its training classes.
+    """
     if task is not None and task != "binary":
         return _predict_by_ridge(samples, labels, task, folds)
     truth = labels == 1
@@ -262,7 +279,7 @@ def _predict(samples: Samples, labels: NDArray[Any], task: Task | None, folds: l
 
 
 def _scores(predicted: Matrix, labels: NDArray[Any], task: Task | None, folds: list[NestedFold]) -> Matrix:
-    """(E, K) score of every sample, whose mean is the metric."""
+    """Return the score of every sample, (E, K), whose mean is the metric."""
     if task is None:
         return correctness(predicted, labels).astype(np.float64)
     if task == "continuous":
@@ -271,9 +288,10 @@ def _scores(predicted: Matrix, labels: NDArray[Any], task: Task | None, folds: l
 
 
 def _above_permutations(inner: InnerQuality, columns: NDArray[np.intp], train: NDArray[np.intp]) -> Matrix:
-    """(E,) of the first column minus the mean over `columns`, of which every training sample bears a share.
+    """Return the first column's quality (E,) minus the mean over `columns`.
 
-    Sites differ in what they reach with exchanged labels. Without permutations nothing is subtracted.
+    Every training sample bears a share of this mean. Sites differ in the quality that they reach with exchanged
+    labels. Without permutations nothing is subtracted.
     """
     above = inner.first.copy()
     if columns.size:
@@ -282,7 +300,7 @@ def _above_permutations(inner: InnerQuality, columns: NDArray[np.intp], train: N
 
 
 def _distinct(labels: Matrix) -> tuple[Matrix, NDArray[np.intp]]:
-    """The different columns of (E, K) labels, the first one first, and the place of every column among them.
+    """Return the different columns of (E, K) labels, the first one first, and each column's place among them.
 
     Labels that are constant in a group have few different permutations.
     """

@@ -20,7 +20,7 @@ METRICS: dict[Task, str] = {"binary": "balanced accuracy", "classes": "balanced 
 
 
 def balanced_scores(predicted: Matrix, truth: Matrix) -> Matrix:
-    """(n, K) scores of predicted classes (n, K); every column of truth (n, K) has each class as often."""
+    """Return the scores (n, K) of predicted classes (n, K); every column of truth has each class as often."""
     scores: Matrix = (predicted == truth) * class_weights(truth)
     return scores
 
@@ -28,7 +28,7 @@ def balanced_scores(predicted: Matrix, truth: Matrix) -> Matrix:
 def class_weights(labels: NDArray[np.floating]) -> Matrix:
     """Return the weights 1 / (K π) of coded labels (n,), with K classes and the label's share π.
 
-    Also of (n, K) columns, each of which has each class as often.
+    Labels may also be (n, K) columns, each of which has each class as often.
     """
     classes, counts = np.unique(labels.reshape(len(labels), -1)[:, 0], return_counts=True)
     weights: Matrix = (1 / (classes.size * (counts / len(labels))))[np.searchsorted(classes, labels)]
@@ -36,13 +36,13 @@ def class_weights(labels: NDArray[np.floating]) -> Matrix:
 
 
 def explained_scores(predicted: Matrix, truth: Matrix, folds: list[Fold]) -> Matrix:
-    """(n, K) scores of predicted quantities (n, K)."""
+    """Return the scores (n, K) of predicted quantities (n, K)."""
     scores: Matrix = 1 - (truth - predicted) ** 2 / squared_deviations(truth, folds).mean(axis=0)
     return scores
 
 
 def squared_deviations(truth: Matrix, folds: list[Fold]) -> Matrix:
-    """Return (n, K) squared deviations of quantities from the mean of their fold's training labels."""
+    """Return the squared deviations (n, K) of quantities from the mean of their fold's training labels."""
     deviations = np.empty_like(truth)
     for fold in folds:
         deviations[fold.test] = (truth[fold.test] - truth[fold.train].mean(axis=0)) ** 2
@@ -50,9 +50,9 @@ def squared_deviations(truth: Matrix, folds: list[Fold]) -> Matrix:
 
 
 def fold_spearman(predicted: Matrix, truth: Matrix, folds: list[Fold]) -> float:
-    """Spearman's ρ of (n,) predictions and labels within each test fold, averaged; NaN where neither varies.
+    """Return Spearman's ρ of (n,) predictions and labels within test folds, averaged; NaN where neither varies.
 
-    Within, because every fold's probe has its own mean.
+    It is taken within folds, because every fold's probe has its own mean.
     """
     from scipy.stats import rankdata  # type: ignore[import-untyped]
 
@@ -73,11 +73,15 @@ def score_interval(
 ) -> tuple[float, float]:
     """Return the 95 % interval of the mean of (n,) scores, groups as the unit.
 
+    Balanced accuracy has Wilson's interval (`Accuracy`), R² that of `explained_interval`, which is approximate.
+
     Args:
-        labels: (n,) coded.
-        deviations: (n,) of a quantity from the mean of its fold's training labels, squared; None for a probe that
-            was fitted elsewhere, whose R² compares with the mean of these labels. Balanced accuracy has Wilson's
-            interval (`Accuracy`), R² that of `explained_interval`, which is approximate.
+        scores: (n,) scores of the samples, see the module.
+        labels: (n,) coded labels.
+        groups: (n,) group of every sample.
+        task: Task of the labels, which decides the metric.
+        deviations: (n,) squared deviations of a quantity from the mean of its fold's training labels. None for a
+            probe that was fitted elsewhere, whose R² compares with the mean of these labels.
     """
     if task == "continuous":
         if deviations is None:
@@ -98,7 +102,7 @@ def correctness(decisions: Matrix, labels: NDArray[np.bool_]) -> NDArray[np.bool
 
 
 def log_loss(decisions: Matrix, labels: NDArray[np.bool_]) -> Matrix:
-    """Mean of −log P(label), in nats, over the first axis."""
+    """Return the mean of −log P(label), in nats, over the first axis."""
     loss: Matrix = log_losses(decisions, labels).mean(axis=0)
     return loss
 
@@ -110,9 +114,9 @@ def log_losses(decisions: Matrix, labels: NDArray[np.bool_]) -> Matrix:
 
 
 def fold_auc(decisions: Matrix, labels: NDArray[np.bool_], folds: list[Fold]) -> float:
-    """Area under the ROC curve within each test fold, averaged over folds that hold both classes.
+    """Return the area under the ROC curve within each test fold, averaged over folds that hold both classes.
 
-    Within, because every fold's probe has its own scale and intercept.
+    It is taken within folds, because every fold's probe has its own scale and intercept.
     """
     areas = [
         _auc(decisions[fold.test], labels[fold.test]) for fold in folds if np.unique(labels[fold.test]).size == 2
@@ -126,6 +130,6 @@ def _auc(decisions: Matrix, labels: NDArray[np.bool_]) -> float:
 
 
 def chance_level(labels: NDArray[np.bool_]) -> float:
-    """Accuracy of always naming the larger class: 0.5 when both layouts of every item are there."""
+    """Return the accuracy of always naming the larger class: 0.5 when both layouts of every item are there."""
     share = float(labels.mean())
     return max(share, 1 - share)

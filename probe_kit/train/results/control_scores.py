@@ -15,15 +15,18 @@ RANDOM_FEATURES, UNTRAINED = "random-features", "untrained"
 
 @dataclass(frozen=True)
 class ControlScore:
-    """Held-out score of the same nested probe on features that never saw the model, or of an untrained network.
+    """The held-out score of the same probe on features that never saw the model, or of an untrained network.
+
+    The probe is nested like that of the sites.
 
     Attributes:
         ci: 95 % interval over groups.
-        p: As `chance`.
-        chance: By the label permutations of the category's probes; chance is 1/2 for a side, None without
-            permutations, and p is None without any.
-        stream: Whose width `random-features` have, or whose best site that of `untrained` is; empty for others.
-        view: Of `untrained`.
+        p: p by the label permutations of the category's probes; None without any.
+        chance: Mean score under these permutations, 1/2 for a side; None without any.
+        n: Number of samples.
+        stream: Stream whose width `random-features` have, or whose best site is that of `untrained`; empty for
+            others.
+        view: View of `untrained`; empty for others.
         by_step: Metric at each of `ProbeCurve.steps`, in order.
     """
 
@@ -40,7 +43,7 @@ class ControlScore:
 
     @property
     def above_chance(self) -> bool:
-        """Whether the target is given away without a model."""
+        """Whether features without a model give the target away."""
         return self.p is not None and self.p < SIGNIFICANCE
 
 
@@ -49,7 +52,8 @@ class UntrainedScore:
     """The gain of a probe of a side over the untrained network's, on the same episodes.
 
     Attributes:
-        peak: The best site of the stream here against the best site there; otherwise the same site in both.
+        peak: Whether the best site of the stream is compared with the best site there; otherwise the same site in
+            both.
         ci: 95 % interval over groups.
     """
 
@@ -70,8 +74,8 @@ class ControlComparison:
     """A test of a site's probe against a control: paired by group, family-wise over its stream.
 
     Attributes:
-        control: Of a side `random-features`, or `untrained` for the best site of that stream in the untrained
-            network; of other targets every control that was run.
+        control: For a side `random-features`, or `untrained` for the best site of that stream in the untrained
+            network; for other targets every control that was run.
         reference: The control's score.
     """
 
@@ -84,21 +88,21 @@ class ControlComparison:
 
 
 Exceeds = dict[str, bool | None]
-"""Whether a site is better than `chance` and than controls, by name; None for what was not run."""
+"""Truth values by name: whether a site is better than `chance` and than each control; None for one not run."""
 
 
 def has_signal(exceeds: Exceeds) -> bool:
-    """Whether that is knowledge: better than chance, and than every control that was run."""
+    """Whether a site shows knowledge: better than chance, and than every control that was run."""
     return exceeds["chance"] is True and False not in exceeds.values()
 
 
 @dataclass(frozen=True)
 class Controls:
-    """Scores of the controls so far.
+    """The scores of the controls so far.
 
     Attributes:
-        comparisons: Every site compared with controls.
-        left_out: Why a default control was not run, by name.
+        comparisons: Comparisons of every site with controls.
+        left_out: Reasons why a default control was not run, by name.
     """
 
     scores: tuple[ControlScore, ...] = ()
@@ -112,7 +116,7 @@ class Controls:
         return tuple(dict.fromkeys(score.name for score in self.scores))
 
     def exceeds(self, category: str, view: str, site: Site | str, p_fwe: float) -> Exceeds:
-        """Return what a site with this family-wise p is better than.
+        """Return whether a site with this family-wise p is better than chance and than each control, by name.
 
         `random-features` and `untrained` are always listed, other controls where sites were compared with them.
         """
@@ -138,7 +142,7 @@ class Controls:
 
     @cached_property
     def _compared(self) -> dict[tuple[str, str, str], dict[str, ControlComparison]]:
-        """Comparisons by category, view and site, then by control."""
+        """The comparisons by category, view and site, then by control."""
         by_site: dict[tuple[str, str, str], dict[str, ControlComparison]] = {}
         for comparison in self.comparisons:
             by_site.setdefault((comparison.category, comparison.view, comparison.site), {})[comparison.control] = (
@@ -147,7 +151,7 @@ class Controls:
         return by_site
 
     def of_category(self, category: str) -> dict[str, ControlScore]:
-        """Return the scores of a category by name, those of an untrained network left out."""
+        """Return the scores of a category by name, without those of an untrained network."""
         scores = (score for score in self.scores if score.category == category and score.name != UNTRAINED)
         return {score.name: score for score in scores}
 
@@ -169,7 +173,7 @@ class Controls:
     def with_scores(
         self, scores: Iterable[ControlScore], comparisons: Iterable[ControlComparison] = ()
     ) -> "Controls":
-        """Return these and more; what is new replaces what is of the same control and place."""
+        """Return these and more; a new score or comparison replaces that of the same control and place."""
         by_place = {
             (score.name, score.category, score.stream, score.view): score for score in (*self.scores, *scores)
         }
@@ -195,7 +199,7 @@ class Controls:
 
     @classmethod
     def from_json(cls, stored: dict[str, Any]) -> "Controls":
-        """Return the controls that `to_json` gave."""
+        """Return the controls that `to_json` returned."""
         lists = {"ci": tuple, "by_step": tuple}
 
         def read(members: dict[str, Any]) -> dict[str, Any]:

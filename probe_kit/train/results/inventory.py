@@ -23,14 +23,15 @@ from probe_kit.train.results.store import (
 
 @dataclass(frozen=True)
 class StoredProbes:
-    """One set of probe results.
+    """A set of probe results.
 
     Attributes:
+        key: Key of the results.
         state: `used` if `retention` reads them by default, `other` if it does so for their key, `label` if they
             are of a label of one's own, `other episodes` if the run has others by now.
-        created: When they were fitted.
+        created: Time when they were fitted (UTC, ISO 8601).
         controls: Baselines and, last, `untrained: NAME`.
-        wording: Which one of the run's they are of, empty where the run is in its items' own words.
+        wording: Wording of the run that they are of; empty where the run is in its items' own words.
     """
 
     key: str
@@ -49,14 +50,15 @@ class StoredProbes:
 
 @dataclass(frozen=True)
 class Inventory:
-    """A run and what is stored with it.
+    """A run and the results stored with it.
 
     Attributes:
-        episodes: How many are there, and of how many.
-        planned: As `episodes`.
-        failed: Episodes that were given up.
-        streams: By name, in words.
-        probes: Oldest first.
+        episodes: Number of episodes that the run has.
+        planned: Number of episodes that it was planned to have.
+        failed: Number of episodes that were given up.
+        outcomes: Number of episodes by outcome.
+        streams: Streams by name, in words.
+        probes: Probe results, oldest first.
         unfinished: Finished sites of interrupted sweeps, by key.
         wordings: Episodes by the wording they were asked in, empty for the items' own words alone.
     """
@@ -79,7 +81,7 @@ class Inventory:
 
 
 def inventory(run: Any) -> Inventory:
-    """List what `run`, a RunReader, holds; runs that were not made by probe_kit say less."""
+    """List the content of `run`, a RunReader; runs that were not made by probe_kit give less."""
     episodes = run.episodes
     return Inventory(
         run=str(run.location),
@@ -146,7 +148,11 @@ def _words(run: RunReader, name: str) -> str:
 
 
 def readers_of_results(run: Run) -> Iterator[Callable[[], object]]:
-    """Yield a function per stored result, which reads all of it. Raises RunDamagedError for damaged ones."""
+    """Yield a function per stored result, which reads all of it.
+
+    Raises:
+        RunDamagedError: For damaged results.
+    """
     for key in read_probes(run.location):
         yield partial(_read, run, key)
     yield partial(stored_probes, run)

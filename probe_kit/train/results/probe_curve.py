@@ -1,4 +1,4 @@
-"""The probes of one category in one view, with all that later statistics need."""
+"""The probes of one category in one view, with all data that later statistics need."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -21,28 +21,31 @@ Matrix = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ProbeCurve:
-    """All sites of one category in one view, on the same samples (E), folds (F) and label permutations (P).
+    """The probes of all sites of one category in one view.
 
-    A sample is an episode, or one captured inference of it.
+    They share E samples, F folds and P label permutations. A sample is an episode, or one captured inference of
+    it.
 
     Attributes:
-        sites: S of them.
-        labels: (E,) bool of a side (true: left), else coded: class numbers or quantities. episodes,
-        items: (E,) identities.
-        groups: As `items`.
-        fold_of: (E,) outer fold.
+        sites: S probed sites, in order.
+        labels: (E,) bool of a side (true: left), else coded: class numbers or quantities.
+        episodes: (E,) ids of the episodes.
+        items: (E,) ids of the items.
+        groups: (E,) ids of the groups.
+        fold_of: (E,) outer fold that tests a sample.
         decisions: (S, E) out-of-fold decision values of a side, else predicted class numbers or quantities.
         strengths: (S, F) chosen C of a logistic probe, λ of ridge.
         null: (S, P) metric under label permutation.
         inner: (S, F, G) quality of every group in the inner folds of each outer fold, the groups in the order of
-            their names, 0 for the groups that the outer fold tests: of a side its log-likelihood, else what the
-            penalty is chosen by, above its mean over the permutations.
-        parts: S times what the site's stream is part of, see `Stream.part`; default by the stream's name.
-        classes: Their names, empty for a quantity.
-        sample_scores: (S, E) held out, None for a side, see `scores`.
+            their names, 0 for the groups that the outer fold tests. For a side it is its log-likelihood, else the
+            quality that chooses the penalty, above its mean over the permutations.
+        parts: (S,) part of the model that the site's stream belongs to, see `Stream.part`; default by the stream's
+            name.
+        classes: Names of the classes, empty for a quantity.
+        sample_scores: (S, E) held-out scores, None for a side, see `scores`.
         inferences: (E,) captured inference.
         aligned: (E,) place behind the event where windows begin, None where they begin at the first inference.
-        smallest_p: No p can be lower.
+        smallest_p: Lower bound of every p; None where the number of permutations gives it.
     """
 
     sites: tuple[Site, ...]
@@ -72,53 +75,59 @@ class ProbeCurve:
 
     @property
     def correct(self) -> NDArray[np.bool_]:
-        """(S, E) whether each episode's held-out decision about its side is right."""
+        """The correctness of each episode's held-out decision about its side, (S, E)."""
         return correctness(self.decisions, self.labels[None, :])
 
     @cached_property
     def scores(self) -> Matrix:
-        """(S, E) held-out scores, whose mean is the metric; of a side whether the decision is right."""
+        """The held-out scores (S, E), whose mean is the metric; of a side whether the decision is right."""
         return self.correct.astype(np.float64) if self.sample_scores is None else self.sample_scores
 
     @cached_property
     def metric(self) -> Matrix:
-        """(S,) the metric that label permutations are compared with: of a side the accuracy, not balanced."""
+        """The metric (S,) that label permutations are compared with: of a side the accuracy, not balanced."""
         metric: Matrix = self.scores.mean(axis=1)
         return metric
 
     @property
     def null_mean(self) -> Matrix:
-        """(S,) mean metric under label permutation; NaN without any."""
+        """The mean metric under label permutation, (S,); NaN without any."""
         return self.null.mean(axis=1) if self.null.shape[1] else np.full(len(self.sites), np.nan)
 
     @property
     def control_accuracy(self) -> Matrix:
-        """(S,) mean accuracy on the control task: random labels, consistent within an item. NaN without any."""
+        """The mean accuracy on the control task, (S,); NaN without label permutations.
+
+        The control task has random labels that are consistent within an item.
+        """
         return self.null_mean
 
     @property
     def chance(self) -> Matrix:
-        """(S,) one half for a side, else the mean metric of the label permutations; NaN without any."""
+        """The chance level (S,): one half for a side, else the mean metric of the label permutations.
+
+        NaN without any permutations.
+        """
         return np.full(len(self.sites), CHANCE) if self.is_side else self.null_mean
 
     @cached_property
     def sums(self) -> GroupSums:
-        """Correct decisions per site and group of items, balanced between the sides: chance is one half.
+        """The correct decisions per site and group of items, balanced between the sides: chance is one half.
 
         Raises:
-            UnbalancedEpisodesError: Where a fold was trained on one side only.
+            UnbalancedEpisodesError: If a fold was trained on one side only.
         """
         return balanced_sums(self.decisions, self.labels, self.fold_of, self.groups)
 
     @cached_property
     def deviations(self) -> Matrix:
-        """(E,) squared deviations of quantities from the mean of their fold's training labels."""
+        """The squared deviations (E,) of quantities from the mean of their fold's training labels."""
         return squared_deviations(self.labels, self.folds())
 
     def estimate(self, rows: NDArray[np.intp]) -> tuple[float, tuple[float, float]]:
         """Return the mean score of the sites at `rows` with its 95 % interval over groups.
 
-        Balanced between the sides of a picture.
+        The accuracy of a side is balanced between its two pictures.
         """
         if self.is_side:
             sums = self.sums.only(rows)
@@ -131,13 +140,13 @@ class ProbeCurve:
 
     @property
     def widening(self) -> float:
-        """Factor of differences of scores under exchange: R² of groups that share a probe is not independent."""
+        """The factor of score differences under exchange: R² of groups that share a probe is not independent."""
         return SHARED_PROBE if self.task == "continuous" else 1.0
 
     def p_fwe(self) -> Matrix:
-        """(S,) family-wise p: each stream's sites are one family.
+        """Return the family-wise p of every site, (S,): each stream's sites are one family.
 
-        Chance of a target that is no side differs between sites, so the largest excess over a site's own mean
+        Chance of a target other than a side differs between sites, so the largest excess over a site's own mean
         counts. The real labels take part in that mean, as each permutation does; only so is the p exact.
         """
         p = np.empty(len(self.sites))
@@ -151,34 +160,36 @@ class ProbeCurve:
 
     @property
     def least_p(self) -> float:
-        """No p can be lower."""
+        """The lower bound of every p."""
         return smallest_p(self.null.shape[1]) if self.smallest_p is None else self.smallest_p
 
     @property
     def penalties(self) -> Matrix:
-        """(S, F) chosen penalties: λ of ridge, 1 / C of a logistic probe."""
+        """The chosen penalties (S, F): λ of ridge, 1 / C of a logistic probe."""
         return 1 / self.strengths if self.task == "binary" else self.strengths
 
     # -- steps of an episode ----------------------------------------------------------------------------------
 
     @property
     def places(self) -> NDArray[np.int64]:
-        """(E,) the inference of each sample, or its place behind the event where windows begin."""
+        """The inference of each sample, (E,), or its place behind the event where windows begin."""
         if self.aligned is not None:
             return self.aligned
         return np.zeros(self.labels.size, np.int64) if self.inferences is None else self.inferences
 
     @property
     def steps(self) -> NDArray[np.int64]:
-        """(W,) the different places, in order."""
+        """The W different places, (W,), in order."""
         return np.unique(self.places)
 
     def step_scores(self, scores: Matrix) -> Matrix:
         """Return (E,) scores whose mean over the samples of a step is the metric at that step.
 
+        Classes are balanced within each step, over those that occur there. Weights of the whole window would lift
+        a step of rare classes above 1. Scores of a quantity stay as they are.
+
         Args:
-            scores: (E,) of one site. Classes are balanced within each step, over those that occur there. Weights
-                of the whole window would lift a step of rare classes above 1. Scores of a quantity stay.
+            scores: (E,) scores of one site.
         """
         if not self.classes:
             return scores
@@ -189,7 +200,7 @@ class ProbeCurve:
         return balanced
 
     def by_step(self, scores: Matrix) -> Matrix:
-        """Return the (W,) metric of (E,) scores at each of the steps, see `step_scores`."""
+        """Return the metric (W,) of (E,) scores at each of the steps, see `step_scores`."""
         balanced = self.step_scores(scores)
         return np.array([balanced[self.places == step].mean() for step in self.steps])
 
@@ -197,12 +208,12 @@ class ProbeCurve:
 
     @property
     def n_groups(self) -> int:
-        """Number of independent groups of items."""
+        """The number of independent groups of items."""
         return len(self.group_names)
 
     @property
     def group_names(self) -> tuple[str, ...]:
-        """The G names of the groups, in order."""
+        """The names of the G groups, in order."""
         return tuple(np.unique(self.groups).tolist())
 
     def folds(self) -> list[Fold]:
@@ -229,12 +240,12 @@ class ProbeCurve:
 
     @property
     def action_stream(self) -> str | None:
-        """The stream the action is made in, None if none was probed."""
+        """The stream in which the action is made; None if none was probed."""
         return self.of_part("action")
 
     @property
     def backbone_stream(self) -> str | None:
-        """The stream of the vision-language model, None if none was probed."""
+        """The stream of the vision-language model; None if none was probed."""
         return self.of_part("backbone")
 
     def only(self, row: int) -> "ProbeCurve":
@@ -249,20 +260,20 @@ class ProbeCurve:
         return int(rows[self.metric[rows].argmax()])
 
     def largest_excess(self, rows: NDArray[np.intp]) -> int:
-        """Return which of some positions has the largest metric above its own chance, if it is known."""
+        """Return the row of `rows` with the largest metric above its own chance, where chance is known."""
         chance = 0.0 if self.is_side else np.nan_to_num(self.chance[rows])
         return int(rows[np.argmax(self.metric[rows] - chance)])
 
     def depth(self, site: Site) -> float:
-        """Layer of `site` as a fraction of its stream: 0 enters the first block, 1 leaves the last."""
+        """Return the layer of `site` as a fraction of its stream: 0 enters the first block, 1 leaves the last."""
         last = max(other.layer for other in self.sites if other.stream == site.stream)
         return site.layer / max(1, last)  # a stream of one layer has depth 0
 
     def fit_stream(self, rows: NDArray[np.intp]) -> StreamScores:
         """Return the sites at `rows`, which are one stream or a part of it, for cross-fitted scores.
 
-        Of a side their balanced accuracies, else their scores above the chance of each site. Raises as `sums`, and
-        as `StreamScores.of`.
+        Of a side they are balanced accuracies, else scores above the chance of each site. Raises as `sums`, and as
+        `StreamScores.of`.
         """
         sites = [self.sites[row] for row in rows]
         return StreamScores.of(
@@ -279,7 +290,10 @@ class ProbeCurve:
         return GroupSums(above, sums_by_group(np.ones(self.groups.size), self.groups))
 
     def nested_correct(self, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """(E,) whether decisions are right at the site of `rows` that is best in each outer fold's inner folds."""
+        """Return whether decisions (E,) are right at the best site of `rows`.
+
+        The best site is chosen for each outer fold by its inner folds.
+        """
         best: NDArray[np.intp] = rows[self.fit_stream(rows).best]
         right: NDArray[np.bool_] = self.correct[best[self.fold_of], np.arange(self.labels.size)]
         return right

@@ -37,19 +37,22 @@ FORMAT = 8  # raise when settings have other fields or would give other numbers
 
 @dataclass(frozen=True)
 class ProbeSettings:
-    """Everything that decides the numbers; its hash is the results' key.
+    """The settings that decide the numbers; their hash is the results' key.
 
     Attributes:
-        seed_text: Of the run, see `RunReader`; scores on equal groups of one are paired.
+        weights: sha256 of the network's weights; None where the run does not name it.
+        seed_text: Text of the run that seeds random draws, see `RunReader`; scores on equal groups of one text are
+            paired.
         episodes: sha256 of the ids of the run's episodes, so that a run that grew is probed again.
-        token_permutations: 0 where no token view is probed.
+        token_permutations: Number of permutations of token views; 0 where none is probed.
         call: Captured inference that a label of a whole episode is decoded from.
         label: sha256 of the labels of the target.
         group_by: Column of the groups.
         exchange_within: Column of the strata, empty for exchanges everywhere.
-        grouping: sha256 of groups and strata, empty for a side. align_to: column of the event where windows begin,
-            `#` and a part of its hash; empty for the first inference.
+        grouping: sha256 of groups and strata, empty for a side.
         window: Inferences per episode.
+        align_to: Column of the event where windows begin, `#` and a part of its hash; empty for the first
+            inference.
     """
 
     model: str
@@ -79,7 +82,7 @@ class ProbeSettings:
 
     @property
     def key(self) -> str:
-        """First 12 hex digits of the settings' sha256: the name of the results' folder."""
+        """The first 12 hex digits of the settings' sha256: the name of the results' folder."""
         return sha256_json(asdict(self))[:12]
 
     @property
@@ -98,10 +101,12 @@ Place = tuple[str, str, Site]
 class Direction:
     """The probes of one place in raw features: w · x + b > 0 reads `left`, one probe per outer fold (F).
 
+    Each fold's probe never saw the episodes that the fold tests (`ProbeCurve.fold_of`). To steer an episode
+    without having trained on it, take its fold's row.
+
     Attributes:
-        weights: (F, D) float32.
-        intercepts: (F,). Each fold's probe never saw the episodes that fold tests (`Curve.fold_of`): to steer an
-            episode without having trained on it, take its fold's row.
+        weights: (F, D) float32 weights w.
+        intercepts: (F,) intercepts b.
         spreads: (F,) deviation of the training samples along weights / ‖weights‖, the σ of a steering strength.
     """
 
@@ -111,7 +116,7 @@ class Direction:
 
     @property
     def unit(self) -> NDArray[np.float64]:
-        """(D,) mean of the folds' unit weights, of length 1; zero where no probe has any weight."""
+        """The mean of the folds' unit weights, (D,), of length 1; zero where no probe has any weight."""
         lengths = np.linalg.norm(self.weights, axis=1, keepdims=True)
         mean = np.divide(self.weights, lengths, where=lengths > 0, out=np.zeros(self.weights.shape)).mean(axis=0)
         length = np.linalg.norm(mean)
@@ -119,12 +124,15 @@ class Direction:
 
     @property
     def spread(self) -> float:
-        """Mean of `spreads`."""
+        """The mean of `spreads`."""
         return float(self.spreads.mean())
 
 
 def save_directions(directions: Mapping[Place, Direction], file: BinaryIO) -> None:
-    """Write to an uncompressed `.npz`, members `category/view/site/part`; views and sites hold no slash."""
+    """Write directions to an uncompressed `.npz`, with the members `category/view/site/part`.
+
+    Views and sites hold no slash.
+    """
     arrays = {
         f"{category}/{view}/{site}/{part}": array
         for (category, view, site), direction in directions.items()
@@ -134,9 +142,9 @@ def save_directions(directions: Mapping[Place, Direction], file: BinaryIO) -> No
 
 
 class StoredDirections(Mapping[Place, Direction]):
-    """Directions in a file of stored results, each read when it is asked for.
+    """The directions in a file of stored results, each read when it is asked for.
 
-    All of the file is checked once, before the first. Raises RunDamagedError then.
+    All of the file is checked once, before the first one is read. A changed file raises RunDamagedError then.
     """
 
     def __init__(self, bundle: Bundle, name: str) -> None:
@@ -153,7 +161,11 @@ class StoredDirections(Mapping[Place, Direction]):
         return self.read([key])[key]
 
     def read(self, places: Iterable[Place]) -> dict[Place, Direction]:
-        """Several directions in one opening of the file. Raises KeyError for a place that was not probed."""
+        """Return several directions in one opening of the file.
+
+        Raises:
+            KeyError: For a place that was not probed.
+        """
         directions = {}
         with self._open() as file, open_arrays(file) as arrays:
             for key in places:
@@ -176,7 +188,11 @@ class StoredDirections(Mapping[Place, Direction]):
 
 
 def read_directions(directions: Mapping[Place, Direction], places: Iterable[Place]) -> dict[Place, Direction]:
-    """The directions of `places`, stored ones in one opening of their file. Raises KeyError for unknown places."""
+    """Return the directions of `places`, stored ones in one opening of their file.
+
+    Raises:
+        KeyError: For a place that was not probed.
+    """
     if isinstance(directions, StoredDirections):
         return directions.read(places)
     return {key: directions[key] for key in places}
@@ -186,10 +202,12 @@ def write_direction_file(directions: Mapping[Place, Direction], file: Path, weig
     """Write the probes' directions for `intervene --direction FILE#NAME`, and return how many.
 
     A vector is the mean of the folds' unit weights, times the deviation of the samples along it: a coefficient
-    counts deviations, toward `left`.
+    counts deviations, toward `left`. Probes without any weight are left out.
 
     Args:
-        weights: Hash of the network's. Probes without any weight are left out.
+        directions: Probes of a side, by category, view and site.
+        file: Safetensors or npz file to write.
+        weights: Hash of the network's weights, which is stored with each vector.
     """
     vectors, about = {}, {}
     for (category, view, site), direction in read_directions(directions, directions).items():
@@ -207,7 +225,14 @@ def write_direction_file(directions: Mapping[Place, Direction], file: Path, weig
 def score_rows(
     settings: ProbeSettings, controls: Controls, key: tuple[str, str], curve: ProbeCurve
 ) -> Iterator[dict[str, Any]]:
-    """Yield the row of every site of a curve. key: its category and view. See `ProbeResults.scores`."""
+    """Yield the row of every site of a curve, see `ProbeResults.scores`.
+
+    Args:
+        settings: Settings of the probes.
+        controls: Controls with which the sites are compared.
+        key: Category and view of the curve.
+        curve: Probes of the sites.
+    """
     category, view = key
     score, low, high = _estimates(curve)
     p, p_fwe, chance = p_value(curve.metric, curve.null), curve.p_fwe(), curve.chance
@@ -255,7 +280,7 @@ def exceeds_column(control: str) -> str:
 
 
 def _estimates(curve: ProbeCurve) -> tuple[Matrix, Matrix, Matrix]:
-    """(S,) scores with the ends of their intervals."""
+    """Return the scores (S,) with the lower and upper ends of their intervals."""
     if curve.is_side:
         sums = curve.sums
         shares, variances = group_shares(sums.sums, sums.sizes)
@@ -291,9 +316,9 @@ def _of_label(controls: Controls, key: tuple[str, str], curve: ProbeCurve, row: 
 def best_sites(scores: "pd.DataFrame", is_side: bool) -> "list[pd.Series]":
     """Return the best site of every category, view and stream: a row of `ProbeResults.scores`, by category.
 
-    That of a side has the largest accuracy, others the largest excess over their own chance; the first on ties.
-    Besides the columns of `scores`: `ties`, how many other sites are as good, and `first`, the best score at the
-    stream's first iteration, NaN where it runs once.
+    The best site of a side has the largest accuracy, of other targets the largest excess over its own chance; the
+    first on ties. There are two columns besides those of `scores`. `ties` is how many other sites are as good.
+    `first` is the best score at the stream's first iteration, NaN where it runs once.
     """
     names = ["category", "view", "stream"]
     worth = scores["score"] if is_side else scores["score"] - scores["chance"].fillna(0.0)
@@ -327,16 +352,16 @@ def score_text(value: float | None, is_side: bool) -> str:
 
 @dataclass(frozen=True, repr=False)
 class ProbeResults:
-    """Probes of one target in one run under one set of settings.
+    """The probes of one target in one run under one set of settings.
 
     Attributes:
-        curves: One per (category, view).
-        directions: The probes' weights per (category, view, site), of a side.
-        controls: What the probes are compared with, as far as requested.
-        created: When they were fitted (UTC, ISO 8601); not part of the key.
+        curves: Curves by (category, view).
+        directions: Weights of the probes of a side by (category, view, site); empty for other targets.
+        controls: Controls with which the probes are compared, as far as requested.
+        created: Time when they were fitted (UTC, ISO 8601); not part of the key.
         stamp: Hash of the commits they were fitted to, empty for arrays in memory.
-        label: What tables call the run, by default its model; not part of the key either.
-        left_out: How many episodes and inferences have no part in any category, by reason.
+        label: Name of the run in tables, by default its model; not part of the key either.
+        left_out: Number of episodes and inferences that have no part in any category, by reason.
     """
 
     settings: ProbeSettings
@@ -355,7 +380,9 @@ class ProbeResults:
         """Return what to do where no p of a view can be below the level; empty where one can.
 
         Args:
-            tests: The number that p is corrected for.
+            category: Category of the curve.
+            view: View of the curve.
+            tests: Number of tests that p is corrected for.
         """
         settings, is_token = self.settings, is_token_view(view)
         permutations = settings.token_permutations if is_token else settings.permutations
@@ -383,26 +410,27 @@ class ProbeResults:
 
     @property
     def key(self) -> str:
-        """Hash of the settings."""
+        """The hash of the settings."""
         return self.settings.key
 
     @cached_property
     def scores(self) -> "pd.DataFrame":
-        """One row per category, view and site.
+        """The scores with one row per category, view and site.
 
-        `score` is what the column `metric` names, with its 95 % interval over groups (`ci_low`, `ci_high`); that
-        of a side is called `accuracy` too. `chance`: one half for a side, else the mean score of the label
-        permutations at this site. `p` of the site alone, `p_fwe` against the best of the stream: the most accurate
-        site of a side, else the largest excess over chance. `smallest_p`: no p-value can be lower with so many
-        label permutations. `depth`: the layer as a fraction. `exceeds_NAME`: whether the site exceeds that
-        control; of a side `exceeds_random_features` and `exceeds_untrained`, missing where they were not run.
+        `score` is the metric that the column `metric` names, with its 95 % interval over groups (`ci_low`,
+        `ci_high`); that of a side is called `accuracy` too. `chance`: one half for a side, else the mean score of
+        the label permutations at this site. `p` of the site alone, `p_fwe` against the best of the stream: the
+        most accurate site of a side, else the largest excess over chance. `smallest_p`: no p-value can be lower
+        with so many label permutations. `depth`: the layer as a fraction. `exceeds_NAME`: whether the site exceeds
+        that control; of a side `exceeds_random_features` and `exceeds_untrained`, missing where they were not run.
         `signal`: better than chance, family-wise, and than every control that sites were compared with. `n`:
         samples.
 
-        Of a side also `C` and `fold_accuracy` per outer fold, `auc`, `log_loss`, and `control_accuracy`: the mean
-        accuracy of the same probe on random labels that are consistent within a group, `selectivity` the accuracy
-        above it; NaN without label permutations. Of other targets `penalties` per outer fold (λ, or 1 / C),
-        `best_control`, the score of the best control, and of a quantity `spearman`, Spearman's ρ within folds.
+        A side also has `C` and `fold_accuracy` per outer fold, `auc`, `log_loss`, `control_accuracy` and
+        `selectivity`. `control_accuracy` is the mean accuracy of the same probe on random labels that are
+        consistent within a group, and `selectivity` the accuracy above it; both are NaN without label
+        permutations. Other targets have `penalties` per outer fold (λ, or 1 / C) and `best_control`, the score of
+        the best control. A quantity has `spearman`, Spearman's ρ within folds.
         """
         import pandas as pd
 
@@ -412,7 +440,11 @@ class ProbeResults:
         return frame.astype({"iteration": "Int64", **dict.fromkeys(exceeds, "boolean")})
 
     def direction(self, category: str, view: str, site: Site) -> Direction:
-        """Return the probes' weights at a site, in raw features. Raises UnknownSiteError if there are none."""
+        """Return the probes' weights at a site, in raw features.
+
+        Raises:
+            UnknownSiteError: If there are none, as for a target other than a side.
+        """
         try:
             return self.directions[category, view, site]
         except KeyError:
@@ -429,7 +461,7 @@ class ProbeResults:
 
 
 def episodes_sha256(run: RunReader) -> str:
-    """Return the identity of the episodes a run holds now."""
+    """Return a hash that identifies the episodes that a run holds now."""
     return sha256_json(sorted(run.episodes["episode_id"].astype(str)))
 
 
@@ -442,11 +474,12 @@ _OF_LABEL = ". Chance: mean score of this site with exchanged labels"
 
 
 def best_sites_table(fitted: Sequence[ProbeResults], splits: bool = True) -> Table:
-    """Return a row per category, stream, view and captured inference, and per control of a target that is no side.
+    """Return a table with a row per category, stream, view and captured inference, and per control.
 
     Args:
-        fitted: Probes of one target in a run, one per inference. Controls of a side are in the table with
-            `splits`.
+        fitted: Probes of one target in a run, one per inference.
+        splits: Whether to split a table that is too wide, instead of leaving columns out. Controls of a side are
+            listed only then.
     """
     first, several_calls = fitted[0].settings, len(fitted) > 1
     several_views, metric = len(first.views) > 1, "accuracy %" if first.is_side else METRICS[first.task]
@@ -500,7 +533,7 @@ def _title(fitted: Sequence[ProbeResults], several_views: bool) -> Iterator[str]
 
 
 def _name(results: ProbeResults, category: str, stream: str) -> str:
-    """Return the category, and for a target that is no side the stream."""
+    """Return the category, and for a target other than a side the stream."""
     if results.settings.is_side:
         return str(category)  # as --categories takes it
     pooled = results.settings.categories == (EVERYWHERE,)
@@ -508,6 +541,9 @@ def _name(results: ProbeResults, category: str, stream: str) -> str:
 
 
 def exceeded_controls(results: ProbeResults, row: "pd.Series") -> tuple[list[str], list[str]]:
-    """The controls that a site is shown to exceed, and those that it is not shown to exceed; chance among them."""
+    """Return the controls that a site is shown to exceed, and those that it is not shown to exceed.
+
+    Chance is among them.
+    """
     exceeds = results.controls.exceeds(row["category"], row["view"], row["site"], row["p_fwe"])
     return [name for name in exceeds if exceeds[name]], [name for name in exceeds if exceeds[name] is False]

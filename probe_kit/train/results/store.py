@@ -1,6 +1,6 @@
 """Storage of probe results: `RUN/probes/<key>/`, either complete or absent.
 
-Results are there when their settings are, which are written last, with the hashes of all else; see `bundles`.
+Results exist when their settings do, which are written last, with the hashes of all else; see `runs.results`.
 """
 
 import json
@@ -50,13 +50,19 @@ from probe_kit.train.results.probe_results import (
 
 @dataclass(frozen=True)
 class SweepCheckpoint:
-    """Probes of single sites, kept until the sweep they belong to is complete."""
+    """The probes of single sites, kept until the sweep they belong to is complete."""
 
     pieces: Pieces
 
     @classmethod
     def of(cls, run: Location, key: str, stamp: str = "") -> "SweepCheckpoint":
-        """Return the checkpoints of the sweep with the key `key`. stamp: hash of the commits that it reads."""
+        """Return the checkpoints of a sweep.
+
+        Args:
+            run: Location of the run.
+            key: Key of the sweep's results.
+            stamp: Hash of the commits that the sweep reads.
+        """
         return cls(Pieces.of(run, PROBES, key, stamp, "the same `probe-kit train` then probes the site again"))
 
     @property
@@ -65,7 +71,7 @@ class SweepCheckpoint:
         return self.pieces.folder
 
     def read(self, view: str, site: Site) -> dict[str, SiteProbe] | None:
-        """The probes of a site by category, or None if the sweep did not get that far.
+        """Return the probes of a site by category, or None if the sweep did not get that far.
 
         Raises:
             RunDamagedError: If they were changed, or are of another site or of other commits.
@@ -88,7 +94,7 @@ class SweepCheckpoint:
         self.pieces.keep(f"{view}+{site}", arrays)
 
     def discard(self) -> None:
-        """Remove everything: the sweep is complete."""
+        """Remove all checkpoints, because the sweep is complete."""
         self.pieces.discard()
 
 
@@ -101,11 +107,13 @@ _TEXTS, _FACTS = ("parts", "classes"), ("task", "is_side", "smallest_p")
 
 
 def save_results(results: ProbeResults, run: Path | Location, *, requested: bool = True) -> None:
-    """Write to `probes/<key>/` of the run that lies there, all or nothing; probes that are there are kept.
+    """Write results to `probes/<key>/` of a run, all or nothing; probes that are there are kept.
 
     Args:
-        requested: Whether a user wants these probes, which `load_results` then prefers to all older ones, rather
-            than needing them in passing, as the untrained control of another run.
+        results: Probes with their controls.
+        run: Location of the run.
+        requested: Whether a user wants these probes, which `load_results` then prefers to all older ones. False
+            for those that are only needed for others, as the untrained control of another run.
     """
     location, scores = locate(run), {SCORES: csv_of_frame(results.scores).encode()}
     controls: dict[str, bytes] = {}
@@ -140,16 +148,18 @@ def _npz(write: Callable[[BytesIO], None]) -> bytes:
 
 
 def is_stored(run: Location, key: str) -> bool:
-    """Whether complete results called `key` are there."""
+    """Whether complete results called `key` exist."""
     return run.exists(f"{PROBES}/{key}/{HEAD}")
 
 
 def load_results(run: RunReader, key: str | None = None, target: str | None = None) -> ProbeResults:
     """Return the stored results called `key`, or else the newest for `target` on the episodes the run has now.
 
+    The newest are those that were asked for last, whether they were fitted then or loaded.
+
     Args:
-        key: As `probe-kit run show` lists it; its beginning will do, and no other results are read. Newest: those
-            that were asked for last, whether they were fitted then or loaded.
+        run: Run with the results.
+        key: Key, as `probe-kit run show` lists it, or its beginning; no other results are read.
         target: A side, a built-in column, or one of a table; by default the correct side. The newest of a side are
             of the first captured inference; those of later ones are read by their key.
 
@@ -204,7 +214,11 @@ def load_results_by_call(run: RunReader, like: ProbeResults) -> dict[int, ProbeR
 
 
 def load_side_results(run: RunReader, key: str | None = None) -> ProbeResults:
-    """Return stored results of a side, as `load_results` does. Raises UsageError for a key of another target."""
+    """Return stored results of a side, as `load_results` does.
+
+    Raises:
+        UsageError: For a key of another target.
+    """
     results = load_results(run, key)
     if not results.settings.is_side:
         raise UsageError(
@@ -215,9 +229,10 @@ def load_side_results(run: RunReader, key: str | None = None) -> ProbeResults:
 
 
 def stored_targets(run: RunReader) -> dict[str, int]:
-    """Return the targets but sides that the run has probes of on its present episodes, in alphabetical order.
+    """Return the targets, without sides, that the run has probes of on its present episodes.
 
-    With each the number of different values that it had: every one of them was a test.
+    They are in alphabetical order. The value of each is the number of different labels that it had: every one of
+    them was a test.
     """
     current = _current(run, read_probes(run.location))
     versions = {(settings.target, settings.label) for _, settings in current if not settings.is_side}
@@ -255,7 +270,7 @@ def how_to_probe(run: RunReader) -> str:
 def _rank(bundle: Bundle) -> tuple[bool, str, str, str]:
     """Return a key to sort by: the newest results have the highest.
 
-    Probes of a side on all categories together come behind others: what is said by category has no number of them.
+    Probes of a side on all categories together rank below others: statements by category have no number from them.
     """
     settings = settings_of(bundle)
     by_category = not settings.is_side or settings.categories != (EVERYWHERE,)
@@ -293,7 +308,11 @@ def _unpack(arrays: Mapping[str, Any]) -> dict[tuple[str, str], ProbeCurve]:
 
 
 def read_probes(run: Location) -> dict[str, Bundle]:
-    """Return every complete result by key. Raises RunDamagedError for a changed one or another format."""
+    """Return every complete result by key.
+
+    Raises:
+        RunDamagedError: For a changed result or another format.
+    """
     return {key: _checked(bundle) for key, bundle in read_bundles(run, PROBES).items()}
 
 
@@ -305,7 +324,11 @@ def _checked(bundle: Bundle) -> Bundle:
 
 
 def settings_of(bundle: Bundle) -> ProbeSettings:
-    """Return the settings of stored results. Raises RunDamagedError."""
+    """Return the settings of stored results.
+
+    Raises:
+        RunDamagedError: If they cannot be those of this format.
+    """
     stored = bundle.head["settings"]
     try:
         lists = {name: tuple(stored[name]) for name in ("categories", "views")}
@@ -315,7 +338,11 @@ def settings_of(bundle: Bundle) -> ProbeSettings:
 
 
 def read_controls(bundle: Bundle) -> Controls:
-    """Return the controls that results were compared with so far. Raises RunDamagedError."""
+    """Return the controls that results were compared with so far.
+
+    Raises:
+        RunDamagedError: If the file holds no controls.
+    """
     if not bundle.has(CONTROLS):
         return Controls()
     try:

@@ -14,9 +14,10 @@ if TYPE_CHECKING:
 
 
 def best_sites_findings(results: ProbeResults) -> list[str]:
-    """Return what was left out, then where the target can be decoded: a line per category and view.
+    """Return a line per reason for leaving out samples or a control, then a line per category and view.
 
-    Of a side the first view alone, and whether the pictures alone decode it: no model has to know it then.
+    The latter lines say where the target can be decoded. For a side they cover the first view alone, and whether
+    the pictures alone decode it: no model has to know it then.
     """
     settings = results.settings
     lines = []

@@ -20,12 +20,12 @@ Array = Any
 
 
 def array_namespace(array: Array) -> Any:
-    """The module that made `array`: numpy or torch."""
+    """Return the module that made `array`: numpy or torch."""
     return np if isinstance(array, np.ndarray) else import_module("torch")
 
 
 def to_device(array: NDArray[Any], device: "str | torch.device | None") -> Array:
-    """`array` as a torch tensor on `device`, or as it is without one."""
+    """Return `array` as a torch tensor on `device`, or as it is without one."""
     if device is None:
         return array
     import torch
@@ -35,17 +35,22 @@ def to_device(array: NDArray[Any], device: "str | torch.device | None") -> Array
 
 
 def to_device_of(like: Array, array: NDArray[Any]) -> Array:
-    """`array` where `like` is, and made by the same module."""
+    """Return `array` on the device of `like`, and made by the same module."""
     return array if isinstance(like, np.ndarray) else to_device(array, like.device)
 
 
 def to_numpy(array: Array) -> NDArray[Any]:
-    """`array` as a numpy array in this machine's memory."""
+    """Return `array` as a numpy array in this machine's memory."""
     return array if isinstance(array, np.ndarray) else np.asarray(array.cpu())
 
 
 def check_device(device: str | None) -> None:
-    """Raises MissingExtraError without torch, and UsageError for a device torch does not know or see."""
+    """Raise an error for a device that torch cannot use; None is always accepted.
+
+    Raises:
+        MissingExtraError: For a device without torch.
+        UsageError: For a device that torch does not know or see.
+    """
     if device is None:
         return
     check_device_name(device)
@@ -63,10 +68,10 @@ def check_device(device: str | None) -> None:
 
 
 def keep_freed_memory() -> None:
-    """Have glibc keep up to 64 MB of what is freed for the next arrays, instead of giving it back to the system.
+    """Have glibc keep up to 64 MB of freed memory for the next arrays, instead of returning it to the system.
 
-    It learns so from the largest block, up to 32 MB, that was ever freed. Arrays of some megabytes that come and
-    go with every step are otherwise mapped anew each time. Costs nothing: the block is never touched.
+    It sets this limit by the largest block, up to 32 MB, that was ever freed. Arrays of some megabytes that come
+    and go with every step are otherwise mapped anew each time. Costs nothing: the block is never touched.
     """
     np.empty(2**25 - 2**16, np.uint8)  # below 32 MB, with what glibc adds to a block
 
@@ -74,7 +79,7 @@ def keep_freed_memory() -> None:
 # -- rows of large arrays ------------------------------------------------------------------------------------
 
 ROWS_PER_BLOCK = 2048
-"""32 MB of float64 at a width of 2,048."""
+"""Rows of a block: 32 MB of float64 at a width of 2,048."""
 
 
 @dataclass(frozen=True)
@@ -86,12 +91,12 @@ class RowSubset:
 
     @classmethod
     def all(cls, matrix: Array) -> "RowSubset":
-        """Every row."""
+        """Return every row."""
         return cls(matrix, np.arange(len(matrix)))
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(N, D)."""
+        """The shape (N, D)."""
         return len(self.rows), self.matrix.shape[1]
 
     def __len__(self) -> int:
@@ -104,30 +109,30 @@ class RowSubset:
         return np.asarray(to_numpy(self.read()), dtype)
 
     def read(self) -> Array:
-        """(N, D), copied."""
+        """Return the rows (N, D), copied."""
         return self.matrix[self.rows]
 
     def blocks(self) -> Iterator[Array]:
-        """All rows in order, ROWS_PER_BLOCK at a time, each block a copy."""
+        """Yield all rows in order, ROWS_PER_BLOCK at a time, each block a copy."""
         for start in range(0, len(self), ROWS_PER_BLOCK):
             yield self.matrix[self.rows[start : start + ROWS_PER_BLOCK]]
 
     def to(self, device: str | None) -> "RowSubset":
-        """The same with the matrix as a torch tensor on `device`; unchanged without one."""
+        """Return the same with the matrix as a torch tensor on `device`; unchanged without one."""
         return RowSubset(to_device(self.matrix, device), self.rows)
 
 
 Features = Array | RowSubset
-"""(N, D) in memory, or rows that are visited block by block."""
+"""Features (N, D) in memory, or rows that are visited block by block."""
 
 
 def blocks_of(features: Features) -> Iterator[Array]:
-    """The rows of `features` in blocks; an array is one block, itself."""
+    """Return the rows of `features` in blocks; an array is one block, itself."""
     return features.blocks() if isinstance(features, RowSubset) else iter([features])
 
 
 def module_of(features: Features) -> Any:
-    """numpy or torch, whichever holds `features`."""
+    """Return the module that holds `features`: numpy or torch."""
     return array_namespace(features.matrix if isinstance(features, RowSubset) else features)
 
 
@@ -135,7 +140,13 @@ def module_of(features: Features) -> Any:
 
 
 class Moments(NamedTuple):
-    """(D,) float64 each: mean and deviation of features, and the rounding of the mean in their stored type."""
+    """The moments of D features, (D,) float64 each.
+
+    Attributes:
+        mean: Mean of every feature.
+        scale: Standard deviation of every feature.
+        rounding: Rounding of the mean in the stored type of the features, at least one unit in the last place.
+    """
 
     mean: Array
     scale: Array
@@ -146,7 +157,7 @@ class Moments(NamedTuple):
         """Return the moments of (N, D) samples.
 
         Sums are of differences from the first sample in float64. A feature that never varies has deviation 0, and
-        a variation that is small against its offset is exact. rounding: at least one unit in the last place.
+        a variation that is small against its offset is exact.
         """
         xp, count = module_of(features), len(features)
         first = xp.asarray(next(blocks_of(features))[0], dtype=xp.float64)
@@ -158,12 +169,12 @@ class Moments(NamedTuple):
 
 @dataclass(frozen=True)
 class Standardiser:
-    """Mean and scale of every feature that varies, learned on training samples only.
+    """The mean and scale of every feature that varies, learned on training samples only.
 
     Attributes:
         varies: (D,) bool, features with non-zero variance.
-        mean: (V,) float64 of these V features.
-        scale: As `mean`.
+        mean: (V,) float64 mean of these V features.
+        scale: (V,) float64 standard deviation of these V features.
     """
 
     varies: Array
@@ -183,7 +194,7 @@ class Standardiser:
         return cls(varies, mean[varies], scale[varies])
 
     def __call__(self, features: Array) -> Array:
-        """(N, D) samples as (N, V) float64 with the training samples' mean 0 and deviation 1."""
+        """Return (N, D) samples as (N, V) float64 with the training samples' mean 0 and deviation 1."""
         samples = features[:, self.varies] - self.mean
         samples /= self.scale
         return samples

@@ -26,19 +26,19 @@ WORTH_NARROWING = 1024
 """Features from which on eigenvectors in float32, made orthogonal again, take less time than in float64."""
 
 LEADING, POWERS, SETTLED = 64, 4, 1e-3
-"""Axes looked for first, by so many products with a block of vectors, and the share of their variance that they
+"""Axes computed first, by so many products with a block of vectors, and the share of their variance that they
 may miss to be kept. They are the steepest, and would blur the others: float32 knows eigenvectors up to a part of
 the largest eigenvalue, which may be 10,000 times the hundredth."""
 
 
 def principal_axes(samples: Array) -> Array:
-    """Orthonormal axes whose span holds the rows of `samples`: (D, R) for (N, D), R = min(N, D).
+    """Return orthonormal axes whose span holds the rows of `samples`: (D, R) for (N, D), R = min(N, D).
 
-    An L2-penalised linear model fitted on `samples @ axes` is the one fitted on `samples`: what lies outside
-    their span is only penalised, so its weight is zero. In these coordinates the samples' second moments are
-    diagonal; only nearly so where there are many, which is enough for steps to be short. Both factors are
-    orthogonal to machine precision, or 1e-10 where there are many, also for nearly equal samples, which the
-    eigenvectors of a Gram matrix, scaled back, are not.
+    An L2-penalised linear model fitted on `samples @ axes` is the one fitted on `samples`: weights outside their
+    span are only penalised, so they are zero. In these coordinates the samples' second moments are diagonal; only
+    nearly so where there are many, which is enough for steps to be short. Both factors are orthogonal to machine
+    precision, or 1e-10 where there are many. This also holds for nearly equal samples, for which it does not hold
+    of the eigenvectors of a Gram matrix, scaled back.
     """
     xp = array_namespace(samples)
     if samples.shape[0] < samples.shape[1]:
@@ -51,9 +51,9 @@ def principal_axes(samples: Array) -> Array:
 
 
 def narrow_axes(moments: Array) -> Array:
-    """(D, D) float32 principal axes of samples with such moments, which are lost, by ascending variance.
+    """Return principal axes (D, D) in float32 of samples with these moments, by ascending variance.
 
-    They shape steps only, so that float32 will do, in half the time.
+    The moments are overwritten. Axes shape steps only, so that float32 is sufficient, in half the time.
     """
     xp = array_namespace(moments)
     if len(moments) < WORTH_NARROWING:
@@ -72,7 +72,10 @@ def narrow_axes(moments: Array) -> Array:
 
 
 def _leading(moments: Array) -> tuple[Array, Array]:
-    """(D, k) axes of the largest variances, and these, ascending: as many as a few products settle, maybe none."""
+    """Return the axes (D, k) of the largest variances, and these, ascending.
+
+    These are as many as a few products settle, maybe none.
+    """
     xp = array_namespace(moments)
     start = np.random.default_rng(0).standard_normal((len(moments), LEADING))
     block = to_device_of(moments, start)
@@ -87,7 +90,10 @@ def _leading(moments: Array) -> tuple[Array, Array]:
 
 
 def _eigenvectors(moments: Array) -> Array:
-    """(D, D) of symmetric `moments` in float32, which are lost, by ascending eigenvalue."""
+    """Return the eigenvectors (D, D) of symmetric float32 `moments`, by ascending eigenvalue.
+
+    The moments are overwritten.
+    """
     if not isinstance(moments, np.ndarray):
         return array_namespace(moments).linalg.eigh(moments)[1]
     from scipy.linalg import eigh  # type: ignore[import-untyped]  # numpy's takes as long in float32 as in float64
@@ -96,7 +102,10 @@ def _eigenvectors(moments: Array) -> Array:
 
 
 def _orthogonal(axes: Array) -> Array:
-    """(D, D) float64: float32 axes after a step of Newton and Schulz, which squares what they lack, some 2e-6."""
+    """Return float32 axes as (D, D) float64, after a step of Newton and Schulz.
+
+    The step squares their deviation from orthogonality, some 2e-6.
+    """
     xp = array_namespace(axes)
     exact = xp.asarray(axes, dtype=xp.float64)
     lacking = exact.T @ exact
@@ -118,49 +127,50 @@ WORTH_CONVERTING = 2**17
 class _OfAllColumns:
     """The same samples for every label column.
 
-    small: whether the moments of all label columns cost less than the many small calls of an iteration.
+    Attributes:
+        small: Whether the moments of all label columns cost less than the many small calls of an iteration.
     """
 
     small = False
 
     def of(self, _columns: Array) -> Self:
-        """Itself."""
+        """Return itself."""
         return self
 
     def narrow(self) -> Self:
-        """Itself."""
+        """Return itself."""
         return self
 
 
 @dataclass(frozen=True)
 class DenseDesign(_OfAllColumns):
-    """Samples in memory, (N, R) float64, or float32 if narrowed."""
+    """The samples in memory, (N, R) float64, or float32 if narrowed."""
 
     samples: Array
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(N, R)."""
+        """The shape (N, R)."""
         return self.samples.shape[0], self.samples.shape[1]
 
     @cached_property
     def spectrum(self) -> Array:
-        """(R, 1) squared length of every column."""
+        """The squared length of every column, (R, 1)."""
         return array_namespace(self.samples).einsum("nr,nr->r", self.samples, self.samples)[:, None]
 
     def __matmul__(self, weights: Array) -> Array:
         return self.samples @ weights
 
     def gather(self, values: Array) -> Array:
-        """Zᵀ · values, (R, K) for (N, K)."""
+        """Return Zᵀ · values, (R, K) for (N, K)."""
         return self.samples.T @ values
 
     def moments(self, weights: Array) -> Array:
-        """Zᵀ · diag(column) · Z per column of weights, (K, R, R) for (N, K)."""
+        """Return Zᵀ · diag(column) · Z per column of weights, (K, R, R) for (N, K)."""
         return (self.samples.T * weights.T[:, None, :]) @ self.samples
 
     def narrow(self) -> Self:
-        """The same in float32, unless it is small."""
+        """Return the same in float32, unless it is small."""
         xp, (count, width) = array_namespace(self.samples), self.shape
         if count * width < WORTH_CONVERTING:
             return self
@@ -169,7 +179,7 @@ class DenseDesign(_OfAllColumns):
 
 @dataclass(frozen=True)
 class StackedDesign:
-    """Samples of several folds in memory, (F, N, R) float64, filled up with zeros before the last column.
+    """The samples of several folds in memory, (F, N, R) float64, filled up with zeros before the last column.
 
     Attributes:
         fold_of: (K,) the fold that each label column belongs to.
@@ -195,47 +205,48 @@ class StackedDesign:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(N, R)."""
+        """The shape (N, R)."""
         return self.samples.shape[1], self.samples.shape[2]
 
     @property
     def spectrum(self) -> Array:
-        """(R, K) squared length of every column of a label column's samples."""
+        """The squared length of every column of a label column's samples, (R, K)."""
         return array_namespace(self.samples).square(self.samples).sum(axis=1)[self.fold_of].T
 
     def of(self, columns: Array) -> "StackedDesign":
-        """The same samples for the label columns of a mask (K,)."""
+        """Return the same samples for the label columns of a mask (K,)."""
         return StackedDesign(self.samples, self.fold_of[columns])
 
     def narrow(self) -> Self:
-        """Itself."""
+        """Return itself."""
         return self
 
     @cached_property
     def _samples_by_label(self) -> Array:
-        """(K, N, R) the samples of every label column."""
+        """The samples of every label column, (K, N, R)."""
         return self.samples[self.fold_of]
 
     def __matmul__(self, weights: Array) -> Array:
         return (self._samples_by_label @ weights.T[..., None])[..., 0].T
 
     def gather(self, values: Array) -> Array:
-        """Zᵀ · values, (R, K) for (N, K)."""
+        """Return Zᵀ · values, (R, K) for (N, K)."""
         return (values.T[:, None] @ self._samples_by_label)[:, 0].T
 
     def moments(self, weights: Array) -> Array:
-        """Zᵀ · diag(column) · Z per column of weights, (K, R, R) for (N, K)."""
+        """Return Zᵀ · diag(column) · Z per column of weights, (K, R, R) for (N, K)."""
         return (self._samples_by_label * weights.T[..., None]).swapaxes(1, 2) @ self._samples_by_label
 
 
 @dataclass(frozen=True)
 class StreamedDesign(_OfAllColumns):
-    """Samples made from raw features block by block in every product: standardised, then turned to `axes`.
+    """The samples made from raw features block by block in every product: standardised, then turned to `axes`.
+
+    Its memory is one block in float64, and (N, K) for K problems.
 
     Attributes:
-        axes: (V, R − 1) of the V features that vary.
-        variances: (R − 1,) squared lengths of the columns without the intercept's. Memory is one block in float64,
-            and (N, K) for K problems.
+        axes: (V, R − 1) axes of the V features that vary.
+        variances: (R − 1,) squared lengths of the columns without the intercept's.
     """
 
     features: RowSubset
@@ -245,12 +256,12 @@ class StreamedDesign(_OfAllColumns):
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(N, R)."""
+        """The shape (N, R)."""
         return len(self.features), self.axes.shape[1] + 1
 
     @property
     def spectrum(self) -> Array:
-        """(R, 1) squared length of every column."""
+        """The squared length of every column, (R, 1)."""
         xp = array_namespace(self.axes)
         return xp.hstack([self.variances, xp.ones_like(self.axes[0, :1]) * len(self.features)])[:, None]
 
@@ -259,7 +270,7 @@ class StreamedDesign(_OfAllColumns):
         return self._joined([self.standardise(block) @ turned for block in self.features.blocks()]) + weights[-1]
 
     def gather(self, values: Array) -> Array:
-        """Zᵀ · values, (R, K) for (N, K)."""
+        """Return Zᵀ · values, (R, K) for (N, K)."""
         start, total = 0, 0.0
         for block in self.features.blocks():
             total = total + self.standardise(block).T @ values[start : start + len(block)]
@@ -267,7 +278,7 @@ class StreamedDesign(_OfAllColumns):
         return self._joined([self.axes.T @ total, values.sum(axis=0)[None]])
 
     def moments(self, weights: Array) -> Array:
-        """Zᵀ · diag(column) · Z per column of weights, (K, R, R) for (N, K)."""
+        """Return Zᵀ · diag(column) · Z per column of weights, (K, R, R) for (N, K)."""
         return array_namespace(self.axes).stack([self._moments(column) for column in weights.T])
 
     def _moments(self, weights: Array) -> Array:
@@ -288,7 +299,7 @@ class StreamedDesign(_OfAllColumns):
 
 
 Design = DenseDesign | StackedDesign | StreamedDesign
-"""N samples Z in R orthogonal coordinates, the last one all ones for the intercept."""
+"""A matrix of N samples Z in R orthogonal coordinates, the last one all ones for the intercept."""
 
 
 # -- a training fold -----------------------------------------------------------------------------------------
@@ -299,7 +310,7 @@ IN_MEMORY = 2**29
 
 @dataclass(frozen=True)
 class Projection:
-    """A training fold's samples in standardised principal coordinates, and the way to get others there.
+    """A training fold's samples in standardised principal coordinates, and the map of other samples to them.
 
     Attributes:
         train: N samples in R + 1 (nearly) orthogonal columns, the last one all ones for the intercept.
@@ -325,11 +336,11 @@ class Projection:
         return cls(standardise, axes, DenseDesign(_turned(samples, axes)))
 
     def __call__(self, features: Array) -> Array:
-        """(N, D) other samples as (N, R + 1)."""
+        """Return other samples (N, D) as (N, R + 1)."""
         return _turned(self.standardise(features), self.axes)
 
     def raw_weights(self, weights: Array) -> tuple[NDArray[np.float64], float]:
-        """Weights (D,) and intercept on the raw features that decide like `weights` (R + 1,) do here."""
+        """Return weights (D,) and intercept on the raw features that decide like `weights` (R + 1,) do here."""
         varying = to_numpy(self.axes @ weights[:-1] / self.standardise.scale)
         raw = np.zeros(self.standardise.varies.shape[0])
         raw[to_numpy(self.standardise.varies)] = varying
@@ -343,7 +354,7 @@ def _stay(features: RowSubset) -> bool:
 
 
 def _turned(samples: Array, axes: Array) -> Array:
-    """(N, R + 1) along axes, and a column of ones for the intercept."""
+    """Return the samples along axes, with a column of ones for the intercept, (N, R + 1)."""
     xp = array_namespace(samples)
     turned = xp.ones((samples.shape[0], axes.shape[1] + 1), dtype=xp.float64, device=samples.device)
     xp.matmul(samples, axes, out=turned[:, :-1])

@@ -1,14 +1,14 @@
 """Exact solver of many L2-regularised logistic regressions on the same samples.
 
-The objective is scikit-learn's: C · Σ log(1 + exp(−y f)) + ½‖w‖², f = Zw, the intercept not penalised.
-Samples come in principal coordinates (`design_matrix.Projection`), whose columns are nearly orthogonal: there the
-Hessian I + C·ZᵀSZ is nearly diagonal, so Newton steps by conjugate gradients with a diagonal preconditioner
-need a few products each, and all label columns share them as matrix–matrix products.
+The objective is scikit-learn's: C · Σ log(1 + exp(−y f)) + ½‖w‖², f = Zw, the intercept not penalised. Samples
+come in principal coordinates (`design_matrix.Projection`), whose columns are nearly orthogonal: there the Hessian
+I + C·ZᵀSZ is nearly diagonal. So Newton steps by conjugate gradients with a diagonal preconditioner need a few
+products each. All label columns share these as matrix–matrix products.
 
-Through many samples, products are float32 between two points that are known exactly: decisions and sums there are
+With many samples, products are float32 between two points that are known exactly: decisions and sums there are
 float64, and float32 only adds what changed since. Whether a solution is accepted is decided at an exact point, so
-that the precision of a step shapes the way, never the optimum. numpy arrays or torch tensors: samples on a GPU are
-solved there.
+that the precision of a step shapes the way, never the optimum. Samples may be numpy arrays or torch tensors; those
+on a GPU are solved there.
 """
 
 from collections.abc import Iterable, Iterator
@@ -25,21 +25,23 @@ from probe_kit.train.solver.design_matrix import Design
 # -- one Newton step, by conjugate gradients -----------------------------------------------------------------
 
 MAX_CG_STEPS = 100
-"""Columns that need more are solved by factorising; another number changes times, not optima."""
+"""Steps beyond which a column is solved by factorising; another number changes times, not optima."""
 
 
 def newton_steps(
     design: Design, penalty: Array, gradient: Array, curvature: Array, precision: Array
 ) -> tuple[Array, Array, Array]:
-    """Solve (penalty + ZᵀSZ) step = −gradient per column, to relative `precision` (K,), in the design's precision.
+    """Solve (penalty + ZᵀSZ) step = −gradient per column, in the design's precision.
 
     Args:
-        penalty: (R, 1).
-        gradient: (R, K).
+        design: N samples Z in R coordinates.
+        penalty: (R, 1) diagonal of the penalty.
+        gradient: (R, K) gradient of every column.
         curvature: (N, K), the diagonals S.
+        precision: (K,) relative precision of every column's step.
 
     Returns:
-        The steps (R, K), what they change in the decisions, Z · step (N, K), which costs no product more, and the
+        The steps (R, K), the change Z · step (N, K) of the decisions, which needs no further product, and the
         numbers of the columns that were not solved in time, whose steps are 0.
     """
     xp = array_namespace(gradient)
@@ -89,36 +91,36 @@ def newton_steps(
 
 
 def _dots(first: Array, second: Array) -> Array:
-    """(K,) products of columns."""
+    """Return the scalar products of columns, (K,)."""
     return array_namespace(first).einsum("rk,rk->k", first, second)
 
 
 # -- the solver ----------------------------------------------------------------------------------------------
 
 MAX_NEWTON_STEPS = 100
-"""After these `ProbeNotConvergedError` is raised: no probe is used that is not at its optimum."""
+"""Bound after which `ProbeNotConvergedError` is raised: no probe is used that is not at its optimum."""
 MAX_STEPS_BETWEEN = 10
 """Newton steps by products in float32 from one exact point to the next."""
 COARSEST, FINEST = 0.1, 1e-5
-"""Relative precision of a step: what any is worth, and what is rounding in float32."""
+"""Relative precision of a step: the coarsest that is useful, and the finest before rounding in float32."""
 NEAR = 2e-2
-"""Relative gradient after which one more step in float32 is made, before a point is looked at exactly."""
+"""Relative gradient after which one more step in float32 is made, before a point is computed exactly."""
 GAIN = 1e-5
 """Share of an exact point's gradient that steps in float32 leave: less would be their rounding."""
 EXACT = 1e-12
 """Share of an objective that is rounding in float64."""
 SAFETY = 0.3
-"""Share of the tolerance that they aim at, so that the exact gradient is below it."""
+"""Share of the tolerance at which steps aim, so that the exact gradient is below it."""
 
 
 @dataclass(frozen=True)
 class _Point:
-    """The weights at which problems, one column each, are, and the objective there.
+    """The weights of problems, one column each, and the objective there.
 
     Attributes:
-        weights: (R, K).
+        weights: (R, K) weights.
         decisions: (N, K) Z · weights.
-        loss: (K,) of all samples.
+        loss: (K,) loss summed over all samples.
         misfit: (N, K) 1 − P(label).
         pulled: (R, K) Zᵀ · (signs ∘ misfit).
     """
@@ -134,18 +136,18 @@ class _Point:
         return _Point(*(array_namespace(part).empty_like(part) for part in vars(self).values()))
 
     def only(self, mask: Array) -> "_Point":
-        """Some of them."""
+        """Return some of the points."""
         return _Point(*(part[..., mask] for part in vars(self).values()))
 
     def put(self, mask: Array, points: "_Point") -> None:
-        """Put `points` in the place of some."""
+        """Replace some of the points by `points`."""
         for part, other in zip(vars(self).values(), vars(points).values(), strict=True):
             part[..., mask] = other
 
 
 @dataclass(frozen=True)
 class _Problems:
-    """Problems still to be solved, one column each, and where they are."""
+    """The problems still to be solved, one column each, and their points."""
 
     samples: Design
     columns: Array
@@ -155,7 +157,7 @@ class _Problems:
     at: _Point
 
     def only(self, mask: Array) -> "_Problems":
-        """Some of them."""
+        """Return some of the problems."""
         if mask.all():
             return self
         columns, strength, rounding = self.columns[mask], self.strength[mask], self.rounding[mask]
@@ -165,7 +167,7 @@ class _Problems:
 
 
 class LogisticSolver:
-    """Solves every column of a label matrix for one C after another, each warm-started by the one before.
+    """A solver of every column of a label matrix for one C after another, each warm-started by the one before.
 
     Args:
         samples: N samples in R orthogonal columns, the last one all ones for the intercept.
@@ -184,10 +186,10 @@ class LogisticSolver:
         self.rounding = 1e-15 * (spectrum.sum(axis=0) * samples.shape[0]) ** 0.5
 
     def path(self, labels: NDArray[np.bool_], strengths: NDArray[np.float64]) -> Iterator[Array]:
-        """Optimal weights (R, K) of every label column of (N, K), for each C of ascending `strengths`.
+        """Yield the optimal weights (R, K) of every label column of (N, K), for each C of ascending `strengths`.
 
         Raises:
-            ProbeNotConvergedError: Rather than return a column that is not at its optimum.
+            ProbeNotConvergedError: If a column is not at its optimum after the last step.
             TooFewGroupsError: For a column with a single class, which has no optimum.
         """
         check_single_class(labels)
@@ -195,7 +197,15 @@ class LogisticSolver:
         yield from self.path_of_signs(signs, strengths)
 
     def path_of_signs(self, signs: Array, strengths: Iterable[float | Array]) -> Iterator[Array]:
-        """`path` for labels as −1 and +1, (N, K); a sample with 0 is none. A C may be (K,), one per column."""
+        """Yield the weights of `path` for labels −1 and +1, (N, K).
+
+        Args:
+            signs: (N, K) labels; 0 leaves the sample out of that column.
+            strengths: Ascending C, each a number or one per column (K,).
+
+        Raises:
+            ProbeNotConvergedError: If a column is not at its optimum after the last step.
+        """
         if self._narrow is not self.samples:
             keep_freed_memory()
         shape = self.samples.shape[1], signs.shape[1]
@@ -206,7 +216,7 @@ class LogisticSolver:
             yield at.weights
 
     def _solved(self, signs: Array, strength: float | Array, start: _Point) -> _Point:
-        """The optima of labels −1/+1 (N, K), found from points `start` that are known exactly."""
+        """Return the optima of labels −1/+1 (N, K), found from points `start` that are known exactly."""
         xp = self.xp
         solved = start.like()
         each = xp.ones_like(start.weights[-1])
@@ -232,7 +242,10 @@ class LogisticSolver:
         )
 
     def _led(self, todo: _Problems, gradient: Array, relative: Array) -> _Point:
-        """Exact points behind steps in float32; where those led astray, behind a single one that was looked at."""
+        """Return the exact points after steps in float32.
+
+        Where those lead astray, it is the point after a single step that was checked.
+        """
         weights = self._led_nearer(todo, gradient, relative)
         led = self._point(todo.samples, todo.signs, weights, todo.samples @ weights)
         before, after = self._objective(todo.strength, todo.at), self._objective(todo.strength, led)
@@ -242,16 +255,16 @@ class LogisticSolver:
         return led
 
     def _stepped(self, todo: _Problems, gradient: Array, relative: Array) -> _Point:
-        """The exact points behind one Newton step."""
+        """Return the exact points after one Newton step."""
         step, change = self._newton_steps(todo, gradient, relative, SAFETY * self.tolerance)
         if self._narrow is not self.samples:
             change = todo.samples @ step
         return self._moved(todo, gradient, step, change, is_exact=True)
 
     def _led_nearer(self, todo: _Problems, gradient: Array, relative: Array) -> Array:
-        """(R, K) weights nearer to the optimum, by products in float32 that add to what is known exactly.
+        """Return weights (R, K) nearer to the optimum, by products in float32 that add to the exact point.
 
-        The last step is not looked back at: the exact point does that.
+        The last step is not checked: the exact point does that.
         """
         weights = self.xp.empty_like(todo.at.weights)
         goal = (GAIN * relative).clip(min=SAFETY * self.tolerance)
@@ -271,7 +284,7 @@ class LogisticSolver:
         return weights
 
     def _gradient(self, todo: _Problems) -> tuple[Array, Array, Array]:
-        """(R, K) of the objective; its norm (K,), and that in units of the weights."""
+        """Return the objective's gradient (R, K), its norm (K,), and the norm in units of the weights (K,)."""
         xp, at = self.xp, todo.at
         gradient = self.penalty * at.weights
         gradient -= todo.strength * at.pulled
@@ -282,7 +295,10 @@ class LogisticSolver:
     def _newton_steps(
         self, todo: _Problems, gradient: Array, relative: Array, goal: Array | float
     ) -> tuple[Array, Array]:
-        """(R, K) steps, as precise as `goal` asks, the relative gradient that is wanted, and Z · steps, (N, K)."""
+        """Return the steps (R, K) and Z · steps (N, K).
+
+        They are as precise as `goal`, the requested relative gradient, needs.
+        """
         curvature = todo.strength * todo.at.misfit * (1 - todo.at.misfit)
         if todo.samples.small:
             step = self._exact_newton_steps(todo.samples, gradient, curvature)
@@ -298,7 +314,7 @@ class LogisticSolver:
 
     @cached_property
     def _narrow(self) -> Design:
-        """The samples that steps are found with."""
+        """The samples with which steps are found."""
         return self.samples.narrow()
 
     def _exact_newton_steps(self, samples: Design, gradient: Array, curvature: Array) -> Array:
@@ -308,10 +324,15 @@ class LogisticSolver:
         return self.xp.linalg.solve(hessians, -gradient.T[..., None])[..., 0].T
 
     def _moved(self, todo: _Problems, gradient: Array, step: Array, change: Array, *, is_exact: bool) -> _Point:
-        """The points along `step`, which is halved per column until the objective falls enough.
+        """Return the points along `step`, which is halved per column until the objective falls enough.
 
         Args:
-            is_exact: Whether what is known of them is float64; else float32 adds to what is.
+            todo: K problems with their present points.
+            gradient: (R, K) gradient at these points.
+            step: (R, K) step of the weights.
+            change: (N, K) change of the decisions by the step.
+            is_exact: Whether the points are computed in float64; else float32 changes are added to the present
+                ones.
         """
         start = todo.at
         value, slope = self._objective(todo.strength, start), (gradient * step).sum(axis=0)
@@ -353,7 +374,10 @@ def check_single_class(labels: NDArray[np.bool_]) -> None:
 
 
 def _losses(margins: Array) -> tuple[Array, Array]:
-    """(K,) sums of log(1 + exp(−m)) over (N, K) margins, and each one's negative slope, 1 − P(label)."""
+    """Return the sums (K,) of log(1 + exp(−m)) over (N, K) margins, and each margin's 1 − P(label).
+
+    The latter is the negative slope of a loss.
+    """
     xp = array_namespace(margins)
     small = -abs(margins)  # exp of it never overflows, whatever the sign of the margin
     xp.exp(small, out=small)
