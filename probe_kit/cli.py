@@ -54,8 +54,7 @@ PARSE_ERROR: type[Exception] = typer.BadParameter.__mro__[1]
 _FOR_TYPER: tuple[type[BaseException], ...] = (
     typer.Exit, typer.Abort, typer.BadParameter.__mro__[2], BrokenPipeError
 )  # fmt: skip
-"""Exceptions that typer handles: an exit code, complaints about arguments, and an output that `head` has closed.
-"""
+"""Exceptions that typer handles: an exit code, complaints about arguments, and a closed output (`head`)."""
 
 
 class Commands(typer.core.TyperGroup):

@@ -125,8 +125,7 @@ class WeightsError(ProbeKitError):
 
 
 class PolicyFailedError(ProbeKitError):
-    """The code of a policy raised an error of its own, ended the process, or returned something that is no action.
-    """
+    """The code of a policy raised an error of its own, ended the process, or returned no valid action."""
 
 
 class CheckpointError(ProbeKitError):

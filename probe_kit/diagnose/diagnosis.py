@@ -282,8 +282,7 @@ def load_diagnosis(run: "Run", key: str) -> Diagnosis:
 
 
 def check_base(run: "Run", source: "ReplaySource", base: str) -> None:
-    """Check the base against the run's checkpoint as far as both files declare it; raises as `check_base_files`.
-    """
+    """Check the base against the run's checkpoint by the files of both; raises as `check_base_files`."""
     origin = origin_of(run)
     checkpoint, options = source.checkpoint or origin.checkpoint, {**origin.options, **source.options}
     check_base_files(run.model, checkpoint, base, options, cameras_of(run))

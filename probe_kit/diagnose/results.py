@@ -17,8 +17,7 @@ if TYPE_CHECKING:
 
 
 FRAMES = 24
-"""With so many frames, words that decide were detected in nine of ten draws or more; see `docs/notes/causal.md`.
-"""
+"""With so many frames, words that decide were detected in nine of ten draws or more (`docs/notes/causal.md`)."""
 LEAST_GROUPS = 6
 """Fewer groups cannot show at p < 0.05 that anything matters, by sign flips of whole groups: 2⁻⁵ is 0.03."""
 

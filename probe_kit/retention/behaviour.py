@@ -330,7 +330,9 @@ def _flagged(episodes: "pd.DataFrame") -> float | None:
 
 
 def units_of(episodes: "pd.DataFrame") -> "NDArray[np.str_]":
-    """Return the units (E,) of resampling: the group of items that share pictures, or the item where none is known.
+    """Return the units (E,) that are drawn as a whole.
+
+    A unit is the group of items that share pictures, or the item where no group is known.
     """
     return episodes["group_id" if "group_id" in episodes else "item_id"].to_numpy(dtype=str)
 
@@ -474,7 +476,7 @@ def chosen_wordings(runs: Sequence[RunReader]) -> list[str]:
 def mixed_settings(
     results: Mapping[tuple[str, str], ProbeResults], views: Sequence[str] | None = None
 ) -> list[str]:
-    """Return a sentence if probes of several runs were not fitted alike, and one for labels that are not the answer.
+    """Return a sentence if probes of several runs were not fitted alike, and one per target other than the answer.
 
     Args:
         results: Probe results by the location of the run and the target.
@@ -554,7 +556,7 @@ class OutcomeRuleScores:
 
 @dataclass(frozen=True)
 class TableRun:
-    """A run in the form that a table reads: by a score, by an outcome rule, and under a name that no other run has.
+    """A run in the form that a table reads: by a score, by an outcome rule, and under a name of its own.
 
     Attributes:
         run: The run, by its score if it was asked.

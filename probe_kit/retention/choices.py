@@ -11,8 +11,7 @@ options.
 Section = Literal["success", "rules", "answers", "probes", "retention", "controls", "interventions"]
 """Groups of tables that `retention --details` shows."""
 Family = Literal["label", "table"]
-"""The tests of labels that are corrected together: a stream's sites, or those of every label of the table (Holm).
-"""
+"""Tests of labels that are corrected together: a stream's sites, or those of every label of the table (Holm)."""
 Iterations = Literal["all", "best", "last"] | int
 """The iterations of the expert, or action tokens, that take part: all, the last one, or one by number.
 
