@@ -161,7 +161,9 @@ def gains(first: "Sequence[pd.DataFrame]", second: "Sequence[pd.DataFrame]") -> 
 
 
 def _of_side(tables: "Sequence[pd.DataFrame]") -> tuple[dict[str, Fraction], dict[str, str]] | None:
-    """Return by episode the share that was right, averaged over runs, and its group; None if runs differ in episodes.
+    """Return by episode the share that was right, averaged over runs, and its group.
+
+    None if runs differ in episodes.
     """
     by_episode: dict[str, list[Fraction]] = {}
     units: dict[str, str] = {}

@@ -348,7 +348,9 @@ def _items(
 
 
 def _only_probed(items: "pd.DataFrame") -> "tuple[pd.DataFrame, list[str]]":
-    """Return the items without those that were left out when others of their category were probed, and a sentence.
+    """Return the items without those that were left out when others of their category were probed.
+
+    A sentence about the dropped items goes with them, if there are some.
     """
     probed = items["encoded"].notna()
     dropped = ~probed & probed.groupby(items["category"]).transform("any")

@@ -169,8 +169,7 @@ class CallCurves:
         return CallLine(stream, self._part(stream), calls, accuracy, low, high, significant, null, episodes)
 
     def aligned(self, stream: str, event: str) -> AlignedLine | None:
-        """Return the accuracy of the stream's best sites counted from an event; None where too few episodes have it.
-        """
+        """Return the stream's best sites counted from an event; None where too few episodes have it."""
         pools: dict[int, list[bool]] = {}
         for call, curve in self._curves.items():
             right = curve.nested_correct(curve.stream(stream))

@@ -373,8 +373,7 @@ class Display(ABC):
         return []
 
     def finish(self, figure: "Figure", grid: "Sequence[Axes]") -> None:
-        """Add to a figure of one or more panels the parts that all of them share: a legend with every name once.
-        """
+        """Add the parts that all panels of a figure share: a legend with every name once."""
         if every := [*legend_handles(*grid).values(), *self.further_handles()]:
             legend_above(figure, every)
 

@@ -92,14 +92,12 @@ class SiteEffectDisplay(Display):
         Args:
             run: The run that stores the interchange.
             results: Probes of the run.
-            category: The category that is drawn.
-            view: View of the probes.
+            category: A category that was probed.
+            view: A view that was probed.
             stored: Result of `shown_passing`; None reads it from the run.
 
         Raises:
             NoInterventionsError: If no interchange is stored of the category.
-            UnknownCategoryError: If the category was not probed.
-            UnknownSiteError: If the view was not probed.
         """
         rows = (shown_passing(run) if stored is None else stored).get(category, [])
         if not rows:
