@@ -172,7 +172,9 @@ _LEAST = 100 * CHANCE
 
 
 def _colours(part: str) -> "Colormap":
-    """Return colours from white at chance, through the part's colour, to nearly black: lightness alone orders cells.
+    """Return colours from white at chance, through the part's colour, to nearly black.
+
+    Lightness alone orders the cells.
     """
     from matplotlib.colors import LinearSegmentedColormap
 
