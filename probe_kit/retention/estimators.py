@@ -47,7 +47,8 @@ class StreamScores:
         names: `action` and `backbone` in this order, as far as they were probed.
         fit: Their scores, on the same groups.
         at_most: Of a side, by name, an upper limit of the best site's accuracy, see `sufficiency.at_most`.
-        findable: Of a side, by name, see `sufficiency.findable`.
+        findable: Of a side, by name, the least accuracy of a site that such items find, see
+            `sufficiency.findable`.
     """
 
     names: tuple[str, ...]
@@ -334,7 +335,7 @@ def best_site(curve: ProbeCurve, stream: str, iterations: Iterations = "all") ->
 
 
 def stream_peaks(curve: ProbeCurve, iterations: Iterations = "all") -> dict[str, Peak]:
-    """Return the best sites of `backbone` and `action`, the stream the action is made in, as far as they were probed.
+    """Return the best sites of `backbone` and of the stream the action is made in, `action`, as far as probed.
 
     Args:
         curve: Probes of one category in one view.
@@ -352,7 +353,7 @@ def stream_peaks(curve: ProbeCurve, iterations: Iterations = "all") -> dict[str,
 
 
 def curve_scores(curve: ProbeCurve, iterations: Iterations = "all", seed_text: str = "") -> StreamScores | None:
-    """Return cross-fitted scores of the backbone and of the stream the action is made in, as far as they were probed.
+    """Return cross-fitted scores of the backbone and of the stream the action is made in, as far as probed.
 
     None with too few groups, or where a fold was trained on one side only: then no score is defined.
     """
@@ -414,8 +415,7 @@ def estimate_retention(
 
 
 def _published(action: float, backbone: float) -> float:
-    """Return the paper's ratio, of the accuracies of the best sites above one half; NaN where the backbone's is 0.
-    """
+    """Return the paper's ratio, of the best sites' accuracies above one half; NaN where the backbone's is 0."""
     return nan if backbone == CHANCE else float((action - CHANCE) / (backbone - CHANCE))
 
 

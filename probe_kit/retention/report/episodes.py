@@ -136,8 +136,7 @@ def _with_pictures(listed: Sequence[_Listed], stride: int) -> list[_Listed]:
 
 
 def _fitting(listed: Sequence[_Listed], step: int, most: int) -> int:
-    """Return the smallest multiple of `step` that keeps at most so many bytes of pictures, or one item's pictures.
-    """
+    """Return the smallest multiple of `step` that keeps at most so many bytes of pictures, or one item's."""
     last = max((episode.rank for episode in listed), default=0) + step
     for stride in range(step, last, step):
         pictures = {picture for picture, _ in _without_repeats(_with_pictures(listed, stride)).values()}

@@ -440,8 +440,7 @@ def encode(kind: str, content: bytes) -> str:
 
 
 def compact_svg(svg: bytes) -> bytes:
-    """Return the same drawing without metadata, comments, line breaks, names that nothing uses, and fine decimals.
-    """
+    """Return the same drawing without metadata, comments, line breaks, unused names and fine decimals."""
     ElementTree.register_namespace("", _SVG)
     ElementTree.register_namespace("xlink", _XLINK)
     root = ElementTree.fromstring(svg)
@@ -514,8 +513,7 @@ def provenance(name: str, run: RunReader, results: Sequence[ProbeResults]) -> di
 
 
 def _protocol(settings: Mapping[str, Any]) -> dict[str, str]:
-    """Return the protocol that a run follows, its differences from the default, and the run's deviations from it.
-    """
+    """Return the protocol of a run, its differences from the default, and the run's deviations from it."""
     protocol = settings.get("protocol")
     if not protocol:
         return {}

@@ -535,8 +535,7 @@ def with_corrected_p(
 
 
 def _missing(row: RetentionRow, results: ProbeResults, tests: int) -> tuple[str, str]:
-    """Return the reason why there is nothing to retain, in few words and in full; two empty texts where there is.
-    """
+    """Return the reason why there is nothing to retain, in few words and in full; two empty texts otherwise."""
     settings, backbone = results.settings, row.backbone
     if backbone.peak is None or row.action.peak is None:
         part = "backbone" if backbone.peak is None else "action"

@@ -77,7 +77,7 @@ class RunInfo:
 
 @dataclass(frozen=True, kw_only=True)
 class AnswerStats:
-    """The way in which the model of a VLM run was asked, and further numbers of its answers; all None for a policy run.
+    """The prompt of a VLM run, and further numbers of its answers; all None for a policy run.
 
     `share_by_clause` and `accuracy_strict` are None for runs that do not store them.
 
