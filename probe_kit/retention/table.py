@@ -91,7 +91,7 @@ class RetentionTable:
         return f"<RetentionTable of {models}: {categories} categories; print(table.to_markdown()) shows it>"
 
     def _repr_html_(self) -> str:
-        """Return the summary with its sentences, and folded below it the tables; pointing at a heading explains it.
+        """Return the summary with its sentences, and the tables folded below it; pointing at a heading explains it.
         """
         from markupsafe import Markup
 
@@ -169,7 +169,7 @@ class RetentionTable:
 
     @property
     def rules(self) -> "pd.DataFrame":
-        """The success that the rule grants without skill, by `run` and `category`, with the fields of `OutcomeRuleScores`.
+        """The success that the rule grants without skill, by `run` and `category`; fields of `OutcomeRuleScores`.
         """
         return part_frame(self.all_rows, "rules", by_view=False)
 
@@ -261,7 +261,10 @@ class RetentionTable:
         return render("latex", tables, notes=(*self.unpaired, *self.notes))
 
     def tables(self, sections: Collection[Section] | None = None) -> dict[str, Table]:
-        """Return answers, success, retention and controls by title, with the columns of some sections, all by default.
+        """Return answers, success, retention and controls by title.
+
+        Args:
+            sections: Sections whose columns are shown; None for all.
         """
         return retention_tables(self.all_rows, self.differences, self.unpaired, sections)
 
@@ -298,7 +301,7 @@ class RetentionTable:
         return self.to_rich()
 
     def to_rich(self, details: Collection[Section] | Literal["all"] = (), with_next_step: bool = True) -> "Group":
-        """Return the summary for a rich console: one table, a sentence per category, and one line with the next step.
+        """Return the summary for a rich console: one table, a sentence per category, and the next step in one line.
 
         Args:
             details: Sections that are shown above it, see `probe_kit.retention.choices.Section`; all of them by

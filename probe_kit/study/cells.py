@@ -191,8 +191,7 @@ class Cell:
 
     @property
     def units(self) -> float:
-        """The most inferences of an episode, in which conditions differ; 1 for cells without a policy that acts.
-        """
+        """The most inferences of an episode, in which conditions differ; 1 without a policy that acts."""
         return self.inferences / self.episodes if self.inferences else 1.0
 
     @property
@@ -202,8 +201,7 @@ class Cell:
 
     @cached_property
     def key(self) -> str:
-        """The hash of everything that the settings decide except the selection; the run's folder is named by it.
-        """
+        """The hash of everything that the settings decide except the selection; it names the run's folder."""
         if self.packed_key:
             return self.packed_key
         settings = self.settings
