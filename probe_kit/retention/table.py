@@ -91,7 +91,9 @@ class RetentionTable:
         return f"<RetentionTable of {models}: {categories} categories; print(table.to_markdown()) shows it>"
 
     def _repr_html_(self) -> str:
-        """Return the summary with its sentences, and the tables folded below it; pointing at a heading explains it.
+        """Return the summary with its sentences, and the tables folded below it.
+
+        Pointing at a heading explains it.
         """
         from markupsafe import Markup
 
@@ -169,8 +171,7 @@ class RetentionTable:
 
     @property
     def rules(self) -> "pd.DataFrame":
-        """The success that the rule grants without skill, by `run` and `category`; fields of `OutcomeRuleScores`.
-        """
+        """The success that the rule grants without skill, by `run` and `category`, as `OutcomeRuleScores`."""
         return part_frame(self.all_rows, "rules", by_view=False)
 
     @property
@@ -301,7 +302,7 @@ class RetentionTable:
         return self.to_rich()
 
     def to_rich(self, details: Collection[Section] | Literal["all"] = (), with_next_step: bool = True) -> "Group":
-        """Return the summary for a rich console: one table, a sentence per category, and the next step in one line.
+        """Return the summary for a rich console: one table, a sentence per category, and one line on the next step.
 
         Args:
             details: Sections that are shown above it, see `probe_kit.retention.choices.Section`; all of them by

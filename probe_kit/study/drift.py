@@ -107,7 +107,9 @@ def _decisions(
 
 
 def _moved(features: Features, origin: Features, like: Features) -> Features:
-    """Return features with means and deviations of `like` instead of those of `origin`; constant ones become means.
+    """Return features with means and deviations of `like` instead of those of `origin`.
+
+    Constant features become means.
     """
     spread = origin.std(axis=0)
     scale = np.divide(like.std(axis=0), spread, out=np.zeros_like(spread), where=spread > _CONSTANT * spread.max())
@@ -273,7 +275,7 @@ def measure_drift(
 
 
 def why_alone(before: RunReader, after: RunReader, view: str = "mean") -> str:
-    """Return the reason why probes of one run are not used on the other: other words or other frames; empty if they are.
+    """Return the reason why probes of one run are not used on the other: other words or frames; empty if they are.
 
     A VLM and a policy are compared where the VLM was shown the instruction and the frame in the size that the
     policy gets, both were delivered the same tokens, and the view has the same positions in both.

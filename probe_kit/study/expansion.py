@@ -66,8 +66,7 @@ def members(study: Study) -> Iterator[Member]:
 
 
 def of_side[Run: (Member, Cell)](runs: Sequence[Run], side: str) -> list[Run]:
-    """Return the runs that a side of a drift pair names: of a model's first condition, or of that after the slash.
-    """
+    """Return the runs of one side of a drift pair: of a model's first condition, or of that after the slash."""
     model, _, way = side.partition("/")
     of_model = [run for run in runs if run.model == model and (run.way == way if way else not run.asks)]
     return [run for run in of_model if run.way == of_model[0].way]
@@ -177,7 +176,7 @@ def _same_settings(cells: list[Cell]) -> list[Mistake]:
 
 
 def control_of(study: Study, cells: Sequence[Cell], cell: Cell) -> Cell | None:
-    """Return the run of a policy's untrained network that its probes are compared with; None without such a network.
+    """Return the run of a policy's untrained network that its probes are compared with; None without a network.
 
     It is in the same condition, or else of the same scene and seed: whether a network then acts changes nothing in
     what was captured before.

@@ -204,8 +204,7 @@ class StudyPlan:
         return {name: model.unavailable for name, model in self.study.study.models.items() if model.unavailable}
 
     def totals(self) -> dict[str, int]:
-        """Count runs, episodes by the model's task in them, inferences of policies, and missing episodes and probes.
-        """
+        """Count runs, episodes by the model's task, inferences of policies, and missing episodes and probes."""
         cells = [planned.cell for planned in self.played]
         n_asked = sum(cell.episodes for cell in cells if cell.asks)
         captured = sum(cell.episodes for cell in cells if cell.captured)

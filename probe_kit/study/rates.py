@@ -174,8 +174,7 @@ def _score_limits(row: RetentionRow) -> tuple[float | None, float | None] | None
 
 
 def probing_table(table: RetentionTable) -> Table:
-    """Return best accuracies in the backbone and where the action is made, and retention, by category and as a mean.
-    """
+    """Return best accuracies in the backbone and the action, and retention, by category and as a mean."""
     rows = [row for row in table.all_rows if row.view is not None]
     cells = tuple(
         (
