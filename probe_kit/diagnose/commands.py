@@ -97,7 +97,7 @@ def diagnose(
     probe-kit diagnose pi0 --checkpoint DIR --dataset FOLDER --require instruction
     probe-kit diagnose runs/mine --base lerobot/pi0_base
     probe-kit diagnose runs/mine --target side.correct
-    """
+    """  # noqa: D301
     from probe_kit.diagnose.diagnosis import diagnose_run
     from probe_kit.diagnose.inputs import names_of, read_paraphrases
     from probe_kit.intervene.pairs import read_pairs

@@ -302,12 +302,12 @@ class RetentionTable:
         return self.to_rich()
 
     def to_rich(self, details: Collection[Section] | Literal["all"] = (), with_next_step: bool = True) -> "Group":
-        """Return the summary for a rich console: one table, a sentence per category, and one line on the next step.
+        """Return the summary for a rich console: one table, a sentence per category, and the next step.
 
         Args:
             details: Sections that are shown above it, see `probe_kit.retention.choices.Section`; all of them by
                 "all".
-            with_next_step: Whether the line with the next step is added.
+            with_next_step: Whether a line with the next step is added.
         """
         from rich.console import Group
         from rich.text import Text

@@ -98,7 +98,7 @@ def run(
     probe-kit study run mine.toml --dry-run --verify --orphans
     probe-kit study run mine.toml --slots 2
     probe-kit study run mine.toml --only base --retry-failed
-    """
+    """  # noqa: D301
     from probe_kit.study import load_study, plan_study
 
     if slots and ray is not None:

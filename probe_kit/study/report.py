@@ -149,7 +149,9 @@ class StudyReport:
 
 
 def write_study_report(study: LoadedStudy, path: Path | str, partial: bool = False) -> StudyReport:
-    """Write the report of a study as one HTML file, whole or not at all; raises as `make_table` and `make_figures` too.
+    """Write the report of a study as one HTML file, whole or not at all.
+
+    Raises as `make_table` and `make_figures` too.
 
     Args:
         study: The study whose runs are stored.

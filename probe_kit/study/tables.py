@@ -52,7 +52,9 @@ _FEW = "!"
 
 
 def difference_table(table: RetentionTable, title: str) -> Table:
-    """Return differences of success rates, a row per pair and category; the whole comparison is one family of tests.
+    """Return differences of success rates, a row per pair and category.
+
+    The whole comparison is one family of tests.
     """
     rows = _tested(behaviour_once(table.differences))
     cells = [
@@ -72,14 +74,12 @@ def difference_table(table: RetentionTable, title: str) -> Table:
 
 
 def _tested(rows: Sequence[Difference]) -> list[Difference]:
-    """Return the same rows without tests of fewer than FEWEST_GROUPS groups, and Holm's p over those that are left.
-    """
+    """Return the same rows without tests of fewer than FEWEST_GROUPS groups, and Holm's p over the others."""
     return with_holm([row if (row.n_groups or 0) >= FEWEST_GROUPS else replace(row, p=None) for row in rows])
 
 
 def _items(count: int | None, of_count: int | None) -> str:
-    """Return the items in common, of how many where some are left out, with a mark where that is more than a fifth.
-    """
+    """Return the items in common, of how many where some are left out, marked where that is more than a fifth."""
     if count is None or of_count is None:
         return "other items" if count is None else str(count)
     if count == of_count:
@@ -95,8 +95,7 @@ def _remarks(rows: Sequence[Difference]) -> list[str]:
 
 
 def group_table(table: RetentionTable, title: str) -> Table:
-    """Return the differences of groups of models: the exact p over models first, the interval of these models apart.
-    """
+    """Return the differences of groups of models: the exact p over models first, then these models' interval."""
     rows = behaviour_once(table.differences)
     cells = [
         (

@@ -16,7 +16,9 @@ if TYPE_CHECKING:
     from probe_kit.runs import Run
 
 RUNS_BY_NAME: "list[Callable[[str], list[Run] | None]]" = []
-"""Functions that find several runs by one name, or return None for an unknown name; the command line adds studies.
+"""Functions that find several runs by one name, or return None for an unknown one.
+
+The command line adds studies.
 """
 
 

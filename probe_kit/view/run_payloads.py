@@ -106,8 +106,7 @@ def payload_script(name: str, value: Any, places: tuple[str, ...] = ()) -> bytes
 
 
 def failure_script(name: str, words: str, places: tuple[str, ...] = ()) -> bytes:
-    """Return the script `refuse(name, words)`, with the reason why there is no payload of this name, for the page to show.
-    """
+    """Return the script `refuse(name, words)`: the reason why there is no such payload, for the page to show."""
     return _script("refuse", name, _encode(words, places))
 
 

@@ -124,8 +124,7 @@ class _Pages:
         self._files = page_files()
 
     def file(self, request: Request) -> Response:
-        """Return the page, a file of it, or the picture in the tab of the page that leads to it, which names none.
-        """
+        """Return the page, a file of it, or the picture in the tab of the page that leads to it."""
         names = {"/": INDEX, _ICON: "app/icon.svg"}
         name = names.get(request.url.path) or f"app/{request.path_params['name']}"
         content = self._files.get(name)
@@ -177,8 +176,7 @@ class _Pages:
                 _ = self._catalogue.stamp(f"{key}/run"), self._catalogue.runs[key].table
 
     async def follow(self, request: Request) -> Response:
-        """Return events of runs that grow: how many episodes are committed. Nothing where every run is finished.
-        """
+        """Return events of runs that grow, with their committed episodes; nothing where every run is finished."""
         if not self._catalogue.growing:
             return Response(status_code=204)
         return StreamingResponse(self._events(request), media_type="text/event-stream")

@@ -77,9 +77,11 @@ class FrozenProbes:
         return self.curve.sites
 
     def first(self, position: int) -> Values:
-        """Return the log-odds (S,) of the episode in row `position` at the inference of the probes; see `log_odds`.
+        """Return the log-odds (S,) of the episode in row `position` at the inference of the probes.
 
-        Those of the run's own probes are the stored out-of-fold ones; NaN for an episode without any.
+        They are those of `log_odds`. Of the run's own probes they are the stored out-of-fold ones; NaN for an
+        episode without
+        any.
         """
         row = self.run.episodes.iloc[position]
         if self._readings is None:
@@ -97,7 +99,7 @@ class FrozenProbes:
         return np.asarray(self.curve.decisions[:, column] * toward(side_correct))
 
     def log_odds(self, position: int) -> tuple[Values, bool]:
-        """Return the log-odds (K, S) of the episode in row `position`, by captured inference that it reached and site.
+        """Return the log-odds (K, S) of the episode in row `position`, by captured inference it reached and site.
 
         Toward the correct side; NaN where the inference is a later one, and its activations are left out, or lack
         the view of the probe. The flag tells whether no probe that gave them was trained on the episode's item.
@@ -122,8 +124,7 @@ class FrozenProbes:
         return log_odds, fold is not None
 
     def _features(self, stream: str, probes: _StreamProbes, position: int, calls: int) -> Values:
-        """Return the view (K, S, D) at every captured inference; NaN where the view of an inference is not stored.
-        """
+        """Return the view (K, S, D) at every captured inference; NaN where it is not stored."""
         sites: tuple[Any, ...] = (slice(None), *probes.at)
         first: Values = self._rows[stream][position][:calls][(*sites, probes.view)].astype(np.float64)
         if len(first) == calls:
@@ -256,8 +257,7 @@ class ViewedRun:
         return self.run.ask is not None
 
     def outcome_word(self, outcome: Any) -> Any:
-        """Return the page's name of the outcome: `unread` where no rule could read the answer of a VLM, not `oob`.
-        """
+        """Return the page's name of the outcome: `unread` where no rule could read the answer of a VLM."""
         return UNREAD if self.answers and outcome == "oob" else outcome
 
     @cached_property
