@@ -1,10 +1,10 @@
 """Model organisms, which validate the pipeline, and the stages of `probe-kit demo`.
 
 `vlm-tiny` answers and does not act: it was trained on questions of Color, Shape, State and Traffic (*known*),
-and of nothing else. `pi0-tiny` is made of its backbone: it was trained to act on Color and Shape (*used*), while
-the actions of State questions went to a random side (*not used*). `pi0-tiny-state` differs in that they
-followed the answer (*used*). The early checkpoint has the VLM's backbone and an action expert of random weights
-(*does not decide*); untrained networks know nothing (*absent*).
+and of nothing else. `pi0-tiny` is made of its backbone. It was trained to act on Color and Shape (*used*); the
+actions of State questions went to a random side (*not used*). `pi0-tiny-state` differs in that they followed the
+answer (*used*). The early checkpoint has the VLM's backbone and an action expert of random weights (*does not
+decide*); untrained networks know nothing (*absent*).
 """
 
 import shlex

@@ -97,7 +97,7 @@ def _or_nan(value: float | None) -> float:
 
 
 def places_of(model: "Model") -> list[SiteGroup]:
-    """Return every layer of every stored stream and what the backbone passes on, in the order of the network."""
+    """Return every layer of every stored stream and the keys and values of the backbone, in network order."""
     streams = list(model.streams)
     if model.prompt_kv is not None:
         streams.insert(1, KV_STREAM)

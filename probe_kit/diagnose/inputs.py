@@ -74,7 +74,7 @@ def controls_of(frame: Frame, name: str, spread: NDArray[np.float64]) -> list[Ob
 
     See `hardly_changed`. Without other words of the frame, the first letter's case and the full stop change, or
     one
-    of them: a tokenizer of words may know only one spelling.
+    of them. A tokenizer of words may know only one spelling.
 
     Args:
         frame: Its other words are the only control of its instruction, if it has some.

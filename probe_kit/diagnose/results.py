@@ -63,7 +63,7 @@ class SitePassage:
         name: Name of the site in the form of `--sites`.
         difference: Norm of the difference of the activations, relative to the clean ones.
         carried: The change of the action under the patch of this site, projected on the change under the donor's
-            input, 1 for all of it; NaN where the donor changes no action.
+            input. It is 1 for all of the change, and NaN where the donor changes no action.
     """
 
     name: str

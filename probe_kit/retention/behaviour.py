@@ -72,7 +72,7 @@ class ScoredAnswers:
 
     @cached_property
     def episodes(self) -> "pd.DataFrame":
-        """Return the episodes of the run with `outcome` and `side_placed` by the score; `outcome_text` stays."""
+        """The episodes of the run with `outcome` and `side_placed` by the score; `outcome_text` stays."""
         episodes = self._run.episodes
         if not self._with_side_words and "side_word" in episodes:
             episodes = episodes[~episodes["side_word"].astype(bool)]
@@ -340,9 +340,9 @@ def units_of(episodes: "pd.DataFrame") -> "NDArray[np.str_]":
 def independent_items(episodes: "pd.DataFrame") -> float:
     """Return how many items the success rate rests on: all, or fewer where those of a group answer alike.
 
-    It is the number of items divided by a ratio: the variation of the success rate between groups, over its
-    variation
-    if the items of a group had nothing in common.
+    It is the number of items divided by the ratio of two variations of the success rate: between groups, and as if
+    the
+    items of a group had nothing in common.
     """
     correct = _correct(episodes)
     residual = correct - correct.mean()

@@ -279,7 +279,7 @@ class RetentionEstimate:
 
     Attributes:
         value: Cross-fitted score of the action's best site over that of the backbone's, both above one half (see
-            `probe_kit.statistics.crossfit`); NaN where the backbone's is 0, or no score is defined.
+            `probe_kit.statistics.crossfit`). NaN where the backbone's is 0, or no score is defined.
         interval: 95 %, Fieller's; without limits where the backbone is not known well enough to divide by.
         published: The ratio of the peaks, as in the paper.
         defined: Whether the backbone's best site is above chance (family-wise) and better than every control that

@@ -277,8 +277,9 @@ def measure_drift(
 def why_alone(before: RunReader, after: RunReader, view: str = "mean") -> str:
     """Return the reason why probes of one run are not used on the other: other words or frames; empty if they are.
 
-    A VLM and a policy are compared where the VLM was shown the instruction and the frame in the size that the
-    policy gets, both were delivered the same tokens, and the view has the same positions in both.
+    A VLM and a policy are compared under three conditions. The VLM was shown the instruction and the frame in the
+    size
+    that the policy gets. Both were delivered the same tokens. The view has the same positions in both.
     """
     if wording_of(before) != wording_of(after):
         return "other words"

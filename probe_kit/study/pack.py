@@ -68,7 +68,7 @@ def pack_study(study: LoadedStudy, out: Path, partial: bool = False, extras: Col
         extras: Further parts of the runs, see EXTRAS.
 
     Raises:
-        UsageError: Where anything lies at `out`.
+        UsageError: If `out` exists.
         RunIncompleteError: For missing runs.
     """
     if out.exists():
@@ -156,12 +156,12 @@ def write_data_set(
     Args:
         study: The study whose runs are stored.
         folder: Folder of the data set.
-        partial: Leave out what is missing.
+        partial: Leave out runs and tables that are missing.
         licence: The licence in the hub's spelling, such as `cc-by-4.0`; named in the card. None for none.
         again: Accept a folder that holds this very data set, such as after an upload that failed.
 
     Raises:
-        UsageError: Where anything else lies there.
+        UsageError: If `folder` exists and holds anything else.
         DiskSpaceError: On a full disk.
         MissingExtraError: Without pyarrow.
     """

@@ -250,7 +250,7 @@ class StudyPlan:
     def bytes(self) -> dict[str, float | None]:
         """Return the bytes of missing episodes by model, uncompressed, with columns and probes.
 
-        They are counted by stored streams of the model, else as its configuration or its family declares them;
+        They are counted by stored streams of the model, else as its configuration or its family declares them.
         None where no
         stream is known before the model is loaded.
         """

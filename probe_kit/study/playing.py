@@ -197,7 +197,7 @@ def _problem(planned: PlannedCell, rehearsed: list[SceneSpec], ray: str | None) 
     """Return the fault of a run that shows without the model.
 
     Args:
-        planned: The run.
+        planned: The run with its state.
         rehearsed: Scenes that can be built; one that was built now is added.
         ray: Address of a Ray cluster, whose devices are not those of this machine.
     """

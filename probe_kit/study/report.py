@@ -138,7 +138,7 @@ class StudyReport:
     """The report of a study.
 
     Attributes:
-        html: The page.
+        html: Text of the page.
         missing: By table or figure, the reason why it is not there.
         is_partial: Whether a run is missing.
     """

@@ -192,7 +192,7 @@ class ModelTable(_Table, ModelSettings):
         vlm: The VLM of its backbone.
         finetuned_from: The model that it was trained from.
         untrained: Its network with random weights.
-        protocol: As in `probe-kit extract`.
+        protocol: The protocol, as in `probe-kit extract`.
         scene: The scene, as in `probe-kit extract`.
         execute: Actions executed per inference, as in `probe-kit extract`.
         batch: Batch size, as in `probe-kit extract`.

@@ -140,7 +140,7 @@ def run_payload(viewed: ViewedRun, page_runs: Sequence[ViewedRun] = ()) -> dict[
     """Return everything that is stated once per run.
 
     Args:
-        viewed: The run.
+        viewed: The run, as the page names it.
         page_runs: Runs of the page, of which VLM runs give a column.
     """
     run, results = viewed.run, viewed.results
@@ -289,7 +289,7 @@ def site_map_payload(viewed: ViewedRun, category: str) -> dict[str, Any]:
     that were fitted to later inferences, by inference.
 
     Args:
-        viewed: The run.
+        viewed: A run with probes of its own or of another run.
         category: A probed category.
 
     Raises:
@@ -328,7 +328,7 @@ def target_map_payload(viewed: ViewedRun, number: int) -> dict[str, Any]:
     """Return the scores by site of a target that was probed.
 
     Args:
-        viewed: The run.
+        viewed: A run with probes of targets.
         number: Position of the target among those that were probed.
 
     Raises:

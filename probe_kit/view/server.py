@@ -1,7 +1,8 @@
 """The viewer's server: loopback only, behind a token, and names are looked up and never joined to a path.
 
-Checks in order: the Host header (another name of this machine may be a rebound one), the method, the token, the
-site of the request and the cookie, and the name of the payload.
+Five parts of a request are checked in order: the Host header, the method, the token, the site of the request with
+the
+cookie, and the name of the payload. A Host header with another name of this machine may be a rebound one.
 """
 
 import asyncio

@@ -1,7 +1,7 @@
 """The columns of the tables, each declared once: terminal, Markdown, LaTeX, report and glossary only render them.
 
-A column names the field that it shows (`part.field` of `RetentionRow`, which is also its place in JSON and in data
-frames), its heading, its entry in the glossary, its text, and its sort key. `TABLES` lists the columns of each
+A column names the field that it shows, `part.field` of `RetentionRow`, which is also its place in JSON and in data
+frames. It also has a heading, an entry in the glossary, a text, and a sort key. `TABLES` lists the columns of each
 table. To add a column: compute the field where its part is made, and declare the column here.
 """
 

@@ -271,7 +271,7 @@ class Side:
 
         Args:
             name: Name of the run in tables.
-            run: The run.
+            run: The only run of the side.
             rows: Rows of several runs, of which the run's own are taken.
         """
         location = str(run.location)
@@ -291,8 +291,8 @@ def compare(
     `p_holm` is not set: `with_holm` sets it, over all rows that are shown together.
 
     Args:
-        first: The minuend.
-        second: The subtrahend.
+        first: The side that the other one is subtracted from.
+        second: The side that is subtracted.
         of: Success rates, backbone, action and retention; or success rates (answers of a VLM) alone.
         items: Items that all runs have in common by category, see `common_items`; None computes them.
         others_too: Compare categories without such items, each side on its own.
@@ -538,9 +538,9 @@ def compare_runs(
 ) -> PairedRuns:
     """Return every other run minus the run `against`, by default the first; VLM runs and policy runs apart.
 
-    Runs of one seed and wording are compared, on the items that both have: success rates on these alone, probes
-    where
-    no run has other items.
+    Runs of one seed and wording are compared, on the items that both have. Success rates are those on these items
+    alone.
+    Probes are compared where no run has other items.
 
     Args:
         runs: Runs of the table in the order in which they were named.
@@ -578,8 +578,9 @@ def compare_groups(
 ) -> PairedRuns:
     """Return every group of runs minus every earlier one, or minus the group `against`; see `compare_runs`.
 
-    Two groups count as pairs in categories in which all of their runs have at least 80 % of the items in common,
-    and then on these items alone. In other categories each group has its own items.
+    Two groups count as pairs in categories in which all of their runs have at least 80 % of the items in common.
+    They are
+    then compared on these items alone. In other categories each group has its own items.
 
     Args:
         groups: Runs by the name of their group.

@@ -77,8 +77,8 @@ class CategoryCounts:
         guessed: The counts that coins would give.
         episodes: The same counts of single episodes; nothing is tested there.
         has_signal: Whether the probes beat chance and every control that was run, without which encoded means
-            nothing; None without probes, or over categories that differ in it.
-        not_acted_on: Of the items answered right and encoded, those that the action does not follow; None without
+            nothing. None without probes, or over categories that differ in it.
+        not_acted_on: Of the items answered right and encoded, those that the action does not follow. None without
             signal, and over all categories only of those with signal.
         share_not_acted_on_ci: Exact 95 % interval of their share.
         p_linked: Test whether answered and acted on go together among encoded items: Fisher's exact test, over

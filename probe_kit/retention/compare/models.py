@@ -31,8 +31,8 @@ def grew_from(policy: RunReader, vlm: RunReader) -> Relation:
 
     Compares hash, hub id and number of parameters on both cards; `unknown` where they are too little. A family's
     name
-    tells the network and not the weights: another name is another source, the same name is no evidence. A card
-    names
+    identifies the network and not the weights: another name is another source, the same name is no evidence. A
+    card names
     its commit behind an @; the source of a family is known by repository only.
     """
     grown, vlm_card = card_of(policy), card_of(vlm)
@@ -73,9 +73,9 @@ def split_checkpoint(checkpoint: str) -> tuple[str, int] | None:
 def origins_of(runs: Sequence[RunReader], declared: Mapping[str, str] | None = None) -> dict[str, str]:
     """Return the origin of every run's model, by location; runs of equal origin are of one model.
 
-    A run without a declared origin has the folder of its training where its checkpoint is one of several steps,
-    else
-    its weights, else its own location.
+    A run without a declared origin has the folder of its training where its checkpoint is one of several steps.
+    Otherwise
+    it has its weights, or else its own location.
 
     Args:
         runs: The runs that are compared.

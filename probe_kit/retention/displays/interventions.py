@@ -319,7 +319,7 @@ def attention_on_picture(run: RunReader, category: str | None = None) -> "Figure
 
     Args:
         run: The run that stores attention on patches, and pictures.
-        category: By default the first one with stored patches.
+        category: Category of the episode; None for the first one with stored patches.
 
     Raises:
         NoInterventionsError: If patches or pictures are not stored.

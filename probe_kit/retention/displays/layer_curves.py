@@ -359,7 +359,8 @@ def layer_curve(
     stream
     (family-wise p < 0.05), and above every control that was run. Grey: chance, and the band that holds 95 % of the
     scores
-    under label permutation; of a label at the best site of each layer, with the best control.
+    under label permutation. For a label, both are at the best site of each layer, and the best control is drawn
+    too.
 
     Args:
         results: Probes of one run.

@@ -283,9 +283,9 @@ def _labels(
 ) -> list[dict[str, Any]]:
     """Return a section per label of the table.
 
-    A section holds the label's rows of the table and their sentences, its figures, its best sites with their
-    controls
-    (a table per run), and sentences on the probes.
+    A section holds the label's rows of the table and their sentences, and its figures. It also holds the best
+    sites with
+    their controls, a table per run, and sentences on the probes.
 
     Args:
         table: A retention table of labels.
@@ -373,7 +373,8 @@ def arranged(
     """Draw figures, by subject and kind.
 
     Tables are left out, which the page prints as such. All but the first of a kind and run are extra, to be
-    unfolded, and so are those of single runs that another figure shows side by side.
+    unfolded.
+    Figures of single runs that another figure shows side by side are extra too.
 
     Args:
         figures: Figures of all runs.

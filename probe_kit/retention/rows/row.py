@@ -148,10 +148,11 @@ class SwapEffect:
 class StreamPart:
     """The scores of probes of one stream.
 
-    Of a target that is no side, peak is the metric of the site with the largest score above its own chance, and
-    chance the mean score of the label permutations there. Score, verdict, at_most, selectivity and minus_untrained
-    are
-    of sides alone.
+    Of a target that is no side, peak is the metric of the site with the largest score above its own chance. Its
+    chance is
+    the mean score of the label permutations there. Score, verdict, at_most, selectivity and minus_untrained are of
+    sides
+    alone.
 
     Attributes:
         score: Accuracy of the sites that the inner folds choose, on the outer folds; balanced between the sides,
@@ -226,7 +227,7 @@ class ActionPart(StreamPart):
     Attributes:
         iteration: The flow-matching step or action token of the site.
         first_peak: Accuracy of the best layer at the first iteration, which has seen no action.
-        first_layer: That layer.
+        first_layer: The best layer at the first iteration.
     """
 
     iteration: int | None = None
