@@ -1,10 +1,10 @@
 """Model organisms, which validate the pipeline, and the stages of `probe-kit demo`.
 
-`vlm-tiny` answers and does not act: it was trained on questions of Color, Shape, State and Traffic (*known*),
-and of nothing else. `pi0-tiny` is made of its backbone. It was trained to act on Color and Shape (*used*); the
-actions of State questions went to a random side (*not used*). `pi0-tiny-state` differs in that they followed the
-answer (*used*). The early checkpoint has the VLM's backbone and an action expert of random weights (*does not
-decide*); untrained networks know nothing (*absent*).
+`vlm-tiny` answers and does not act: it was trained on questions of Color, Shape, State and Traffic (*known*), and
+of nothing else. `pi0-tiny` is made of its backbone. It was trained to act on Color and Shape (*used*); the actions
+of State questions went to a random side (*not used*). `pi0-tiny-state` differs in that they followed the answer
+(*used*). The early checkpoint has the VLM's backbone and an action expert of random weights (*does not decide*);
+untrained networks know nothing (*absent*).
 """
 
 import shlex
@@ -215,8 +215,7 @@ def measured(row: RetentionRow, another_acts: bool) -> Truth:
     Args:
         row: The row of one category in the organism's own table.
         another_acts: Whether the trained one acts on some category. It has the same scene, questions and network,
-            so
-            that following would be seen in every other. A policy that was not trained to act follows nowhere by
+            so that following would be seen in every other. A policy that was not trained to act follows nowhere by
             itself.
     """
     use, reading = row.image_swap.use, readable(row)

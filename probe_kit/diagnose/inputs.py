@@ -73,8 +73,7 @@ def controls_of(frame: Frame, name: str, spread: NDArray[np.float64]) -> list[Ob
     """Return the frame's observation after changes of one input that mean nothing, the best first.
 
     See `hardly_changed`. Without other words of the frame, the first letter's case and the full stop change, or
-    one
-    of them. A tokenizer of words may know only one spelling.
+    one of them. A tokenizer of words may know only one spelling.
 
     Args:
         frame: Its other words are the only control of its instruction, if it has some.

@@ -108,8 +108,7 @@ class InputExchange:
         """Return the pairs (frame, donor) of an input: from the table, or drawn by `draw_donors`.
 
         Every call returns the same pairs. Donors of a frame hold different values of the input, as far as there
-        are so
-        many.
+        are so many.
         """
         values = self._values(name)
         if self.table:

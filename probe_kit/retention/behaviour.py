@@ -159,8 +159,7 @@ class SuccessRate:
         share_wrong: Share that ended on the other picture.
         share_outside: Share that ended on neither picture.
         share_never_moved: Share that ended where it started, a failed grasp; part of `share_outside`, None if it
-            was
-            not recorded.
+            was not recorded.
         share_invalid_action: Share of inferences that put out no action, None for a policy that cannot tell.
         chance_margin_episodes: Half-width of the band around 0.5 that guessing explains, for N = episodes (the
             paper's).
@@ -205,7 +204,7 @@ def regime(
         sr: Success rate, 0 to 1.
         margin: Half-width of the band around 0.5 that guessing explains.
         share_wrong: Share of episodes that ended on the wrong picture.
-        share_outside: Share of episodes that ended on neither; of answers, those that could not be read.
+        share_outside: Share of episodes that ended on neither (`oob`); of answers, those that could not be read.
         answers: Whether the rate is one of answers in words.
     """
     share = "accuracy" if answers else "SR"
@@ -275,8 +274,7 @@ def success_rate(episodes: "pd.DataFrame") -> SuccessRate:
     Args:
         episodes: Columns `item_id`, `layout`, `side_correct`, `outcome` (`correct`, `wrong`, `oob`),
             `side_placed`, and `group_id` where items share pictures. Where the last steps of an episode were
-            averaged
-            also `share_correct` and so on, which the pairs of items take no notice of.
+            averaged also `share_correct` and so on, which the pairs of items take no notice of.
 
     Raises:
         UsageError: For a table that is empty or of several wordings, and for episodes in which the model did not
@@ -341,8 +339,7 @@ def independent_items(episodes: "pd.DataFrame") -> float:
     """Return how many items the success rate rests on: all, or fewer where those of a group answer alike.
 
     It is the number of items divided by the ratio of two variations of the success rate: between groups, and as if
-    the
-    items of a group had nothing in common.
+    the items of a group had nothing in common.
     """
     correct = _correct(episodes)
     residual = correct - correct.mean()
@@ -513,8 +510,7 @@ class OutcomeRuleScores:
     """The outcome rule, and the success that it grants without skill.
 
     Numbers about answers are there for every run with a success rate. The others are None or empty where the run
-    keeps
-    no trajectories.
+    keeps no trajectories.
 
     Attributes:
         rule: The rule by which all outcomes of the row are judged.

@@ -214,8 +214,7 @@ class PooledScores:
         """Return the covariance (K, L) of the scores; 0 on other groups.
 
         The covariance of a stream with itself leaves room for unseen groups, in which one run may hold all and the
-        other
-        nothing.
+        other nothing.
         """
         if self.fit is None or other.fit is None or not self.shares_groups_with(other):
             return np.zeros((len(self.names), len(other.names)))

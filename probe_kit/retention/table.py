@@ -58,16 +58,14 @@ class RetentionTable:
     """Rows per run, category and view, and per run and view their category mean.
 
     Runs are never averaged with each other, so no mean mixes suites. Rows of targets that are no side have no
-    mean, as
-    their metrics differ.
+    mean, as their metrics differ.
 
     Attributes:
         differences: Differences between runs, or groups of runs.
         results: The probes that the rows were made of, by location of the run and target; figures and reports of
             the table draw these.
         iterations: Flow-matching iterations of the expert, or positions of action tokens, that take part.
-        notes: Remarks for the reader, a sentence each: which runs have no probes, and which settings the rows
-            mix.
+        notes: Remarks for the reader, a sentence each: which runs have no probes, and which settings the rows mix.
         wordings: Of runs that were asked in several wordings, every two against each other.
         vlm_vla: VLM − VLA, if that was requested.
         unpaired: Which runs of several have no difference, or leave items out, and why, a sentence each.
@@ -204,9 +202,8 @@ class RetentionTable:
 
         Shares, ratios and limits are floats, NaN where they are not defined: retention without backbone signal
         too, whose raw ratio `to_json` keeps. Intervals become two columns, `success.ci_low` and so on. Mappings
-        become one
-        column per name, such as `controls.baselines.pixels`, and lists become text. The frames `success`, `rules`,
-        `answers`, `probes`, `retention`, `controls` and `interventions` hold one part each.
+        become one column per name, such as `controls.baselines.pixels`, and lists become text. The frames
+        `success`, `rules`, `answers`, `probes`, `retention`, `controls` and `interventions` hold one part each.
         """
         return frame_of(self.all_rows)
 
@@ -218,10 +215,8 @@ class RetentionTable:
         """Return all rows as a JSON list of objects, whose keys are the fields of `RetentionRow`.
 
         Parts are objects in them. Where runs are compared, every row has a list `differences` as well: those of
-        its run
-        minus others. With groups, runs in several wordings or VLM − VLA, the result is an object. It has the lists
-        `rows`,
-        `differences` between groups, `wordings` and `vlm_vla`, as far as there are any.
+        its run minus others. With groups, runs in several wordings or VLM − VLA, the result is an object. It has
+        the lists `rows`, `differences` between groups, `wordings` and `vlm_vla`, as far as there are any.
         """
         return table_json(self.all_rows, self.differences, self.wordings, self.vlm_vla)
 
@@ -378,14 +373,12 @@ def retention_table(
         against: The name of the run or group that every other is compared with; None for the default.
         labels: Names of runs in tables and figures by their location, instead of their own.
         pairs: Pairs of locations of runs that are compared, each the first minus the second, instead of every
-            other
-            with the first; all of them are one family of tests.
+            other with the first; all of them are one family of tests.
         origins: Of groups, the origins of the models by the location of their runs; models of one origin count as
             one. By default checkpoints of one training do.
         categories: Categories that have rows and are averaged; None for all. Probes are those of the whole runs.
         with_behaviour: False leaves empty the parts that the rule `disc` does not need (other rules and
-            behaviour),
-            so that no trajectory is read.
+            behaviour), so that no trajectory is read.
 
     Raises:
         UnknownSiteError: For a view that was not probed.

@@ -92,8 +92,7 @@ def step_table(table: RetentionTable, steps: Mapping[str, int]) -> Table:
     """Return success, backbone, action, retention and drift by category and training step.
 
     Keys of a row's numbers are `category`, `step`, `run`, `view`, `sr`, `backbone`, `action`, `retention`, `drift`
-    (of
-    the backbone) and, for each of them, its limits under the name with `_ci`.
+    (of the backbone) and, for each of them, its limits under the name with `_ci`.
 
     Args:
         table: A table of runs in the order of their steps, the first of which all others are compared with.

@@ -3,8 +3,7 @@
 The module also holds the suite as far as a plan needs it, and the failures of cells. Each failure is a file
 `OUT/failures/<run>.json`, until the run or its probes are made. Runs describe themselves, so that a study notes
 nothing else. No number of a table comes from a failure. Each is a file of its own: two processes that play
-different
-models of a study need no lock between them.
+different models of a study need no lock between them.
 """
 
 import json

@@ -57,9 +57,9 @@ def _transfer(
     """Return accuracies of the probes of one run on the activations of another, as shares, and p: (3, S).
 
     The first accuracies are of decisions as they are. For the second ones features are centred and scaled as in
-    the
-    other run's own training folds, without labels. p is of these, against the best site under label permutations
-    of whole groups. Each of the `common` episodes is judged by the probe that was trained without its fold.
+    the other run's own training folds, without labels. p is of these, against the best site under label
+    permutations of whole groups. Each of the `common` episodes is judged by the probe that was trained without its
+    fold.
 
     Args:
         probed: The run whose probes are used.
@@ -121,8 +121,7 @@ def _cosines(first: Direction, second: Direction, features: Features) -> tuple[f
     """Return three cosines of the directions of two runs.
 
     The first is of their unit vectors. The second is weighted by the covariance of the features, which is the
-    correlation
-    of the two decisions. The third is the ceiling: the mean between the folds of the first run.
+    correlation of the two decisions. The third is the ceiling: the mean between the folds of the first run.
 
     Args:
         first: Direction of the first run.
@@ -278,8 +277,7 @@ def why_alone(before: RunReader, after: RunReader, view: str = "mean") -> str:
     """Return the reason why probes of one run are not used on the other: other words or frames; empty if they are.
 
     A VLM and a policy are compared under three conditions. The VLM was shown the instruction and the frame in the
-    size
-    that the policy gets. Both were delivered the same tokens. The view has the same positions in both.
+    size that the policy gets. Both were delivered the same tokens. The view has the same positions in both.
     """
     if wording_of(before) != wording_of(after):
         return "other words"

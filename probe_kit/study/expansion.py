@@ -179,8 +179,7 @@ def control_of(study: Study, cells: Sequence[Cell], cell: Cell) -> Cell | None:
     """Return the run of a policy's untrained network that its probes are compared with; None without a network.
 
     It is in the same condition, or else of the same scene and seed. Whether a network then acts changes nothing in
-    the
-    activations that were captured before.
+    the activations that were captured before.
     """
     of_network = [
         other for other in cells if other.model == study.models[cell.model].untrained and other.seed == cell.seed

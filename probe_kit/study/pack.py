@@ -283,8 +283,7 @@ def publish_data_set(
     """Upload a folder of `write_data_set` as a data set; return the address of the commit or pull request.
 
     The commit is tagged with the version of its content, a pull request is not. The token is the hub's own:
-    HF_TOKEN, or
-    that of `hf auth login`. Files that are there already are not sent again.
+    HF_TOKEN, or that of `hf auth login`. Files that are there already are not sent again.
 
     Args:
         folder: Folder of the data set.

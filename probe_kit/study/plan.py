@@ -251,8 +251,7 @@ class StudyPlan:
         """Return the bytes of missing episodes by model, uncompressed, with columns and probes.
 
         They are counted by stored streams of the model, else as its configuration or its family declares them.
-        None where no
-        stream is known before the model is loaded.
+        None where no stream is known before the model is loaded.
         """
         stored = {planned.cell.work: planned.streams for planned in self.played if planned.streams is not None}
         missing = [planned for planned in self.played if planned.missing]

@@ -118,8 +118,7 @@ def conduct_study(
 
     Every run is checked, and every scene built, before the first one is played. A model that fails stops itself
     alone: episodes that are committed stay, and the next call resumes after them. A run that failed while it was
-    played
-    is not tried again until its settings change, or with `retry_failed`.
+    played is not tried again until its settings change, or with `retry_failed`.
 
     Args:
         plan: The plan of the study.

@@ -33,10 +33,8 @@ def episode_payload(viewed: ViewedRun, number: int) -> dict[str, Any]:
     """Return the payload of the episode of this number.
 
     `inferences` holds the control step of every inference, of which the first K were captured. `log_odds` and
-    `refitted`
-    are packed (K, S) by captured inference and site. The first are of the probes of one inference, the second of
-    the
-    probes that were fitted to each inference.
+    `refitted` are packed (K, S) by captured inference and site. The first are of the probes of one inference, the
+    second of the probes that were fitted to each inference.
 
     Args:
         viewed: The run of the episode.
@@ -237,10 +235,9 @@ def episodes_payload(viewed: ViewedRun) -> dict[str, Any]:
     """Return numbers, ids and words of all episodes in the order of the plan.
 
     `log_odds` are of the category's best sites, held out, at the inference that the probes are of, toward the
-    correct
-    side. `swap` is of the stored image swap, 1 where the action follows the pictures, -1 where it does the
-    reverse,
-    else 0; None without any. `seeds` are equal where scene and policy seed are equal, by which runs are paired.
+    correct side. `swap` is of the stored image swap, 1 where the action follows the pictures, -1 where it does the
+    reverse, else 0; None without any. `seeds` are equal where scene and policy seed are equal, by which runs are
+    paired.
     """
     episodes = viewed.run.episodes
     words = _WORDS | ({"item": "picture"} if "picture" in episodes else {})

@@ -97,10 +97,8 @@ def payload_script(name: str, value: Any, places: tuple[str, ...] = ()) -> bytes
     """Return the script `put(name, value)` in ASCII.
 
     A page that is opened as a file may load scripts, and fetch nothing. Text of `value` has visible signs in place
-    of
-    control and direction characters, and the last part alone of `places` and other absolute paths. No `<` is left,
-    so
-    that no text can end the script.
+    of control and direction characters, and the last part alone of `places` and other absolute paths. No `<` is
+    left, so that no text can end the script.
     """
     return _script("put", name, _encode(value, places))
 
@@ -285,8 +283,7 @@ def site_map_payload(viewed: ViewedRun, category: str) -> dict[str, Any]:
     """Return scores by site, spelt as in the tables; log-odds (S, E) packed, toward the correct side.
 
     `rows` holds the place of each of the E episodes among those of the run. `refitted` holds the same scores of
-    probes
-    that were fitted to later inferences, by inference.
+    probes that were fitted to later inferences, by inference.
 
     Args:
         viewed: A run with probes of its own or of another run.

@@ -1,8 +1,7 @@
 """The viewer's server: loopback only, behind a token, and names are looked up and never joined to a path.
 
 Five parts of a request are checked in order: the Host header, the method, the token, the site of the request with
-the
-cookie, and the name of the payload. A Host header with another name of this machine may be a rebound one.
+the cookie, and the name of the payload. A Host header with another name of this machine may be a rebound one.
 """
 
 import asyncio

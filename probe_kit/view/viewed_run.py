@@ -58,8 +58,7 @@ class FrozenProbes:
         category: Category of the probes.
         view: View of the probes.
         readings: None for probes of `run` itself, whose stored log-odds are taken. For another run's probes, the
-            first
-            log-odds that were computed so far, by number of the episode.
+            first log-odds that were computed so far, by number of the episode.
     """
 
     def __init__(
@@ -80,8 +79,7 @@ class FrozenProbes:
         """Return the log-odds (S,) of the episode in row `position` at the inference of the probes.
 
         They are those of `log_odds`. Of the run's own probes they are the stored out-of-fold ones; NaN for an
-        episode without
-        any.
+        episode without any.
         """
         row = self.run.episodes.iloc[position]
         if self._readings is None:
@@ -257,7 +255,10 @@ class ViewedRun:
         return self.run.ask is not None
 
     def outcome_word(self, outcome: Any) -> Any:
-        """Return the page's name of the outcome: `unread` where no rule could read the answer of a VLM."""
+        """Return the page's name of the outcome.
+
+        It is `unread` instead of `oob` where no rule could read the answer of a VLM.
+        """
         return UNREAD if self.answers and outcome == "oob" else outcome
 
     @cached_property

@@ -539,8 +539,7 @@ def compare_runs(
     """Return every other run minus the run `against`, by default the first; VLM runs and policy runs apart.
 
     Runs of one seed and wording are compared, on the items that both have. Success rates are those on these items
-    alone.
-    Probes are compared where no run has other items.
+    alone. Probes are compared where no run has other items.
 
     Args:
         runs: Runs of the table in the order in which they were named.
@@ -579,8 +578,7 @@ def compare_groups(
     """Return every group of runs minus every earlier one, or minus the group `against`; see `compare_runs`.
 
     Two groups count as pairs in categories in which all of their runs have at least 80 % of the items in common.
-    They are
-    then compared on these items alone. In other categories each group has its own items.
+    They are then compared on these items alone. In other categories each group has its own items.
 
     Args:
         groups: Runs by the name of their group.
@@ -695,8 +693,7 @@ def compare_wordings(runs: Sequence[RunReader]) -> list[Difference]:
     """Return every two wordings of each run against each other, the earlier one minus the later.
 
     The comparison separates not knowing from not being able. A policy that places the cube by "the left picture",
-    and
-    not by the content of the picture, can act and does not know.
+    and not by the content of the picture, can act and does not know.
 
     Args:
         runs: Runs that acted, judged by the rule of the table.

@@ -30,10 +30,8 @@ def grew_from(policy: RunReader, vlm: RunReader) -> Relation:
     """Return whether the policy's network grew from the VLM's weights.
 
     Compares hash, hub id and number of parameters on both cards; `unknown` where they are too little. A family's
-    name
-    identifies the network and not the weights: another name is another source, the same name is no evidence. A
-    card names
-    its commit behind an @; the source of a family is known by repository only.
+    name identifies the network and not the weights: another name is another source, the same name is no evidence.
+    A card names its commit behind an @; the source of a family is known by repository only.
     """
     grown, vlm_card = card_of(policy), card_of(vlm)
     if grown.get("random_weights") or vlm_card.get("random_weights"):
@@ -74,8 +72,7 @@ def origins_of(runs: Sequence[RunReader], declared: Mapping[str, str] | None = N
     """Return the origin of every run's model, by location; runs of equal origin are of one model.
 
     A run without a declared origin has the folder of its training where its checkpoint is one of several steps.
-    Otherwise
-    it has its weights, or else its own location.
+    Otherwise it has its weights, or else its own location.
 
     Args:
         runs: The runs that are compared.

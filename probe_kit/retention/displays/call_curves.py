@@ -83,8 +83,7 @@ class AlignedLine:
     """Held-out accuracy of a stream's best sites, counted from an event of each episode.
 
     Offset 0 is the last inference before the action that brought the event about. Sites are those that the inner
-    folds
-    of every call choose. There is no interval.
+    folds of every call choose. There is no interval.
 
     Attributes:
         offsets: (O,) offsets with at least `FEWEST` episodes.
@@ -251,10 +250,8 @@ class CallCurveDisplay(Display):
     """Held-out accuracy of each stream's best site by captured inference, for one category in one view.
 
     Filled markers are above chance against all sites of their stream, and above the controls that were run. The
-    best
-    site of permuted labels stays below the dotted line in 95 %. Upright lines: when the events of the trajectories
-    fell
-    due, in the median, with quartiles. A site is chosen anew at each call.
+    best site of permuted labels stays below the dotted line in 95 %. Upright lines: when the events of the
+    trajectories fell due, in the median, with quartiles. A site is chosen anew at each call.
 
     Attributes:
         event: The event from which accuracies are counted instead, see `plot_aligned`.

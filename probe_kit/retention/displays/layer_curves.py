@@ -105,8 +105,7 @@ class StreamCurve(LayerLine):
     Attributes:
         part: Part of the model, see `Stream.part`.
         sites: The L best sites among the iterations that are shown, of a label by the score above their own
-            chance;
-            `score` is theirs.
+            chance; `score` is theirs.
         depth: The layer as a fraction.
         iterations: Number of iterations that are shown.
         lines: The lines that are drawn: one per iteration, or the best.
@@ -354,13 +353,10 @@ def layer_curve(
     """Return a figure of held-out score by layer for every category (`figure.savefig(…)`).
 
     The backbone is drawn next to the action, which has a line per iteration on one scale of colours. Bars: each
-    layer's
-    95 % interval, where the stream runs once. Filled markers are above chance against the best site of their
-    stream
-    (family-wise p < 0.05), and above every control that was run. Grey: chance, and the band that holds 95 % of the
-    scores
-    under label permutation. For a label, both are at the best site of each layer, and the best control is drawn
-    too.
+    layer's 95 % interval, where the stream runs once. Filled markers are above chance against the best site of
+    their stream (family-wise p < 0.05), and above every control that was run. Grey: chance, and the band that
+    holds 95 % of the scores under label permutation. For a label, both are at the best site of each layer, and the
+    best control is drawn too.
 
     Args:
         results: Probes of one run.

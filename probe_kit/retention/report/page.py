@@ -284,8 +284,7 @@ def _labels(
     """Return a section per label of the table.
 
     A section holds the label's rows of the table and their sentences, and its figures. It also holds the best
-    sites with
-    their controls, a table per run, and sentences on the probes.
+    sites with their controls, a table per run, and sentences on the probes.
 
     Args:
         table: A retention table of labels.
@@ -373,8 +372,7 @@ def arranged(
     """Draw figures, by subject and kind.
 
     Tables are left out, which the page prints as such. All but the first of a kind and run are extra, to be
-    unfolded.
-    Figures of single runs that another figure shows side by side are extra too.
+    unfolded. Figures of single runs that another figure shows side by side are extra too.
 
     Args:
         figures: Figures of all runs.
@@ -408,8 +406,7 @@ def data_uri(exhibit: ReportFigure, places: tuple[str, ...] = ()) -> tuple[str, 
     """Return the drawn figure as SVG, or WebP if that would be large, with its caption.
 
     A figure gives the same bytes every time. Its ground is transparent, so that the page's colour shows through.
-    Of
-    `places` and other absolute paths in its words the last part is left.
+    Of `places` and other absolute paths in its words the last part is left.
 
     Args:
         exhibit: The figure that is drawn.

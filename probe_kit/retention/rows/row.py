@@ -149,10 +149,8 @@ class StreamPart:
     """The scores of probes of one stream.
 
     Of a target that is no side, peak is the metric of the site with the largest score above its own chance. Its
-    chance is
-    the mean score of the label permutations there. Score, verdict, at_most, selectivity and minus_untrained are of
-    sides
-    alone.
+    chance is the mean score of the label permutations there. Score, verdict, at_most, selectivity and
+    minus_untrained are of sides alone.
 
     Attributes:
         score: Accuracy of the sites that the inner folds choose, on the outer folds; balanced between the sides,
