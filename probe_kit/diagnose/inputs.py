@@ -142,13 +142,13 @@ Thus episodes are looked at in different phases.
 def frames_of(
     session: "ReplaySession", count: int, paraphrases: Mapping[str, str] = MappingProxyType({})
 ) -> list[Frame]:
-    """Return the frames of `count` episodes; all where the run has fewer.
+    """Return up to `count` frames of a run's episodes; all where it has fewer.
 
     Of the scene they are two first frames of each group; of other sources, frames of as many groups as possible.
 
     Args:
         session: The run's policy and its observations.
-        count: Number of frames.
+        count: Largest number of frames.
         paraphrases: Other words of the same meaning, by instruction.
 
     Raises:

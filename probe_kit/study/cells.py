@@ -1,9 +1,9 @@
 """Cells: one model in one condition, or asked in one way, with one seed. Known without loading a model.
 
 The module also holds the suite as far as a plan needs it, and the failures of cells. Each failure is a file
-`OUT/failures/<run>.json`, until the run or its probes are made. Runs describe themselves, so that a study notes
-nothing else. No number of a table comes from a failure. Each is a file of its own: two processes that play
-different models of a study need no lock between them.
+`OUT/failures/<run>.json` of its own, until the run or its probes are made. Runs describe themselves, so that a
+study notes nothing else. No number of a table comes from a failure. Two processes that play different models of a
+study need no lock between them.
 """
 
 import json

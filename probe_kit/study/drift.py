@@ -357,7 +357,7 @@ def _category(
 def lens_accuracy(run: RunReader, episodes: NDArray[np.str_]) -> NDArray[np.float64] | None:
     """Return the share (L,) of these episodes in which layer l would answer with the right side; a tie is half.
 
-    None for a run without margins, which is every run but questions that are answered by letter.
+    None for a run without margins. Only runs of questions that are answered by letter have margins.
     """
     stored: NDArray[np.float64] | None = run.lens_margins
     if stored is None:

@@ -122,16 +122,16 @@ def conduct_study(
 
     Args:
         plan: The plan of the study.
-        report: Called with every event as it happens.
+        report: Called with every event as it happens; None for no reports.
         slots: Processes, each with one model at a time; 0 for this process.
-        ray: Address of a Ray cluster that plays instead, or `auto`.
+        ray: Address of a Ray cluster that plays instead, or `auto`; None for this machine.
         env_workers: Processes that simulate, as in `ExtractSettings`.
         retry_failed: Whether runs are tried again that failed while they were played.
 
     Raises:
         DiskSpaceError: If the place of the runs is full or cannot be written.
         StoreError: If the object store of the runs cannot be used.
-        MissingExtraError: Without Ray.
+        MissingExtraError: For a cluster, if Ray is not installed.
         UsageError: If no cluster answers.
     """
     if ray is not None:
@@ -274,13 +274,13 @@ def play_models(tasks: Sequence[ModelTask], report: Report, slots: int = 0, ray:
         tasks: One task per model.
         report: Called with every event as it happens.
         slots: Processes, each with one model at a time; 0 for this process.
-        ray: Address of a Ray cluster that plays instead, or `auto`.
+        ray: Address of a Ray cluster that plays instead, or `auto`; None for this machine.
 
     Raises:
         DiskSpaceError: If any worker raises it.
         StoreError: If any worker raises it.
         WorkerDiedError: If workers die before they begin.
-        MissingExtraError: Without Ray.
+        MissingExtraError: For a cluster, if Ray is not installed.
         UsageError: If no cluster answers.
     """
     tasks = sorted(tasks, key=lambda task: -task.size)  # begun last, the longest would be waited for alone

@@ -97,10 +97,11 @@ class FrozenProbes:
         return np.asarray(self.curve.decisions[:, column] * toward(side_correct))
 
     def log_odds(self, position: int) -> tuple[Values, bool]:
-        """Return the log-odds (K, S) of the episode in row `position`, by captured inference it reached and site.
+        """Return the log-odds (K, S) of the episode in row `position`, by captured inference and site.
 
-        Toward the correct side; NaN where the inference is a later one, and its activations are left out, or lack
-        the view of the probe. The flag tells whether no probe that gave them was trained on the episode's item.
+        Only the inferences that the episode reached are in it. Log-odds are toward the correct side. They are NaN
+        where the inference is a later one, and its activations are left out, or lack the view of the probe. The
+        flag tells whether no probe that gave them was trained on the episode's item.
         """
         row = self.run.episodes.iloc[position]
         side, item = str(row["side_correct"]), str(row["item_id"])
