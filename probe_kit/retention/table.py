@@ -358,7 +358,7 @@ def retention_table(
             each other.
         views: Views of the probes; None for all that were probed.
         target: A column of labels, or several, whose retention is shown instead of that of a side. Then only runs,
-            views, iterations, keys, family and labels count. None for the side of the correct picture.
+            views, iterations, keys, family and labels count. None for sides of a picture.
         family: `table` corrects p for all targets by Holm's method, per run, category, view and stream.
         iterations: Expert iterations that take part.
         keys: Keys of the stored probe results of each run, in order; None for the newest, "" for none.
