@@ -116,8 +116,9 @@ class SwapEffect:
     """Effect of exchanging the two pictures, if `probe-kit intervene` was run.
 
     Attributes:
-        follow_rate: Share of episodes whose action turns to the other side.
-        reversal_rate: Share of episodes whose action does the reverse.
+        follow_rate: Share of episodes in which the action goes to the correct picture, and to the other side once
+            the two are swapped.
+        reversal_rate: Share of episodes in which it does the reverse.
         net_follow_rate: Difference of the two shares.
         reach_share: Displacement toward the correct picture in units of the policy's reach.
         follow_p: Exact, one-sided; see `intervene.ImageSwapEffect`.
