@@ -4,7 +4,7 @@ from probe_kit._terminal.interruption import leave_at_once
 
 
 def main() -> None:
-    """Entry point of the console script; a SIGTERM counts as Ctrl-C."""
+    """Run the console script; a SIGTERM counts as Ctrl-C."""
     leave_at_once()
     from probe_kit.cli import main as run_command
 

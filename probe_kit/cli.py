@@ -46,22 +46,22 @@ PANELS = {
     "A whole study from one file": ("study",),
     "Your own model or environment": ("new-adapter", "check-adapter", "check-environment", "verify"),
 }
-"""Commands and groups by what one wants to do, in the order in which help lists them."""
+"""Commands and groups by the user's aim, in the order in which help lists them."""
 _PANEL_OF = {name: panel for panel, names in PANELS.items() for name in names}
 
 PARSE_ERROR: type[Exception] = typer.BadParameter.__mro__[1]
-"""click's UsageError, from the copy of click that typer uses, whichever that is."""
+"""The `UsageError` of click, from the copy of click that typer uses, whichever that is."""
 _FOR_TYPER: tuple[type[BaseException], ...] = (
     typer.Exit, typer.Abort, typer.BadParameter.__mro__[2], BrokenPipeError
 )  # fmt: skip
-"""What typer answers: an exit code, complaints about arguments, and a reader such as `head` that has enough."""
+"""Exceptions that typer handles: an exit code, complaints about arguments, and a closed output (`head`)."""
 
 
 class Commands(typer.core.TyperGroup):
     """Turns errors and interruptions of any command into messages and exit codes."""
 
     def list_commands(self, ctx: Any) -> list[str]:
-        """All commands in the order of `PANELS`."""
+        """Return all commands in the order of `PANELS`."""
         order = {name: number for number, name in enumerate(_PANEL_OF)}
         return sorted(super().list_commands(ctx), key=lambda name: (order.get(name, len(order)), name))
 
@@ -95,7 +95,7 @@ class Commands(typer.core.TyperGroup):
             raise self._told_where(error, ctx) from None
 
     def _told_where(self, error: Any, ctx: Any) -> Exception:
-        """The same error; of an option that only other commands have, it says which."""
+        """Return the same error; for an option that only other commands have, it names them."""
         # Only of an option that is unknown: one without its value carries its name too.
         option = error.option_name if hasattr(error, "possibilities") else None
         homes = [path for path, command in commands_of(self, ctx) if option in _options(command)]
@@ -111,7 +111,7 @@ class Commands(typer.core.TyperGroup):
 
 
 def commands_of(group: Any, ctx: Any, prefix: str = "") -> list[tuple[str, Any]]:
-    """Every command below `group` with its path, such as `suite build`."""
+    """Return every command below `group` with its path, such as `suite build`."""
     commands: list[tuple[str, Any]] = []
     for name in group.list_commands(ctx):
         command = group.get_command(ctx, name)
@@ -153,7 +153,7 @@ def _before_commands(
 
 
 def _stored_runs_of_study(name: str) -> "list[Run] | None":
-    """The stored runs of a study file or of a study of the package; None for a run."""
+    """Return the stored runs of a study file or of a study of the package; None for a run."""
     if Path(name).is_dir() or "://" in name:
         return None
     from probe_kit.study.stored import stored_runs_by_name

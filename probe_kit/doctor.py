@@ -1,7 +1,8 @@
 """Checks of this installation, with a suggested fix for each failure; printed by `probe-kit doctor`.
 
-What the demo needs is tried, not looked up: one child process draws a scene, another lets the embedded policy act.
-They are processes of their own because native code prints to stdout, and because its crash is a finding as well.
+The requirements of the demo are tried, not looked up: one child process draws a scene, another lets the embedded
+policy act. They are processes of their own because native code prints to stdout, and because its crash is a
+finding as well.
 """
 
 import json
@@ -40,11 +41,11 @@ _PYTHONS = ((3, 12), (3, 14))  # from, and below
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was looked at.
+    """The result of one check.
 
     Attributes:
         state: `ok`, `note` (something cannot be used, the demo can), or `missing` (the demo cannot run).
-        advice: What to do, empty if nothing.
+        advice: The fix, empty if there is nothing to do.
     """
 
     subject: str
@@ -58,7 +59,10 @@ class Finding:
 
 
 def examine() -> list[Finding]:
-    """Everything, in the order a newcomer needs it. Takes ten seconds or more: it loads torch and a simulator."""
+    """Run every check, in the order a newcomer needs it.
+
+    Takes ten seconds or more, as it loads torch and a simulator.
+    """
     with ThreadPoolExecutor(3) as pool:
         scene, policy, hub = pool.submit(_scene), pool.submit(_policy), pool.submit(_hub)
         quick = [_python(), _processor(), _memory(), _disk()]
@@ -95,7 +99,7 @@ def _memory() -> Finding:
 
 
 def _available_memory() -> float | None:
-    """Bytes, as Linux counts them; elsewhere all of the machine's, or None."""
+    """Return the available bytes by Linux's count; elsewhere all of the machine's, or None."""
     meminfo = Path("/proc/meminfo")
     if meminfo.is_file():
         match = re.search(r"MemAvailable:\s+(\d+) kB", meminfo.read_text(encoding="utf-8"))
@@ -124,7 +128,11 @@ def _disk() -> Finding:
 
 
 def draw_scene() -> dict[str, Any]:
-    """Draw one picture of the default scene, as an episode does. Raises SceneError if it shows nothing."""
+    """Draw one picture of the default scene, as an episode does.
+
+    Raises:
+        SceneError: If the picture is blank.
+    """
     from probe_kit.env import Act2AnswerEnv
     from probe_kit.env.simulation import import_pybullet
 
@@ -149,7 +157,7 @@ def draw_scene() -> dict[str, Any]:
 
 
 def let_policy_act() -> dict[str, Any]:
-    """Load the embedded policy and ask it for actions once; and say what torch can compute on."""
+    """Load the embedded policy, infer actions once, and report the devices that torch can compute on."""
     import numpy as np
     import torch
 
@@ -207,11 +215,14 @@ def _gpu(gpus: list[dict[str, Any]]) -> Finding:
 
 
 def _trial(subject: str, function: str, advice: str) -> "dict[str, Any] | Finding":
-    """Return what a function of this module returns in a process of its own, or the finding that it failed.
+    """Return the result of a function of this module in a process of its own, or the finding that it failed.
+
+    A trial without an answer in time is no failure: the machine is busy, and installing again would not help.
 
     Args:
-        advice: What to do where it failed. A trial without an answer in time is no failure: the machine is busy,
-            and installing again would not help.
+        subject: Subject of the finding.
+        function: Name of the function, which takes no arguments and returns what JSON can hold.
+        advice: The fix where the function failed.
     """
     code = f"import json, probe_kit.doctor as d; print('\\n' + json.dumps(d.{function}()))"
     try:
@@ -268,7 +279,7 @@ def _tokenizers() -> list[Finding]:
 
 
 def _extras() -> list[Finding]:
-    """Optional dependencies by extra; Ray is one of them."""
+    """Return the optional dependencies by extra; Ray is one of them."""
     needed: dict[str, list[str]] = {}
     for requirement in requires("probe-kit") or ():
         match = re.match(r"([\w.-]+).*extra == ['\"]([\w-]+)['\"]", requirement)

@@ -12,7 +12,7 @@ FULL_DISK = {
     errno.EDQUOT: "has no quota left for you",
     errno.EFBIG: "or a limit of this process (ulimit -f) takes no file so large",
 }
-"""What the system says of a disk that takes no more, in words."""
+"""The reasons for which a disk takes no more bytes, in words, by error number."""
 
 
 class ProbeKitError(Exception):
@@ -25,7 +25,7 @@ class ProbeKitError(Exception):
 
 
 class UsageError(ProbeKitError):
-    """An argument cannot be what was given."""
+    """An argument has a value that is not allowed."""
 
     exit_code = 2
 
@@ -125,7 +125,7 @@ class WeightsError(ProbeKitError):
 
 
 class PolicyFailedError(ProbeKitError):
-    """The code of a policy raised an error of its own, ended the process, or gave what are no actions."""
+    """The code of a policy raised an error of its own, ended the process, or returned no valid action."""
 
 
 class CheckpointError(ProbeKitError):

@@ -36,9 +36,9 @@ _RUNS = {
         "Questions about two episodes are asked, and every stored site is loaded again.",
     ),
 }
-"""Name and sentence of the run by whether it acts."""
+"""The name and the sentence of the run, by whether the model acts."""
 STEPS = 8
-"""Control steps of an episode at most."""
+"""The largest number of control steps of an episode."""
 _SIDE = 224
 _COLOURS = ("red", "blue")
 _RUN_ADVICE = "Correct what the error names; the contract checks above do not see a scene."
@@ -51,8 +51,12 @@ def subjects_of(
     """Return the family under check: as a policy, as a model that answers, or both.
 
     Args:
-        options: As KEY=VALUE.
-        instructions: At least two, None for those of the embedded suite.
+        model: Name of the family.
+        checkpoint: Folder or name of the weights; None for those of the family.
+        options: Options of the family, each as KEY=VALUE.
+        instructions: At least two; None for those of the embedded suite.
+        device: The device on which the model runs, such as `cpu`.
+        dtype: Data type of the weights; None for that of the family.
 
     Raises:
         UnknownModelError: As `Family.check` does.
@@ -69,7 +73,7 @@ def subjects_of(
 
 
 def outcomes(subjects: Sequence[Subject]) -> Iterator[Outcome]:
-    """Check every subject and give what came of each check; without a loaded model the rest is left out."""
+    """Check every subject and yield the outcome of each check; without a loaded model the rest is left out."""
     first, package = subjects[0], package_of(subjects[0].family.loader)
 
     def checked(name: str, sentence: str, change: str, body: Callable[[], object]) -> Outcome:
@@ -108,9 +112,14 @@ def outcomes(subjects: Sequence[Subject]) -> Iterator[Outcome]:
 def _run(subject: Subject, mismatch: bool) -> None:
     """Extract or ask about two episodes, in the folder of the subject, and load every site again.
 
+    Raises as `extract_run` and `ask_run` too.
+
     Args:
-        mismatch: Do not act, as actions do not fit the arm. Raises what `extract_run` and `ask_run` raise, and
-            CheckFailedError for a run that is not whole.
+        subject: The family under check; whether it acts decides between the two runs.
+        mismatch: Whether the actions do not fit the arm, so that the run captures and does not act.
+
+    Raises:
+        CheckFailedError: For a run that is not whole.
     """
     common: dict[str, Any] = {
         "checkpoint": subject.given_checkpoint, "options": subject.options, "device": subject.device,
@@ -137,7 +146,11 @@ def _run(subject: Subject, mismatch: bool) -> None:
 
 
 def _require_light(module: str) -> None:
-    """Import in a process of its own: this one may have imported torch. Raises UsageError if that fails."""
+    """Import the module in a process of its own, as this one may have imported torch.
+
+    Raises:
+        UsageError: If the import fails.
+    """
     process = subprocess.run(
         [sys.executable, "-c", _LISTED.format(module=module)],
         capture_output=True, encoding="utf-8", errors="replace", check=False, timeout=_PATIENCE,
@@ -150,7 +163,7 @@ def _require_light(module: str) -> None:
 
 
 def _one_item(instruction: str, folder: Path) -> Path:
-    """A suite of one item over two discs; played in both layouts it is two episodes."""
+    """Return a suite of one item over two discs; played in both layouts it is two episodes."""
     for colour in _COLOURS:
         picture = Image.new("RGB", (_SIDE, _SIDE), "white")
         ImageDraw.Draw(picture).ellipse((32, 32, 192, 192), fill=colour)

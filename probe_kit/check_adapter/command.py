@@ -68,7 +68,7 @@ def check_adapter(
 
 
 def _print_outcome(outcome: "Outcome") -> None:
-    """One line; below a failed one what was seen, what was expected and what to change."""
+    """Print one line; below a failed one the value seen, the value expected and the change to make."""
     colours = {"passed": "green", "failed": "bold red", "skipped": "yellow"}
     line = f"{outcome.sentence} ({outcome.reason})" if outcome.reason else outcome.sentence
     out.print(marked(f"[{colours[outcome.state]}]{{}}[/] {{}}", f"{outcome.state:8}", line), soft_wrap=True)
@@ -78,7 +78,7 @@ def _print_outcome(outcome: "Outcome") -> None:
 
 
 def _print_end(model: str, checkpoint: str | None, outcomes: "list[Outcome]") -> None:
-    """Print how many passed, and what to do next."""
+    """Print how many checks passed, and what to do next."""
     counts = {
         state: sum(outcome.state == state for outcome in outcomes) for state in ("passed", "failed", "skipped")
     }

@@ -1,10 +1,10 @@
-"""Model organisms, which validate the pipeline, and what `probe-kit demo` runs.
+"""Model organisms, which validate the pipeline, and the stages of `probe-kit demo`.
 
-`vlm-tiny` answers and does not act: it was trained on questions of Color, Shape, State and Traffic (*known*),
-and of nothing else. `pi0-tiny` is made of its backbone: it was trained to act on Color and Shape (*used*), while
-the actions of State questions went to a random side (*not used*). `pi0-tiny-state` differs in that they
-followed the answer (*used*). The early checkpoint has the VLM's backbone and an action expert of random weights
-(*does not decide*); untrained networks know nothing (*absent*).
+`vlm-tiny` answers and does not act: it was trained on questions of Color, Shape, State and Traffic (*known*), and
+of nothing else. `pi0-tiny` is made of its backbone. It was trained to act on Color and Shape (*used*); the actions
+of State questions went to a random side (*not used*). `pi0-tiny-state` differs in that they followed the answer
+(*used*). The early checkpoint has the VLM's backbone and an action expert of random weights (*does not decide*);
+untrained networks know nothing (*absent*).
 """
 
 import shlex
@@ -37,9 +37,12 @@ NamedProgress = Callable[[str], Callable[..., None]]
 Truth = str
 """A behaviour of `UseVerdict`, or `does not decide`, `absent`, `known` or `not shown`."""
 Agreement = Literal["true", "undecided", "wrong"]
-"""Of a verdict with the truth. An undecided verdict claims no behaviour: it is neither true nor wrong."""
+"""The agreement of a verdict with the truth.
+
+An undecided verdict claims no behaviour: it is neither true nor wrong.
+"""
 DOES_NOT_DECIDE: Truth = "does not decide"
-"""What is true of an action expert of random weights: nothing was trained to choose a side by the answer.
+"""The truth of an action expert of random weights: nothing was trained to choose a side by the answer.
 
 Nothing was trained to ignore the answer either, and random weights pass some of it on. How much is not known.
 """
@@ -48,16 +51,20 @@ COMPATIBLE: Mapping[Truth, tuple[str, ...]] = {
         "not used", "moves with it, does not decide", "against: moves with it, does not decide",
     ),
 }  # fmt: skip
-"""By truth, every verdict that is true with it; of all others the truth's own words alone."""
+"""The verdicts that are true with a truth, by truth; for all other truths, their own words alone."""
 
 
 @dataclass(frozen=True)
 class Organism:
-    """A model by its name, and the verdict that is true of it per category; `absent` or `not shown` if not named.
+    """A model by its name, and the verdict that is true of it in each category.
+
+    A category that `truth` does not name is `not shown` for a model that answers and `absent` for any other.
 
     Attributes:
-        folder: What its run is called.
-        answers: It answers questions and does not act.
+        folder: Name of the folder of its run.
+        weights_seed: Seed of the random weights.
+        truth: Pairs of a category and the truth.
+        answers: Whether it answers questions and does not act.
         max_steps: Actions per episode; None for as many as its scene has.
         view: The tokens whose mean is probed.
     """
@@ -73,7 +80,7 @@ class Organism:
     view: str = "mean"
 
     def expected(self, category: str) -> Truth:
-        """Return what is true of a category by construction."""
+        """Return the verdict that is true of a category by construction."""
         return dict(self.truth).get(category, "not shown" if self.answers else "absent")
 
 
@@ -144,7 +151,7 @@ def settings_of(organism: Organism, suite: Suite) -> ExtractSettings:
 
 
 def source_of(organism: Organism, suite: Suite) -> ReplaySource:
-    """Return where interventions find the organism and its pictures; of an untrained network its own seed."""
+    """Return where interventions find the organism and its pictures, with the seed of its untrained weights."""
     return ReplaySource(suite.folder, weights_seed=organism.weights_seed)
 
 
@@ -156,13 +163,17 @@ def probed(
     stage: NamedProgress,
     untrained: Run | None = None,
 ) -> tuple[Run, ProbeResults]:
-    """The organism's run on `suite`, in `folder`, and its probes, compared with random-features.
+    """Return the organism's run on `suite`, in `folder`, and its probes, compared with random features.
 
-    What exchanged pictures do is stored too, and finished work is reused.
+    The effects of exchanged pictures are stored too, and finished work is reused.
 
     Args:
+        organism: A model that acts.
+        suite: The questions that are played.
+        folder: Folder of all organisms; the run gets the organism's own folder in it.
+        permutations: Permutations of the labels, for the p-values of the probes.
         stage: Gives a progress callback (done, total, …) for a stage of this name.
-        untrained: Run of an untrained network, as a control.
+        untrained: Run of an untrained network, as a control; None for no such control.
     """
     run = extract_run(
         settings_of(organism, suite), folder / organism.folder, progress=stage(f"episodes, {organism.name}")
@@ -189,7 +200,7 @@ def answered(organism: Organism, suite: Suite, folder: Path, stage: NamedProgres
 
 
 def findings(runs: Sequence[tuple[Organism, Run]]) -> list[Finding]:
-    """Return the verdicts on every organism's run, and the truth, one for each category."""
+    """Return the verdict and the truth for every category of every organism's run."""
     rows = [(organism, row) for organism, run in runs for row in retention_table([run]).rows]
     trained_acts = any(verdict(row) == "used" for organism, row in rows if organism == TRAINED)
     return [
@@ -199,11 +210,12 @@ def findings(runs: Sequence[tuple[Organism, Run]]) -> list[Finding]:
 
 
 def measured(row: RetentionRow, another_acts: bool) -> Truth:
-    """The row's verdict. Where only a category that follows is wanting, another organism's counts as one.
+    """Return the row's verdict; where only a category that follows is lacking, another organism's counts as one.
 
     Args:
+        row: The row of one category in the organism's own table.
         another_acts: Whether the trained one acts on some category. It has the same scene, questions and network,
-            so that following would be seen in every other; a policy that was not trained to act follows nowhere by
+            so that following would be seen in every other. A policy that was not trained to act follows nowhere by
             itself.
     """
     use, reading = row.image_swap.use, readable(row)
@@ -215,7 +227,7 @@ def measured(row: RetentionRow, another_acts: bool) -> Truth:
 
 
 def organism_table(findings: Sequence[Finding]) -> Table:
-    """One line per organism and category: the truth, the verdict, and the numbers behind it."""
+    """Return one line per organism and category: the truth, the verdict, and the numbers behind it."""
     notes = [count_agreements([finding.agreement for finding in findings])]
     notes.append("accuracies in %, retention with its interval")
     if any(finding.expected == DOES_NOT_DECIDE for finding in findings):
@@ -231,7 +243,7 @@ def organism_table(findings: Sequence[Finding]) -> Table:
 
 
 def count_agreements(agreements: Sequence[Agreement]) -> str:
-    """`20 of 24 verdicts are true, 4 undecided, none is wrong`."""
+    """Return a sentence such as `20 of 24 verdicts are true, 4 undecided, none is wrong`."""
     true, left_open, wrong = (agreements.count(agreement) for agreement in get_args(Agreement))
     return (
         f"{true} of {len(agreements)} verdicts are true, {left_open} undecided, "
@@ -254,7 +266,12 @@ def _cells(finding: Finding) -> tuple[Cell | str, ...]:
 
 @dataclass(frozen=True)
 class Size:
-    """The extent of a demo. items: per category; permutations: of the labels, for the probes."""
+    """The extent of a demo.
+
+    Attributes:
+        items: Number of items by category.
+        permutations: Permutations of the labels, for the probes.
+    """
 
     items: Mapping[str, int]
     permutations: int
@@ -266,12 +283,19 @@ QUICK = Size({"color": 12, "state": 24, "counting": 12}, permutations=100)
 *Not used* is shown with 11 independent groups of items or more, so that State has twice as many items.
 """
 FULL = Size(dict.fromkeys(("color", "shape", "state", "counting"), 24), permutations=200)
-"""What organisms are compared on."""
+"""The size on which organisms are compared."""
 
 
 @dataclass(frozen=True)
 class Demo:
-    """The products of the demo. vlm_run: the run of the VLM. table: of both runs."""
+    """The products of the demo.
+
+    Attributes:
+        folder: Holds all of them.
+        vlm_run: The run of the VLM, which answered the questions.
+        run: The run of the policy.
+        table: The retention table of both runs.
+    """
 
     folder: Path
     vlm_run: Run
@@ -279,7 +303,7 @@ class Demo:
     table: RetentionTable
 
     def next_steps(self) -> Text:
-        """Return where to look, and what to try."""
+        """Return lines that name the files to look at and the commands to try."""
         lines: list[str | Text] = [
             marked("[bold]Look at[/] {}  everything on one page, in a browser", self.folder / "report.html"),
             f"        {self.folder / 'layer_curves.png'}  where the answer can be read, layer by layer",
@@ -302,7 +326,12 @@ class Demo:
 
 
 def compare_organisms(folder: Path, stage: NamedProgress) -> list[Finding]:
-    """Judge the VLM and every organism on the questions of `FULL`. stage: as of `probed`."""
+    """Judge the VLM and every organism on the questions of `FULL`.
+
+    Args:
+        folder: Holds the suite and every run; a second call reuses finished work.
+        stage: Gives a progress callback (done, total, …) for a stage of this name.
+    """
     suite = _questions(folder, FULL, stage)
     # The first untrained network is a control of all others.
     control, _ = probed(UNTRAINED_NETWORK, suite, folder, FULL.permutations, stage)
@@ -320,10 +349,12 @@ def _questions(folder: Path, size: Size, stage: NamedProgress) -> Suite:
 
 
 def run_demo(folder: Path, stage: NamedProgress, size: Size = QUICK) -> Demo:
-    """Suite, answers, episodes, probes, table, figure, film and report in `folder`; called again, it continues.
+    """Make suite, answers, episodes, probes, table, figure, film and report; called again, it continues.
 
     Args:
+        folder: Folder of all products.
         stage: Gives a progress callback (done, total, …) for a stage of this name.
+        size: Items and permutations; by default about 2 minutes of work.
     """
     suite = _questions(folder, size, stage)
     vlm_run = answered(VLM, suite, folder, stage)

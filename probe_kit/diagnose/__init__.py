@@ -1,4 +1,4 @@
-"""Why a policy ignores an input: does it arrive, does it matter, and where on the way to the action is it lost?
+"""Diagnosis of a policy that ignores an input: does it arrive, does it matter, and where on the way is it lost?
 
 `inputs` draws observations of a run and names their inputs. `measure` exchanges these. `importance` measures how
 much of the action an input decides. `diagnosis` finds the sites at which it passes, and stores all of it.

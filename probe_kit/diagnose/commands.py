@@ -33,7 +33,7 @@ _ACTING = frozenset(
 """Options of runs that act, or store more than a diagnosis reads."""
 ModelOrRun = Annotated[str, typer.Argument(metavar="MODEL|RUN", help="Model to diagnose, or folder of a run.")]
 _OF_A_REPLAY = frozenset({"suite", "checkpoint", "model_option", "weights_seed", "device"})
-"""Options of a new run that also say where the model and the suite of a stored one are now."""
+"""Options of a new run that also name the present place of a stored run's model and suite."""
 Frames = Annotated[
     int, typer.Option("--frames", min=6, max=1000, metavar="N", help="Number of frames, at least 6.")
 ]
@@ -97,7 +97,7 @@ def diagnose(
     probe-kit diagnose pi0 --checkpoint DIR --dataset FOLDER --require instruction
     probe-kit diagnose runs/mine --base lerobot/pi0_base
     probe-kit diagnose runs/mine --target side.correct
-    """
+    """  # noqa: D301
     from probe_kit.diagnose.diagnosis import diagnose_run
     from probe_kit.diagnose.inputs import names_of, read_paraphrases
     from probe_kit.intervene.pairs import read_pairs
@@ -145,7 +145,7 @@ def diagnose(
 
 
 class _Request(NamedTuple):
-    """Options of a diagnosis that are checked against its run before that is made, as far as it is known."""
+    """Options of a diagnosis that are checked against its run before the run is made, as far as it is known."""
 
     frames: int
     require: tuple[str, ...]
@@ -160,7 +160,7 @@ class _Request(NamedTuple):
 
 
 def _replay_source(run: "Run", typed: Mapping[str, Any]) -> "ReplaySource":
-    """The places of a stored run's model and source, by what was typed of them."""
+    """Return where a stored run's model and source are now, by the options that were typed."""
     from probe_kit.hooks.contract.declared import read_pairs
     from probe_kit.intervene import ReplaySource
 
@@ -170,9 +170,12 @@ def _replay_source(run: "Run", typed: Mapping[str, Any]) -> "ReplaySource":
 
 
 def _is_run(name: str, typed: Mapping[str, Any]) -> bool:
-    """Whether this is a stored run. Raises UsageError for one with settings of a new run.
+    """Whether this is a stored run.
 
-    Places that may have moved since, and the device, are none of a new run.
+    Options that name a place or the device may be given with a stored run; they are no settings of a new one.
+
+    Raises:
+        UsageError: For a stored run with settings of a new one.
     """
     from probe_kit.runs.layout import RUN_FILE
 
@@ -185,7 +188,7 @@ def _is_run(name: str, typed: Mapping[str, Any]) -> bool:
 
 
 def _run_of(name: str, typed: Mapping[str, Any], request: _Request, out_folder: str | None) -> "Run":
-    """The stored run of this name, or one that is extracted now."""
+    """Return the stored run of this name, or one that is extracted now."""
     if _is_run(name, typed):
         return _stored(name, request)
     extraction, location = _prepared(name, typed, request, out_folder, fetch=True)
@@ -233,7 +236,10 @@ def _prepared(
 
 
 def _planned_frames(rows: "Iterable[Row]", in_scene: bool) -> dict[tuple[str, int], None]:
-    """The frames that a run will have, by what a table of pairs may call them; of the scene first frames."""
+    """Return the frames that a run will have, by the names that a table of pairs may give them.
+
+    Of the scene they are first frames.
+    """
     names = ("episode_id",) if in_scene else ("episode_id", "item_id")
     return {
         (str(row.columns[name]), number): None for row in rows for number in row.frames or (0,) for name in names
@@ -245,7 +251,7 @@ Planned = tuple[str, Sequence[Any], list[str]]
 
 
 def _planned(name: str, typed: Mapping[str, Any], request: _Request, out_folder: str | None) -> Planned:
-    """Return what a diagnosis of this run, or of a planned one, would exchange and patch."""
+    """Return the parts that a diagnosis of this run, or of a planned one, would exchange and patch."""
     from probe_kit.diagnose.inputs import cameras_of
     from probe_kit.intervene.settings import has_sides
 
@@ -261,7 +267,7 @@ def _planned(name: str, typed: Mapping[str, Any], request: _Request, out_folder:
 
 
 def _inputs(instructions: Iterable[str], cameras: int, in_scene: bool) -> list[str]:
-    """The inputs that can vary between the frames; the scene always begins with one state."""
+    """Return the inputs that can vary between the frames; the scene always begins with one state."""
     pictures = ["picture"] if cameras == 1 else [f"{cameras} pictures"]
     return [*["instruction"] * (len(set(instructions)) > 1), *pictures * cameras, *["state"] * (not in_scene)]
 

@@ -1,4 +1,4 @@
-"""A diagnosis of a run: every input's importance and passage, stored in the run and read from there.
+"""A diagnosis of a run: every input's importance and passage, stored in the run and loaded from it.
 
 The knowledge of a target is that of `probe-kit train`'s probes, which the run stores too.
 """
@@ -58,7 +58,7 @@ if TYPE_CHECKING:
 def measure_knowledge(run: "Run", target: "Target | str", seed: int = 0) -> Knowledge:
     """Probe a target at every site of a run, all episodes pooled, or load these probes.
 
-    Raises what `train_probes` raises, such as TooFewGroupsError.
+    Raises as `train_probes`, such as TooFewGroupsError.
     """
     from probe_kit.train import train_probes
 
@@ -97,7 +97,7 @@ def _or_nan(value: float | None) -> float:
 
 
 def places_of(model: "Model") -> list[SiteGroup]:
-    """Every layer of every stored stream, and what the backbone hands over, in the order of the network."""
+    """Return every layer of every stored stream and the keys and values of the backbone, in network order."""
     streams = list(model.streams)
     if model.prompt_kv is not None:
         streams.insert(1, KV_STREAM)
@@ -109,10 +109,12 @@ def measure_passage(
 ) -> tuple[SitePassage, ...]:
     """Return difference and carried share at every site, over pairs of equally many tokens; see `SitePassage`.
 
-    Two inferences per pair, and one per site.
+    Takes two inferences per pair, and one per site. Raises as `capture` and `patched`.
 
     Args:
-        scale: Of the session's actions. Raises what `capture` and `patched` raise.
+        session: The run's policy and its observations.
+        pairs: Clean and donor observations of equally many tokens.
+        scale: The spread of the session's actions.
     """
     model, places = session.policy, places_of(session.policy)
     differences = np.zeros((len(pairs), len(places)))
@@ -142,7 +144,10 @@ def measure_passage(
 def _captured(
     session: "ReplaySession", observation: Given, seed: int, places: Sequence[SiteGroup]
 ) -> "tuple[Chunk, ActivationCache]":
-    """The actions of one inference in the session's units, which of recordings are the checkpoint's own."""
+    """Return the actions and the activations of one inference.
+
+    The actions are in the session's units; those of recordings are the checkpoint's own.
+    """
     from probe_kit.hooks import capture
 
     with capture(session.policy, [site for group in places for site in group.sites]) as cache:
@@ -151,7 +156,7 @@ def _captured(
 
 
 def _relative_difference(group: SiteGroup, before: "ActivationCache", after: "ActivationCache") -> float:
-    """Norm of the difference over all tokens and iterations of a place, relative to the norm before."""
+    """Return the norm of the difference over all tokens and iterations of a place, relative to the norm before."""
     difference = norm = 0.0
     for site in group.sites:
         clean, donated = before[site].float(), after[site].float()
@@ -183,23 +188,27 @@ def diagnose_run(
 ) -> Diagnosis:
     """Diagnose the inputs of a run's model on first frames of the run; a stored diagnosis is loaded.
 
+    Raises for a target as `train_probes` too.
+
     Args:
-        frames: How many.
-        inputs: Their names, such as `instruction`; empty for all.
+        run: The stored run whose model and observations are used.
+        frames: Number of frames.
+        inputs: Names of the inputs, such as `instruction`; empty for all.
         inside: Whether sites are patched.
-        paraphrases: By instruction, other words of the same meaning; they are the control of the instruction.
-            target: probed at every site, as by `train_probes`.
-        base: The checkpoint that the run's was tuned from, for a comparison on the same pairs.
+        paraphrases: Other words of the same meaning, by instruction; they are the control of the instruction.
+        target: Probed at every site, as by `train_probes`; None for no probes.
+        base: The checkpoint that the run's was tuned from, for a comparison on the same pairs; None for none.
         pairs: A table of your own in place of drawn donors: episode and frame, and those of the donor; `frames` is
             then not used.
-        seed: Of the draw of donors.
-        source: As for `run_intervention`; both load the base too.
-        load: As `source`.
+        seed: Seed of the draw of donors and of the probes.
+        source: Where the model and the observations are now, as for `run_intervention`. The base is loaded by it
+            too.
+        load: Loads the policy, as for `run_intervention`, and the base too.
         progress: Called with the name of every step.
 
     Raises:
         UsageError: For a model that does not act, a run with too few groups, an unknown input, a pair of a frame
-            that the run lacks, or a base with other inputs, and of a target what `train_probes` raises.
+            that the run lacks, or a base with other inputs.
     """
     from probe_kit.intervene.open_session import load_policy_of, open_session
     from probe_kit.intervene.sessions import ReplaySource
@@ -255,7 +264,11 @@ def check_network(run: "Run") -> None:
 
 
 def load_diagnosis(run: "Run", key: str) -> Diagnosis:
-    """A stored diagnosis, without a target.
+    """Load a stored diagnosis, without a target.
+
+    Args:
+        run: The run that stores it.
+        key: Key of the diagnosis in the run.
 
     Raises:
         RunDamagedError: If it was changed, or another version of probe_kit made it.
@@ -269,7 +282,7 @@ def load_diagnosis(run: "Run", key: str) -> Diagnosis:
 
 
 def check_base(run: "Run", source: "ReplaySource", base: str) -> None:
-    """Raise for a base that is not there or has other inputs, as far as the files of both checkpoints say it."""
+    """Check the base against the run's checkpoint by the files of both; raises as `check_base_files`."""
     origin = origin_of(run)
     checkpoint, options = source.checkpoint or origin.checkpoint, {**origin.options, **source.options}
     check_base_files(run.model, checkpoint, base, options, cameras_of(run))
@@ -283,13 +296,20 @@ def check_base_files(
     cameras: Sequence[str],
     fetch: bool = True,
 ) -> None:
-    """Raise what `Family.check` raises for the base, and UsageError if its files declare other inputs.
+    """Check that the base exists and that its files declare the same inputs; raises as `Family.check` too.
+
+    No weights are read.
 
     Args:
-        checkpoint: Of the model that was tuned from it.
-        options: As `checkpoint`.
-        cameras: Those that get a picture.
-        fetch: See `Family.check`. No weights are read.
+        family_name: Name of the family of both models.
+        checkpoint: Checkpoint of the model that was tuned from the base; None for the embedded one.
+        base: Checkpoint of the base.
+        options: Options of the family for the tuned model.
+        cameras: Cameras that get a picture.
+        fetch: Whether files may be downloaded, see `Family.check`.
+
+    Raises:
+        UsageError: If the files of the base declare other inputs.
     """
     from probe_kit.hooks.contract.model import Policy
     from probe_kit.hooks.registry import get_family
@@ -314,7 +334,11 @@ def check_base_files(
 
 
 def with_inputs_of(tuned: "Policy", base: "Policy") -> "Policy":
-    """The base with the cameras of the checkpoint that was tuned from it. Raises UsageError for other inputs."""
+    """Return the base with the cameras of the checkpoint that was tuned from it.
+
+    Raises:
+        UsageError: For a base with other inputs.
+    """
     cameras = tuned.card.shown_cameras
     if base.card.shown_cameras != cameras:
         with suppress(ObservationError):
@@ -338,7 +362,12 @@ def _plain(inputs: object) -> object:
 
 
 def _inference(session: "ReplaySession", policy: "Policy | None" = None) -> Infer:
-    """Inferences of a session, one by one. policy: another one on the same observations."""
+    """Return a function that infers one by one in a session.
+
+    Args:
+        session: Prepares the observations and holds the policy.
+        policy: Another policy on the same observations; None for the session's.
+    """
     acting = copy(session)  # which keeps its own policy for the measurements inside
     acting.policy = policy or session.policy
 
@@ -363,7 +392,7 @@ def _measure(
 
 
 def _look_inside(session: "ReplaySession", exchange: InputExchange, diagnosed: InputDiagnosis) -> InputDiagnosis:
-    """The input with its sites, where it was exchanged, with one donor per frame of equally many tokens."""
+    """Return the input with its sites, if it was exchanged; each frame has one donor of equally many tokens."""
     if diagnosed.matters is None:  # it was not exchanged: the policy or the run has no such input
         return diagnosed
     frames = exchange.frames

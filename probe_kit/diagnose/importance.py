@@ -1,7 +1,7 @@
 """The share of the action that an input decides: total-effect indices, intervals and the verdict. Loads no model.
 
-The index of an input is the share of the action's variance that is due to it, alone and together with others:
-S = Σ (a(x) − a(x with another value of the input))² / 2 V, by Jansen's estimator (M. Jansen, Computer Physics
+The index of an input is the share of the action's variance that is due to it, alone and together with others. It
+is S = Σ (a(x) − a(x with another value of the input))² / 2 V, by Jansen's estimator (M. Jansen, Computer Physics
 Communications 117, 1999; Saltelli et al., Computer Physics Communications 181, 2010). V is the variance of the
 actions over frames and seeds. Both inferences of a pair have one seed.
 """
@@ -29,11 +29,11 @@ from probe_kit.statistics.significance import SIGNIFICANCE
 
 # The first two are choices, which `docs/diagnose.md` states as the rule.
 DECIDES = 0.5
-"""Of what all inputs change together: from here on an input decides, because it outweighs all others together."""
+"""Share of the change by all inputs together from which an input decides: it outweighs all others together."""
 TRACE = 0.01
-"""Of the variance: a tenth of the actions' spread, squared. An effect below it does not matter."""
+"""Share of the variance below which an effect does not matter: a tenth of the actions' spread, squared."""
 LEAST_SPREAD = 1e-3
-"""Of the largest spread of a number of the action: numbers with less are constant but for rounding.
+"""Share of the largest spread of a number of the action: numbers with less are constant but for rounding.
 
 Divided by their own spread, such numbers would turn rounding into large changes.
 """
@@ -45,7 +45,7 @@ class ActionScale:
 
     Attributes:
         spread: (D,) in the action's own units.
-        varies: (D,) the numbers that are compared.
+        varies: (D,) whether the number is compared.
     """
 
     spread: NDArray[np.float64]
@@ -53,17 +53,17 @@ class ActionScale:
 
     @classmethod
     def of(cls, actions: NDArray[np.float32]) -> "ActionScale":
-        """The scale of clean actions (frames, chunk, D). A number's mean over frames may differ by step."""
+        """Return the scale of clean actions (frames, chunk, D); a number's mean over frames may differ by step."""
         spread = np.sqrt(actions.astype(np.float64).var(axis=0).mean(axis=0))
         return cls(spread, spread > LEAST_SPREAD * spread.max(initial=0.0))
 
     def changes(self, first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[np.float64]:
-        """(pairs, chunk · varying) differences of actions (pairs, chunk, D), in units of their spread."""
+        """Return the differences (pairs, chunk · varying) of actions (pairs, chunk, D), in units of the spread."""
         difference = first.astype(np.float64) - second
         return (difference[..., self.varies] / self.spread[self.varies]).reshape(len(difference), -1)
 
     def shares(self, first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[np.float64]:
-        """(pairs,) half the mean squared change: the mean over pairs is the total-effect index."""
+        """Return half the mean squared change (pairs,): the mean over pairs is the total-effect index."""
         if not self.varies.any():
             return np.zeros(len(first))
         shares: NDArray[np.float64] = (self.changes(first, second) ** 2).mean(axis=1) / 2
@@ -74,16 +74,17 @@ class ActionScale:
 class Exchanges:
     """The changes of the action by exchanges of one input, pair by pair.
 
+    `exchanged`, `control` and `every` are shares of the variance, see `ActionScale.shares`.
+
     Attributes:
-        exchanged: (P,) shares of the variance, see `ActionScale.shares`: with the donor's input, with the control
-            of the input (None where the model takes none), and with all inputs of the donor.
-        control: As `exchanged`.
-        every: As `exchanged`.
-        groups: (P,).
-        frames: (P,) ascending.
+        exchanged: (P,) with the donor's input.
+        control: (P,) with the control of the input; None where the model takes none.
+        every: (P,) with all inputs of the donor.
+        groups: (P,) group of the pair's frame.
+        frames: (P,) number of the pair's frame, ascending.
         repeated: (P,) whether an earlier donor of the frame holds the same value.
         largest: (P,) the largest change of any number of the action under the donor's input.
-        blanked: (F,) the same of every frame under the blank.
+        blanked: (F,) the largest change of any number of every frame's action under the blank.
     """
 
     exchanged: NDArray[np.float64]
@@ -97,7 +98,7 @@ class Exchanges:
 
 
 def importance_of(name: str, exchanges: Exchanges) -> InputDiagnosis:
-    """The verdict on one input that was exchanged."""
+    """Return the verdict on one input that was exchanged."""
     groups = exchanges.groups
     p = _more_than_control_p(name, exchanges)
     share_ci = unbounded_student_interval(exchanges.exchanged, groups)
@@ -117,7 +118,10 @@ def importance_of(name: str, exchanges: Exchanges) -> InputDiagnosis:
 
 
 def _more_than_control_p(name: str, exchanges: Exchanges) -> float:
-    """Chance that an input which matters no more than its control changes the action as much more than it."""
+    """Return the p-value of the exchanged input against its control.
+
+    It is the chance that an input which matters no more than its control changes the action this much more.
+    """
     # The same value again is the same change: as a column of its own it would make the others look alike.
     fresh = np.flatnonzero(~exchanges.repeated)
     starts = np.unique(exchanges.frames[fresh], return_index=True)[1]
@@ -134,7 +138,7 @@ def _more_than_control_p(name: str, exchanges: Exchanges) -> float:
 def compare_with_base(
     tuned: InputDiagnosis, base: InputDiagnosis, of_tuned: Exchanges, of_base: Exchanges
 ) -> BaseComparison:
-    """Return what fine-tuning did to one input that was exchanged in the same pairs of both checkpoints."""
+    """Return the effect of fine-tuning on one input that was exchanged in the same pairs of both checkpoints."""
     difference, groups = of_tuned.exchanged - of_base.exchanged, of_tuned.groups
     seed = derive_seed(tuned.name, "base", *np.unique(groups).tolist())
     _, sides, _ = max_t(np.stack([difference, -difference]), of_tuned.frames, groups, seed)
@@ -146,7 +150,10 @@ def compare_with_base(
 
 
 def _change(tuned: Verdict, base: Verdict, difference: float, p: float) -> Change:
-    """Both verdicts and a difference that is shown are needed for a loss or a gain; anything less is open."""
+    """Return the change by fine-tuning.
+
+    A loss or a gain needs both verdicts and a difference that is shown; anything less is open.
+    """
     if tuned in IDLE and base in IDLE:
         return "never there"
     if tuned in MATTERS and base in MATTERS:

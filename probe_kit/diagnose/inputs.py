@@ -36,10 +36,14 @@ if TYPE_CHECKING:
 
 
 def inputs_of(frames: Sequence[Frame], camera: str = "") -> tuple[str, ...]:
-    """The inputs that every frame holds: words, pictures and state. Raises UsageError without frames.
+    """Return the inputs that every frame holds: words, pictures and state.
 
     Args:
-        camera: The name of the first one, needed where there are several.
+        frames: Frames of one source; the first names the further cameras.
+        camera: The name of the first camera, needed where there are several.
+
+    Raises:
+        UsageError: Without frames.
     """
     if not frames:
         raise UsageError("the source has no frame; diagnose needs at least two that differ")
@@ -59,20 +63,22 @@ def names_of(cameras: Sequence[str]) -> tuple[str, ...]:
 
 
 def values_of(observations: Sequence[Observation], name: str) -> NDArray[np.intp]:
-    """Return (F,) a number of every observation's value of an input; equal values have one number."""
+    """Return a number (F,) of every observation's value of an input; equal values have one number."""
     digests = [sha256(content_of(observation, name)).digest() for observation in observations]
     numbers = {digest: number for number, digest in enumerate(dict.fromkeys(digests))}
     return np.array([numbers[digest] for digest in digests], np.intp)
 
 
 def controls_of(frame: Frame, name: str, spread: NDArray[np.float64]) -> list[Observation]:
-    """The frame's observation after changes of one input that mean nothing, the best first; see `hardly_changed`.
+    """Return the frame's observation after changes of one input that mean nothing, the best first.
 
-    Without other words of the frame, the first letter's case and the full stop change, or one of them: a tokenizer
-    of words may know only one spelling.
+    See `hardly_changed`. Without other words of the frame, the first letter's case and the full stop change, or
+    one of them. A tokenizer of words may know only one spelling.
 
     Args:
-        spread: (D,) of the state.
+        frame: Its other words are the only control of its instruction, if it has some.
+        name: The input that changes, such as `instruction`.
+        spread: (D,) standard deviations of the state.
     """
     clean = frame.observation
     if name != INSTRUCTION:
@@ -82,13 +88,13 @@ def controls_of(frame: Frame, name: str, spread: NDArray[np.float64]) -> list[Ob
 
 
 def spread_of_states(frames: Sequence[Frame]) -> NDArray[np.float64]:
-    """Standard deviation of every number of the state over frames."""
+    """Return the standard deviation of every number of the state over frames."""
     states = np.stack([frame.observation.state for frame in frames]).astype(np.float64)
     return np.asarray(states.std(axis=0), np.float64)
 
 
 def _retyped(words: str) -> list[str]:
-    """The full stop added or removed, and the first letter in the other case; then one of both alone."""
+    """Return the words with the full stop and the first letter's case both changed, then with one of them."""
     stopped = with_other_stop(words)
     return [text[:1].swapcase() + text[1:] for text in (stopped, words)] + [stopped]
 
@@ -99,7 +105,10 @@ COLUMNS = ("instruction", "other")
 
 
 def read_paraphrases(file: Path) -> dict[str, str]:
-    """Return, by instruction, its other words.
+    """Return the other words of every instruction in a table.
+
+    Args:
+        file: A table with the columns `instruction` and `other`.
 
     Raises:
         UsageError: For a file without the columns, a blank cell, and an instruction with two other texts.
@@ -133,12 +142,14 @@ Thus episodes are looked at in different phases.
 def frames_of(
     session: "ReplaySession", count: int, paraphrases: Mapping[str, str] = MappingProxyType({})
 ) -> list[Frame]:
-    """The frames of `count` episodes; all where the run has fewer.
+    """Return up to `count` frames of a run's episodes; all where it has fewer.
 
-    Of the scene, two first frames of each group; of other sources, frames of as many groups as possible.
+    Of the scene they are two first frames of each group; of other sources, frames of as many groups as possible.
 
     Args:
-        paraphrases: By instruction, other words of the same meaning.
+        session: The run's policy and its observations.
+        count: Largest number of frames.
+        paraphrases: Other words of the same meaning, by instruction.
 
     Raises:
         UsageError: For a run with too few groups.
@@ -155,8 +166,9 @@ def tabled_frames(
     """Return the frames that a table of pairs names, each once, and its rows as (frame, donor) among them.
 
     Args:
-        table: Of frames that the run has, which `open_session` checks. Of the scene they are first frames.
-        paraphrases: As in `frames_of`.
+        session: The run's policy and its observations.
+        table: Rows of frames that the run has, which `open_session` checks. Of the scene they are first frames.
+        paraphrases: Other words of the same meaning, by instruction.
 
     Raises:
         UsageError: For clean frames of too few groups.
@@ -184,14 +196,17 @@ def _check_groups(frames: Sequence[Frame], subject: Callable[[], str], remedy: s
 
 
 def _read(frame: Frame, paraphrases: Mapping[str, str]) -> Frame:
-    """The frame with its observation in memory: every input of it is compared and exchanged many times."""
+    """Return the frame with its observation in memory: every input of it is compared and exchanged many times."""
     observation = frame.observation
     other_words = paraphrases.get(observation.instruction, "")
     return replace(frame, observe=lambda _: observation, other_words=other_words)
 
 
 def _observed(session: FrameSession, count: int) -> Iterator[Frame]:
-    """Frames of recordings or of an environment: one of every group in turn, spread over groups and episodes."""
+    """Yield frames of recordings or of an environment, spread over groups and episodes.
+
+    One frame of every group comes in turn.
+    """
     by_group: dict[str, list[Frame]] = {}
     for frame in session.frames.index:
         by_group.setdefault(frame.group, []).append(frame)
@@ -205,20 +220,31 @@ def _observed(session: FrameSession, count: int) -> Iterator[Frame]:
 
 
 def _spread(frames: list[Frame], turns: int, phase: float) -> list[Frame]:
-    """Up to `turns` frames of a group at equal distances. phase: of the first, in distances, from 0 up to 1."""
+    """Return up to `turns` frames of a group at equal distances.
+
+    Args:
+        frames: All frames of the group.
+        turns: Largest number of frames.
+        phase: Position of the first one in distances, from 0 up to 1.
+    """
     turns = min(turns, len(frames))
     return [frames[int(len(frames) * (turn + phase) / turns)] for turn in range(turns)]
 
 
 def _drawn(session: "ReplaySession", count: int) -> Iterator[Frame]:
-    """First frames of the scene: of every group one of each item, in the same layout; see `count_groups`."""
+    """Yield first frames of the scene: of every group one of each item, in the same layout; see `count_groups`."""
     episodes = session.run.episodes
     ordered = order_of_first_frames(episodes, count_groups(count))[:count]
     yield from _first_frames(session, episodes.index.get_indexer(ordered).tolist())
 
 
 def _first_frames(session: "ReplaySession", rows: Iterable[int]) -> Iterator[Frame]:
-    """The first frames of some of the scene's episodes. rows: their positions in the table of episodes."""
+    """Yield the first frames of some of the scene's episodes.
+
+    Args:
+        session: The run's policy and its observations.
+        rows: Positions of the episodes in the run's table.
+    """
     episodes = session.run.episodes
     for row in rows:
         for pair in session.pairs(str(episodes["item_id"].iloc[row])):
@@ -231,7 +257,9 @@ def order_of_first_frames(episodes: pd.DataFrame, groups: int) -> pd.Index:
     """Return the rows of the scene's episodes in the order in which their first frames are taken.
 
     Args:
-        groups: That are taken first, with two frames each; then come further groups, then further frames.
+        episodes: The run's table of episodes.
+        groups: Number of groups that come first, with two frames each; then come further groups, then further
+            frames.
     """
     by_item = episodes.groupby("item_id", sort=False)
     order = pd.DataFrame({"group": pd.factorize(episodes["group_id"])[0], "layout": by_item.cumcount()})

@@ -28,7 +28,7 @@ With six, and 24 frames, no verdict on the organisms of `docs/notes/causal.md` i
 """
 Actions = NDArray[np.float32]
 Infer = Callable[[Sequence["Observation"], Sequence[int]], Actions]
-"""From observations and seeds to actions (B, chunk, D), in any unit; deterministic for a seed."""
+"""A function from observations and seeds to actions (B, chunk, D), in any unit; deterministic for a seed."""
 
 
 def count_inferences(
@@ -37,9 +37,11 @@ def count_inferences(
     """Return how many inferences a diagnosis takes at most.
 
     Args:
-        sites: That are patched, 0 for none.
+        frames: Number of frames.
+        inputs: Number of inputs that are exchanged.
+        sites: Number of sites that are patched, 0 for none.
         base: Whether a base checkpoint is compared.
-        pairs: Of a table; None for donors that are drawn.
+        pairs: Number of pairs of a table; None for donors that are drawn.
     """
     checkpoints, pairs = 1 + base, frames * DONORS if pairs is None else pairs
     # Clean ones twice and with another seed; per input the donors' value, all of their inputs, control and blank.
@@ -50,10 +52,12 @@ def count_inferences(
 
 @dataclass(frozen=True)
 class InputExchange:
-    """Exchanges of inputs between frames, and what they change.
+    """Exchanges of inputs between frames, and the changes that they cause.
 
     Attributes:
-        seed: Of the draw of donors.
+        infer: Infers with the policy that is diagnosed.
+        frames: The frames between which inputs are exchanged.
+        seed: Seed of the draw of donors.
         table: Pairs (frame, donor) of the user's own in order; empty for drawn ones.
     """
 
@@ -69,9 +73,9 @@ class InputExchange:
         """Return how much of the action every input decides.
 
         Args:
-            names: Of the inputs; empty for all.
-            absent: Inputs that the model is said never to read, such as by `Model.absent_inputs`.
-            camera: The name of the first one.
+            names: Names of the inputs; empty for all.
+            absent: Inputs that the model declares never to read, such as `Model.absent_inputs`.
+            camera: The name of the first camera.
 
         Raises:
             UsageError: For an unknown name, fewer than two groups, or a policy that gives other actions for the
@@ -83,11 +87,11 @@ class InputExchange:
         return tuple(_declared(diagnosed) if diagnosed.name in absent else diagnosed for diagnosed in measured)
 
     def against(self, base: Infer, inputs: Sequence[InputDiagnosis]) -> tuple[InputDiagnosis, ...]:
-        """Return the inputs with their comparison with a base checkpoint, of those that were exchanged.
+        """Return the inputs, the exchanged ones with their comparison with a base checkpoint; raises as `measure`.
 
         Args:
-            base: Infers with it.
-            inputs: That `measure` of this object returned. Raises what `measure` raises.
+            base: Infers with the base checkpoint.
+            inputs: Results of `measure` of this object.
         """
         other = InputExchange(base, self.frames, self.seed, self.table)
         compared = []
@@ -101,9 +105,10 @@ class InputExchange:
         return tuple(compared)
 
     def donors(self, name: str) -> list[tuple[int, int]]:
-        """Pairs (frame, donor) of an input, the same at every call: of the table, or drawn; see `draw_donors`.
+        """Return the pairs (frame, donor) of an input: from the table, or drawn by `draw_donors`.
 
-        Donors of a frame hold different values of the input, as far as there are so many.
+        Every call returns the same pairs. Donors of a frame hold different values of the input, as far as there
+        are so many.
         """
         values = self._values(name)
         if self.table:
@@ -119,12 +124,16 @@ class InputExchange:
         return pairs
 
     def first_donors(self, name: str) -> list[tuple[int, int]]:
-        """One donor per frame of an input, of those that `donors` draws."""
+        """Return one donor per frame of an input, of those that `donors` draws."""
         return list(dict(reversed(self.donors(name))).items())  # of a key named twice, a dict keeps the last value
 
     @cached_property
     def clean(self) -> Actions:
-        """Actions of all frames. Raises UsageError unless they are the same again."""
+        """The actions of all frames.
+
+        Raises:
+            UsageError: Unless a second inference gives the same actions.
+        """
         actions, again = (self.infer(self.observations, self._seeds) for _ in range(2))
         if not np.array_equal(actions, again):
             raise UsageError(
@@ -136,7 +145,11 @@ class InputExchange:
 
     @cached_property
     def scale(self) -> ActionScale:
-        """The spread of clean actions over frames and seeds. Raises UsageError if all are equal."""
+        """The spread of clean actions over frames and seeds.
+
+        Raises:
+            UsageError: If all actions are equal.
+        """
         other = self.infer(self.observations, [derive_seed(seed, "other") for seed in self._seeds])
         scale = ActionScale.of(np.concatenate([self.clean, other]))
         if not scale.varies.any():
@@ -194,7 +207,10 @@ class InputExchange:
         return importance_of(name, self._exchanges[name])
 
     def _controlled(self, name: str) -> Actions | None:
-        """Actions of all frames after a change without meaning; None where the model takes none of some frame."""
+        """Return the actions of all frames after a change without meaning.
+
+        None where the model takes no such change of some frame.
+        """
         chunks = []
         for frame in self.frames:
             for control in controls_of(frame, name, self._spread):
@@ -206,7 +222,7 @@ class InputExchange:
         return np.stack(chunks)
 
     def _blanked(self, name: str) -> Actions:
-        """Actions of all frames without one input; of none where the family refuses text without words."""
+        """Return the actions of all frames without one input; none where the family refuses text without words."""
         try:
             return self.infer(
                 [with_input(observation, name, self._blank) for observation in self.observations], self._seeds
@@ -216,14 +232,14 @@ class InputExchange:
 
 
 def _repeated(rows: NDArray[np.intp], values: NDArray[np.intp]) -> NDArray[np.bool_]:
-    """(P,) whether an earlier pair of the same frame has a donor with the same value."""
+    """Return whether an earlier pair of the same frame has a donor with the same value, (P,)."""
     repeated = np.ones(rows.size, bool)
     repeated[np.unique(np.stack([rows, values]), axis=1, return_index=True)[1]] = False
     return repeated
 
 
 def _declared(measured: InputDiagnosis) -> InputDiagnosis:
-    """The diagnosis of an input that the adapter says is never read: it is no input, where nothing arrived.
+    """Return the diagnosis of an input that the adapter declares unread: it is no input if nothing arrived.
 
     A measured effect counts more than the declaration.
     """

@@ -20,9 +20,9 @@ _HEAD = (
 
 
 def draw_passage(diagnosis: "Diagnosis") -> "Figure":
-    """A curve per input over the sites in the network's order: the difference, and the share carried on.
+    """Draw a curve per input over the sites in the network's order: the difference, and the share carried on.
 
-    Below them that of a target: its score above chance.
+    Below them the curve of a target is drawn: its score above chance.
     """
     curves = [diagnosed for diagnosed in diagnosis.inputs if diagnosed.passage]
     places = list(dict.fromkeys(site.name for diagnosed in curves for site in diagnosed.passage))
@@ -55,7 +55,7 @@ def _look(position: int) -> dict[str, Any]:
 
 
 def write_page(diagnosis: "Diagnosis", file: Path) -> None:
-    """Write one HTML file without links to outside."""
+    """Write one HTML file without external links."""
     from base64 import b64encode
 
     from markupsafe import Markup, escape

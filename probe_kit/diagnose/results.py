@@ -17,13 +17,13 @@ if TYPE_CHECKING:
 
 
 FRAMES = 24
-"""With so many, words that decide were seen to in nine of ten draws or more; see `docs/notes/causal.md`."""
+"""With so many frames, words that decide were detected in nine of ten draws or more (`docs/notes/causal.md`)."""
 LEAST_GROUPS = 6
 """Fewer groups cannot show at p < 0.05 that anything matters, by sign flips of whole groups: 2⁻⁵ is 0.03."""
 
 
 def count_groups(frames: int) -> int:
-    """Return of how many groups of the scene so many frames are drawn: two frames of each.
+    """Return the number of groups of the scene from which so many frames are drawn, two of each.
 
     The two items of a group ask for one side each, before the same pictures. A policy that goes to one side where
     it does not understand is moved by other words in one of both, whichever side that is. The mean of both varies
@@ -35,16 +35,16 @@ def count_groups(frames: int) -> int:
 Verdict = Literal["decides", "moves", "no effect", "open", "does not arrive", "not varied", "not an input"]
 MATTERS: tuple[Verdict, ...] = ("decides", "moves")
 IDLE: tuple[Verdict, ...] = ("no effect", "does not arrive")
-"""Verdicts that an input does not matter; `open` is none."""
+"""Verdicts that an input does not matter; `open` is none of them."""
 INPUTS_DECIDE = 0.25
-"""Of the variance of the actions: where all inputs together change less, the seed decides and no input does.
+"""Share of the variance of the actions below which the seed decides and no input does.
 
-A choice: half of the spread, which is a quarter of the variance.
+It applies to the change by all inputs together. A choice: half of the spread, which is a quarter of the variance.
 """
 CARRIES = 0.5
-"""Share of the change of the action from which a site is said to carry an input."""
+"""Share of the change of the action from which a site counts as carrying an input."""
 LIKE_NONE = 1e-6
-"""Relative difference of activations that rounding can make: some units of the last place of float32."""
+"""Relative difference of activations that rounding can cause: some units of the last place of float32."""
 Number = Annotated[
     float,
     BeforeValidator(lambda stored: nan if stored is None else stored),
@@ -57,13 +57,13 @@ NO_LIMITS = (nan, nan)
 
 @dataclass(frozen=True)
 class SitePassage:
-    """One site of the network. Means over pairs.
+    """One site of the network; its numbers are means over pairs.
 
     Attributes:
-        name: As `--sites` names it.
+        name: Name of the site in the form of `--sites`.
         difference: Norm of the difference of the activations, relative to the clean ones.
         carried: The change of the action under the patch of this site, projected on the change under the donor's
-            input, 1 for all of it; NaN where the donor changes no action.
+            input. It is 1 for all of the change, and NaN where the donor changes no action.
     """
 
     name: str
@@ -89,11 +89,11 @@ class BaseComparison:
     """One input in the base checkpoint, and the difference to it.
 
     Attributes:
-        verdict: Of the base, on the same pairs.
-        share: As `verdict`.
-        difference: Of the shares, tuned minus base.
-        ci: Its 95 % interval by groups.
-        p: Two-sided, by sign flips of whole groups.
+        verdict: The verdict on the base, on the same pairs.
+        share: The total-effect index in the base, on the same pairs.
+        difference: Difference of the shares, tuned minus base.
+        ci: The 95 % interval of the difference by groups.
+        p: The two-sided p-value of the difference, by sign flips of whole groups.
     """
 
     change: Change
@@ -109,16 +109,17 @@ class InputDiagnosis:
     """One input: does it arrive, how much of the action does it decide, and which sites lie on its way?
 
     Attributes:
-        reason: Of the verdict.
-        share: The total-effect index, 1 where nothing else matters, with its 95 % interval by groups (Student).
+        reason: Reason of the verdict.
+        share: The total-effect index, 1 where nothing else matters.
+        share_ci: The 95 % interval of the index by groups (Student).
         control: The index of a change that should not matter.
-        every: Of all inputs together.
+        every: The index of all inputs together.
         p: Exact, one-sided, by permutation in whole groups: the input changes more than its control.
         unchanged: Inferences, of `n_inferences` with another value or a blank, in which no number of the action
             changed.
         passage: The sites in the order of the network.
-        note: Why there are none.
-        base: The same in the base checkpoint.
+        note: Reason why there are no sites.
+        base: The same input in the base checkpoint; None without one.
     """
 
     name: str
@@ -186,10 +187,10 @@ class SiteKnowledge:
     """One layer of a stream, at its best iteration.
 
     Attributes:
-        name: As `--sites` names it.
-        part: Of the model, such as `backbone`.
-        score: Held out.
-        chance: Of this site.
+        name: Name of the site in the form of `--sites`.
+        part: Part of the model, such as `backbone`.
+        score: Held-out score.
+        chance: Chance level of this site.
         signal: Whether it exceeds chance, family-wise, and every control.
     """
 
@@ -202,12 +203,13 @@ class SiteKnowledge:
 
 @dataclass(frozen=True)
 class Knowledge:
-    """The knowledge of one target. key: of the probes, which the run stores.
+    """The knowledge of one target.
 
     Attributes:
-        metric: Of the scores.
+        key: Key of the probes, which the run stores.
+        metric: Name of the metric of the scores.
         retention: Share of the backbone's score above chance that the action part has, NaN where it is undefined.
-        note: why.
+        note: Reason why it is undefined.
     """
 
     target: str
@@ -219,12 +221,16 @@ class Knowledge:
     note: str
 
     def best(self, backbone: bool) -> SiteKnowledge | None:
-        """Return the site farthest above its chance, of the backbone or behind it; one with signal if there is."""
+        """Return the site farthest above its chance, of the backbone or after it; one with signal if there is."""
         sites = [site for site in self.sites if (site.part == "backbone") == backbone]
         return max(sites, key=lambda site: (site.signal, site.score - site.chance), default=None)
 
     def describe(self, decided: bool) -> str:
-        """Return a sentence. decided: whether any input decides the action."""
+        """Return a sentence about the sites that know the target.
+
+        Args:
+            decided: Whether any input decides the action.
+        """
         best = [site for site in (self.best(True), self.best(False)) if site is not None]
         carriers = [site for site in best if site.signal]
         if not carriers:
@@ -251,12 +257,12 @@ class Diagnosis:
     """The diagnosis of every input of a run's model.
 
     Attributes:
-        key: Of the stored diagnosis.
-        label: Of the run.
-        n_frames: That were used.
-        n_groups: As `n_frames`.
-        base: The checkpoint that it is compared with.
-        knowledge: Of a target.
+        key: Key of the stored diagnosis.
+        label: Label of the run.
+        n_frames: Number of frames that were used.
+        n_groups: Number of groups of those frames.
+        base: The checkpoint that it is compared with; empty for none.
+        knowledge: The knowledge of a target; None for none.
     """
 
     key: str
@@ -268,13 +274,13 @@ class Diagnosis:
     knowledge: Knowledge | None = None
 
     def exit_code(self, required: Sequence[str] = ()) -> int:
-        """0 if every required input arrives and matters, else 1; see `exit_code`."""
+        """Return 0 if every required input arrives and matters, else 1; see `exit_code`."""
         names = [diagnosed.name for diagnosed in self.inputs]
         check_names(required, names)
         return exit_code(self.inputs, required)
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values; numbers that are not known are None."""
+        """Return the diagnosis as plain values; numbers that are not known are None."""
         plain: dict[str, Any] = _adapter().dump_python(self, mode="json")
         for values, diagnosed in zip(plain["inputs"], self.inputs, strict=True):
             values["where"] = diagnosed.where
@@ -282,7 +288,7 @@ class Diagnosis:
 
     @classmethod
     def from_json(cls, stored: Mapping[str, Any]) -> "Diagnosis":
-        """The diagnosis that `to_json` gave."""
+        """Return the diagnosis from the values that `to_json` returned."""
         return _adapter().validate_python(stored)
 
 
@@ -300,7 +306,12 @@ def check_names(names: Sequence[str], available: Sequence[str]) -> None:
 
 
 def exit_code(inputs: Sequence[InputDiagnosis], required: Sequence[str] = ()) -> int:
-    """0 if every required input arrives and matters, else 1. required: names; empty for all that were tested."""
+    """Return 0 if every required input arrives and matters, else 1.
+
+    Args:
+        inputs: Diagnosed inputs of one run.
+        required: Names of inputs; empty for all that were tested.
+    """
     tested = [diagnosed for diagnosed in inputs if diagnosed.matters is not None]
     judged = [diagnosed for diagnosed in inputs if diagnosed.name in required] if required else tested
     return 0 if judged and all(diagnosed.matters for diagnosed in judged) else 1
@@ -344,7 +355,7 @@ _OF_BASE = (
 
 
 def diagnosis_table(diagnosis: "Diagnosis") -> Table:
-    """One line per input, with one sentence per input below it, and one of the target."""
+    """Return a table with one line per input, one sentence per input below it, and one of the target."""
     headings = (*_HEADINGS, *_OF_BASE) if diagnosis.base else _HEADINGS
     rows = [_row(diagnosed, headings) for diagnosed in diagnosis.inputs]
     title = f"Inputs of {diagnosis.label}: {diagnosis.n_frames} frames of {diagnosis.n_groups} groups"
@@ -379,7 +390,7 @@ def _row(diagnosed: "InputDiagnosis", headings: Sequence[Heading]) -> Sequence[C
 
 
 def sentences(diagnosis: "Diagnosis") -> list[str]:
-    """Return what became of every input, whether the seed decides more than they do, and of the target."""
+    """Return a sentence per input, one if the seed decides more than the inputs, and one about the target."""
     lines = [sentence(diagnosed) for diagnosed in diagnosis.inputs]
     together = max((diagnosed.every for diagnosed in diagnosis.inputs if diagnosed.matters is not None), default=1)
     if together < INPUTS_DECIDE:
@@ -391,7 +402,7 @@ def sentences(diagnosis: "Diagnosis") -> list[str]:
 
 
 def sentence(diagnosed: "InputDiagnosis") -> str:
-    """Return one sentence: what became of an input, and where."""
+    """Return one sentence on the outcome of an input, and on where it is lost or carried."""
     reason = "" if diagnosed.verdict in MATTERS else f" ({diagnosed.reason})"
     where = f"; {diagnosed.where}" if diagnosed.where else ""
     base = f"; {_CHANGES[diagnosed.base.change]}" if diagnosed.base is not None else ""

@@ -1,4 +1,4 @@
-"""The behaviour of a run: success rate, answers and outcome rule; and its name beside other runs."""
+"""The behaviour of a run: success rate, answers and outcome rule, and its name among other runs."""
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -34,17 +34,20 @@ SCORES: Mapping[str, tuple[str, str]] = {
     "logits": ("outcome_logits", "side_logits"),
     "order-balanced": ("outcome_debiased", "side_debiased"),
 }
-"""By score, the columns of outcome and side."""
+"""The columns of outcome and side, by score."""
 
 MANY_BY_CLAUSE = 0.05
 """Share of answers found among other words from which the accuracy without them is shown too."""
 
 
 def read_by_clause(episodes: "pd.DataFrame", text: "pd.Series[str]") -> tuple[float, float | None]:
-    """The share of answers that were found among other words, and the accuracy with these as unparsable.
+    """Return the share of answers that were found among other words, and the accuracy with these as unparsable.
+
+    The accuracy is None where the share is `MANY_BY_CLAUSE` or less.
 
     Args:
-        text: Outcomes of the answers in text. The accuracy is None where the share is `MANY_BY_CLAUSE` or less.
+        episodes: Episodes of a VLM, with the column `parse_tier`.
+        text: Outcomes of the answers in text, one per episode.
     """
     in_clause = episodes["parse_tier"] == "clause"
     share = float(in_clause.mean())
@@ -55,6 +58,8 @@ class ScoredAnswers:
     """A VLM run, read by one of its scores; everything else is the run's own.
 
     Args:
+        run: The run of a VLM.
+        score: A key of `SCORES`.
         with_side_words: Keep items in whose name a side stands, such as "no left turn sign": answers and names of
             these are not distinguishable.
     """
@@ -67,7 +72,7 @@ class ScoredAnswers:
 
     @cached_property
     def episodes(self) -> "pd.DataFrame":
-        """Return the episodes of the run with `outcome` and `side_placed` by the score; `outcome_text` stays."""
+        """The episodes of the run with `outcome` and `side_placed` by the score; `outcome_text` stays."""
         episodes = self._run.episodes
         if not self._with_side_words and "side_word" in episodes:
             episodes = episodes[~episodes["side_word"].astype(bool)]
@@ -78,7 +83,12 @@ class ScoredAnswers:
 
 
 def scored(run: RunReader, score: str, with_side_words: bool = False) -> RunReader:
-    """A VLM run by a score, in place of any that it was read by; a policy run as it is.
+    """Return a VLM run by a score, in place of any that it was read by; a policy run stays as it is.
+
+    Args:
+        run: The run of a VLM or of a policy.
+        score: A key of `SCORES`.
+        with_side_words: Keep items in whose name a side stands, see `ScoredAnswers`.
 
     Raises:
         UsageError: For an unknown score.
@@ -92,7 +102,7 @@ def scored(run: RunReader, score: str, with_side_words: bool = False) -> RunRead
 
 
 def left_out(runs: Sequence[RunReader]) -> list[str]:
-    """A sentence per VLM run whose items with side words are not counted."""
+    """Return a sentence per VLM run whose items with side words are not counted."""
     return [
         f"{run.location}: {missing} episodes are left out because a side stands in the name that was asked for, "
         "such as 'no left turn sign' (--with-side-words counts them)."
@@ -114,12 +124,12 @@ class Regime(StrEnum):
 
 @dataclass(frozen=True)
 class PairedItems:
-    """Items that ran in both layouts, by how many of the two were right.
+    """Items that ran in both layouts, counted by how many of the two were right.
 
     Attributes:
-        both: Numbers of items.
-        exactly_one: As `both`.
-        none: As `both`.
+        both: Items right in both layouts.
+        exactly_one: Items right in one layout.
+        none: Items right in no layout.
         both_wrong: Items wrong twice, part of `none`.
         p: Exact one-sided p of groups with more of `both` against groups with more of `both_wrong`. A side bias of
             any strength makes them equally likely, and items that share a picture count once.
@@ -136,27 +146,29 @@ class PairedItems:
 class SuccessRate:
     """Outcomes of the episodes of one category (or of any table of episodes); rates are shares, 0 to 1.
 
+    A rate over no episodes is None, and so is every rate of a model that did not act.
+
     Attributes:
         n_groups: Independent groups of items.
         ci: 95 % interval of `sr`, groups of items as the unit (`Share.interval`).
-        sr_original: Per layout, and layout_mean their mean.
-        sr_swapped: As `sr_original`.
-        sr_left: Per side of the correct picture.
-        sr_right: As `sr_left`.
-        share_wrong: Ended on the other picture, or on neither.
-        share_outside: As `share_wrong`.
-        share_never_moved: Share that ended where it started, a failed grasp; part of share_outside, None if it was
-            not recorded.
+        sr_original: Rate in the original layout.
+        sr_swapped: Rate in the swapped layout.
+        layout_mean: Mean of the rates of both layouts.
+        sr_left: Rate of episodes whose correct picture is on the left.
+        sr_right: Rate of episodes whose correct picture is on the right.
+        share_wrong: Share that ended on the other picture.
+        share_outside: Share that ended on neither picture.
+        share_never_moved: Share that ended where it started, a failed grasp; part of `share_outside`, None if it
+            was not recorded.
         share_invalid_action: Share of inferences that put out no action, None for a policy that cannot tell.
         chance_margin_episodes: Half-width of the band around 0.5 that guessing explains, for N = episodes (the
             paper's).
         chance_margin_items: The same for N = items.
-        chance_margin: For as many items as count, fewer where items of a group answer alike, and what `regime` is
-            judged by.
-        reason: Why that regime, or why there is no rate.
+        chance_margin: The same for as many items as count, fewer where items of a group answer alike; `regime` is
+            judged by it.
+        reason: Reason of the regime, or reason why there is no rate.
         side_preference: Share placed left among episodes placed in a zone.
-        normalised_score: Only of a mean over categories. A rate over no episodes is None, and so is every rate of
-            a model that did not act.
+        normalised_score: Only of a mean over categories.
     """
 
     n_episodes: int
@@ -186,7 +198,15 @@ class SuccessRate:
 def regime(
     sr: float, margin: float, share_wrong: float, share_outside: float, answers: bool = False
 ) -> tuple[Regime, str]:
-    """The regime of a success rate, and why in a few words. answers: it is one of answers, `oob` one not read."""
+    """Return the regime of a success rate, and the reason in a few words.
+
+    Args:
+        sr: Success rate, 0 to 1.
+        margin: Half-width of the band around 0.5 that guessing explains.
+        share_wrong: Share of episodes that ended on the wrong picture.
+        share_outside: Share of episodes that ended on neither (`oob`); of answers, those that could not be read.
+        answers: Whether the rate is one of answers in words.
+    """
     share = "accuracy" if answers else "SR"
     if sr > 0.5 + margin:
         return Regime.KNOWLEDGE, f"{share} {sr:.3f} is above 0.5 + Δ = {0.5 + margin:.3f}"
@@ -202,7 +222,7 @@ def regime(
 
 
 def normalised_score(success_rates: Sequence[float]) -> float:
-    """Mean success rate over categories on a scale where guessing is 0 and perfection 100."""
+    """Return the mean success rate over categories on a scale where guessing is 0 and perfection 100."""
     if not success_rates:
         raise UsageError("the normalised score needs the success rate of at least one category")
     return (100 * fmean(success_rates) - 50) / 50 * 100
@@ -211,7 +231,7 @@ def normalised_score(success_rates: Sequence[float]) -> float:
 def capture_only(episodes: "pd.DataFrame") -> bool:
     """Whether the model of these episodes only captured: it did not act, and there is no success rate.
 
-    Episodes without a column `outcome`, such as those of arrays of your own, do not say so.
+    False for episodes without a column `outcome`, such as those of arrays of your own.
     """
     if episodes.empty or "outcome" not in episodes:
         return False
@@ -224,7 +244,10 @@ def _check_acted(episodes: "pd.DataFrame") -> None:
 
 
 def shares_of(episodes: "pd.DataFrame", outcome: str) -> "NDArray[np.float64]":
-    """(E,) how much of each episode had this outcome: 0 or 1, or a share where several last steps were judged."""
+    """Return the share (E,) of each episode that had this outcome.
+
+    It is 0 or 1, or a share where several last steps were judged.
+    """
     name = f"share_{outcome}"
     if name in episodes:
         return episodes[name].to_numpy(dtype=np.float64)
@@ -236,22 +259,22 @@ def _correct(episodes: "pd.DataFrame") -> "pd.Series[float]":
 
 
 def success_share(episodes: "pd.DataFrame", seed_text: str = "") -> Share:
-    """SR with groups of items as the unit; the run's `seed_text` tells groups of several suites apart."""
+    """Return the SR with groups of items as the unit; the run's `seed_text` separates groups of several suites."""
     return Share.of(shares_of(episodes, "correct"), group_names(episodes, seed_text))
 
 
 def group_names(episodes: "pd.DataFrame", seed_text: str) -> "NDArray[np.str_]":
-    """(E,) groups of items, named after the questions of their suite too."""
+    """Return the groups of items (E,), named after the questions of their suite too."""
     return np.char.add(f"{seed_text}/", units_of(episodes))
 
 
 def success_rate(episodes: "pd.DataFrame") -> SuccessRate:
-    """Success rate and its companions for a table of episodes.
+    """Return the success rate and related numbers for a table of episodes.
 
     Args:
         episodes: Columns `item_id`, `layout`, `side_correct`, `outcome` (`correct`, `wrong`, `oob`),
-            `side_placed`, and `group_id` where items share pictures; `share_correct` and so on where the last
-            steps of an episode were averaged, which items' pairs take no notice of.
+            `side_placed`, and `group_id` where items share pictures. Where the last steps of an episode were
+            averaged also `share_correct` and so on, which the pairs of items take no notice of.
 
     Raises:
         UsageError: For a table that is empty or of several wordings, and for episodes in which the model did not
@@ -298,22 +321,25 @@ def success_rate(episodes: "pd.DataFrame") -> SuccessRate:
 
 
 def _flagged(episodes: "pd.DataFrame") -> float | None:
-    """Every inference counts once, whatever its episode."""
+    """Return the share of inferences that were flagged; every inference counts once, whatever its episode."""
     if not {"flagged_steps", "inferences"} <= set(episodes):
         return None
     return float(episodes["flagged_steps"].sum() / episodes["inferences"].sum())
 
 
 def units_of(episodes: "pd.DataFrame") -> "NDArray[np.str_]":
-    """(E,) what is drawn as a whole: the group of items that share pictures, or the item where none is known."""
+    """Return the units (E,) that are drawn as a whole.
+
+    A unit is the group of items that share pictures, or the item where no group is known.
+    """
     return episodes["group_id" if "group_id" in episodes else "item_id"].to_numpy(dtype=str)
 
 
 def independent_items(episodes: "pd.DataFrame") -> float:
-    """Return how many items the success rate rests on: all of them, or fewer where those of a group answer alike.
+    """Return how many items the success rate rests on: all, or fewer where those of a group answer alike.
 
-    The number of items over how much more the success rate varies between groups than it would if their items had
-    nothing in common.
+    It is the number of items divided by the ratio of two variations of the success rate: between groups, and as if
+    the items of a group had nothing in common.
     """
     correct = _correct(episodes)
     residual = correct - correct.mean()
@@ -324,11 +350,14 @@ def independent_items(episodes: "pd.DataFrame") -> float:
 
 
 def sensitivity(episodes: "pd.DataFrame", radii: Sequence[float] = SENSITIVITY_RADII) -> dict[float, float]:
-    """Success rate by zone radius ε in metres, from where the cube ended: no episode runs again.
+    """Return the success rate by zone radius ε in metres, from where the cube ended: no episode runs again.
+
+    Empty for a table without the columns.
 
     Args:
         episodes: Columns `distance_correct` and `distance_wrong`, metres; missing where the simulator broke, which
-            is no success. Empty for a table without these columns.
+            is no success.
+        radii: Zone radii in metres.
 
     Raises:
         SceneError: For a radius with overlapping zones.
@@ -341,7 +370,11 @@ def sensitivity(episodes: "pd.DataFrame", radii: Sequence[float] = SENSITIVITY_R
 
 
 def paired_items(episodes: "pd.DataFrame") -> PairedItems:
-    """Items that ran in both layouts, by outcome; others are left out. Raises UsageError if nothing was acted."""
+    """Return the items that ran in both layouts, by outcome; others are left out.
+
+    Raises:
+        UsageError: If the model did not act.
+    """
     _check_acted(episodes)
     outcomes = episodes.pivot(index="item_id", columns="layout", values="outcome")
     outcomes = outcomes.reindex(columns=["original", "swapped"]).dropna()
@@ -369,15 +402,17 @@ _MARKS: Sequence[Callable[[RunReader, int], str]] = (
     lambda run, _: run.location.name,
     lambda _, number: str(number),
 )
-"""What is added to a name that comes twice, one after the other, until none does: settings, folder, number."""
+"""The marks that are added one after the other to a name that comes twice: settings, folder, number."""
 
 
 def distinct_labels(runs: Sequence[RunReader], names: Mapping[str, str] | None = None) -> dict[str, str]:
     """Return the label of each run by its location, so that no two full names are equal.
 
+    Runs of one name get the hash of their settings, where that is the same their folders, and else a number.
+
     Args:
-        names: Labels by location instead of the runs' own. Runs of one name get the hash of their settings, where
-            that is the same their folders, and else a number.
+        runs: Runs of one table.
+        names: Labels by location instead of the runs' own.
 
     Raises:
         UsageError: For a label of a run that is none of these.
@@ -416,7 +451,7 @@ _COMPARED: Mapping[str, Callable[[ProbeSettings], str]] = {
 
 
 def mixed_episodes(runs: Sequence[RunReader]) -> list[str]:
-    """A sentence for every run whose episodes were not all made by the same device kind and versions."""
+    """Return a sentence for every run whose episodes were not all made by the same device kind and versions."""
     return [
         f"{run.location} is mixed: its episodes were made with other {', '.join(mixed)}, which changes numbers "
         "(--allow-mixed)."
@@ -426,7 +461,7 @@ def mixed_episodes(runs: Sequence[RunReader]) -> list[str]:
 
 
 def chosen_wordings(runs: Sequence[RunReader]) -> list[str]:
-    """A sentence for every run that was asked in several wordings: which one its rows are of."""
+    """Return a sentence for every run that was asked in several wordings: which one its rows are of."""
     return [
         f"Rows of {run.location} are of the wording {run.episodes['wording'].iloc[0]!r}; it was asked in "
         f"{', '.join(names)} (--wording)."
@@ -438,11 +473,11 @@ def chosen_wordings(runs: Sequence[RunReader]) -> list[str]:
 def mixed_settings(
     results: Mapping[tuple[str, str], ProbeResults], views: Sequence[str] | None = None
 ) -> list[str]:
-    """A sentence if the probes of several runs were not fitted alike, and one for labels that are not the answer.
+    """Return a sentence if probes of several runs were not fitted alike, and one per target other than the answer.
 
     Args:
-        results: By the location of the run and the target.
-        views: Those that are shown, if not all are; then it does not matter which others there are.
+        results: Probe results by the location of the run and the target.
+        views: Views that are shown, if not all are; then it does not matter which others there are.
     """
     differences = []
     for name, value in _COMPARED.items():
@@ -472,25 +507,28 @@ def mixed_settings(
 
 @dataclass(frozen=True, kw_only=True)
 class OutcomeRuleScores:
-    """The outcome rule, and what it gives away.
+    """The outcome rule, and the success that it grants without skill.
+
+    Numbers about answers are there for every run with a success rate. The others are None or empty where the run
+    keeps no trajectories.
 
     Attributes:
-        rule: By which all outcomes of the row are.
-        rule_words: As `rule`.
+        rule: The rule by which all outcomes of the row are judged.
+        rule_words: The rule in words.
         last_steps: Control steps at the end that it judged.
-        n_answered: Episodes that ended in a zone.
-        share_answered: As `n_answered`.
-        sr_answered: Success among them. n_grasped,
-        sr_grasped: The same of episodes in which both fingers ever touched the cube.
+        n_answered: Number of episodes that ended in a zone.
+        share_answered: Share of episodes that ended in a zone.
+        sr_answered: Success among them.
+        n_grasped: Number of episodes in which both fingers ever touched the cube.
+        sr_grasped: Success among those.
         share_unmoved_answers: Share of answers whose cube never left its start.
-        sr_idle: What a policy that does nothing would score.
+        sr_idle: Success rate that a policy would score that does nothing.
         idle_side: The picture in whose zone the untouched cube then lies, `none`, or `both` where it differs
             between episodes.
         share_both_zones: Share of episodes whose cube counts for both pictures, which is called correct.
-            sr_by_rule: by every rule, at the last step.
-        sr_by_epsilon: By zone radius in metres, for the rule `disc`. behaviour: shares of episodes by what hand
-            and cube did. What is about answers is there for every run with a success rate; the rest is None or
-            empty where the run keeps no trajectories.
+        sr_by_rule: Success rate by every rule, at the last step.
+        sr_by_epsilon: Success rate by zone radius in metres, for the rule `disc`.
+        behaviour: Shares of episodes by the behaviour of hand and cube.
     """
 
     rule: str = DEFAULT_RULE
@@ -514,16 +552,17 @@ class OutcomeRuleScores:
 
 @dataclass(frozen=True)
 class TableRun:
-    """A run as a table reads it: by a score, by an outcome rule, and under a name that no other run has.
+    """A run in the form that a table reads: by a score, by an outcome rule, and under a name of its own.
 
     Attributes:
-        run: By its score, if it was asked.
-        judged: With its outcomes by the rule; as `run` where there is nothing to judge by.
+        run: The run, by its score if it was asked.
+        judged: The run with its outcomes by the rule; the same as `run` where there is nothing to judge by.
         label: Its name without marks.
-        group: The one it belongs to, of several.
+        group: The group of runs that it belongs to, if there are several.
         words: The rule in words.
-        verdicts: By rule a row per episode.
-        behaviour: A row per episode. Both are None without trajectories.
+        last_steps: Control steps at the end that are judged.
+        verdicts: By rule, a row per episode; None without trajectories.
+        behaviour: A row per episode; None without trajectories.
     """
 
     run: RunReader
@@ -550,8 +589,12 @@ class TableRun:
         """Judge every episode by every rule, where the run keeps trajectories; answers in words have no rule.
 
         Args:
+            run: The run, already by its score if it was asked.
+            rule: Name of the outcome rule.
+            last_steps: Control steps at the end that are judged.
             with_behaviour: False reads no trajectory for the rule whose outcomes are stored.
-            label: By default that of the run.
+            label: Name of the run in the table; by default its own label.
+            group: The group of runs that it belongs to; None for none.
         """
         label = run.label if label is None else label
         if run.ask is not None:
@@ -595,9 +638,12 @@ class TableRun:
         return self.verdicts is not None or (self.rule, self.last_steps) == (DEFAULT_RULE, 1)
 
     def part(self, episodes: "pd.DataFrame") -> tuple[OutcomeRuleScores, dict[str, Share]]:
-        """The row part of some of the episodes, whose index is their position in the run, and shares by name.
+        """Return the outcome-rule part of a row for some of the episodes, and shares by name.
 
-        Shares: `sr_answered` and `sr_grasped`, where they are defined.
+        The shares are `sr_answered` and `sr_grasped`, where they are defined.
+
+        Args:
+            episodes: Episodes whose index is their position in the run.
         """
         identity: dict[str, Any] = {"rule": self.rule, "rule_words": self.words, "last_steps": self.last_steps}
         if not self.is_judged:
@@ -629,7 +675,7 @@ class TableRun:
         return OutcomeRuleScores(**identity, **facts), defined
 
     def _conditional(self, episodes: "pd.DataFrame", weights: "NDArray[np.float64]") -> Share | None:
-        """Success where the weights are, groups of items as the unit; None where there is no weight."""
+        """Return the success where the weights are, groups of items as the unit; None where there is no weight."""
         if not weights.any():
             return None
         counted = weights > 0
@@ -648,7 +694,7 @@ def _idle_side(idle: "pd.Series[str]", sides: "pd.Series[str]") -> str:
 
 
 def _behaviour(acted: "pd.DataFrame") -> dict[str, float]:
-    """Shares of episodes; of those that made a choice where there is one to make."""
+    """Return shares of episodes; for choices, of the episodes that made one."""
     shares = {name: float(acted[name].mean()) for name in ("grasped", "moved", "released")}
     for name in ("first_choice", "closer_to", "release_near"):
         choices = acted[name][acted[name].isin(["correct", "wrong"])]
@@ -660,7 +706,7 @@ def _behaviour(acted: "pd.DataFrame") -> dict[str, float]:
 
 
 def rule_sentence(rules: OutcomeRuleScores) -> str:
-    """Return what outcomes were judged by, and what the rule gives away; for captions."""
+    """Return the rule that judged the outcomes, and the success that it grants without skill; for captions."""
     steps = f", mean of the last {rules.last_steps} control steps (all, where there are fewer)" * (
         rules.last_steps > 1
     )
@@ -677,6 +723,6 @@ def rule_sentence(rules: OutcomeRuleScores) -> str:
 
 
 def check_epsilons(rule: str, are_set: bool) -> None:
-    """Radii are those of the rule `disc`. Raises UsageError where they are asked for with another one."""
+    """Raise UsageError where zone radii are set for another rule than `disc`, to which they belong."""
     if are_set and rule != DEFAULT_RULE:
         raise UsageError(f"zone radii belong to the outcome rule disc; {rule} has none. Leave out --epsilons")

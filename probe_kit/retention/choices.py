@@ -3,15 +3,18 @@
 from typing import Literal
 
 AnswerScore = Literal["text", "logits", "order-balanced"]
-"""How the answers of a VLM are read: from its text, from the logits of the options, or from logits averaged over
-both orders of the options."""
+"""The reading of a VLM's answers.
+
+They are read from its text, from the logits of the options, or from logits averaged over both orders of the
+options.
+"""
 Section = Literal["success", "rules", "answers", "probes", "retention", "controls", "interventions"]
 """Groups of tables that `retention --details` shows."""
 Family = Literal["label", "table"]
 """Tests of labels that are corrected together: a stream's sites, or those of every label of the table (Holm)."""
 Iterations = Literal["all", "best", "last"] | int
-"""Which iterations of the expert, or which action tokens, take part: all, the last one, or one by number.
+"""The iterations of the expert, or action tokens, that take part: all, the last one, or one by number.
 
-Where one number is made of all of them it is the best one's, so that `best` is another word for `all`; a layer
+Where one number is made of all of them it is the best one's, so that `best` is another word for `all`. A layer
 curve draws a line for each of `all`, and one line for the `best` of every layer.
 """

@@ -1,4 +1,4 @@
-"""`probe-kit retention`, and what it prints and writes."""
+"""The command `probe-kit retention`, its output and its files."""
 
 from collections.abc import Collection, Mapping, Sequence
 from inspect import signature
@@ -45,7 +45,11 @@ class Radii(tuple[float, ...]):
 
     @classmethod
     def parse(cls, text: "str | Radii") -> "Radii":
-        """The numbers of a comma-separated text. Raises UsageError for one that is not positive."""
+        """Return the numbers of a comma-separated text.
+
+        Raises:
+            UsageError: For one that is not positive.
+        """
         return cls(map(_radius, split(text) or ())) if isinstance(text, str) else text
 
     def __str__(self) -> str:
@@ -64,7 +68,11 @@ def _radius(text: str) -> float:
 
 
 def read_iterations(text: str) -> "Iterations":
-    """all, best, last or a number. Raises UsageError for another text."""
+    """Return `all`, `best`, `last` or a number.
+
+    Raises:
+        UsageError: For another text.
+    """
     if (number := whole_number(text)) is not None:
         return number
     if text not in ("all", "best", "last"):
@@ -97,7 +105,7 @@ COMPARISONS = ("groups", "vlm-vla", "stages", "steps")
 
 
 def read_comparison(text: str | None) -> tuple[str, str | None]:
-    """Return the kind of comparison, `run` for that of runs, and what stands behind its `=`; the name of a run."""
+    """Return the kind of comparison, and the text after its `=`; of the kind `run`, the name of a run."""
     if text is None:
         return "run", None
     kind, separator, value = text.partition("=")
@@ -358,7 +366,7 @@ def retention(
 
 
 def _print_sections(table: "RetentionTable", style: str, details: Sequence[str]) -> None:
-    """Print the table in a format, with the sections that are asked for where the format has any."""
+    """Print the table in a format, with the sections that were requested where the format has any."""
     sections: Collection[Section] | Literal["all"]
     sections = "all" if "all" in details else cast("tuple[Section, ...]", details)
     if style == "table":
@@ -372,7 +380,14 @@ def _print_sections(table: "RetentionTable", style: str, details: Sequence[str])
 
 
 def _show_steps(table: "RetentionTable", training: Mapping[str, int], style: str, figures: Path | None) -> None:
-    """Print the table over training steps, and draw its figure. training: steps by the location of a run."""
+    """Print the table over training steps, and draw its figure.
+
+    Args:
+        table: The retention table of all checkpoints.
+        training: Steps by the location of a run.
+        style: Format of the printed table.
+        figures: Folder of the figure; None for no figure.
+    """
     from probe_kit.retention.displays.display import ProvenanceLine
     from probe_kit.retention.training_steps import step_table, training_step_figure
 
@@ -388,9 +403,9 @@ def _check_only(values: Mapping[str, object], allowed: Collection[str], option: 
 
     Args:
         values: The value of every parameter.
-        allowed: What goes with it.
-        option: The one that asks for the table.
-        table: What it is called.
+        allowed: Parameters that go with the table.
+        option: The parameter that requests the table.
+        table: Name of the table in messages.
     """
     are_set = {
         f"--{'format' if name == 'style' else name.replace('_', '-')}": values[name] != parameter.default
@@ -401,13 +416,16 @@ def _check_only(values: Mapping[str, object], allowed: Collection[str], option: 
 
 
 def check_file(figures: Path | None) -> None:
-    """Raise UsageError if figures should go to what is a file."""
+    """Raise UsageError if figures should go to a path that is a file."""
     if figures is not None and figures.exists() and not figures.is_dir():
         raise UsageError(f"--figures {figures} is a file; give a folder")
 
 
 def _keys(paths: list[str], texts: list[str]) -> list[str | None]:
-    """The key of every run in order, None where none was chosen; a run goes by its path or its folder's name."""
+    """Return the key of every run in order, None where none was chosen.
+
+    A run goes by its path or its folder's name.
+    """
     keys: list[str | None] = [None] * len(paths)
     for text in texts:
         name, separator, key = text.rpartition("=")
@@ -430,7 +448,10 @@ def _stripped(path: str) -> str:
 
 
 def _check_doubles(paths: Sequence[str]) -> None:
-    """Said before anything is opened; `retention` also knows copies of a run."""
+    """Raise UsageError for a path that is given twice, before anything is opened.
+
+    The function `retention` also knows copies of a run.
+    """
     for at, path in enumerate(paths):
         if _stripped(path) in map(_stripped, paths[:at]):
             raise UsageError(f"{path} is given twice; its episodes would count twice. Leave one out")
@@ -449,10 +470,12 @@ def _groups(texts: Sequence[str]) -> dict[str, tuple[str, ...]]:
 
 
 def save_all(exhibits: "Sequence[ReportFigure]", folder: Path, details: bool = False) -> None:
-    """Draw the main figures into a folder, and say where each is and how many are left out.
+    """Draw the main figures into a folder, and print where each is and how many are left out.
 
     Args:
-        details: Draw every figure.
+        exhibits: All figures of a table.
+        folder: Folder of the figures.
+        details: Whether every figure is drawn.
     """
     from probe_kit.retention.displays import save_figures
 
@@ -464,7 +487,7 @@ def save_all(exhibits: "Sequence[ReportFigure]", folder: Path, details: bool = F
 
 
 def say_report(written: Path) -> None:
-    """Say where a report is, and how large."""
+    """Print where a report is, and its size."""
     from probe_kit.runs.run_folders import in_units
 
     say(f"report: {written} ({in_units(written.stat().st_size)})")
@@ -483,15 +506,20 @@ def show_stages(
     """Compare what a VLM answers, a policy encodes and a policy does, question by question.
 
     Answered: the VLM answers right. Encoded: a probe of the policy reads the answer, above chance and controls.
-    Acted: the cube ends on the correct picture.
+    Acted: the cube ends on the correct picture. Raises as `match_runs` too.
 
     Args:
         runs: The VLM's, then the policy's; both need the same first frames.
         views: At most one, of the policy run's probes; None for the first.
-        key: Of its probe results.
+        key: Key of the policy's probe results; None for the default.
+        wording: The wording of the policy run; None for the default.
+        score: The score by which the VLM's answers are read.
+        with_side_words: Whether items in whose name a side stands are counted.
+        as_json: Whether JSON is printed instead of tables.
+        figures: Folder of the figures; None for no figure.
 
     Raises:
-        UsageError: For other runs or views, and what `match_runs` raises.
+        UsageError: For other runs or views.
     """
     from probe_kit.retention.behaviour import scored
     from probe_kit.retention.columns.tables import known_used_tables

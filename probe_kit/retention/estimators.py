@@ -1,4 +1,4 @@
-"""The scores of a category's streams, and retention: how much of what the backbone knows the action still holds.
+"""The scores of a category's streams, and retention: the share of the backbone's knowledge that the action holds.
 
 The action is made in the action expert or, in a policy without one, at the positions that choose its tokens.
 """
@@ -35,7 +35,7 @@ Limits = tuple[float | None, float | None]
 
 
 def limits(interval: Interval) -> Limits:
-    """The interval as two numbers."""
+    """Return the interval as two numbers; (None, None) where it has no limits."""
     return (interval.low, interval.high) if interval.bounded else (None, None)
 
 
@@ -47,6 +47,8 @@ class StreamScores:
         names: `action` and `backbone` in this order, as far as they were probed.
         fit: Their scores, on the same groups.
         at_most: Of a side, by name, an upper limit of the best site's accuracy, see `sufficiency.at_most`.
+        findable: Of a side, by name, the least accuracy of a site that such items find, see
+            `sufficiency.findable`.
     """
 
     names: tuple[str, ...]
@@ -64,7 +66,7 @@ class StreamScores:
         return float(self.fit.above[self.names.index(name)])
 
     def above_interval(self, name: str) -> Interval:
-        """Return its 95 % interval, Student's."""
+        """Return the 95 % interval of the score above chance, Student's."""
         row, scores = self.names.index(name), self.scores
         spread = t_quantile(scores.df) * sqrt(scores.covariance[row, row])
         return Interval(self.above(name) - spread, self.above(name) + spread)
@@ -74,23 +76,28 @@ class StreamScores:
         return CHANCE + self.above(name)
 
     def interval(self, name: str) -> Interval:
-        """Its 95 % interval (Wilson)."""
+        """Return the 95 % interval of the accuracy (Wilson)."""
         return accuracy_interval(self.fit, self.names.index(name))
 
     def peak(self, name: str) -> float:
-        """Accuracy of the site that is best on all groups, scored on them too."""
+        """Return the accuracy of the site that is best on all groups, scored on them too."""
         return float(self.fit.peaks[self.names.index(name)])
 
     def as_of(self, seed_text: str) -> "StreamScores":
-        """The same, its groups taken to be those of another run's suite, which items in common may come from."""
+        """Return the same scores, their groups taken to be those of another run's suite.
+
+        Items in common may come from that suite.
+        """
         return replace(self, fit=replace(self.fit, suite=seed_text))
 
 
 def score_streams(curve: ProbeCurve, rows: Mapping[str, NDArray[np.intp]], seed_text: str) -> StreamScores | None:
-    """The scores of streams by their rows of a curve; None without any.
+    """Return the scores of streams by their rows of a curve; None without any.
 
     Args:
-        seed_text: Of the run; scores on equal groups of one are paired.
+        curve: Probes of one category in one view.
+        rows: Positions of each stream's sites in the curve, by name.
+        seed_text: Seed text of the run; scores on equal groups of one are paired.
 
     Raises:
         TooFewGroupsError: For fewer than 5 groups.
@@ -120,7 +127,11 @@ def score_streams(curve: ProbeCurve, rows: Mapping[str, NDArray[np.intp]], seed_
 
 @dataclass(frozen=True)
 class Rate:
-    """A share of episodes with its 95 % interval. share: by groups, None where it averages over other groups."""
+    """A share of episodes with its 95 % interval.
+
+    Attributes:
+        share: The share by groups; None where the rate averages over other groups.
+    """
 
     value: float
     interval: Interval
@@ -128,7 +139,7 @@ class Rate:
 
     @classmethod
     def pooled(cls, shares: Sequence[Share]) -> "Rate":
-        """The mean of several runs' shares; of runs on the same groups their common group means count."""
+        """Return the mean of several runs' shares; for runs on the same groups their common group means count."""
         first = shares[0]
         if all(np.array_equal(first.groups, of_run.groups) for of_run in shares):
             sums, sizes = ([getattr(of_run, name) for of_run in shares] for name in ("sums", "sizes"))
@@ -138,12 +149,16 @@ class Rate:
 
     @classmethod
     def mean(cls, rates: Sequence["Rate"]) -> "Rate":
-        """The mean of independent shares or accuracies. Raises UsageError without any."""
+        """Return the mean of independent shares or accuracies.
+
+        Raises:
+            UsageError: Without any.
+        """
         values = [rate.value for rate in rates]
         return cls(float(np.mean(values)), mean_interval(values, [rate.interval for rate in rates]))
 
     def minus(self, other: "Rate") -> "Rate":
-        """The difference, paired where both are of the same groups."""
+        """Return the difference, paired where both are of the same groups."""
         if self.share is not None and other.share is not None:
             gap = self.share.difference(other.share)
         else:
@@ -162,7 +177,7 @@ class PooledScores:
     """Scores of one or more runs in one category.
 
     Attributes:
-        accuracies: Of the chosen sites, in the order of `names`.
+        accuracies: Accuracies of the chosen sites, in the order of `names`.
         fit: The runs' mean on common groups, None on others.
     """
 
@@ -173,7 +188,7 @@ class PooledScores:
 
     @classmethod
     def of(cls, runs: Sequence[StreamScores]) -> "PooledScores | None":
-        """The mean over runs, of the streams that all have; None without any."""
+        """Return the mean over runs, of the streams that all have; None without any."""
         names = tuple(name for name in runs[0].names if all(name in run.names for run in runs)) if runs else ()
         if not names:
             return None
@@ -188,7 +203,7 @@ class PooledScores:
         return cls(names, Scores.of(fit), _rates(fit), fit)
 
     def accuracy(self, name: str) -> Rate:
-        """Accuracy of a stream's chosen site with its interval."""
+        """Return the accuracy of a stream's chosen site with its interval."""
         return self.accuracies[self.names.index(name)]
 
     def shares_groups_with(self, other: "PooledScores") -> bool:
@@ -196,10 +211,10 @@ class PooledScores:
         return self.fit is not None and other.fit is not None and self.fit.shares_groups_with(other.fit)
 
     def covariance_with(self, other: "PooledScores") -> NDArray[np.float64]:
-        """(K, L) covariance of the scores; 0 on other groups.
+        """Return the covariance (K, L) of the scores; 0 on other groups.
 
-        Of a stream with itself it leaves room for unseen groups, in which one run may hold all and the other
-        nothing.
+        The covariance of a stream with itself leaves room for unseen groups, in which one run may hold all and the
+        other nothing.
         """
         if self.fit is None or other.fit is None or not self.shares_groups_with(other):
             return np.zeros((len(self.names), len(other.names)))
@@ -213,7 +228,7 @@ class PooledScores:
         return between
 
     def accuracy_difference(self, other: "PooledScores", name: str) -> Rate:
-        """Accuracy of a stream here minus there."""
+        """Return the accuracy of a stream here minus there."""
         mine, theirs = self.accuracy(name), other.accuracy(name)
         row, column = self.names.index(name), other.names.index(name)
         variances = float(self.scores.covariance[row, row]), float(other.scores.covariance[column, column])
@@ -223,7 +238,7 @@ class PooledScores:
 
 
 def _rates(fit: CrossFit) -> tuple[Rate, ...]:
-    """The accuracies of all streams."""
+    """Return the accuracies of all streams."""
     return tuple(Rate(CHANCE + float(above), accuracy_interval(fit, row)) for row, above in enumerate(fit.above))
 
 
@@ -236,7 +251,7 @@ def _only(run: StreamScores, names: Sequence[str]) -> CrossFit:
 # -- retention -----------------------------------------------------------------------------------------------
 
 NO_SCORES = "n/a (too few groups of items, or a fold with one side only)"
-"""In place of retention where no score is defined."""
+"""The text in place of retention where no score is defined."""
 
 
 @dataclass(frozen=True)
@@ -246,7 +261,7 @@ class Peak:
     Attributes:
         score: Of a side the accuracy, else the metric. It is too high by the luck of being chosen; `StreamScores`
             holds the score without it.
-        ties: How many other sites of the stream are as accurate; `site` is the first of them all.
+        ties: Number of other sites of the stream that are as accurate; `site` is the first of them all.
         chance: One half, else the mean score of the label permutations at the site; NaN without any.
     """
 
@@ -263,11 +278,12 @@ class RetentionEstimate:
 
     Attributes:
         value: Cross-fitted score of the action's best site over that of the backbone's, both above one half (see
-            `probe_kit.statistics.crossfit`); NaN where the backbone's is 0, or no score is defined.
+            `probe_kit.statistics.crossfit`). NaN where the backbone's is 0, or no score is defined.
         interval: 95 %, Fieller's; without limits where the backbone is not known well enough to divide by.
-        published: The ratio of the peaks, as the paper has it.
+        published: The ratio of the peaks, as in the paper.
         defined: Whether the backbone's best site is above chance (family-wise) and better than every control that
-            was run; `note` else says what is missing.
+            was run.
+        note: The missing condition where it is not defined.
     """
 
     value: float
@@ -282,8 +298,8 @@ class Retention(RetentionEstimate):
     """Retention of one target in one category and view.
 
     Attributes:
-        backbone: The best sites.
-        action: As `backbone`.
+        backbone: The best site of the backbone.
+        action: The best site of the stream the action is made in.
         streams: The scores; None with too few groups of items.
     """
 
@@ -296,6 +312,11 @@ def best_site(curve: ProbeCurve, stream: str, iterations: Iterations = "all") ->
     """Return the best site of `stream`, the first one on ties; None if the curve has no such stream.
 
     Of a side the most accurate one counts, else the largest score above the site's own chance.
+
+    Args:
+        curve: Probes of one category in one view.
+        stream: Name of the stream.
+        iterations: Iterations that take part.
 
     Raises:
         UsageError: If the stream has no such iteration.
@@ -313,7 +334,11 @@ def best_site(curve: ProbeCurve, stream: str, iterations: Iterations = "all") ->
 
 
 def stream_peaks(curve: ProbeCurve, iterations: Iterations = "all") -> dict[str, Peak]:
-    """The best sites of `backbone` and of the stream the action is made in, `action`, as far as they were probed.
+    """Return the best sites of `backbone` and of the stream the action is made in, `action`, as far as probed.
+
+    Args:
+        curve: Probes of one category in one view.
+        iterations: Iterations of the action's stream that take part.
 
     Raises:
         UsageError: If the action's stream has no such iteration.
@@ -327,7 +352,7 @@ def stream_peaks(curve: ProbeCurve, iterations: Iterations = "all") -> dict[str,
 
 
 def curve_scores(curve: ProbeCurve, iterations: Iterations = "all", seed_text: str = "") -> StreamScores | None:
-    """Cross-fitted scores of the backbone and of the stream the action is made in, as far as they were probed.
+    """Return cross-fitted scores of the backbone and of the stream the action is made in, as far as probed.
 
     None with too few groups, or where a fold was trained on one side only: then no score is defined.
     """
@@ -343,11 +368,13 @@ def curve_scores(curve: ProbeCurve, iterations: Iterations = "all", seed_text: s
 def measure_retention(
     curve: ProbeCurve, iterations: Iterations = "all", seed_text: str = "", exceeds: Exceeds | None = None
 ) -> Retention | None:
-    """Retention of `curve`, or None if it lacks the backbone or the stream the action is made in.
+    """Return the retention of `curve`, or None if it lacks the backbone or the stream the action is made in.
 
     Args:
-        seed_text: Of the run; scores on equal groups of one are paired.
-        exceeds: What the backbone's best site is better than, as `Controls.exceeds` says; chance alone by default.
+        curve: Probes of one category in one view.
+        iterations: Iterations of the action's stream that take part.
+        seed_text: Seed text of the run; scores on equal groups of one are paired.
+        exceeds: Result of `Controls.exceeds` for the backbone's best site; by default chance alone counts.
 
     Raises:
         UsageError: If the action's stream has no such iteration.
@@ -365,11 +392,13 @@ def measure_retention(
 def estimate_retention(
     peaks: Mapping[str, Peak], streams: StreamScores | None, exceeds: Exceeds, absent_below: float = ABSENT_BELOW
 ) -> RetentionEstimate:
-    """Retention of the best sites `action` and `backbone`, with the streams' scores.
+    """Return the retention of the best sites `action` and `backbone`, with the streams' scores.
 
     Args:
-        exceeds: What the backbone's best site is better than.
-        absent_below: See `verdict`.
+        peaks: The best sites by name.
+        streams: Cross-fitted scores of both; None where no score is defined.
+        exceeds: By name, whether the backbone's best site exceeds chance and each control.
+        absent_below: Accuracy below which a backbone without signal counts as absent, see `verdict`.
     """
     if streams is None:
         published = _published(peaks[ACTION].score, peaks[BACKBONE].score)
@@ -385,12 +414,12 @@ def estimate_retention(
 
 
 def _published(action: float, backbone: float) -> float:
-    """The paper's ratio, of the accuracies of the best sites above one half; NaN where the backbone's is 0."""
+    """Return the paper's ratio, of the best sites' accuracies above one half; NaN where the backbone's is 0."""
     return nan if backbone == CHANCE else float((action - CHANCE) / (backbone - CHANCE))
 
 
 def _missing_signal(exceeds: Exceeds, streams: StreamScores, absent_below: float) -> str:
-    """Why there is nothing to retain; empty where the backbone's signal is shown."""
+    """Return the reason why there is nothing to retain; empty where the backbone's signal is shown."""
     if exceeds["chance"] is None:
         return "n/a (no permutations)"
     if not exceeds["chance"]:
@@ -406,7 +435,11 @@ def _missing_signal(exceeds: Exceeds, streams: StreamScores, absent_below: float
 
 
 def stream_rows(curve: ProbeCurve, stream: str, iterations: Iterations) -> NDArray[np.intp]:
-    """Positions of a stream's sites at these iterations. Raises UsageError if it has no such iteration."""
+    """Return the positions of a stream's sites at these iterations.
+
+    Raises:
+        UsageError: If the stream has no such iteration.
+    """
     rows = curve.stream(stream)
     steps = {curve.sites[row].iteration for row in rows} - {None}
     if iterations in ("all", "best") or not steps:

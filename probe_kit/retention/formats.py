@@ -24,27 +24,28 @@ _DTYPES = {float: "float64", int: "Int64", bool: "bool", str: "string"}
 
 
 def frame_of(rows: Sequence[RetentionRow] | Sequence[Difference]) -> "pd.DataFrame":
-    """One line per row, with `part.field` for the fields of its parts.
+    """Return one line per row, with `part.field` for the fields of its parts.
 
     Floats stay floats, undefined ones are NaN; whole numbers and text are nullable. Intervals become two columns,
-    `ci_low` and `ci_high`; what is kept by name one column per name, such as `controls.baselines.pixels`.
+    `ci_low` and `ci_high`. A mapping becomes one column per name, such as `controls.baselines.pixels`.
     """
     return _frame([_flat(_defined(row)) for row in rows])
 
 
 def part_frame(rows: Sequence[RetentionRow], part: str, by_view: bool = True) -> "pd.DataFrame":
-    """One part of every row, keyed by `run`, `category` and, of what depends on probes, `view`.
+    """Return one part of every row, keyed by `run`, `category` and, for parts that depend on probes, `view`.
 
     Args:
-        part: Its name in `RetentionRow`.
-        by_view: Whether it depends on the view; else every category stands once.
+        rows: Rows of a retention table.
+        part: Name of the part in `RetentionRow`.
+        by_view: Whether the part depends on the view; else every category is listed once.
     """
     of_views = [row for row in rows if row.view is not None] if by_view else once_per_category(rows)
     return _frame([_key(row, by_view) | _flat(getattr(_defined(row), part)) for row in of_views])
 
 
 def peak_frame(rows: Sequence[RetentionRow]) -> "pd.DataFrame":
-    """The best sites, one line per run, category, view and `stream`: `backbone` and `action`."""
+    """Return the best sites, one line per run, category, view and `stream`: `backbone` and `action`."""
     return _frame(
         [
             _key(row, True) | _flat(getattr(row, stream)) | {"stream": ("string", stream)}
@@ -57,7 +58,7 @@ def peak_frame(rows: Sequence[RetentionRow]) -> "pd.DataFrame":
 
 
 _Flat = dict[str, tuple[str, Any]]
-"""By column its type in pandas and its value."""
+"""By column, its type in pandas and its value."""
 
 
 def _frame(lines: Sequence[_Flat]) -> "pd.DataFrame":
@@ -77,14 +78,14 @@ def _key(row: RetentionRow, by_view: bool) -> _Flat:
 
 
 def _defined(row: Any) -> Any:
-    """The row without numbers of retention where it is not defined."""
+    """Return the row without numbers of retention where it is not defined."""
     if not isinstance(row, RetentionRow) or row.retention.defined:
         return row
     return replace(row, retention=RetentionPart(note=row.retention.note, reason=row.retention.reason))
 
 
 def _flat(part: Any, before: str = "") -> _Flat:
-    """The fields of a dataclass by their path; those of its own parts and names behind a dot."""
+    """Return the fields of a dataclass by their path; those of its own parts and names follow a dot."""
     hints = get_type_hints(type(part))
     flat: _Flat = {}
     for declared in fields(part):
@@ -138,7 +139,7 @@ def table_json(
     wordings: Sequence[Difference],
     vlm_vla: Sequence[Difference],
 ) -> str:
-    """See `RetentionTable.to_json`."""
+    """Return the JSON of a table, see `RetentionTable.to_json`."""
     between_runs = [difference for difference in differences if difference.run is not None]
     between_groups = [difference for difference in differences if difference.run is None]
     several = len({row.run.location for row in rows}) > 1 and not any(row.group for row in rows)
@@ -154,7 +155,7 @@ def table_json(
 
 
 def _in_words(row: RetentionRow) -> dict[str, Any]:
-    """The verdict and what follows from it, as tables and sentences have them; None of a mean."""
+    """Return the verdict and its conclusion, as tables and sentences have them; None of a mean."""
     if row.category == MEAN:
         return {"verdict": None, "finding": None, "conclusion": None}
     words = {"verdict": verdict(row)} if row.is_side else {"metric": row.metric, "verdict": None}
@@ -162,7 +163,7 @@ def _in_words(row: RetentionRow) -> dict[str, Any]:
 
 
 def _json_of_row(row: RetentionRow, differences: Sequence[Difference]) -> dict[str, Any]:
-    """Return the differences of a row's run from the others; a difference of behaviour stands in every view."""
+    """Return the differences of a row's run from the others; a difference of behaviour is listed in every view."""
     differences_of = [
         asdict(difference)
         for difference in differences
@@ -173,14 +174,14 @@ def _json_of_row(row: RetentionRow, differences: Sequence[Difference]) -> dict[s
 
 
 def _of_wordings(row: Difference) -> dict[str, Any]:
-    """Two wordings of a run by the words of their table."""
+    """Return two wordings of a run by the words of their table."""
     names = {"run": row.run, "category": row.category, "wording": row.group, "other": row.minus}
     rates = {"sr": row.sr_group, "other_sr": row.sr_minus, "difference": row.sr, "difference_ci": row.sr_ci}
     return names | rates | {"only": row.only, "only_other": row.only_minus} | _test(row)
 
 
 def _of_vlm_and_policy(row: Difference) -> dict[str, Any]:
-    """A VLM minus a policy by the words of their table."""
+    """Return a VLM minus a policy by the words of their table."""
     names = {"asked": row.group, "acted": row.minus, "category": row.category, "paired": row.paired}
     rates = {"accuracy": row.sr_group, "sr": row.sr_minus, "difference": row.sr, "difference_ci": row.sr_ci}
     return names | rates | {"same_frames": row.same_frames, "source": row.source} | _test(row)
@@ -222,9 +223,9 @@ def paper_table(rows: Sequence[RetentionRow], means: Sequence[RetentionRow], out
     episodes), `regime`, `normalised_score` (of means), `backbone`, `action` (maxima over sites) and `retention`.
 
     Args:
-        rows: Of a retention table, one mean per run and view.
-        means: As `rows`.
-        outcome_rule: How episodes were judged, in words.
+        rows: Rows of a retention table.
+        means: One mean per run and view of the same table.
+        outcome_rule: The rule by which episodes were judged, in words.
     """
     numbers = []
     for mean in means:
@@ -252,7 +253,7 @@ def _category_numbers(row: RetentionRow) -> dict[str, Any]:
 
 
 def _mean_numbers(mean: RetentionRow, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """The means over categories, each over all that have the number: none is left out for a weak signal."""
+    """Return the means over categories, each over all that have the number: none is left out for a weak signal."""
     rates = [row["sr"] for row in rows]
     return {
         **_identity(mean),

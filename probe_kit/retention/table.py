@@ -1,4 +1,4 @@
-"""The retention table: several runs joined, and the ways to write it down."""
+"""The retention table: several runs joined, and its output formats."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -57,19 +57,19 @@ if TYPE_CHECKING:
 class RetentionTable:
     """Rows per run, category and view, and per run and view their category mean.
 
-    Runs are never averaged with each other, so no mean mixes suites.
+    Runs are never averaged with each other, so no mean mixes suites. Rows of targets that are no side have no
+    mean, as their metrics differ.
 
     Attributes:
-        differences: Between runs, or groups of runs.
+        differences: Differences between runs, or groups of runs.
         results: The probes that the rows were made of, by location of the run and target; figures and reports of
-            the table draw these. Rows of targets that are no side have no mean, as their metrics differ.
+            the table draw these.
         iterations: Flow-matching iterations of the expert, or positions of action tokens, that take part.
-        notes: What a reader must know, a sentence each: which runs have no probes, and which settings the rows
-            mix.
-        wordings: Of runs that were asked in several, every two against each other.
+        notes: Remarks for the reader, a sentence each: which runs have no probes, and which settings the rows mix.
+        wordings: Of runs that were asked in several wordings, every two against each other.
         vlm_vla: VLM − VLA, if that was requested.
-        unpaired: Which runs of several have none, or leave items out, and why, a sentence each.
-        runs: As the rows read them, VLM runs first.
+        unpaired: Which runs of several have no difference, or leave items out, and why, a sentence each.
+        runs: The runs in the form that the rows read, VLM runs first.
     """
 
     rows: list[RetentionRow]
@@ -89,7 +89,10 @@ class RetentionTable:
         return f"<RetentionTable of {models}: {categories} categories; print(table.to_markdown()) shows it>"
 
     def _repr_html_(self) -> str:
-        """The summary with its sentences, and folded below it the tables; pointing at a heading explains it."""
+        """Return the summary with its sentences, and the tables folded below it.
+
+        Pointing at a heading explains it.
+        """
         from markupsafe import Markup
 
         rows = [category for run in self.summary for category in run.categories]
@@ -117,7 +120,11 @@ class RetentionTable:
         return next((results for (of_run, _), results in self.results.items() if of_run == str(location)), None)
 
     def runs_of(self, runs: Sequence[RunReader]) -> list[TableRun]:
-        """Return runs as the table reads them, in order. Raises UsageError for one that it has no rows of."""
+        """Return runs in the form that the table reads, in order.
+
+        Raises:
+            UsageError: For a run that the table has no rows of.
+        """
         with_rows = {row.run.location for row in self.rows}
         read = {run.location: run for run in self.runs if run.location in with_rows}
         if strangers := [str(run.location) for run in runs if str(run.location) not in read]:
@@ -162,12 +169,12 @@ class RetentionTable:
 
     @property
     def rules(self) -> "pd.DataFrame":
-        """Return what the rule gives away, by `run` and `category`, with the fields of `OutcomeRuleScores`."""
+        """The success that the rule grants without skill, by `run` and `category`, as `OutcomeRuleScores`."""
         return part_frame(self.all_rows, "rules", by_view=False)
 
     @property
     def answers(self) -> "pd.DataFrame":
-        """Return the answers of VLM runs by `run` and `category`, with the fields of `AnswerStats`."""
+        """The answers of VLM runs by `run` and `category`, with the fields of `AnswerStats`."""
         return part_frame([row for row in self.all_rows if row.run.mode == "answers"], "answers", by_view=False)
 
     @property
@@ -182,7 +189,7 @@ class RetentionTable:
 
     @property
     def controls(self) -> "pd.DataFrame":
-        """Return the controls of probes by `run`, `category` and `view`, with the fields of `ControlScores`."""
+        """The controls of probes by `run`, `category` and `view`, with the fields of `ControlScores`."""
         return part_frame(self.all_rows, "controls")
 
     @property
@@ -191,31 +198,30 @@ class RetentionTable:
         return part_frame([row for row in self.all_rows if row.image_swap.follow_rate is not None], "image_swap")
 
     def to_frame(self) -> "pd.DataFrame":
-        """All rows as one data frame: the fields of `RetentionRow`, those of its parts as `part.field`.
+        """Return all rows as one data frame: the fields of `RetentionRow`, those of its parts as `part.field`.
 
         Shares, ratios and limits are floats, NaN where they are not defined: retention without backbone signal
-        too, whose raw ratio `to_json` keeps. Intervals become two columns, `success.ci_low` and so on, what is
-        kept by name one column per name, such as `controls.baselines.pixels`, and lists become text. The frames
+        too, whose raw ratio `to_json` keeps. Intervals become two columns, `success.ci_low` and so on. Mappings
+        become one column per name, such as `controls.baselines.pixels`, and lists become text. The frames
         `success`, `rules`, `answers`, `probes`, `retention`, `controls` and `interventions` hold one part each.
         """
         return frame_of(self.all_rows)
 
     def differences_frame(self) -> "pd.DataFrame":
-        """Differences as a data frame with the fields of `Difference`, intervals as two columns."""
+        """Return the differences as a data frame with the fields of `Difference`, intervals as two columns."""
         return frame_of(self.differences)
 
     def to_json(self) -> str:
-        """All rows as a JSON list of objects; the keys are the fields of `RetentionRow`,
-        which hold objects for its parts.
+        """Return all rows as a JSON list of objects, whose keys are the fields of `RetentionRow`.
 
-        Where runs are compared, every row has a list `differences` as well: those of its run minus others. With
-        groups, runs in several wordings or VLM − VLA, an object with the lists `rows`, `differences` between
-        groups, `wordings` and `vlm_vla`, as far as there are any.
+        Parts are objects in them. Where runs are compared, every row has a list `differences` as well: those of
+        its run minus others. With groups, runs in several wordings or VLM − VLA, the result is an object. It has
+        the lists `rows`, `differences` between groups, `wordings` and `vlm_vla`, as far as there are any.
         """
         return table_json(self.all_rows, self.differences, self.wordings, self.vlm_vla)
 
     def to_csv(self) -> str:
-        """All rows as comma-separated values with a header; differences have `differences_frame`.
+        """Return all rows as comma-separated values with a header; differences have `differences_frame`.
 
         A text that a spreadsheet would compute has a `'` in front.
         """
@@ -225,13 +231,14 @@ class RetentionTable:
         """Return the summary, a sentence per category and the tables of some sections in a format of text.
 
         Args:
-            details: As of `to_rich`.
+            style: Name of the format, such as `markdown`.
+            details: Sections whose tables follow the summary, as of `to_rich`; all of them by "all".
         """
         sentences = [f"{category.name}  {category.finding}" for run in self.summary for category in run.categories]
         return render(style, [self.summary_table, *self._details(details)], sentences, self.notes)
 
     def to_markdown(self) -> str:
-        """Success rates, retention, controls and differences as Markdown tables, with all columns."""
+        """Return success rates, retention, controls and differences as Markdown tables, with all columns."""
         rows = [category for run in self.summary for category in run.categories]
         sentences = [
             *(f"{category.name}  {category.finding}" for category in rows),
@@ -244,13 +251,17 @@ class RetentionTable:
         """Return the summary in LaTeX with booktabs rules, each table with a caption, a label and a line's width.
 
         Args:
-            details: Sections whose tables stand below it, as of `to_rich`; all of them by "all".
+            details: Sections whose tables follow it, as of `to_rich`; all of them by "all".
         """
         tables = [self.summary_table, *self._details(details)]
         return render("latex", tables, notes=(*self.unpaired, *self.notes))
 
     def tables(self, sections: Collection[Section] | None = None) -> dict[str, Table]:
-        """Return answers, success, retention and controls by title. sections: those shown, all by default."""
+        """Return answers, success, retention and controls by title.
+
+        Args:
+            sections: Sections whose columns are shown; None for all.
+        """
         return retention_tables(self.all_rows, self.differences, self.unpaired, sections)
 
     @property
@@ -264,7 +275,7 @@ class RetentionTable:
         return summary_table(self.summary, self.differences)
 
     def _details(self, details: Collection[Section] | Literal["all"]) -> list[Table]:
-        """The tables of some sections, without columns that need room."""
+        """Return the tables of some sections, without columns that need room."""
         sections: Collection[Section] = get_args(Section) if details == "all" else details
         narrow = (table.details(False) for table in self.tables(sections).values())
         wordings = self.wording_tables if "success" in sections else []
@@ -273,7 +284,7 @@ class RetentionTable:
 
     @property
     def summary(self) -> list[RunSummary]:
-        """Per run a row and a sentence for every category: what the table found."""
+        """The findings of the table: per run, a row and a sentence for every category."""
         return summarise_runs(self.all_rows)
 
     @property
@@ -286,11 +297,12 @@ class RetentionTable:
         return self.to_rich()
 
     def to_rich(self, details: Collection[Section] | Literal["all"] = (), with_next_step: bool = True) -> "Group":
-        """The summary for a rich console: one table, a sentence per category, and one line what to do next.
+        """Return the summary for a rich console: one table, a sentence per category, and the next step.
 
         Args:
             details: Sections that are shown above it, see `probe_kit.retention.choices.Section`; all of them by
                 "all".
+            with_next_step: Whether a line with the next step is added.
         """
         from rich.console import Group
         from rich.text import Text
@@ -337,34 +349,36 @@ def retention_table(
 ) -> RetentionTable:
     """Return success rates, best sites of probes and retention of several runs, per category and view.
 
+    A run that keeps no trajectories has no success rate by another rule than `disc`. A run without activations or
+    probes shows success rates only.
+
     Args:
         runs: A list, of which the first is compared with every other on the same questions (see `compare_runs`),
             or lists by the name of a group, such as `{"vqa": [a], "no vqa": [b, c]}`; groups are compared with
             each other.
-        views: Those that were probed by default.
-        target: Columns of labels, whose retention it is instead of that of a side; of these runs, views,
-            iterations, keys, family and labels alone count.
+        views: Views of the probes; None for all that were probed.
+        target: A column of labels, or several, whose retention is shown instead of that of a side. Then only runs,
+            views, iterations, keys, family and labels count. None for sides of a picture.
         family: `table` corrects p for all targets by Holm's method, per run, category, view and stream.
-        iterations: Which expert iterations take part.
-        keys: Which stored probe results of each run to use, in order, the newest by default, and none for "".
+        iterations: Expert iterations that take part.
+        keys: Keys of the stored probe results of each run, in order; None for the newest, "" for none.
         epsilons: Zone radii in metres at which SR is scored again, for the rule `disc`.
-        score: By which VLM runs are read, `text`, `logits` or `order-balanced`; they stand first.
-        with_side_words: Count their items in whose name a side stands. vlm_vla: compare every VLM run with every
-            acting one, see `compare_with_vlms`, or pairs of these by their locations.
-        rule: By which episodes are judged, a name of `probe_kit.env.scoring.RULES`.
-        last_steps: Control steps at their end that count.
-        absent_below: Accuracy below which a stream without signal is called absent. A run that keeps no
-            trajectories has no success rate by another rule than `disc`. A run without activations or probes shows
-            success rates only.
-        against: The run or group that every other is compared with instead, by its name.
+        score: The score by which VLM runs are read, `text`, `logits` or `order-balanced`; they come first.
+        with_side_words: Whether items of VLM runs in whose name a side stands are counted.
+        vlm_vla: Whether every VLM run is compared with every acting one, see `compare_with_vlms`; or pairs of
+            these by their locations.
+        rule: The rule by which episodes are judged, a name of `probe_kit.env.scoring.RULES`.
+        last_steps: Number of control steps at the end of an episode that count.
+        absent_below: Accuracy below which a stream without signal is called absent.
+        against: The name of the run or group that every other is compared with; None for the default.
         labels: Names of runs in tables and figures by their location, instead of their own.
-        pairs: By location, the runs that are compared, each the first minus the second, instead of every other
-            with the first; all of them are one family of tests.
-        origins: Of groups, what the models grew from by the location of their runs; models of one origin count as
+        pairs: Pairs of locations of runs that are compared, each the first minus the second, instead of every
+            other with the first; all of them are one family of tests.
+        origins: Of groups, the origins of the models by the location of their runs; models of one origin count as
             one. By default checkpoints of one training do.
-        categories: Rows of these alone, and means over them; probes are those of the whole runs.
-        with_behaviour: False leaves empty what the rule `disc` does not need (other rules and behaviour), so that
-            no trajectory is read.
+        categories: Categories that have rows and are averaged; None for all. Probes are those of the whole runs.
+        with_behaviour: False leaves empty the parts that the rule `disc` does not need (other rules and
+            behaviour), so that no trajectory is read.
 
     Raises:
         UnknownSiteError: For a view that was not probed.
@@ -457,13 +471,19 @@ def retention_table(
 
 
 Member = tuple[str | None, RunReader]
-"""The name of a group, of several, and a run of it."""
+"""A run of a group, and the name of the group where there are several."""
 
 
 def _of_sides(
     members: Sequence[Member], keys: Sequence[str | None], score: str, with_side_words: bool
 ) -> tuple[list[Member], list[str | None]]:
     """Return runs, read by a score, and their keys, those of VLM runs first.
+
+    Args:
+        members: Runs with the name of their group.
+        keys: Key of each run's probe results.
+        score: The score by which VLM runs are read.
+        with_side_words: Whether items of VLM runs in whose name a side stands are counted.
 
     Raises:
         UsageError: For a run without sides, or one that is given twice.
@@ -489,7 +509,10 @@ def _key_of_run(keys: Sequence[str | None] | None, runs: int) -> list[str | None
 
 
 def _check_doubles(runs: Sequence[RunReader]) -> None:
-    """A run that counts twice makes every interval too narrow; a copy of its folder is the same run."""
+    """Raise UsageError for a run that is given twice; a copy of its folder is the same run.
+
+    A run that counts twice makes every interval too narrow.
+    """
     location_of: dict[str, str] = {}
     for run in runs:
         stamp = run.stamp
@@ -507,7 +530,7 @@ ProbesOfRows = list[tuple[TableRun, ProbeResults | None]]
 
 
 def _read_sides(runs: Sequence[TableRun], keys: Sequence[str | None]) -> tuple[ProbesOfRows, list[str]]:
-    """Return the probes of sides, and a sentence for every run without, but for models that were only asked."""
+    """Return the probes of sides, and a sentence for every run without, except for models that were only asked."""
     probes_of_rows: ProbesOfRows = []
     notes = []
     for table_run, key in zip(runs, keys, strict=True):
@@ -536,7 +559,9 @@ def _read_labels(runs: Sequence[TableRun], targets: Sequence[str], keys: Sequenc
     """Return the stored probes of every target in every run.
 
     Args:
-        keys: Which ones of each run, the newest by default; with one target only.
+        runs: Runs of the table.
+        targets: Label columns in order.
+        keys: Key of each run's probe results, the newest by default; with one target only.
 
     Raises:
         NoProbesError: For a run without probes of a target.
@@ -571,7 +596,7 @@ def _read_labels(runs: Sequence[TableRun], targets: Sequence[str], keys: Sequenc
 
 
 _NAMED = 8
-"""Labels of a run that a sentence names."""
+"""Largest number of labels of a run that a sentence names."""
 
 
 def _label_notes(runs: Sequence[TableRun], rows: Sequence[RetentionRow], family: Family) -> Iterator[str]:

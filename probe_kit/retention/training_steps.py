@@ -33,11 +33,14 @@ _COLUMNS = {
     "drift of the backbone, points": "drift: the backbone's accuracy minus that of the first step, paired by "
     "items where both ran the same",
 }
-"""The meaning of each column, which the note gives of those that are shown."""
+"""The meaning of each column; a note lists it for the columns that are shown."""
 
 
 def training_step(run: RunReader) -> int:
     """Return the training step of the run's checkpoint, from the last folder of its path.
+
+    Args:
+        run: A run of a policy from a checkpoint.
 
     Raises:
         UsageError: For a run whose checkpoint is unknown or names no step.
@@ -53,7 +56,11 @@ def training_step(run: RunReader) -> int:
 
 
 def read_steps(text: str | None, runs: Sequence[RunReader]) -> dict[str, int]:
-    """Return the training step of every run by its location; text: comma-separated numbers, None for the folders'.
+    """Return the training step of every run by its location.
+
+    Args:
+        text: Comma-separated steps in the order of the runs; None reads them from the folders.
+        runs: Runs of policies.
 
     Raises:
         UsageError: For another text, a number of steps that is not that of the runs, runs of one step, or VLM
@@ -84,10 +91,12 @@ def read_steps(text: str | None, runs: Sequence[RunReader]) -> dict[str, int]:
 def step_table(table: RetentionTable, steps: Mapping[str, int]) -> Table:
     """Return success, backbone, action, retention and drift by category and training step.
 
+    Keys of a row's numbers are `category`, `step`, `run`, `view`, `sr`, `backbone`, `action`, `retention`, `drift`
+    (of the backbone) and, for each of them, its limits under the name with `_ci`.
+
     Args:
-        table: Of runs in the order of their steps, the first of which all others are compared with.
-        steps: By location. Keys of a row's numbers: `category`, `step`, `run`, `view`, `sr`, `backbone`, `action`,
-            `retention`, `drift` (of the backbone) and, for each of them, its limits under the name with `_ci`.
+        table: A table of runs in the order of their steps, the first of which all others are compared with.
+        steps: Steps by the location of a run.
     """
     first: dict[str, str | None] = {}  # the first view of each run, which its rows are of
     rows = [row for row in table.all_rows if first.setdefault(row.run.location, row.view) == row.view]
@@ -157,13 +166,18 @@ _PANELS = (
     ("retention", "retention", 1.0, None),
     ("drift", "drift of the backbone (points)", 100.0, 0.0),
 )
-"""Number, label, its factor, and where a dashed line stands."""
+"""The number of each panel, its label, its factor, and the height of its dashed line."""
 _SIDESTEP = 0.02
-"""Of the range of steps: how far categories stand apart."""
+"""Share of the range of steps by which categories are drawn apart."""
 
 
 def training_step_figure(table: Table, lines: Sequence[ProvenanceLine]) -> ReportFigure:
-    """Return the figure of a table of training steps. Nothing is drawn yet. lines: of the runs, below it."""
+    """Return the figure of a table of training steps. Nothing is drawn yet.
+
+    Args:
+        table: Result of `step_table`.
+        lines: Origin of the runs, written below the figure.
+    """
     return ReportFigure(
         "training-steps", "Training steps", "retention",
         "What a training does to success, to the answer in the backbone, and to the share of it that reaches the "

@@ -38,11 +38,11 @@ SCHEMA: Final = 2
 MOST_FILES, MOST_BYTES, MOST_RECORD_BYTES = 1_000_000, 256 << 30, 64 << 20
 """Bounds of an archive: its files, their bytes together, and the bytes of `pack.json` and `SHA256SUMS`."""
 MOST_NAME_BYTES = 255
-"""Of a name with its folders, which any file system takes below a folder of one's own."""
+"""Largest number of bytes of a name with its folders, which any file system takes below a folder of one's own."""
 MOST_EXPANSION, FREE_EXPANSION = 200, 64 << 20
 """Bytes that a byte of a zip file may unpack to, and bytes that are free of this bound. JSON gives 10 to 30."""
 _DATE = (1980, 1, 1, 0, 0, 0)
-"""Of every member, the first that a zip file can say: an archive made again has the same bytes."""
+"""The date of every member, the first that a zip file can hold: an archive made again has the same bytes."""
 _RESTORE = "Fetch the archive again, or make it anew with `probe-kit study pack`"
 _DEVICE = re.compile(r"(aux|con|nul|prn|(com|lpt)[0-9¹²³]) *(\..*)?", re.IGNORECASE)
 """A name that Windows gives to a device, whatever its ending is."""
@@ -54,14 +54,24 @@ class _Part(BaseModel):
 
 
 class PackedSuite(_Part):
-    """The suite of an archive. identity: `name@version`. items: by category."""
+    """The suite of an archive.
+
+    Attributes:
+        identity: `name@version`.
+        items: Number of items by category.
+    """
 
     identity: str
     items: dict[str, NonNegativeInt]
 
 
 class PackedRun(_Part):
-    """A run of an archive. key: in its folder's name. settings_sha256: of its settings with the weights' hash."""
+    """A run of an archive.
+
+    Attributes:
+        key: The key in its folder's name.
+        settings_sha256: Hash of its settings with the weights' hash.
+    """
 
     key: str = Field(pattern=r"^[0-9a-f]{8}$")
     settings_sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
@@ -71,9 +81,9 @@ class Pack(_Part):
     """The content of `pack.json`.
 
     Attributes:
-        study: Its name.
-        version: Of probe_kit.
-        runs: By name, such as `base/plain`.
+        study: Name of the study.
+        version: Version of probe_kit.
+        runs: Runs by name, such as `base/plain`.
         missing: Runs and tables that are not there, each with the reason.
         left_out: Kinds of files that were not packed.
     """
@@ -87,12 +97,20 @@ class Pack(_Part):
     schema_version: Literal[2] = SCHEMA
 
     def to_json(self) -> str:
-        """The text of `pack.json`."""
+        """Return the text of `pack.json`."""
         return self.model_dump_json(indent=1)
 
     @classmethod
     def read(cls, folder: Path) -> Self:
-        """The record in a folder. Raises RunDamagedError if it is none, UsageError if it is of another version."""
+        """Read the record in a folder.
+
+        Args:
+            folder: Folder of an archive.
+
+        Raises:
+            RunDamagedError: If the file is no record of an archive.
+            UsageError: If it is of another version.
+        """
         file = folder / PACK_FILE
         try:
             content: Any = parse_json(_read_bounded(file))
@@ -108,7 +126,10 @@ class Pack(_Part):
 
 
 def open_archive(name: str | Path) -> Path | None:
-    """The folder of an archive, unpacked for this process if it is a zip file; None for what is no archive.
+    """Return the folder of an archive, unpacked for this process if it is a zip file; None if there is no archive.
+
+    Args:
+        name: A folder or a zip file.
 
     Raises:
         RunDamagedError: Where a file is missing, was added, or has other bytes than were packed, and for a link or
@@ -194,7 +215,11 @@ def _check_sizes(files: int, size: int, where: str) -> None:
 
 
 def _read_bounded(file: Path) -> bytes:
-    """The bytes of `pack.json` or of the sums. Raises RunDamagedError for more than such a file has."""
+    """Return the bytes of `pack.json` or of the sums.
+
+    Raises:
+        RunDamagedError: For more bytes than such a file has.
+    """
     try:
         return read_regular(file, MOST_RECORD_BYTES)
     except FileNotFoundError:
@@ -204,7 +229,7 @@ def _read_bounded(file: Path) -> bytes:
 
 
 def write_zip(folder: Path, out: Path) -> None:
-    """The files of a folder as a zip file whose bytes depend on theirs alone."""
+    """Write the files of a folder as a zip file whose bytes depend on theirs alone."""
     with ZipFile(out, "w", ZIP_DEFLATED) as archive:
         for file in files_of(folder):
             info = ZipInfo(file.relative_to(folder).as_posix(), _DATE)
@@ -215,7 +240,11 @@ def write_zip(folder: Path, out: Path) -> None:
 
 
 def files_of(folder: Path) -> list[Path]:
-    """All files below a folder, in order. Raises RunDamagedError for a link, pipe or device there."""
+    """Return all files below a folder, in order.
+
+    Raises:
+        RunDamagedError: For a link, pipe or device there.
+    """
     files = []
     for home, folders, names in os.walk(folder):
         for path in (Path(home) / name for name in (*folders, *names)):
@@ -230,7 +259,7 @@ def files_of(folder: Path) -> list[Path]:
 
 
 def write_sums(folder: Path) -> None:
-    """`SHA256SUMS` of all other files below a folder."""
+    """Write `SHA256SUMS` of all other files below a folder."""
     lines = [
         f"{_digest(file)}  {file.relative_to(folder).as_posix()}\n"
         for file in files_of(folder)
@@ -259,7 +288,11 @@ def check_sums(folder: Path) -> None:
 
 
 def _read_sums(file: Path) -> dict[str, str]:
-    """Digests by name. Raises RunDamagedError for a wrong line, and for a name that leads out or stands twice."""
+    """Return the digests by name.
+
+    Raises:
+        RunDamagedError: For a wrong line, and for a name that leads out of the folder or is listed twice.
+    """
     try:
         lines = _read_bounded(file).decode("utf-8").split("\n")
     except UnicodeDecodeError as error:
@@ -287,7 +320,7 @@ def _digest(file: Path) -> str:
 
 
 def table_record(table: Table) -> dict[str, Any]:
-    """All of a table as plain values, from which `table_of_record` makes it again."""
+    """Return a table as plain values, from which `table_of_record` makes it again."""
     return {
         "title": table.title,
         "notes": list(table.notes),
@@ -301,7 +334,13 @@ def table_record(table: Table) -> dict[str, Any]:
 
 
 def table_of_record(record: dict[str, Any]) -> Table:
-    """The table of a record. Raises KeyError, TypeError or ValueError for what is none."""
+    """Return the table of a record.
+
+    Raises:
+        KeyError: If the record lacks a part of a table.
+        TypeError: If a part has another type.
+        ValueError: If a part has another form.
+    """
     return Table(
         title=str(record["title"]),
         headings=tuple(Heading(str(text), group=str(group)) for group, text in record["headings"]),

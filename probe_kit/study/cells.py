@@ -1,9 +1,9 @@
 """Cells: one model in one condition, or asked in one way, with one seed. Known without loading a model.
 
-With the suite as far as a plan needs it, and the failures of cells: `OUT/failures/<run>.json` each, until the
-run or its probes are made. Runs describe themselves, so that a study notes nothing else. No number of a table
-comes from a failure. Each is a file of its own: two processes that play different models of a study need no lock
-between them.
+The module also holds the suite as far as a plan needs it, and the failures of cells. Each failure is a file
+`OUT/failures/<run>.json` of its own, until the run or its probes are made. Runs describe themselves, so that a
+study notes nothing else. No number of a table comes from a failure. Two processes that play different models of a
+study need no lock between them.
 """
 
 import json
@@ -30,9 +30,9 @@ class PlannedSuite:
 
     Attributes:
         identity: `name@version`; when a run grows, items are compared by content.
-        items: By category.
+        items: Number of items by category.
         folder: None for the embedded suite.
-        source: Where the numbers of items are from.
+        source: Origin of the numbers of items.
         contents: Hash of every item's content by its id, of a suite in a folder; empty for others.
     """
 
@@ -44,7 +44,7 @@ class PlannedSuite:
 
 
 def planned_suite(table: SuiteTable) -> tuple[PlannedSuite, list[Mistake]]:
-    """The suite that a file names, and what is wrong with it."""
+    """Return the suite that a file names, and the mistakes in it."""
     from probe_kit.suite import load_suite
     from probe_kit.suite.build import ITEMS, default_identity
     from probe_kit.suite.generators import GENERATORS
@@ -83,28 +83,32 @@ def planned_suite(table: SuiteTable) -> tuple[PlannedSuite, list[Mistake]]:
 
 
 def slug(name: str) -> str:
-    """The slug of a category that was named by slug or title, in any case."""
+    """Return the slug of a category that was named by slug or title, in any case."""
     return "-".join(name.lower().split())
 
 
 def slugs(names: Sequence[str]) -> tuple[str, ...]:
-    """The same of several, each once, in order."""
+    """Return the slugs of several categories, each once, in order."""
     return tuple(dict.fromkeys(map(slug, names)))
 
 
 KEY_DIGITS = 8
-"""Of a key in a folder's name; `stored` finds out if two settings ever share them."""
+"""Digits of a key in a folder's name; `stored` detects two settings that share them."""
 
 
 @dataclass(frozen=True)
 class Selection:
-    """Categories, and items of each."""
+    """Categories, and the number of items of each.
+
+    Attributes:
+        items: Largest number of items per category; None for all.
+    """
 
     categories: tuple[str, ...]
     items: int | None = None
 
     def counts(self, suite: PlannedSuite) -> dict[str, int]:
-        """Items by category."""
+        """Return the number of items by category."""
         every = {name: suite.items.get(name, 0) for name in self.categories}
         return {name: count if self.items is None else min(count, self.items) for name, count in every.items()}
 
@@ -119,14 +123,15 @@ def joined(selections: Iterable[Selection]) -> Selection:
 
 @dataclass(frozen=True)
 class Cell:
-    """A run of the study. settings: what it is played with, without its selection.
+    """A run of the study.
 
     Attributes:
-        model: Names in the file; way is the condition or the ask.
-        way: As `model`.
-        selections: Of the blocks that use the run, by their names.
-        suite: Of all cells.
-        unavailable: Why it is not played, empty if it is.
+        model: Name of the model in the file.
+        way: Name of the condition or the ask in the file.
+        settings: Settings of the run without its selection.
+        selections: Selections of the blocks that use the run, by their names.
+        suite: The suite of all cells.
+        unavailable: Reason why it is not played, empty if it is.
         packed_key: In an archive, the key of the run that was packed.
     """
 
@@ -185,7 +190,7 @@ class Cell:
 
     @property
     def units(self) -> float:
-        """The most inferences of an episode, in which conditions differ; 1 for what has no policy that acts."""
+        """The most inferences of an episode, in which conditions differ; 1 without a policy that acts."""
         return self.inferences / self.episodes if self.inferences else 1.0
 
     @property
@@ -195,7 +200,7 @@ class Cell:
 
     @cached_property
     def key(self) -> str:
-        """The hash of all that the settings decide but the selection, by which the run's folder is named."""
+        """The hash of everything that the settings decide except the selection; it names the run's folder."""
         if self.packed_key:
             return self.packed_key
         settings = self.settings
@@ -230,9 +235,9 @@ class Cell:
 
 
 def checkpoint_stamp(checkpoint: str | None) -> Any:
-    """Return what tells checkpoints apart without reading gigabytes for every plan.
+    """Return a stamp that distinguishes checkpoints without reading gigabytes for every plan.
 
-    Of a folder or file, name, size and time of every file; else the hub id.
+    Of a folder or file, it is name, size and time of every file; else the hub id.
     """
     if checkpoint is None or not (folder := Path(checkpoint).expanduser()).exists():
         return checkpoint
@@ -252,12 +257,12 @@ NOT_TRIED_AGAIN: tuple[Stage, ...] = ("playing", "episodes")
 
 
 class Failure(Record):
-    """Why runs of a model, or probes of a run, were not made.
+    """The reason why runs of a model, or probes of a run, were not made.
 
     Attributes:
         stage: `checking` before anything was loaded, `playing` for the whole model, `episodes` for single ones
             that were given up, `probes`, or `waiting` for a run that is not whole.
-        run: As the plan names it.
+        run: Name of the run in the plan.
         error: Class of the error.
         when: UTC, ISO 8601.
     """
@@ -273,7 +278,7 @@ class Failure(Record):
 
     @classmethod
     def of(cls, stage: Stage, model: str, run: str, error: BaseException) -> "Failure":
-        """Return the failure that an error is, with its traceback and the time."""
+        """Return the failure of an error, with its traceback and the time."""
         reason = str(error) or type(error).__name__
         return cls(
             stage=stage, model=model, run=run, reason=reason, error=type(error).__name__,
@@ -286,7 +291,7 @@ class Failure(Record):
         return f"{self.model} failed at {self.run}: {self.reason}"
 
     def same(self, other: "Failure | None") -> bool:
-        """Whether both say the same, at whatever time."""
+        """Whether both have the same stage, run, error and reason, at whatever time."""
         key = (self.stage, self.run, self.error, self.reason)
         return other is not None and key == (other.stage, other.run, other.error, other.reason)
 
@@ -298,12 +303,25 @@ class Failures:
         self._location = locate(out)
 
     def check_place(self) -> None:
-        """Raise DiskSpaceError or StoreError for a place that cannot be written; remove drafts of killed ones."""
+        """Check that failures can be written, and remove drafts of killed processes.
+
+        Raises:
+            DiskSpaceError: For a folder that cannot be written.
+            StoreError: For an object store that cannot be written.
+        """
         with self._location.explained_errors(), self._location.tended(FOLDER):
             pass
 
     def of(self, cell: Cell, probes: str = "") -> Failure | None:
-        """Return the failure of a run, or of its probes, None without one. Raises RunDamagedError if changed."""
+        """Return the failure of a run, or of its probes; None without one.
+
+        Args:
+            cell: The cell of the run.
+            probes: Name of a table of probes; empty for the run itself.
+
+        Raises:
+            RunDamagedError: If the record was changed.
+        """
         key = _key(cell, probes)
         if not self._location.exists(key):
             return None
@@ -316,7 +334,7 @@ class Failures:
                 self._location.write(_key(cell, probes), failure.to_bytes())
 
     def clear(self, cell: Cell, probes: str = "") -> None:
-        """Remove the failure of what is made."""
+        """Remove the failure of a run or of probes that are made now."""
         self._location.delete(_key(cell, probes))
 
 

@@ -1,4 +1,4 @@
-"""Checks of a study file: names that nothing has, then what does not fit together where all names are known."""
+"""Checks of a study file: unknown names, then tables that do not fit together where all names are known."""
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from graphlib import CycleError, TopologicalSorter
@@ -90,14 +90,14 @@ def _uses(study: Study) -> Iterator[Use]:
 
 
 FEWEST_ITEMS = 10
-"""Items of a category that five folds need, where every group is a pair of counterparts."""
+"""Number of items of a category that five folds need, where every group is a pair of counterparts."""
 _NEEDS: Mapping[TableKind, str] = {
     "ablation": "comparison",
     "groups": "comparison",
     "chain": "comparison",
     "drift": "drift",
 }
-"""By kind of table, the field that names what it shows; other kinds need `runs`."""
+"""By kind of table, the field that names its content; other kinds need `runs`."""
 _COMPARES = {"ablation": "pairs", "chain": "chain", "groups": "groups"}
 """By kind of table, the kind of comparison it shows."""
 _OF_PROBES = ("probing", "as-paper", "curves")
@@ -108,7 +108,7 @@ _BY_ROLE = ("mean:", "tokens:")
 
 
 def misfits(study: Study, suite: PlannedSuite) -> list[Mistake]:
-    """Return what does not fit together, in the order of the tables. Every name of the file is known."""
+    """Return the mistakes of tables that do not fit together, in order. Every name of the file is known."""
     checks: tuple[Callable[[Study, PlannedSuite], Iterator[Mistake]], ...] = (
         _out, _suite, _models, _lineages, _run_blocks, _excludes, _unused, _probes, _comparisons, _drift,
         _tables, _figures,
@@ -279,7 +279,7 @@ def _few_items(study: Study, block: BlockTable, suite: PlannedSuite, path: Place
 
 
 def _views(path: Place, views: list[str], model: ModelTable) -> Iterator[Mistake]:
-    """Yield a mistake for views that no stream of a model has, or whose form is none where streams are unknown."""
+    """Yield a mistake for views that no stream of a model has, or of unknown form where streams are unknown."""
     declared = [view for stream in _declared(model) for view in view_names(stream.roles)]
     for view in views:
         pooled = view.replace("tokens", "mean", 1)  # every token is there of what has a mean
@@ -389,7 +389,7 @@ def _other_view(study: Study, runs: list[Member], view: str, side: str, path: Pl
 
 
 def _other_streams(study: Study, side: str, second: str, path: Place) -> Iterator[Mistake]:
-    """Yield a mistake for backbones without a site of one name and width, as far as their families say it."""
+    """Yield a mistake for backbones without a site of one name and width, as far as their families declare it."""
     widths = [
         {
             (declared.stream.name, declared.stream.width)

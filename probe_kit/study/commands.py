@@ -98,7 +98,7 @@ def run(
     probe-kit study run mine.toml --dry-run --verify --orphans
     probe-kit study run mine.toml --slots 2
     probe-kit study run mine.toml --only base --retry-failed
-    """
+    """  # noqa: D301
     from probe_kit.study import load_study, plan_study
 
     if slots and ray is not None:
@@ -198,7 +198,7 @@ def _played(plan: "StudyPlan", **options: Any) -> "list[Failure]":
 
 
 def _counters(bar: Any, prefix: str) -> Callable[..., None]:
-    """A callback (run, done, total, …) with a bar per run, which appears with the first thing that is counted."""
+    """Return a callback (run, done, total, …) with a bar per run, which appears with the first count."""
     of_run = cache(lambda run: counter(bar, f"{prefix}{run}"))
     return lambda run, finished, total, *_: of_run(run)(finished, total)
 

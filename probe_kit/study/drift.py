@@ -33,7 +33,10 @@ from probe_kit.train.results.store import load_results
 Features = NDArray[np.float64]
 
 PERMUTATIONS = 999
-"""Of the labels of whole groups, for the p of a transfer: with the observed order, p comes in steps of 1/1000."""
+"""Number of permutations of the labels of whole groups, for the p of a transfer.
+
+With the observed order, p comes in steps of 1/1000.
+"""
 _CONSTANT = 1e-9
 """Share of the largest deviation below which a feature does not vary."""
 
@@ -43,7 +46,7 @@ Side = tuple[RunReader, ProbeResults]
 
 
 def _features(side: Side, site: Site, view: str, episodes: NDArray[np.str_]) -> Features:
-    """Return (E, D) of these episodes, in this order."""
+    """Return the features (E, D) of these episodes, in this order."""
     at = {name: row for row, name in enumerate(side[0].episodes["episode_id"].astype(str))}
     return np.asarray(side[0].column(site, view)[[at[name] for name in episodes]], np.float64)
 
@@ -51,12 +54,23 @@ def _features(side: Side, site: Site, view: str, episodes: NDArray[np.str_]) -> 
 def _transfer(
     probed: Side, other: Side, category: str, view: str, sites: Sequence[Site], common: NDArray[np.str_]
 ) -> Features:
-    """Return (3, S): accuracies of the probes of one run on the activations of another, as shares, and p.
+    """Return accuracies of the probes of one run on the activations of another, as shares, and p: (3, S).
 
-    The first ones are of decisions as they are. For the second ones features are centred and scaled as in the
-    other run's own training folds, without labels. p is of these, against the best site under label permutations
-    of whole groups. Each of the `common` episodes is judged by the probe that was trained without its fold. Raises
-    UnknownSiteError for a site without a stored direction.
+    The first accuracies are of decisions as they are. For the second ones features are centred and scaled as in
+    the other run's own training folds, without labels. p is of these, against the best site under label
+    permutations of whole groups. Each of the `common` episodes is judged by the probe that was trained without its
+    fold.
+
+    Args:
+        probed: The run whose probes are used.
+        other: The run whose activations they are used on.
+        category: Category of the probes.
+        view: View of the probes.
+        sites: The S sites, which both runs have.
+        common: Ids of episodes that both runs have.
+
+    Raises:
+        UnknownSiteError: For a site without a stored direction.
     """
     curve = probed[1].curves[category, view]
     rows = np.flatnonzero(np.isin(curve.episodes, common))
@@ -81,7 +95,7 @@ def _decisions(
     fold_of: NDArray[np.int64],
     folds: NDArray[np.int64],
 ) -> Features:
-    """Return (E,) decisions on features (E, D), moved and scaled from their own training folds to `like`'s."""
+    """Return decisions (E,) on features (E, D), moved and scaled from their own training folds to `like`'s."""
     decisions = np.empty(len(features))
     for position, fold in enumerate(folds):
         tested = fold_of == fold
@@ -93,7 +107,10 @@ def _decisions(
 
 
 def _moved(features: Features, origin: Features, like: Features) -> Features:
-    """Features with means and deviations of `like` instead of those of `origin`; constant ones become means."""
+    """Return features with means and deviations of `like` instead of those of `origin`.
+
+    Constant features become means.
+    """
     spread = origin.std(axis=0)
     scale = np.divide(like.std(axis=0), spread, out=np.zeros_like(spread), where=spread > _CONSTANT * spread.max())
     moved: Features = (features - origin.mean(axis=0)) * scale + like.mean(axis=0)
@@ -101,10 +118,15 @@ def _moved(features: Features, origin: Features, like: Features) -> Features:
 
 
 def _cosines(first: Direction, second: Direction, features: Features) -> tuple[float, float, float]:
-    """Return three cosines of the directions of two runs. features: (E, D) of the second run.
+    """Return three cosines of the directions of two runs.
 
-    Of their unit vectors; weighted by the covariance of the features, which is the correlation of the two
-    decisions; and the ceiling: the mean between the folds of the first run.
+    The first is of their unit vectors. The second is weighted by the covariance of the features, which is the
+    correlation of the two decisions. The third is the ceiling: the mean between the folds of the first run.
+
+    Args:
+        first: Direction of the first run.
+        second: Direction of the second run.
+        features: (E, D) of the second run.
     """
     before, after = first.unit, second.unit
     varied = features - features.mean(axis=0)
@@ -130,17 +152,19 @@ VERDICTS: Mapping[Verdict, str] = {
     "not shown in either": "signal in neither",
     "not clear": "signal in one, and the interval of the difference includes 0 or there is none",
 }
-"""What each means; signal: above chance family-wise and better than every control that was run."""
+"""The meaning of each verdict; signal: above chance family-wise and better than every control that was run."""
 
 
 @dataclass(frozen=True)
 class SiteDrift:
     """One site of one category: accuracies of transferred probes, there and back, and likeness.
 
+    The cosines are None where a side has no signal.
+
     Attributes:
-        cosine: Of the probes' directions, see `_cosines`; None where a side has no signal.
-        weighted: As `cosine`.
-        ceiling: As `cosine`.
+        cosine: Cosine of the unit vectors of the probes' directions, see `_cosines`.
+        weighted: The same cosine weighted by the covariance of the features.
+        ceiling: Mean cosine between the folds of the first run.
         lens: Accuracy of the logit lens at this layer, before and after; None unless both runs answer by letter.
     """
 
@@ -164,9 +188,10 @@ class CategoryDrift:
 
     Attributes:
         difference: After minus before.
-        sites: Of the backbone, empty where frames or words differ.
-        best: The position of the one at which the first run's own probes are best.
-        why_alone: Why nothing is transferred, empty if it is.
+        sites: Sites of the backbone, empty where frames or words differ.
+        best: The position of the site at which the first run's own probes are best.
+        episodes: Number of episodes that both runs have.
+        why_alone: Reason why nothing is transferred, empty if it is.
     """
 
     category: str
@@ -180,7 +205,10 @@ class CategoryDrift:
 
     @property
     def verdict(self) -> Verdict:
-        """One of VERDICTS; `not clear` where probes could not be transferred and the verdict hangs on that."""
+        """The verdict, a key of VERDICTS.
+
+        It is `not clear` where probes could not be transferred and the verdict depends on that.
+        """
         before, after = (row.backbone.verdict == "shown" for row in (self.before, self.after))
         if before and after:
             if not self.sites:
@@ -206,17 +234,20 @@ def measure_drift(
     labels: Mapping[str, str] | None = None,
     probes: Sequence[ProbeResults | None] = (None, None),
 ) -> list[CategoryDrift]:
-    """Drift of every category that both runs were probed in, in one view.
+    """Return the drift of every category that both runs were probed in, in one view.
 
     Probes are the stored ones of the first captured inference. Frames and words must be the same for a transfer:
     otherwise only own accuracies are given.
 
     Args:
-        labels: Names of the runs by location.
-        probes: Of both runs, the newest stored ones where None.
+        before: The first run, such as that of the base checkpoint.
+        after: The second run.
+        view: A view that both runs were probed in.
+        labels: Names of the runs by location; None for their own.
+        probes: Probes of both runs, the newest stored ones where None.
 
     Raises:
-        NoProbesError: For a view that was not probed.
+        NoProbesError: For a run without probes.
         UnknownSiteError: For a view that was not probed.
         UsageError: Where the backbones have no site of one name and width in common.
     """
@@ -243,10 +274,10 @@ def measure_drift(
 
 
 def why_alone(before: RunReader, after: RunReader, view: str = "mean") -> str:
-    """Why probes of one run are not used on the other: other words or other frames; empty if they are.
+    """Return the reason why probes of one run are not used on the other: other words or frames; empty if they are.
 
-    A VLM and a policy are compared where the VLM was shown the instruction and the frame in the size that the
-    policy gets, both were delivered the same tokens, and the view has the same positions in both.
+    A VLM and a policy are compared under three conditions. The VLM was shown the instruction and the frame in the
+    size that the policy gets. Both were delivered the same tokens. The view has the same positions in both.
     """
     if wording_of(before) != wording_of(after):
         return "other words"
@@ -324,9 +355,9 @@ def _category(
 
 
 def lens_accuracy(run: RunReader, episodes: NDArray[np.str_]) -> NDArray[np.float64] | None:
-    """Return (L,) the share of these episodes in which layer l would answer with the right side; a tie is half.
+    """Return the share (L,) of these episodes in which layer l would answer with the right side; a tie is half.
 
-    None for a run without margins, which is every run but questions that are answered by letter.
+    None for a run without margins. Only runs of questions that are answered by letter have margins.
     """
     stored: NDArray[np.float64] | None = run.lens_margins
     if stored is None:
@@ -347,7 +378,7 @@ def _at_layer(lenses: list[NDArray[np.float64] | None], layer: int) -> tuple[flo
 
 
 def _common_sites(sides: tuple[Side, Side], category: str, view: str) -> list[Site]:
-    """Sites of both backbones, by name, where these are equally wide."""
+    """Return the sites of both backbones, by name, where these are equally wide."""
     widths = []
     for run, results in sides:
         curve = results.curves[category, view]
@@ -395,7 +426,13 @@ _LENS_NOTE = (
 
 
 def drift_table(pairs: Mapping[tuple[str, str], Sequence[CategoryDrift]], title: str, view: str) -> Table:
-    """Verdicts with their numbers. pairs: by the labels of both runs, the first one before the second."""
+    """Return the verdicts with their numbers.
+
+    Args:
+        pairs: Drift by the labels of both runs, the first one before the second.
+        title: Name of the comparison.
+        view: View of the probes.
+    """
     drifts = [(names, drift) for names, of_pair in pairs.items() for drift in of_pair]
     has_lens = any(site.lens for _, drift in drifts for site in drift.sites)
     cells = tuple(
@@ -437,7 +474,7 @@ def _cells(drift: CategoryDrift, has_lens: bool) -> tuple[str, ...]:
 
 
 def _numbers(names: tuple[str, str], drift: CategoryDrift, view: str) -> list[Number]:
-    """One of the category, then one of each site."""
+    """Return the numbers of the category, then those of each site."""
     gap = drift.difference
     names_of_row = {"before": names[0], "after": names[1], "category": drift.category, "view": view}
     of_category: Number = {

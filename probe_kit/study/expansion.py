@@ -27,7 +27,12 @@ def acts(model: ModelTable) -> bool:
 
 @dataclass(frozen=True)
 class Member:
-    """A run that a block asks for. position: of the block in the file."""
+    """A run that a block asks for.
+
+    Attributes:
+        position: Position of the block in the file.
+        way: Name of the condition or the ask.
+    """
 
     block: BlockTable
     position: int
@@ -42,7 +47,7 @@ class Member:
 
     @property
     def run(self) -> tuple[str, str, int]:
-        """Model, condition or ask, and seed, which tell runs apart."""
+        """Model, condition or ask, and seed, which distinguish runs."""
         return self.model, self.way, self.seed
 
     @property
@@ -52,7 +57,7 @@ class Member:
 
 
 def members(study: Study) -> Iterator[Member]:
-    """The runs that blocks ask for, excludes left out, in the order of the file."""
+    """Yield the runs that blocks ask for, excludes left out, in the order of the file."""
     for position, block in enumerate(study.runs):
         for model in block.models:
             for way in block.conditions or block.asks or ():
@@ -61,7 +66,7 @@ def members(study: Study) -> Iterator[Member]:
 
 
 def of_side[Run: (Member, Cell)](runs: Sequence[Run], side: str) -> list[Run]:
-    """The runs that a side of a pair of drift names: of a model's first condition, or of that behind the slash."""
+    """Return the runs of one side of a drift pair: of a model's first condition, or of that after the slash."""
     model, _, way = side.partition("/")
     of_model = [run for run in runs if run.model == model and (run.way == way if way else not run.asks)]
     return [run for run in of_model if run.way == of_model[0].way]
@@ -115,7 +120,7 @@ def expand(study: Study, suite: PlannedSuite) -> tuple[list[Cell], list[Mistake]
 
 
 def _blamed(study: Study, member: Member, message: str) -> Place:
-    """The table whose values a settings error is of, and the key in it that the message names."""
+    """Return the table whose values a settings error is about, and the key in it that the message names."""
     home, name = "asks" if member.asks else "conditions", member.way
     # If the model's settings are wrong even in a condition without values, the model is to blame.
     try:
@@ -146,7 +151,7 @@ def _common(study: Study, name: str) -> dict[str, Any]:
 
 
 def _settings_of(study: Study, name: str, condition: ConditionTable, tokens: str | None) -> ExtractSettings:
-    """Return the settings of a policy, with what its protocol decides."""
+    """Return the settings of a policy, completed by its protocol."""
     of_model, of_condition = _common(study, name), dict(condition)
     scene, capture_only = of_condition.pop("scene") or of_model["scene"], of_condition.pop("no_act")
     return ExtractSettings(
@@ -157,7 +162,7 @@ def _settings_of(study: Study, name: str, condition: ConditionTable, tokens: str
 
 
 def _same_settings(cells: list[Cell]) -> list[Mistake]:
-    """Conditions or asks that are the same for a model under two names."""
+    """Return a mistake for conditions or asks that are the same for a model under two names."""
     mistakes = []
     for at, cell in enumerate(cells):
         for other in cells[:at]:
@@ -171,10 +176,10 @@ def _same_settings(cells: list[Cell]) -> list[Mistake]:
 
 
 def control_of(study: Study, cells: Sequence[Cell], cell: Cell) -> Cell | None:
-    """The run of a policy's untrained network that its probes are compared with; None without such a network.
+    """Return the run of a policy's untrained network that its probes are compared with; None without a network.
 
-    It is in the same condition, or else of the same scene and seed: whether a network then acts changes nothing in
-    what was captured before.
+    It is in the same condition, or else of the same scene and seed. Whether a network then acts changes nothing in
+    the activations that were captured before.
     """
     of_network = [
         other for other in cells if other.model == study.models[cell.model].untrained and other.seed == cell.seed
@@ -187,7 +192,7 @@ def control_of(study: Study, cells: Sequence[Cell], cell: Cell) -> Cell | None:
 
 
 def _without_control(study: Study, cells: list[Cell]) -> Iterator[Mistake]:
-    """Probes that are to be compared with an untrained network that is played in other scenes alone."""
+    """Yield a mistake for probes whose untrained network is played in other scenes alone."""
     for name, table in study.probes.items():
         for cell in cells if "untrained" in table.controls else ():
             model = study.models[cell.model]

@@ -1,6 +1,6 @@
 """Packing of a study: its runs without activations, its tables, and their sums.
 
-A data set is a folder as the hub shows it: card, episodes, tables, archive and sums.
+A data set is a folder in the layout of the hub: card, episodes, tables, archive and sums.
 """
 
 import hashlib
@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 
 Extra = Literal["pictures", "trajectories", "directions"]
 EXTRAS: tuple[Extra, ...] = get_args(Extra)
-"""What an archive holds on request: frames and videos, what happened step by step, the weights of probes."""
+"""Parts that an archive holds on request: frames and videos, trajectories step by step, the weights of probes."""
 
 
 def pack_study(study: LoadedStudy, out: Path, partial: bool = False, extras: Collection[Extra] = ()) -> Pack:
@@ -62,11 +62,13 @@ def pack_study(study: LoadedStudy, out: Path, partial: bool = False, extras: Col
     Every table of the file can be printed from it alone. Other outcome rules than `disc` need trajectories.
 
     Args:
+        study: The study whose runs are stored.
+        out: Path of the archive, at which nothing exists yet.
         partial: Leave out runs and tables that are missing; `pack.json` names them and the reason.
-        extras: See EXTRAS.
+        extras: Further parts of the runs, see EXTRAS.
 
     Raises:
-        UsageError: Where anything lies at `out`.
+        UsageError: If `out` exists.
         RunIncompleteError: For missing runs.
     """
     if out.exists():
@@ -136,30 +138,32 @@ _COLUMNS = {
     "first_frame_sha256": "string", "item_content_sha256": "string", "distance_correct": "float64",
     "distance_wrong": "float64", "steps": "int64", "seconds_inference": "float64", "seconds_simulation": "float64",
 }  # fmt: skip
-"""Of the episodes of a run, those that are published, as far as a run has them: no text of an item."""
+"""Columns of the episodes of a run that are published, as far as a run has them: no text of an item."""
 
 TRIES = 5
-"""Of an upload that a server refuses for now, or whose connection breaks."""
+"""Tries of an upload that a server refuses for now, or whose connection breaks."""
 _PAUSE = 2.0
 """Seconds before the second try."""
 _FOR_NOW = (408, 425, 429, 500, 502, 503, 504)
-"""Answers of a server that may be another one a moment later: too slow, too early, too often, out of order."""
+"""Status codes of a server that may differ a moment later: too slow, too early, too often, out of order."""
 
 
 def write_data_set(
     study: LoadedStudy, folder: Path, partial: bool = False, licence: str | None = None, again: bool = False
 ) -> Pack:
-    """Write the data set of a study to `folder`, whole or not at all.
+    """Write the data set of a study to `folder`, whole or not at all; raises as `pack_study` too.
 
     Args:
-        partial: Leave out what is missing.
-        licence: As the hub spells it, such as `cc-by-4.0`; named in the card.
+        study: The study whose runs are stored.
+        folder: Folder of the data set.
+        partial: Leave out runs and tables that are missing.
+        licence: The licence in the hub's spelling, such as `cc-by-4.0`; named in the card. None for none.
         again: Accept a folder that holds this very data set, such as after an upload that failed.
 
     Raises:
-        UsageError: Where anything else lies there.
-        DiskSpaceError: Without pyarrow, and what `pack_study` raises.
-        MissingExtraError: Without pyarrow, and what `pack_study` raises.
+        UsageError: If `folder` exists and holds anything else.
+        DiskSpaceError: On a full disk.
+        MissingExtraError: Without pyarrow.
     """
     require("pyarrow.parquet", "export")
     if folder.exists() and not again:
@@ -196,7 +200,7 @@ def _write(study: LoadedStudy, folder: Path, partial: bool, licence: str | None)
 
 
 def _episodes(study: LoadedStudy) -> "pd.DataFrame":
-    """A row per episode of every run: which run, and what happened."""
+    """Return a row per episode of every run, with the run's name and the outcome."""
     import pandas as pd
 
     frames = []
@@ -220,7 +224,7 @@ def _episodes(study: LoadedStudy) -> "pd.DataFrame":
 
 
 def _card(study: LoadedStudy, pack: Pack, table: "pd.DataFrame", licence: str | None) -> str:
-    """`README.md`: what the hub reads, then what people read."""
+    """Return `README.md`: the head that the hub reads, then the text for readers."""
     import yaml
 
     kinds = {str(name): kind.name for name, kind in table.dtypes.items()}
@@ -276,12 +280,16 @@ def data_set_version(folder: Path) -> str:
 def publish_data_set(
     folder: Path, repository: str, pull_request: bool = False, private: bool = False, pause: float = _PAUSE
 ) -> str:
-    """Upload a folder of `write_data_set` as a data set; returns the address of the commit or pull request.
+    """Upload a folder of `write_data_set` as a data set; return the address of the commit or pull request.
+
+    The commit is tagged with the version of its content, a pull request is not. The token is the hub's own:
+    HF_TOKEN, or that of `hf auth login`. Files that are there already are not sent again.
 
     Args:
-        repository: `owner/name`, created if it is not there. The commit is tagged with the version of its content,
-            a pull request is not. The token is the hub's own: HF_TOKEN, or that of `hf auth login`. Files that are
-            there already are not sent again.
+        folder: Folder of the data set.
+        repository: `owner/name`, created if it is not there.
+        pull_request: Open a pull request in a data set that exists.
+        private: Make a new data set private.
         pause: Seconds before the second try, doubled each time.
 
     Raises:
@@ -316,7 +324,7 @@ def publish_data_set(
 
 
 def _tried(upload: Callable[[], str], repository: str, pause: float) -> str:
-    """The result of an upload that may need several tries."""
+    """Return the result of an upload that may need several tries."""
     import httpx
     from huggingface_hub.errors import HfHubHTTPError
 

@@ -1,6 +1,6 @@
-"""The plan of a study: what is stored of each cell and its probes, why others are to be made, and what they take.
+"""The plan of a study: the stored part of each cell and its probes, the reasons for the rest, and its cost.
 
-Everything is read from the runs themselves, and from the failures that are stored beside them.
+Everything is read from the runs themselves, and from the failures that are stored with them.
 """
 
 from collections import defaultdict
@@ -34,11 +34,11 @@ if TYPE_CHECKING:
 
 
 _FITTED = ("views", "permutations", "seed")
-"""The fields of a table that decide its probes, by which the plan says why they are fitted again."""
+"""The fields of a table that decide its probes; the plan names those that changed as the reason to fit again."""
 
 
 def probes_of(study: LoadedStudy, cell: Cell) -> Iterator[tuple[str, ProbesTable, Selection]]:
-    """Yield the tables of probes that a cell belongs to, by name, each with what of the run is probed."""
+    """Yield the tables of probes that a cell belongs to, by name, each with the part of the run that is probed."""
     for name, table in study.study.probes.items():
         selection = cell.selected(table.runs)
         if not cell.unavailable and selection is not None:
@@ -123,20 +123,22 @@ def untrained_cell(study: LoadedStudy, table: ProbesTable, cell: Cell) -> Cell |
 
 State = Literal["new", "partial", "whole", "damaged", "failed", "waiting", "skipped"]
 _MOST_CHANGES = 3
-"""Settings by which a stored run differs from the file, that a line of the plan names."""
+"""Largest number of changed settings of a stored run that a line of the plan names."""
 
 
 @dataclass(frozen=True)
 class PlannedCell:
-    """A cell with what lies at its location. stored: episodes of its selection. why: the state in words.
+    """A cell, and the state of its run at its location.
 
     Attributes:
-        failure: Of the last time it was played.
+        stored: Episodes of its selection that are stored.
+        why: The state in words.
+        failure: Failure of the last time it was played.
         waits_for: Failure of another run of its model.
-        probes: By table of the file, why they are to be fitted; empty for stored ones.
+        probes: By table of the file, the reason why they are to be fitted; empty for stored ones.
         sealed: Whether nothing is left to do after its last episode.
-        seconds: Mean of a stored episode.
-        streams: Of what is stored.
+        seconds: Mean duration of a stored episode.
+        streams: Streams of the stored run.
     """
 
     cell: Cell
@@ -189,7 +191,7 @@ class StudyPlan:
 
     @property
     def played(self) -> list[PlannedCell]:
-        """All cells but the skipped ones."""
+        """All cells except the skipped ones."""
         return [planned for planned in self.cells if planned.state != "skipped"]
 
     @property
@@ -198,11 +200,11 @@ class StudyPlan:
         return not any(planned.missing or planned.unprobed for planned in self.played)
 
     def skipped(self) -> dict[str, str]:
-        """Return by model why it is not played."""
+        """Return by model the reason why it is not played."""
         return {name: model.unavailable for name, model in self.study.study.models.items() if model.unavailable}
 
     def totals(self) -> dict[str, int]:
-        """Count runs, episodes by what is done in them, inferences of policies, and what is missing."""
+        """Count runs, episodes by the model's task, inferences of policies, and missing episodes and probes."""
         cells = [planned.cell for planned in self.played]
         n_asked = sum(cell.episodes for cell in cells if cell.asks)
         captured = sum(cell.episodes for cell in cells if cell.captured)
@@ -248,8 +250,8 @@ class StudyPlan:
     def bytes(self) -> dict[str, float | None]:
         """Return the bytes of missing episodes by model, uncompressed, with columns and probes.
 
-        By stored streams of the model, else as its configuration or its family declares them; None where no stream
-        is known before the model is loaded.
+        They are counted by stored streams of the model, else as its configuration or its family declares them.
+        None where no stream is known before the model is loaded.
         """
         stored = {planned.cell.work: planned.streams for planned in self.played if planned.streams is not None}
         missing = [planned for planned in self.played if planned.missing]
@@ -259,7 +261,7 @@ class StudyPlan:
         )
 
     def lines(self) -> list[str]:
-        """Return totals, hours and bytes with their source, and what is skipped, in words."""
+        """Return totals, hours and bytes with their source, and skipped models, in words."""
         totals, suite = self.totals(), self.study.suite
         unprobed = f"; probes of {counted(totals['unprobed'], 'run')}" if totals["unprobed"] else ""
         lines = [
@@ -283,7 +285,7 @@ class StudyPlan:
         return [*lines, *(f"skipped: {model}: {reason}" for model, reason in self.skipped().items())]
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values."""
+        """Return the plan as plain values."""
         return {
             "study": self.study.study.name,
             "suite": self.study.suite.identity,
@@ -316,6 +318,7 @@ def plan_study(study: LoadedStudy, only: str | None = None) -> StudyPlan:
     """Compare a study with what is stored. Loads no model and writes nothing.
 
     Args:
+        study: The study file, expanded.
         only: A block or a model, whose runs alone are planned; all by default.
 
     Raises:
@@ -361,7 +364,7 @@ def _planned(study: LoadedStudy, cell: Cell) -> PlannedCell:
 
 
 def _why_new(study: LoadedStudy, cell: Cell) -> str:
-    """Return what changed since the newest run of the same model, condition and seed on this machine, if any."""
+    """Return the changes since the newest run of the same model, condition and seed on this machine, if any."""
     out = study.study.folder
     digits = "[0-9a-f]" * KEY_DIGITS
     files = () if "://" in out else Path(out).glob(f"{cell.folder[:-KEY_DIGITS]}{digits}/{RUN_FILE}")
@@ -398,7 +401,7 @@ def _failed(study: LoadedStudy, planned: PlannedCell) -> PlannedCell:
 
 
 def _waiting(cells: list[PlannedCell]) -> Iterator[PlannedCell]:
-    """Yield the cells, of which those wait whose model failed at another run."""
+    """Yield the cells; those wait whose model failed at another run."""
     failed = {
         planned.cell.model: planned.failure
         for planned in cells
@@ -446,7 +449,12 @@ def _known_sums(sums: Mapping[str, float | None]) -> tuple[dict[str, float], lis
 
 
 def bytes_per_episode(cell: Cell, stored: Sequence[StoredStream] | None) -> int | None:
-    """Return the bytes of an episode with the most inferences, if every one is captured. stored: its streams."""
+    """Return the bytes of an episode with the most inferences, if every one is captured.
+
+    Args:
+        cell: The cell of the run.
+        stored: Streams of a stored run; None for those that the family declares.
+    """
     settings = cell.settings
     if stored is None and settings.model.family in family_names():
         sizes = planned_sizes(settings)
@@ -462,7 +470,7 @@ def bytes_per_episode(cell: Cell, stored: Sequence[StoredStream] | None) -> int 
 
 
 def changed_runs(plan: StudyPlan) -> dict[str, tuple[str, ...]]:
-    """Compare every byte of stored runs with its hash; return by run what is wrong with it."""
+    """Compare every byte of stored runs with its hash; return by run the problems found."""
     audits = {
         planned.cell.name: verify_run(planned.location, deep=True)
         for planned in plan.played
@@ -474,7 +482,8 @@ def changed_runs(plan: StudyPlan) -> dict[str, tuple[str, ...]]:
 def orphaned_runs(plan: StudyPlan) -> list[str]:
     """Return folders of runs below the study's folder that are no run of the file, such as of former settings.
 
-    Another study with the same folder may use them. Of a folder on this machine; none are found at a URL.
+    Another study with the same folder may use them. Only folders of this machine are searched; none are found at a
+    URL.
     """
     out = plan.study.study.folder
     used = {Path(cell.location(out)) for cell in plan.study.cells}

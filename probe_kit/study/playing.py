@@ -1,6 +1,6 @@
 """Playing of all runs that a plan finds missing, here, in processes or on a Ray cluster, then fitting of probes.
 
-A worker gets all runs of one model, loads the model once, and reports events. What is committed stays, so that a
+A worker gets all runs of one model, loads the model once, and reports events. Committed episodes stay, so that a
 model whose worker is lost, or whose study is started again, resumes after its last episode.
 """
 
@@ -40,16 +40,18 @@ from probe_kit.train import train_probes
 STOPS_ALL = (DiskSpaceError, StoreError)
 """Errors of the place of all runs, which stop the study."""
 MOST_LOSSES = 3
-"""Workers of a model that may be lost one after another without an episode in between."""
+"""Number of times that a model's worker may be lost in a row without an episode in between."""
 _SECONDS_PER_INFERENCE = 0.1
 """A guess where no rate is known, by which the longest model is found."""
 
 
 @dataclass(frozen=True)
 class RunTask:
-    """A run to be played or asked. run: as the plan names it. location: an address for any working directory.
+    """A run to be played or asked.
 
     Attributes:
+        run: Name of the run in the plan.
+        location: An address for any working directory.
         stored: Episodes that were stored when the task was made.
     """
 
@@ -61,7 +63,12 @@ class RunTask:
 
 @dataclass(frozen=True)
 class ModelTask:
-    """Runs of one model. gpus: that it needs. size: an estimate by which the longest task is found."""
+    """Runs of one model.
+
+    Attributes:
+        gpus: Number of GPUs that the model needs.
+        size: An estimate by which the longest task is found.
+    """
 
     model: str
     runs: tuple[RunTask, ...]
@@ -71,7 +78,12 @@ class ModelTask:
 
 @dataclass(frozen=True)
 class EpisodeStored:
-    """The event that an episode of a run is stored. stored, planned: episodes."""
+    """The event that an episode of a run is stored.
+
+    Attributes:
+        stored: Number of stored episodes of the run.
+        planned: Number of episodes of the whole run.
+    """
 
     model: str
     run: str
@@ -102,22 +114,24 @@ def conduct_study(
     env_workers: int | None = None,
     retry_failed: bool = False,
 ) -> list[Failure]:
-    """Play and ask all that a plan finds missing; returns what failed, now or before.
+    """Play and ask everything that a plan finds missing; return the failures, those of before included.
 
     Every run is checked, and every scene built, before the first one is played. A model that fails stops itself
-    alone: episodes that are committed stay, and the next call resumes after them. What failed while it was played
-    is not tried again until its settings change, or with `retry_failed`.
+    alone: episodes that are committed stay, and the next call resumes after them. A run that failed while it was
+    played is not tried again until its settings change, or with `retry_failed`.
 
     Args:
-        report: Called with every event as it happens.
+        plan: The plan of the study.
+        report: Called with every event as it happens; None for no reports.
         slots: Processes, each with one model at a time; 0 for this process.
-        ray: Address of a Ray cluster that plays instead, or `auto`.
+        ray: Address of a Ray cluster that plays instead, or `auto`; None for this machine.
         env_workers: Processes that simulate, as in `ExtractSettings`.
+        retry_failed: Whether runs are tried again that failed while they were played.
 
     Raises:
-        DiskSpaceError: Without Ray.
-        StoreError: Without Ray.
-        MissingExtraError: Without Ray.
+        DiskSpaceError: If the place of the runs is full or cannot be written.
+        StoreError: If the object store of the runs cannot be used.
+        MissingExtraError: For a cluster, if Ray is not installed.
         UsageError: If no cluster answers.
     """
     if ray is not None:
@@ -179,7 +193,13 @@ def _checked_tasks(
 
 
 def _problem(planned: PlannedCell, rehearsed: list[SceneSpec], ray: str | None) -> Failure | None:
-    """Return the fault of a run that shows without the model. rehearsed: scenes that can be built."""
+    """Return the fault of a run that shows without the model.
+
+    Args:
+        planned: The run with its state.
+        rehearsed: Scenes that can be built; one that was built now is added.
+        ray: Address of a Ray cluster, whose devices are not those of this machine.
+    """
     cell = planned.cell
     try:
         if planned.state == "damaged":
@@ -200,13 +220,17 @@ def _problem(planned: PlannedCell, rehearsed: list[SceneSpec], ray: str | None) 
 
 
 def play_model(task: ModelTask, report: Report) -> None:
-    """Load the model and make its runs one after another; what fails is reported, and committed episodes stay.
+    """Load the model and make its runs one after another; failures are reported, and committed episodes stay.
 
     Episodes that are given up end their run alone; anything else ends the model.
 
+    Args:
+        task: The runs of the model.
+        report: Called with every event as it happens.
+
     Raises:
-        DiskSpaceError: Which concern all runs.
-        StoreError: Which concern all runs.
+        DiskSpaceError: If the place of all runs is full or cannot be written.
+        StoreError: If the object store of all runs cannot be used.
     """
     loaded: dict[bool, Any] = {}  # as policy and as VLM, on first use
     for run in task.runs:
@@ -246,11 +270,17 @@ def play_models(tasks: Sequence[ModelTask], report: Report, slots: int = 0, ray:
     `MOST_LOSSES` times without an episode in between. With GPUs each process has one of its own; further processes
     play models that need none. Ray finds room for each model; its nodes see the runs.
 
+    Args:
+        tasks: One task per model.
+        report: Called with every event as it happens.
+        slots: Processes, each with one model at a time; 0 for this process.
+        ray: Address of a Ray cluster that plays instead, or `auto`; None for this machine.
+
     Raises:
-        DiskSpaceError: Of any worker.
-        StoreError: Of any worker.
+        DiskSpaceError: If any worker raises it.
+        StoreError: If any worker raises it.
         WorkerDiedError: If workers die before they begin.
-        MissingExtraError: Without Ray.
+        MissingExtraError: For a cluster, if Ray is not installed.
         UsageError: If no cluster answers.
     """
     tasks = sorted(tasks, key=lambda task: -task.size)  # begun last, the longest would be waited for alone
@@ -286,7 +316,7 @@ def play_here(_setup: None, take: Callable[[], ModelTask], report: Callable[[Eve
 
 
 def _note(queue: TaskQueue[ModelTask], slot: int, event: Any, report: Report) -> None:
-    """Note and report an event: what is made or given up is not played again."""
+    """Note and report an event: a run that is made or given up is not played again."""
     if isinstance(event, ModelTask):
         queue.end(slot, event.model)
         return
@@ -308,11 +338,12 @@ def _note(queue: TaskQueue[ModelTask], slot: int, event: Any, report: Report) ->
 
 
 def fit_probes(plan: StudyPlan, progress: ProbeProgress | None = None, jobs: int | None = None) -> list[Failure]:
-    """Fit the probes of a study file that a plan does not find stored. Returns what could not be fitted.
+    """Fit the probes of a study file that a plan does not find stored; return the failures.
 
-    A failure of stage `waiting` says that a run is not whole yet; others are stored with the study.
+    A failure of stage `waiting` marks a run that is not whole yet; others are stored with the study.
 
     Args:
+        plan: The plan of the study.
         progress: Called with the run's name, sites done, sites in all and the last one.
         jobs: Processes, as in `train_probes`.
     """

@@ -18,7 +18,7 @@ from probe_kit.suite.categories import OWN_DOMAIN, category_of, in_order
 
 MARKS = {Regime.KNOWLEDGE: " ↑", Regime.FAILURE: " ↓"}
 DISAGREES = "*"
-"""Of a rate whose 95 % interval and whose regime say different things about guessing."""
+"""Mark of a rate whose 95 % interval and whose regime disagree about guessing."""
 _MARKED = "↑ above what guessing reaches, ↓ below it, at 95 % with items as the unit"
 _MEAN = "the mean is over the categories that a system has"
 OfSystem = Mapping[str, RetentionRow]
@@ -27,7 +27,13 @@ OfSystem = Mapping[str, RetentionRow]
 
 @dataclass(frozen=True)
 class _Column:
-    """heading: of the column. domain: the head over it, empty for none. cell: what it says of a system."""
+    """A column of a table with a row per system.
+
+    Attributes:
+        heading: Heading of the column.
+        domain: The heading over it, empty for none.
+        cell: Makes the text of a system.
+    """
 
     heading: str
     domain: str
@@ -35,7 +41,7 @@ class _Column:
 
 
 def success_table(table: RetentionTable) -> Table:
-    """Success rates of policies, and shares right of VLMs, by system and category; means and score last.
+    """Return success rates of policies, and shares right of VLMs, by system and category; means and score last.
 
     A domain of several categories has a mean of its own, of the category means.
     """
@@ -45,7 +51,7 @@ def success_table(table: RetentionTable) -> Table:
 
 
 def vlm_table(table: RetentionTable) -> Table:
-    """Shares right of VLMs by prompt, size of the picture and category."""
+    """Return shares right of VLMs by prompt, size of the picture and category."""
     of_prompt = [
         _Column("prompt", "", lambda rows: rows[MEAN].answers.prompt or "–"),
         _Column("picture", "", lambda rows: rows[MEAN].answers.picture_size or "–"),
@@ -55,7 +61,7 @@ def vlm_table(table: RetentionTable) -> Table:
 
 
 def success_cell(row: RetentionRow) -> str:
-    """The rate in percent with the mark of its regime; a mean has none."""
+    """Return the rate in percent with the mark of its regime; a mean has none."""
     success = row.success
     if success.sr is None:
         return "–"
@@ -88,7 +94,7 @@ def _disagreement(table: RetentionTable) -> list[str]:
 
 
 def sides_table(table: RetentionTable) -> Table:
-    """Success rates where the correct picture lay on the left and on the right, then by layout of the pictures."""
+    """Return success rates by side of the correct picture, left and right, then by layout of the pictures."""
     by_side = _Column("half", "", lambda _: "left / right")
     by_layout = _Column("half", "", lambda _: "original / swapped")
     note = ["left, right: side of the correct picture", _MEAN]
@@ -116,12 +122,13 @@ _SCORE = _Column("score", "", lambda rows: number(rows[MEAN].success.normalised_
 def score_table(
     table: RetentionTable, title: str = "", source: str = "", elsewhere: Mapping[str, float] | None = None
 ) -> Table:
-    """The normalised score of every system with its interval: 0 for guessing, 100 for perfection.
+    """Return the normalised score of every system with its interval: 0 for guessing, 100 for perfection.
 
     Args:
-        title: A further column of numbers that were not measured here, by location of the run.
-        source: As `title`.
-        elsewhere: As `title`.
+        table: The retention table of the systems.
+        title: Heading of a further column of numbers that were not measured here; empty for none.
+        source: Source of those numbers, named in the caption.
+        elsewhere: Those numbers by location of the run; None for no such column.
     """
     means = [row for row in once_per_category(table.means) if row.success.sr is not None]
     other_scores = {} if elsewhere is None else elsewhere
@@ -159,7 +166,7 @@ def score_table(
 
 
 def _score_limits(row: RetentionRow) -> tuple[float | None, float | None] | None:
-    """The interval of the mean on the scale of the score, which is linear in it."""
+    """Return the interval of the mean on the scale of the score, which is linear in it."""
     if row.success.ci is None:
         return None
     low, high = (None if end is None else (end - 0.5) * 200 for end in row.success.ci)
@@ -167,7 +174,7 @@ def _score_limits(row: RetentionRow) -> tuple[float | None, float | None] | None
 
 
 def probing_table(table: RetentionTable) -> Table:
-    """Best accuracy in the backbone and where the action is made, and retention, by category and as a mean."""
+    """Return best accuracies in the backbone and the action, and retention, by category and as a mean."""
     rows = [row for row in table.all_rows if row.view is not None]
     cells = tuple(
         (
@@ -241,7 +248,7 @@ def episodes_per_category(table: RetentionTable) -> str:
 def _by_category(
     table: RetentionTable, cell: Callable[[RetentionRow], str], domain_means: bool = False
 ) -> Iterator[_Column]:
-    """A column per category under its domain, then the mean."""
+    """Yield a column per category under its domain, then the mean."""
 
     def of(category: str) -> Callable[[OfSystem], str]:
         return lambda rows: cell(rows[category]) if category in rows else "–"
@@ -256,7 +263,7 @@ def _by_category(
 
 
 def _domains(table: RetentionTable) -> list[tuple[str, list[str]]]:
-    """Categories of a table in the order of the paper, by domain; those of a suite's own have none."""
+    """Return the categories of a table in the order of the paper, by domain; those of a suite's own have none."""
     categories = in_order([row.category for row in table.rows])
     by_domain = groupby(categories, key=lambda name: category_of(name).domain)
     return [("" if domain == OWN_DOMAIN else domain, list(members)) for domain, members in by_domain]
@@ -270,7 +277,7 @@ def _mean_of(rows: OfSystem, categories: Sequence[str]) -> float | None:
 
 
 def _systems(table: RetentionTable) -> dict[str, OfSystem]:
-    """Return rows by label, in order. Labels tell runs apart."""
+    """Return rows by label, in order. Labels distinguish runs."""
     systems: dict[str, dict[str, RetentionRow]] = {}
     for row in once_per_category([*table.rows, *table.means]):
         systems.setdefault(row.run.label, {})[row.category] = row
@@ -312,7 +319,7 @@ def _number(row: RetentionRow) -> Number:
 
 
 def _domain_numbers(table: RetentionTable) -> Iterator[Number]:
-    """The means of domains of several categories."""
+    """Yield the means of domains of several categories."""
     for name, rows in _systems(table).items():
         for domain, members in _domains(table):
             if domain and len(members) > 1:

@@ -22,18 +22,20 @@ from probe_kit.study.expansion import expand
 from probe_kit.study.schema import Mistake, Place, StudyFileError, part_in_file
 
 _MOST_BYTES = 1 << 20
-"""Of a study file, which may come with an archive of anyone."""
+"""Largest number of bytes of a study file, which may come with an archive of anyone."""
 _DEEP_KEY = re.compile(r"""(?:[\w"'-]+\s*\.\s*){64}""")
 """A dotted key of 64 tables; tomllib takes minutes for one of some ten thousands."""
 _NAME_PATTERN = "'^[a-z0-9][a-z0-9._-]{0,59}$'"
-"""As pydantic quotes the pattern of `schema.Name`; a message says in words what it means."""
+"""The pattern of `schema.Name` in pydantic's quotes; a message explains it in words."""
 
 
 @dataclass(frozen=True)
 class LoadedStudy:
-    """A study file without mistakes. file: where it lies. cells: the runs that it needs.
+    """A study file without mistakes.
 
     Attributes:
+        file: Path of the file.
+        cells: The runs that it needs.
         pack: The record of the archive that it was read from, whose runs hold no activations; else None.
     """
 
@@ -55,7 +57,11 @@ class LoadedStudy:
 
 
 def find_study(name: str) -> Path:
-    """The file of this path, or the study of the package of this name. Raises UsageError if there is neither."""
+    """Return the file of this path, or the study of the package of this name.
+
+    Raises:
+        UsageError: If there is neither.
+    """
     if Path(name).is_file():
         return Path(name)
     shipped = shipped_studies()
@@ -68,7 +74,7 @@ def find_study(name: str) -> Path:
 
 
 def shipped_studies() -> dict[str, Path]:
-    """The study files of the package by name."""
+    """Return the study files of the package by name."""
     folder = Path(str(files("probe_kit.study"))) / "studies"
     return {file.stem: file for file in sorted(folder.glob("*.toml"))}
 
@@ -83,7 +89,7 @@ def load_study(name: str | Path) -> LoadedStudy:
 
     Raises:
         UsageError: If there is none.
-        StudyFileError: Which lists all mistakes with their paths.
+        StudyFileError: If the file has mistakes; it lists all of them with their paths.
         RunDamagedError: For an archive that was changed.
     """
     archive = open_archive(name)
@@ -114,7 +120,11 @@ def load_study(name: str | Path) -> LoadedStudy:
 
 
 def _parsed(file: Path) -> dict[str, Any]:
-    """The content of a file. Raises UsageError for a text that is no TOML."""
+    """Return the content of a file.
+
+    Raises:
+        UsageError: For a text that is no TOML.
+    """
     try:
         text = read_regular(file, _MOST_BYTES).decode("utf-8-sig")
         if _DEEP_KEY.search(text):
@@ -155,7 +165,7 @@ def _near(path: Place) -> str:
 
 
 def _table_of(path: Place) -> type[BaseModel]:
-    """Return the table that the last name of a path stands in, by the types of the fields on the way."""
+    """Return the table that the last name of a path belongs to, by the types of the fields on the way."""
     table: type[BaseModel] = schema.Study
     for name in path[:-1]:
         field = table.model_fields.get(str(name))

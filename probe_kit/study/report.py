@@ -30,11 +30,13 @@ if TYPE_CHECKING:
 
 
 def make_figures(study: LoadedStudy, name: str, partial_runs: bool = False) -> list[ReportFigure]:
-    """The figures of one name, from stored runs alone; nothing is drawn yet.
+    """Return the figures of one name, from stored runs alone; nothing is drawn yet.
 
     A figure of the kind `dose` is one per run that was steered; others are one of all runs.
 
     Args:
+        study: The study whose runs are stored.
+        name: Name of the figure in the file.
         partial_runs: Accept runs that are missing or unfinished.
 
     Raises:
@@ -64,7 +66,7 @@ def make_figures(study: LoadedStudy, name: str, partial_runs: bool = False) -> l
 def _curves(
     study: LoadedStudy, name: str, runs: StoredRuns, categories: tuple[str, ...] | None, partial_runs: bool
 ) -> ReportFigure:
-    """A panel per category and part of the model, a line per system; of one system a line per iteration."""
+    """Return a panel per category and part of the model, a line per system; of one system a line per iteration."""
     stored_probes = {
         runs.labels[stored.location]: study_probes(study, stored, stored.probed.in_wording(), partial_runs)
         for stored in runs.runs
@@ -103,7 +105,7 @@ def _doses(name: str, runs: StoredRuns) -> list[ReportFigure]:
 
 
 def draw_overview(table: RetentionTable) -> "Figure":
-    """Bars of the normalised score, a panel per domain on one scale, a bar per system.
+    """Draw bars of the normalised score, a panel per domain on one scale, a bar per system.
 
     Raises:
         UsageError: Where no model acted or answered.
@@ -133,7 +135,13 @@ def draw_overview(table: RetentionTable) -> "Figure":
 
 @dataclass(frozen=True)
 class StudyReport:
-    """html: the page. missing: by table or figure, why it is not there. is_partial: whether a run is missing."""
+    """The report of a study.
+
+    Attributes:
+        html: Text of the page.
+        missing: By table or figure, the reason why it is not there.
+        is_partial: Whether a run is missing.
+    """
 
     html: str
     missing: dict[str, str]
@@ -143,11 +151,15 @@ class StudyReport:
 def write_study_report(study: LoadedStudy, path: Path | str, partial: bool = False) -> StudyReport:
     """Write the report of a study as one HTML file, whole or not at all.
 
+    Raises as `make_table` and `make_figures` too.
+
     Args:
+        study: The study whose runs are stored.
+        path: The HTML file.
         partial: Leave out what is missing; the page names it with the reason.
 
     Raises:
-        UsageError: Where no run is stored, and what `make_table` and `make_figures` raise.
+        UsageError: Where no run is stored.
     """
     report = study_report(study, partial)
     write_whole(Path(path), report.html)
@@ -155,7 +167,7 @@ def write_study_report(study: LoadedStudy, path: Path | str, partial: bool = Fal
 
 
 def study_report(study: LoadedStudy, partial: bool = False) -> StudyReport:
-    """The page as text, from stored runs alone. It needs no network, and holds no path of this machine."""
+    """Return the page as text, from stored runs alone. It needs no network, and holds no path of this machine."""
     file = study.study
     tables, no_table = make_each(file.tables, lambda name: make_table(study, name, partial), partial)
     figures, no_figure = make_each(file.figures, lambda name: make_figures(study, name, partial), partial)

@@ -31,20 +31,25 @@ _BARE = re.compile(r"[\w.-]+")
 
 @dataclass(frozen=True)
 class Mistake:
-    """A mistake in a file. path: of the value, such as `("runs", 0, "models")`. text: the fault and the remedy."""
+    """A mistake in a file.
+
+    Attributes:
+        path: Path of the value, such as `("runs", 0, "models")`.
+        text: The fault and the remedy.
+    """
 
     path: Place
     text: str
 
     @property
     def field(self) -> str:
-        """The path as it would be written, such as `runs[0].models`."""
+        """The path in the form of the file, such as `runs[0].models`."""
         parts = [f"[{part}]" if isinstance(part, int) else f".{_key(part)}" for part in self.path]
         return "".join(parts).removeprefix(".") or "the file"
 
 
 def _key(name: str) -> str:
-    """A name on one line, in quotes where it needs them."""
+    """Return a name on one line, in quotes where it needs them."""
     return shortened(name if _BARE.fullmatch(name) else json.dumps(name))
 
 
@@ -57,7 +62,7 @@ class StudyFileError(UsageError):
 
 
 def part_in_file(path: Place, content: Any) -> Place:
-    """The part of a path that leads to a value of the content of a file."""
+    """Return the part of a path that leads to a value of the content of a file."""
     for at, part in enumerate(path):
         try:
             content = content[part]
@@ -67,7 +72,7 @@ def part_in_file(path: Place, content: Any) -> Place:
 
 
 def _order(content: Any, path: Place) -> list[int]:
-    """The position of a value among its neighbours, in every table and list around it."""
+    """Return the position of a value among its neighbours, in every table and list around it."""
     positions = []
     for part in part_in_file(path, content):
         positions.append(part if isinstance(part, int) else list(content).index(part))
@@ -86,25 +91,37 @@ def unknown(what: str, name: str, names: Collection[str]) -> str:
 
 
 SCHEMA_VERSION = 1
-"""Of study files, as their key `schema` says it; raise it when a file of before means something else."""
+"""Version of study files, their key `schema`; raise it when the meaning of earlier files changes."""
 
 
 def _each_once[Value](values: list[Value]) -> list[Value]:
-    """The values. Raises ValueError where one comes twice."""
+    """Return the values.
+
+    Raises:
+        ValueError: Where one comes twice.
+    """
     for twice in (value for at, value in enumerate(values) if value in values[:at]):
         raise ValueError(f"{twice!r} comes twice; name each once")
     return values
 
 
 def _printable(text: str) -> str:
-    """The text. Raises ValueError where a terminal or file name could not show it."""
+    """Return the text.
+
+    Raises:
+        ValueError: Where a terminal or file name could not show it.
+    """
     if any(category(character) in ("Zl", "Zp") or category(character).startswith("C") for character in text):
         raise ValueError("a line break or control character is not allowed")
     return text
 
 
 def _whole_number(value: Any) -> Any:
-    """The value. Raises ValueError for `true` and `1.0`, which Python finds equal to 1."""
+    """Return the value.
+
+    Raises:
+        ValueError: For `true` and `1.0`, which Python finds equal to 1.
+    """
     if type(value) is not int:
         raise ValueError("should be 1")
     return value
@@ -119,7 +136,7 @@ SeveralNames = Annotated[list[str], Field(min_length=2), AfterValidator(_each_on
 TwoNames = Annotated[list[str], Field(min_length=2, max_length=2), AfterValidator(_each_once)]
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
 Even = Annotated[int, Field(ge=2, le=1_000_000, multiple_of=2)]
-"""Items of a category: an odd number would keep one of two role-exchanged twins and drop the other."""
+"""Number of items of a category: an odd number would keep one of two role-exchanged twins and drop the other."""
 Seed = Annotated[int, Field(ge=0, le=2**63 - 1)]
 Size = Annotated[str, Field(pattern=r"^[1-9][0-9]{0,3}x[1-9][0-9]{0,3}$")]
 TableKind = Literal[
@@ -154,9 +171,9 @@ class SuiteTable(_Table):
     """The suite of all runs.
 
     Attributes:
-        path: Its folder; the embedded suite by default.
-        categories: Of all blocks that name none.
-        items: As `categories`.
+        path: Folder of the suite; the embedded suite by default.
+        categories: Categories of all blocks that name none.
+        items: Items per category of all blocks that name none.
         counts: Items per category of a suite that is not here yet, for the plan; later it must hold so many.
     """
 
@@ -170,16 +187,16 @@ class ModelTable(_Table, ModelSettings):
     """One model: the part `model` of the settings of a run, and its place in the study.
 
     Attributes:
-        label: What tables call it.
-        groups: It belongs to.
+        label: Name of the model in tables.
+        groups: Groups that it belongs to.
         vlm: The VLM of its backbone.
-        finetuned_from: What it was trained from.
+        finetuned_from: The model that it was trained from.
         untrained: Its network with random weights.
-        protocol: As in `probe-kit extract`.
-        scene: As `protocol`.
-        execute: As `protocol`.
-        batch: As `protocol`.
-        unavailable: Why it is not played; it is named in plans and tables.
+        protocol: The protocol, as in `probe-kit extract`.
+        scene: The scene, as in `probe-kit extract`.
+        execute: Actions executed per inference, as in `probe-kit extract`.
+        batch: Batch size, as in `probe-kit extract`.
+        unavailable: Reason why it is not played; it is named in plans and tables.
     """
 
     label: Text | None = None
@@ -196,9 +213,9 @@ class ModelTable(_Table, ModelSettings):
 
 
 class ConditionTable(_Table, SceneOptions):
-    """The playing of a policy: the options of a scene, and what else `probe-kit extract` takes.
+    """The playing of a policy: the options of a scene, and further options of `probe-kit extract`.
 
-    scene: in place of the model's.
+    The scene of a condition takes the place of the model's.
     """
 
     background: Annotated[Path | None, Field(strict=False)] = None
@@ -229,7 +246,12 @@ class ExcludeTable(_Table):
 
 
 class BlockTable(_Table):
-    """A block of runs: models × conditions, or models × asks, × seeds. categories, items: default the suite's."""
+    """A block of runs: models × conditions, or models × asks, × seeds.
+
+    Attributes:
+        categories: Categories of the runs; default the suite's.
+        items: Items per category; default the suite's.
+    """
 
     name: Name
     models: Names
@@ -286,7 +308,12 @@ class DriftTable(_Table):
 
 
 class ElsewhereTable(_Table):
-    """Numbers that were not measured here, beside the score. values: by model. source: where they are from."""
+    """Numbers that were not measured here, in a column next to the score.
+
+    Attributes:
+        source: Source of the numbers.
+        values: The numbers by model.
+    """
 
     title: Text
     source: Text
@@ -294,9 +321,12 @@ class ElsewhereTable(_Table):
 
 
 class TableTable(_Table):
-    """A table to print. runs: blocks it is made of; comparison, drift: by name, where its kind shows one.
+    """A table to print.
 
     Attributes:
+        runs: Blocks that it is made of.
+        comparison: Name of the comparison, where its kind shows one.
+        drift: Name of the drift, where its kind shows one.
         elsewhere: Of a table of kind `score`, a column of numbers from elsewhere.
     """
 
@@ -309,7 +339,12 @@ class TableTable(_Table):
 
 
 class FigureTable(_Table):
-    """A figure to draw. runs: blocks it is made of. view: of the tokens in curves, the first probed by default."""
+    """A figure to draw.
+
+    Attributes:
+        runs: Blocks that it is made of.
+        view: View of the tokens in curves, the first probed by default.
+    """
 
     kind: FigureKind
     runs: Names
@@ -322,7 +357,7 @@ class Study(_Table):
 
     Attributes:
         out: Folder or URL of runs; default `runs/NAME`.
-        scene: Of every model that names none, and of VLMs too.
+        scene: Scene of every model that names none, and of VLMs too.
     """
 
     version: Annotated[Literal[1], BeforeValidator(_whole_number)] = Field(alias="schema")
@@ -351,5 +386,5 @@ class Study(_Table):
         return {name: table for name, table in self.probes.items() if table.target == CORRECT}
 
     def block(self, name: str) -> BlockTable:
-        """The block of this name."""
+        """Return the block of this name."""
         return next(block for block in self.runs if block.name == name)

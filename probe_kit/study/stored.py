@@ -1,4 +1,4 @@
-"""The stored runs of a study, restricted to what its blocks select, and why others are missing.
+"""The stored runs of a study, restricted to the selection of its blocks, and the reasons why others are missing.
 
 A folder's name says which run should lie in it. No number is taken before the content says the same: settings,
 weights, wordings and suite.
@@ -56,7 +56,7 @@ def differences(run: "Run", cell: Cell) -> Iterator[str]:
 
 
 def changed_settings(own_settings: Mapping[str, Any], cell: Cell) -> Iterator[Change]:
-    """Yield the settings of a stored run that `cell` has otherwise."""
+    """Yield the settings of a stored run that differ from those of `cell`."""
     stored, expected = flat_settings(own_settings), flat_settings(_expected(cell))
     for name in sorted(stored | expected):
         is_open = name.partition(".")[0] in _OF_LOADED_MODEL
@@ -67,7 +67,7 @@ def changed_settings(own_settings: Mapping[str, Any], cell: Cell) -> Iterator[Ch
 def _expected(cell: Cell) -> dict[str, Any]:
     """Return the settings that a run of the cell has whatever model is loaded, as plain values.
 
-    What the file leaves to the model is absent.
+    Settings that the file leaves to the model are absent.
     """
     settings = cell.settings
     decided = {
@@ -142,8 +142,8 @@ class StoredRun:
     """A run of the study, and its cell.
 
     Attributes:
-        run: The items that a table prints.
-        probed: Those that the file's probes are fitted to.
+        run: The run with the items that a table prints.
+        probed: The run with the items that the file's probes are fitted to.
     """
 
     cell: Cell
@@ -152,7 +152,7 @@ class StoredRun:
 
     @property
     def location(self) -> str:
-        """The run's location, as tables name runs."""
+        """The run's location, by which tables name runs."""
         return str(self.run.location)
 
 
@@ -161,7 +161,7 @@ class StoredRuns:
     """The runs that a table is made of, in the order of the file.
 
     Attributes:
-        missing: Of the others, why they are not in the table.
+        missing: Reasons why the other runs are not in the table.
         unfinished: Episodes that `study run` would still play of both, in words; only of partial tables.
         labels: By location the model's label, with condition or ask and seed where a model has several runs,
             stored or not.
@@ -183,8 +183,9 @@ def stored_runs(
     """Open the stored runs of a study.
 
     Args:
-        select: Returns what of a cell is printed; None leaves it out.
-        subject: What is made of them, for messages.
+        study: The study whose runs are stored.
+        select: Returns the selection of a cell that is printed; None leaves the cell out.
+        subject: The table or figure that is made of them, for messages.
         partial: Accept runs that are missing or unfinished; they are named.
         categories: Slugs, all by default.
 
@@ -234,14 +235,20 @@ def _why_missing(study: LoadedStudy, cell: Cell, error: ProbeKitError) -> str:
 
 
 def _first_sentence(error: ProbeKitError) -> str:
-    """Return what an error found, without its advice on a single run."""
+    """Return the finding of an error, without its advice on a single run."""
     return str(error).partition(". ")[0].removesuffix(".")
 
 
 def open_matching(study: LoadedStudy, cell: Cell, partial: bool) -> "Run":
-    """Open the run of a cell, checked to be of its settings, weights and suite.
+    """Open the run of a cell, checked to be of its settings, weights and suite; raises as `open_run` too.
 
-    Raises what `open_run` raises, and SettingsMismatchError for the run of another cell, which it names.
+    Args:
+        study: The study of the cell.
+        cell: The cell whose run is opened.
+        partial: Accept missing episodes.
+
+    Raises:
+        SettingsMismatchError: For the run of another cell, which it names.
     """
     run = open_run(locate(cell.location(study.study.folder)), allow_partial=partial)
     problems = list(differences(run, cell))
@@ -264,9 +271,15 @@ def open_matching(study: LoadedStudy, cell: Cell, partial: bool) -> "Run":
 def open_stored(study: LoadedStudy, cell: Cell, partial: bool = False) -> "Run":
     """Open the run of a cell as `open_matching` does, checked to hold all items of its blocks.
 
+    Raises as `open_matching` too.
+
     Args:
-        partial: Accept missing episodes. Raises what `open_matching` raises, and RunIncompleteError for a run of
-            fewer items.
+        study: The study of the cell.
+        cell: The cell whose run is opened.
+        partial: Accept missing episodes.
+
+    Raises:
+        RunIncompleteError: For a run of fewer items.
     """
     run = open_matching(study, cell, partial)
     planned = run.items["category"].value_counts().to_dict()
@@ -285,7 +298,7 @@ def open_cell(
     partial: bool = False,
     categories: Sequence[str] | None = None,
 ) -> StoredRun:
-    """Open the stored run of a cell, restricted to a selection. Raises what `open_stored` raises."""
+    """Open the stored run of a cell, restricted to a selection; raises as `open_stored`."""
     run = open_stored(study, cell, partial)
     of_probes = (cell.selected(table.runs) for table in study.study.shown_probes.values())
     fitted = next((of_table for of_table in of_probes if of_table is not None), None)
@@ -308,9 +321,13 @@ def part_of(run: "Run", cell: Cell, selection: Selection, categories: Sequence[s
 def probe_key(study: LoadedStudy, stored: StoredRun, run: "Run", partial: bool) -> str:
     """Return the key of the probes that the file's tables fit to a run; empty for none.
 
+    Probes that were fitted otherwise, by hand or for a former state of the file, give no number.
+
     Args:
-        run: The part of what is stored that is printed. Probes that were fitted otherwise, by hand or for a former
-            state of the file, give no number.
+        study: The study of the run.
+        stored: The run and its cell.
+        run: The part of the stored run that is printed.
+        partial: Accept a run without the probes of the file.
 
     Raises:
         RunIncompleteError: For a run without the probes of the file, unless `partial`.
@@ -341,7 +358,7 @@ def probe_key(study: LoadedStudy, stored: StoredRun, run: "Run", partial: bool) 
 
 
 def study_probes(study: LoadedStudy, stored: StoredRun, run: "Run", partial: bool) -> ProbeResults | None:
-    """Return the probes of the file that are stored of a run, None without any. Raises as `probe_key`."""
+    """Return the probes of the file that are stored of a run, None without any; raises as `probe_key`."""
     key = probe_key(study, stored, run, partial)
     return load_results(run, key) if key else None
 

@@ -44,7 +44,7 @@ _TEST = (
     f"{P_DECIDES}"
 )
 FEWEST_GROUPS = 10
-"""Of items, with which a difference is tested, and counts for Holm's correction of the others.
+"""Number of groups of items from which a difference is tested, and counts for Holm's correction of the others.
 
 Signs of 10 groups give no p below 2⁻⁹ = 0.002, two-sided: enough for Holm's correction over two dozen tests.
 """
@@ -52,7 +52,10 @@ _FEW = "!"
 
 
 def difference_table(table: RetentionTable, title: str) -> Table:
-    """Differences of success rates, a row per pair and category; the whole comparison is one family of tests."""
+    """Return differences of success rates, a row per pair and category.
+
+    The whole comparison is one family of tests.
+    """
     rows = _tested(behaviour_once(table.differences))
     cells = [
         (
@@ -71,12 +74,12 @@ def difference_table(table: RetentionTable, title: str) -> Table:
 
 
 def _tested(rows: Sequence[Difference]) -> list[Difference]:
-    """The same without tests of fewer than FEWEST_GROUPS groups, and Holm's p over those that are left."""
+    """Return the same rows without tests of fewer than FEWEST_GROUPS groups, and Holm's p over the others."""
     return with_holm([row if (row.n_groups or 0) >= FEWEST_GROUPS else replace(row, p=None) for row in rows])
 
 
 def _items(count: int | None, of_count: int | None) -> str:
-    """Items in common, of how many where some are left out, and a mark where that is more than a fifth."""
+    """Return the items in common, of how many where some are left out, marked where that is more than a fifth."""
     if count is None or of_count is None:
         return "other items" if count is None else str(count)
     if count == of_count:
@@ -92,7 +95,7 @@ def _remarks(rows: Sequence[Difference]) -> list[str]:
 
 
 def group_table(table: RetentionTable, title: str) -> Table:
-    """Groups of models: the exact p over models first, the interval of these models apart."""
+    """Return the differences of groups of models: the exact p over models first, then these models' interval."""
     rows = behaviour_once(table.differences)
     cells = [
         (
@@ -114,7 +117,7 @@ def group_table(table: RetentionTable, title: str) -> Table:
 
 
 def vlm_vla_table(differences: Sequence[Difference]) -> Table:
-    """Share right of VLMs minus success rate of policies, where the file names the VLM of a policy."""
+    """Return the share right of VLMs minus the success rate of policies, where the file names a policy's VLM."""
     rows = _tested(differences)
     cells = [
         (
@@ -214,7 +217,7 @@ def stages_table(joins: Sequence[KnownUsedTable]) -> Table:
 
 
 def _encoded(join: KnownUsedTable, row: CategoryCounts) -> int | None:
-    """Encoded items of categories whose probes have signal, which the overall row is summed of anew."""
+    """Return the encoded items of categories whose probes have signal; the overall row is their sum."""
     if row.encoded is None or row.has_signal is False:
         return None
     inside = join.rows if row.category == OVERALL else (row,)
@@ -259,14 +262,16 @@ _OF_PROBED_RUNS: Mapping[str, Callable[[RetentionTable], Table]] = {
 
 
 def make_table(study: LoadedStudy, name: str, partial: bool = False) -> Table:
-    """Make a table of a study file from stored runs alone: no model and no simulator.
+    """Make a table of a study file from stored runs alone: no model and no simulator; raises as `open_run` too.
 
     Args:
+        study: The study whose runs are stored.
+        name: Name of the table in the file.
         partial: Accept runs that are missing or unfinished; the note names them.
 
     Raises:
         UsageError: For an unknown name.
-        RunIncompleteError: For runs that are missing, and what `open_run` raises.
+        RunIncompleteError: For runs that are missing.
     """
     if name not in study.study.tables:
         raise UsageError(unknown("table", name, list(study.study.tables)))
@@ -286,9 +291,9 @@ def make_table(study: LoadedStudy, name: str, partial: bool = False) -> Table:
 def make_each[Made](
     names: Iterable[str], make: Callable[[str], Made], partial: bool
 ) -> tuple[dict[str, Made], dict[str, str]]:
-    """Make a table or figure of every name; return also why others are missing.
+    """Make a table or figure of every name; return also the reasons why others are missing.
 
-    Raises what `make` raises, unless `partial`.
+    Raises as `make`, unless `partial`.
     """
     by_name, missing = dict[str, Made](), dict[str, str]()
     for name in names:
@@ -302,7 +307,7 @@ def make_each[Made](
 
 
 def _numbers(numbers: Sequence[Number], stored: StoredRuns) -> tuple[Number, ...]:
-    """Return numbers with runs as the plan names them, because an archive is unpacked at another location.
+    """Return numbers with the plan's names of runs, because an archive is unpacked at another location.
 
     A value that is not defined is None, because JSON has no NaN.
     """
@@ -441,7 +446,7 @@ def _pairs(comparison: ComparisonTable, runs: Sequence[StoredRun]) -> list[tuple
 
 
 def _sources(study: LoadedStudy, runs: Sequence[StoredRun]) -> list[tuple[str, str]]:
-    """Return the locations of the VLM runs and policy runs whose backbones are the same, as the file says."""
+    """Return the locations of the VLM runs and policy runs whose backbones are the same according to the file."""
     return [
         (vlm.location, policy.location)
         for policy in runs

@@ -23,7 +23,7 @@ from probe_kit.view.run_payloads import (
 from probe_kit.view.viewed_run import view_runs
 
 SCHEMA = 2
-"""Of the payloads; the page refuses another one."""
+"""Version of the payloads; the page refuses another one."""
 INDEX_PAYLOAD = "index"
 """The payload that a page reads first."""
 _NUMBER = re.compile(r"[0-9]{5,8}")
@@ -63,7 +63,11 @@ class Catalogue:
         return len(run.commits()) >= run.planned
 
     def names(self, categories: Collection[str] | None = None) -> Iterator[str]:
-        """All names in the order of export. categories: whose episodes and maps are named, all by default."""
+        """Yield all names in the order of export.
+
+        Args:
+            categories: Categories whose episodes and maps are named, all by default.
+        """
         yield INDEX_PAYLOAD
         for key, viewed in self.runs.items():
             yield from (f"{key}/run", f"{key}/episodes", f"{key}/results")
@@ -74,17 +78,21 @@ class Catalogue:
             yield from (f"{key}/e/{number:05d}" for number in self.numbers(key, categories))
 
     def numbers(self, key: str, categories: Collection[str] | None = None) -> list[int]:
-        """Numbers of the episodes of a run."""
+        """Return the numbers of the episodes of a run, of some categories or all."""
         viewed = self.runs[key]
         episodes = zip(viewed.position_of, viewed.run.episodes["category"], strict=True)
         return [number for number, category in episodes if categories is None or category in categories]
 
     def script(self, name: str) -> bytes:
-        """The payload of this name as a script. Raises KeyError for any other name."""
+        """Return the payload of this name as a script.
+
+        Raises:
+            KeyError: For any other name.
+        """
         return payload_script(name, self._payload(name), self._places)
 
     def failure(self, name: str, error: Exception) -> bytes:
-        """The script that says why a payload cannot be made, without paths of this machine."""
+        """Return the script with the reason why a payload cannot be made, without paths of this machine."""
         return failure_script(name, str(error), self._places)
 
     @property
@@ -92,9 +100,15 @@ class Catalogue:
         return tuple(location for viewed in self.runs.values() for location in viewed.places)
 
     def stamp(self, name: str) -> str:
-        """A hash that changes with the commits and probes that a payload is made of. Raises KeyError.
+        """Return a hash that changes with the commits and probes that a payload is made of.
 
         That of the index needs no table, so that a page begins at once.
+
+        Args:
+            name: Name of a payload.
+
+        Raises:
+            KeyError: For an unknown payload.
         """
         parts = name.split("/")
         if parts[0] not in self.runs:
@@ -106,7 +120,16 @@ class Catalogue:
         return sha256_json([SCHEMA, name, viewed.run.stamp, probes, refitted, stored])
 
     def picture(self, key: str, number: int) -> bytes | None:
-        """The committed frames of an episode, None without any. Raises KeyError; RunDamagedError if changed."""
+        """Return the committed frames of an episode; None without any.
+
+        Args:
+            key: Key of the run.
+            number: Number of the episode.
+
+        Raises:
+            KeyError: For an unknown run or episode.
+            RunDamagedError: If the frames were changed.
+        """
         viewed = self.runs[key]
         frames = episode_frames(viewed.run, viewed.position_of[number])
         return None if frames is None else frames.content

@@ -16,7 +16,10 @@ if TYPE_CHECKING:
     from probe_kit.runs import Run
 
 RUNS_BY_NAME: "list[Callable[[str], list[Run] | None]]" = []
-"""What finds several runs by one name, or None for a name that it does not know; the command line adds studies."""
+"""Functions that find several runs by one name, or return None for an unknown one.
+
+The command line adds studies.
+"""
 
 
 def view(

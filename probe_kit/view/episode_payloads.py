@@ -18,7 +18,7 @@ from probe_kit.view.run_payloads import Packed, best_places, code_words, pack_fl
 from probe_kit.view.viewed_run import ViewedRun, toward
 
 _STILL = 1e-4
-"""Metres a tile may move and still be drawn where it began."""
+"""Distance in metres that a tile may move and still be drawn where it began."""
 _ANSWERS = {
     "question": "question",
     "text": "answer",
@@ -26,15 +26,22 @@ _ANSWERS = {
     "parsing rule": "parse",
     **{f"outcome, {score}": outcome for score, (outcome, _) in SCORES.items()},
 }
-"""By heading, columns of a VLM run that say what was asked and answered."""
+"""By heading, columns of a VLM run that hold its question and answer."""
 
 
 def episode_payload(viewed: ViewedRun, number: int) -> dict[str, Any]:
-    """The episode of this number. Raises KeyError if it is not committed.
+    """Return the payload of the episode of this number.
 
-    `inferences`: control step of every inference, of which the first K were captured.
-    `log_odds` and `refitted`: packed (K, S) by captured inference and site. The first are of the probes of one
-    inference, the second of the probes that were fitted to each inference.
+    `inferences` holds the control step of every inference, of which the first K were captured. `log_odds` and
+    `refitted` are packed (K, S) by captured inference and site. The first are of the probes of one inference, the
+    second of the probes that were fitted to each inference.
+
+    Args:
+        viewed: The run of the episode.
+        number: Number of the episode.
+
+    Raises:
+        KeyError: If it is not committed.
     """
     run, position = viewed.run, viewed.position_of[number]
     row = {str(name): value for name, value in run.episodes.iloc[position].to_dict().items()}
@@ -80,7 +87,7 @@ def _label_words(viewed: ViewedRun, row: dict[str, Any], position: int) -> dict[
 
 
 def _refitted(viewed: ViewedRun, row: dict[str, Any], calls: int) -> Any:
-    """Log-odds of the probes of each inference, None where only one inference was probed."""
+    """Return the log-odds of the probes of each inference; None where only one inference was probed."""
     category, view = str(row["category"]), viewed.view
     if len(viewed.refitted) < 2:  # one alone is that of `log_odds`
         return None
@@ -97,7 +104,8 @@ def _refitted(viewed: ViewedRun, row: dict[str, Any], calls: int) -> Any:
 def _frames(viewed: ViewedRun, number: int, frames: EpisodeFrames) -> dict[str, Any]:
     """Return the division of the episode's picture: `count` frames of one size in `columns`.
 
-    steps: of the frames, where there is one for each inference."""
+    The `steps` are those of the frames, where there is one for each inference.
+    """
     columns = min(frames.count, FRAME_COLUMNS)
     size = picture_size(frames.content)
     if size is None:
@@ -112,7 +120,7 @@ def _frames(viewed: ViewedRun, number: int, frames: EpisodeFrames) -> dict[str, 
 def _attention(viewed: ViewedRun, row: dict[str, Any], position: int, pictures: int) -> dict[str, Any] | None:
     """Return the attention on the patches of a frame of so many pictures, by step; None where none is stored.
 
-    boxes: packed (P, 4) shares of the frame. weights: packed (B, P) of every inference.
+    The `boxes` are packed (P, 4) shares of the frame. The `weights` are packed (B, P) of every inference.
     """
     stored = viewed.patch_attention.get(str(row["category"]))
     if stored is None or not (of_episode := stored.episodes == row["episode_id"]).any():
@@ -129,7 +137,7 @@ def _attention(viewed: ViewedRun, row: dict[str, Any], position: int, pictures: 
 
 
 def _inputs(viewed: ViewedRun, position: int) -> list[dict[str, Any]]:
-    """Return what the inferences of an episode got and gave, by group and number: lines packed (K,)."""
+    """Return inputs and outputs of the inferences of an episode, by group and number: lines packed (K,)."""
     inputs = viewed.run.inputs
     if inputs is None:
         return []
@@ -150,7 +158,12 @@ def _inputs(viewed: ViewedRun, position: int) -> list[dict[str, Any]]:
 
 
 def _series(lines: dict[str, NDArray[Any]], names: Sequence[str]) -> list[dict[str, Any]]:
-    """Return a chart per number. lines: (K, D) by name. names: of the numbers, if they have any."""
+    """Return a chart per number.
+
+    Args:
+        lines: (K, D) values by name of the line.
+        names: Names of the D numbers, if they have any.
+    """
     width = max(values.shape[1] for values in lines.values())
     return [
         {
@@ -181,7 +194,7 @@ def _trajectory(trajectory: Trajectory) -> dict[str, Any]:
 
 
 def _moved(places: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(T + 1, 2) middles of a tile, or its first one alone where it stays."""
+    """Return the middles of a tile (T + 1, 2), or its first one alone where it stays."""
     return places if np.abs(places - places[0]).max() > _STILL else places[:1]
 
 
@@ -191,7 +204,7 @@ def _events(trajectory: Trajectory) -> dict[str, int | None]:
 
 
 def _outcomes(viewed: ViewedRun, trajectory: Trajectory, row: dict[str, Any]) -> dict[str, str]:
-    """The outcome under every rule at the last step."""
+    """Return the outcome under every rule at the last step."""
     scene = viewed.run.settings["scene"]
     return {
         name: judge(trajectory, rule_of(name, scene), row["side_correct"], 1, scene["max_steps"]).outcome
@@ -215,15 +228,16 @@ _WORDS = {
 }
 """Coded columns by the column of `run.episodes`; None where the run has no such column."""
 _SHORT = 12
-"""Hexadecimal digits that tell the seeds of episodes apart."""
+"""Number of hexadecimal digits that distinguish the seeds of episodes."""
 
 
 def episodes_payload(viewed: ViewedRun) -> dict[str, Any]:
-    """Numbers, ids and words of all episodes in the order of the plan.
+    """Return numbers, ids and words of all episodes in the order of the plan.
 
-    `log_odds`: of the category's best sites, held out, at the inference that the probes are of, toward the correct
-    side. `swap`: of the stored image swap, 1 where the action follows the pictures, -1 where it does the reverse,
-    else 0; None without any. `seeds`: equal where scene and policy seed are equal, by which runs are paired.
+    `log_odds` are of the category's best sites, held out, at the inference that the probes are of, toward the
+    correct side. `swap` is of the stored image swap, 1 where the action follows the pictures, -1 where it does the
+    reverse, else 0; None without any. `seeds` are equal where scene and policy seed are equal, by which runs are
+    paired.
     """
     episodes = viewed.run.episodes
     words = _WORDS | ({"item": "picture"} if "picture" in episodes else {})
@@ -260,7 +274,7 @@ def _word(value: Any) -> str | None:
 
 
 def _best_log_odds(viewed: ViewedRun, part: str) -> Packed | None:
-    """Packed (E,); None without probes of that part."""
+    """Return the packed log-odds (E,) of the best sites; None without probes of that part."""
     places = {name: best_places(viewed, name)[part] for name in viewed.probed_categories}
     if all(best is None for best in places.values()):
         return None

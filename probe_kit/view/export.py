@@ -15,7 +15,7 @@ INDEX = "index.html"
 
 
 def page_files() -> dict[str, bytes]:
-    """Content of the page's files by their name below the page's address, in order."""
+    """Return the content of the page's files by their name below the page's address, in order."""
     return {
         path.name if path.name == INDEX else f"app/{path.name}": path.read_bytes()
         for path in sorted(APP.iterdir())
@@ -42,8 +42,10 @@ def write_viewer(
     The same runs give the same bytes.
 
     Args:
-        frames: With the pictures of the episodes.
-        categories: Whose episodes and maps are written, all by default.
+        runs: The runs of the page.
+        folder: Folder of the page; a former export in it is replaced.
+        frames: Whether the pictures of the episodes are written.
+        categories: Categories whose episodes and maps are written, all by default.
         probes_of: A run of the same model whose probes are shown where a run has none.
 
     Raises:

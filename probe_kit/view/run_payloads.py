@@ -50,7 +50,7 @@ from probe_kit.view.viewed_run import Values, ViewedRun, decisions_toward_correc
 LOG_ODDS_SCALE = 256
 """Steps per unit of log-odds: the error is below 0.002."""
 MISSING = -32768
-"""In place of a log-odds that does not exist, such as that of an inference the episode did not reach.
+"""The value in place of a log-odds that does not exist, such as that of an inference the episode did not reach.
 
 The least 16-bit integer, which no rounded log-odds takes: they are cut at 32767 steps on both sides.
 """
@@ -63,12 +63,12 @@ class Packed(str):
 
 
 def pack_floats(values: ArrayLike) -> Packed:
-    """The values as float32, row by row."""
+    """Return the values as float32, row by row."""
     return _packed(values, "<f4")
 
 
 def pack_log_odds(values: ArrayLike) -> Packed:
-    """Log-odds as int16 in steps of 1/256, at most ±127.99; not a number becomes `MISSING`."""
+    """Return log-odds as int16 in steps of 1/256, at most ±127.99; not a number becomes `MISSING`."""
     scaled = np.asarray(values, np.float64) * LOG_ODDS_SCALE
     steps = np.clip(np.round(scaled), MISSING + 1, -MISSING - 1)
     return _packed(np.where(np.isnan(scaled), MISSING, steps), "<i2")
@@ -79,7 +79,7 @@ def _packed(values: ArrayLike, kind: str) -> Packed:
 
 
 def code_words(words: Sequence[Any]) -> dict[str, Any]:
-    """`words` once each, and a `codes` entry per place; None stays None.
+    """Return `words` once each, and a `codes` entry per place; None stays None.
 
     A column of a large run repeats few words thousands of times.
     """
@@ -89,21 +89,22 @@ def code_words(words: Sequence[Any]) -> dict[str, Any]:
 
 
 def rounded(value: Any, digits: int = 4) -> float | None:
-    """A JSON number of so many decimals; None for None and for not a number."""
+    """Return a JSON number of so many decimals; None for None and for not a number."""
     return None if value is None or value != value else round(float(value), digits)
 
 
 def payload_script(name: str, value: Any, places: tuple[str, ...] = ()) -> bytes:
-    """The script `put(name, value)` in ASCII. A page that is opened as a file may load scripts, and fetch nothing.
+    """Return the script `put(name, value)` in ASCII.
 
-    Text of `value` has visible signs in place of control and direction characters, and the last part alone of
-    `places` and other absolute paths. No `<` is left, so that no text can end the script.
+    A page that is opened as a file may load scripts, and fetch nothing. Text of `value` has visible signs in place
+    of control and direction characters, and the last part alone of `places` and other absolute paths. No `<` is
+    left, so that no text can end the script.
     """
     return _script("put", name, _encode(value, places))
 
 
 def failure_script(name: str, words: str, places: tuple[str, ...] = ()) -> bytes:
-    """The script `refuse(name, words)`: why there is no payload of this name, for the page to show."""
+    """Return the script `refuse(name, words)`: the reason why there is no such payload, for the page to show."""
     return _script("refuse", name, _encode(words, places))
 
 
@@ -134,7 +135,12 @@ _PROBED = (BACKBONE, BACKBONE_VERDICT, ACTION, ACTION_VERDICT, RETENTION)
 
 
 def run_payload(viewed: ViewedRun, page_runs: Sequence[ViewedRun] = ()) -> dict[str, Any]:
-    """Return everything that is said once per run. page_runs: of the page, of which VLM runs give a column."""
+    """Return everything that is stated once per run.
+
+    Args:
+        viewed: The run, as the page names it.
+        page_runs: Runs of the page, of which VLM runs give a column.
+    """
     run, results = viewed.run, viewed.results
     certificate = run.certificate if len(run.episodes) else {}
     return {
@@ -210,7 +216,7 @@ def _scene(scene: Mapping[str, Any] | None) -> dict[str, Any] | None:
 
 
 def _table(viewed: ViewedRun, vlm_runs: Sequence[ViewedRun]) -> dict[str, Any]:
-    """Headings, a row per category and their mean, as the retention table spells them."""
+    """Return headings, a row per category and their mean, in the spelling of the retention table."""
     rows = [*viewed.rows.values(), viewed.mean] if len(viewed.run.episodes) and viewed.has_sides else []
     columns: tuple[Column, ...] = (ACCURACY if viewed.answers else SR,)
     if any(row.backbone.site or row.action.site for row in rows):
@@ -244,7 +250,7 @@ def _vlm_cell(vlm: ViewedRun, category: str) -> dict[str, Any]:
 
 
 def _cell(column: Column, row: RetentionRow) -> dict[str, Any]:
-    """The text of the table, and value and interval where the page draws them."""
+    """Return the text of the table, and value and interval where the page draws them."""
     drawn: dict[str, tuple[float | None, Limits | None]] = {
         SR.key: (row.success.sr, row.success.ci),
         BACKBONE.key: (row.backbone.score, row.backbone.ci),
@@ -274,10 +280,14 @@ HEADINGS = (
 
 
 def site_map_payload(viewed: ViewedRun, category: str) -> dict[str, Any]:
-    """Scores by site, spelt as in the tables; log-odds (S, E) packed, toward the correct side.
+    """Return scores by site, spelt as in the tables; log-odds (S, E) packed, toward the correct side.
 
-    `rows`: the place of each of the E episodes among those of the run. `refitted`: the same scores of probes that
-    were fitted to later inferences, by inference.
+    `rows` holds the place of each of the E episodes among those of the run. `refitted` holds the same scores of
+    probes that were fitted to later inferences, by inference.
+
+    Args:
+        viewed: A run with probes of its own or of another run.
+        category: A probed category.
 
     Raises:
         KeyError: For a category without probes.
@@ -312,7 +322,15 @@ def site_map_payload(viewed: ViewedRun, category: str) -> dict[str, Any]:
 
 
 def target_map_payload(viewed: ViewedRun, number: int) -> dict[str, Any]:
-    """Return the scores by site of a target that was probed. Raises KeyError for a number without one."""
+    """Return the scores by site of a target that was probed.
+
+    Args:
+        viewed: A run with probes of targets.
+        number: Position of the target among those that were probed.
+
+    Raises:
+        KeyError: For a number without a target.
+    """
     if number >= len(viewed.target_curves):
         raise KeyError(number)
     results, category = viewed.target_curves[number]
@@ -347,7 +365,7 @@ def _target_cells(row: Mapping[Hashable, Any]) -> list[str]:
 
 
 def _first_log_odds(viewed: ViewedRun, category: str) -> tuple[list[int], Values]:
-    """Rows of the E episodes that the probes of a category read, and (S, E) log-odds."""
+    """Return rows of the E episodes that the probes of a category read, and their log-odds (S, E)."""
     probes = viewed.probes[category]
     if viewed.is_lent:
         rows = np.flatnonzero(viewed.run.episodes["category"] == category).tolist()
@@ -394,7 +412,8 @@ def _or_none(value: float) -> float | None:
 def results_payload(viewed: ViewedRun) -> dict[str, Any]:
     """Return the tables of a run, each with its kind, its key and its finding in sentences.
 
-    refused: why others cannot be read, such as a diagnosis in the format of another version.
+    Under `refused` are the reasons why others cannot be read, such as a diagnosis in the format of another
+    version.
     """
     tables, refused = list[dict[str, Any]](), list[str]()
     for part in _parts(viewed) if len(viewed.run.episodes) else ():
@@ -406,7 +425,7 @@ def results_payload(viewed: ViewedRun) -> dict[str, Any]:
 
 
 def _parts(viewed: ViewedRun) -> Iterator[Callable[[], Iterable[dict[str, Any]]]]:
-    """Yield functions that read what is stored, each apart, so that one that cannot be read hides no other."""
+    """Yield functions that read stored results, each apart, so that one that cannot be read hides no other."""
     for key in bundle_keys(viewed.run.location, DIAGNOSES):
         yield partial(_diagnosis, viewed, key)
     for read in (_interventions, _targets, _action_errors):
@@ -414,7 +433,7 @@ def _parts(viewed: ViewedRun) -> Iterator[Callable[[], Iterable[dict[str, Any]]]
 
 
 def stored_keys(viewed: ViewedRun) -> list[str]:
-    """Return the keys of all that `results_payload` is made of beside the episodes."""
+    """Return the keys of everything except the episodes that `results_payload` is made of."""
     return [key for home in (DIAGNOSES, INTERVENTIONS, PROBES) for key in bundle_keys(viewed.run.location, home)]
 
 
@@ -424,7 +443,7 @@ def _diagnosis(viewed: ViewedRun, key: str) -> Iterator[dict[str, Any]]:
 
 
 def _interventions(viewed: ViewedRun) -> Iterator[dict[str, Any]]:
-    """Yield those that verdicts and tables read; others say no more."""
+    """Yield the tables of interventions that verdicts and tables read; others add nothing."""
     used = {listed.key for listed in listed_interventions(viewed.run) if listed.state == "used"}
     for stored in stored_interventions(viewed.run):
         if stored.key in used:

@@ -1,7 +1,7 @@
 """The viewer's server: loopback only, behind a token, and names are looked up and never joined to a path.
 
-Checks in order: the Host header (another name of this machine may be a rebound one), the method, the token, the
-site of the request and the cookie, and the name of the payload.
+Five parts of a request are checked in order: the Host header, the method, the token, the site of the request with
+the cookie, and the name of the payload. A Host header with another name of this machine may be a rebound one.
 """
 
 import asyncio
@@ -37,9 +37,12 @@ HOST = "127.0.0.1"
 TICK_S = 2.0
 """Seconds between two listings of the commits of a run that grows: a listing of a bucket is a request."""
 _GZIP_FROM = 2000
-"""Bytes of an answer from which it is compressed: less fits into two packets either way."""
+"""Size in bytes of an answer from which it is compressed: less fits into two packets either way."""
 _MOST_HEADER_BYTES = 1 << 20
-"""Of a request: a browser sends the cookies of every other server of 127.0.0.1 too, at most 180 of 4 KB."""
+"""Largest number of bytes of a request's header.
+
+A browser sends the cookies of every other server of 127.0.0.1 too, at most 180 of 4 KB.
+"""
 _LEADING_TO = '<!doctype html><meta charset="utf-8"><meta http-equiv="refresh" content="0; url={address}">\n'
 _ICON = "/favicon.ico"
 _PICTURE = re.compile(r"([A-Za-z0-9._-]+)/f/([0-9]{5,8})\.webp")
@@ -78,7 +81,7 @@ class _Guard:
         return await answer(scope, receive, send_guarded)
 
     def _answer(self, request: Request) -> Response | None:
-        """A refusal, or the way from the token to the page; None for what is admitted."""
+        """Return a refusal, or the way from the token to the page; None for a request that is admitted."""
         if request.headers.get("host") not in self._hosts:
             return PlainTextResponse("unknown host", 400)
         if request.method not in ("GET", "HEAD"):
@@ -104,7 +107,7 @@ def _are_equal(text: str, secret: str) -> bool:
 
 
 def _cookies(request: Request, name: str) -> list[str]:
-    """The values of all cookies of a name.
+    """Return the values of all cookies of a name.
 
     Cookies of other servers of 127.0.0.1 come with ours, in any form, so only the text around `;` and `=` is read.
     """
@@ -113,7 +116,7 @@ def _cookies(request: Request, name: str) -> list[str]:
 
 
 class _Pages:
-    """The endpoints. The catalogue is used by one thread at a time, but for the index, which needs no table."""
+    """The endpoints. One thread at a time uses the catalogue, except for the index, which needs no table."""
 
     def __init__(self, catalogue: Catalogue, tick_s: float) -> None:
         self._catalogue, self._tick_s, self._lock = catalogue, tick_s, Lock()
@@ -121,7 +124,7 @@ class _Pages:
         self._files = page_files()
 
     def file(self, request: Request) -> Response:
-        """The page, a file of it, or the picture in the tab of the page that leads to it, which names none."""
+        """Return the page, a file of it, or the picture in the tab of the page that leads to it."""
         names = {"/": INDEX, _ICON: "app/icon.svg"}
         name = names.get(request.url.path) or f"app/{request.path_params['name']}"
         content = self._files.get(name)
@@ -131,7 +134,7 @@ class _Pages:
         return _tagged(request, content, hashlib.sha256(content).hexdigest(), kind)
 
     def data(self, request: Request) -> Response:
-        """A payload or a picture."""
+        """Return a payload or a picture."""
         name = str(request.path_params["name"])
         if name == f"{INDEX_PAYLOAD}.js":
             return self._payload(request, INDEX_PAYLOAD)
@@ -152,7 +155,10 @@ class _Pages:
             return PlainTextResponse(str(error), 500)
 
     def _payload(self, request: Request, name: str) -> Response:
-        """The payload, or a script that says why it cannot be made: the page cannot read the text of an error."""
+        """Return the payload, or a script with the reason why it cannot be made.
+
+        The page cannot read the text of an error.
+        """
         # Of this server alone: behind the same port, a later one may have other runs, interventions or labels.
         tag = f"{self._session}-{self._catalogue.stamp(name)}"
         is_current = request.headers.get("if-none-match") == f'"{tag}"'
@@ -170,7 +176,7 @@ class _Pages:
                 _ = self._catalogue.stamp(f"{key}/run"), self._catalogue.runs[key].table
 
     async def follow(self, request: Request) -> Response:
-        """Events of runs that grow: how many episodes are committed. Nothing where every run is finished."""
+        """Return events of runs that grow, with their committed episodes; nothing where every run is finished."""
         if not self._catalogue.growing:
             return Response(status_code=204)
         return StreamingResponse(self._events(request), media_type="text/event-stream")
@@ -195,7 +201,7 @@ def _missing() -> Response:
 
 
 def _tagged(request: Request, content: bytes, tag: str, kind: str) -> Response:
-    """The content with its tag, or nothing where the browser has it."""
+    """Return the content with its tag, or nothing where the browser has it."""
     headers = {"etag": f'"{tag}"', "cache-control": "no-cache"}
     if request.headers.get("if-none-match") == headers["etag"]:
         return Response(status_code=304, headers=headers)
@@ -220,7 +226,7 @@ def _application(pages: _Pages, port: int, token: str) -> Starlette:
 
 
 def _opened(port: int) -> socket.socket:
-    """An open socket at a port of the loopback address."""
+    """Return an open socket at a port of the loopback address."""
     listener = socket.socket()
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
@@ -236,7 +242,11 @@ class ViewerServer:
     """A server on loopback whose socket is open from the first moment.
 
     Args:
-        port: 0 for any free one. Raises UsageError if it cannot be opened, for example because it is in use.
+        catalogue: The payloads that it serves.
+        port: Port of the loopback address; 0 for any free one.
+
+    Raises:
+        UsageError: If the port cannot be opened, for example because it is in use.
     """
 
     def __init__(self, catalogue: Catalogue, port: int = 0) -> None:
@@ -262,7 +272,7 @@ class ViewerServer:
 
     @contextmanager
     def private_file(self) -> Iterator[Path]:
-        """A file that leads a browser to `address`, which only this user can read; removed afterwards.
+        """Yield a file that leads a browser to `address`, which only this user can read; removed afterwards.
 
         A command line can be read by every user of a machine, and an address on it would let them in.
         """

@@ -1,4 +1,4 @@
-"""A run as the viewer shows it: its rows of the retention table, a name for addresses, and its probes.
+"""A run in the form of the viewer: its rows of the retention table, a name for addresses, and its probes.
 
 Probes of one inference are applied to every captured inference of an episode, held out by fold.
 """
@@ -31,7 +31,13 @@ Values = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class _StreamProbes:
-    """The probes of one stream. places: of its sites among all. weights: (S, F, D). intercepts: (S, F)."""
+    """The probes of one stream, at S sites with F folds.
+
+    Attributes:
+        places: Positions of its sites among all.
+        weights: (S, F, D).
+        intercepts: (S, F).
+    """
 
     places: list[int]
     at: tuple[list[int], ...]
@@ -47,9 +53,12 @@ class FrozenProbes:
     folds' log-odds, and is then not held out in the sense of the scores.
 
     Args:
-        results: Of `run`, or of another run of the same model.
-        readings: None for probes of `run` itself, whose stored log-odds are taken. Of another run the first
-            log-odds that were computed so far, by number of the episode.
+        run: The run whose episodes are read.
+        results: Probes of `run`, or of another run of the same model.
+        category: Category of the probes.
+        view: View of the probes.
+        readings: None for probes of `run` itself, whose stored log-odds are taken. For another run's probes, the
+            first log-odds that were computed so far, by number of the episode.
     """
 
     def __init__(
@@ -63,13 +72,14 @@ class FrozenProbes:
 
     @property
     def sites(self) -> Sequence[Site]:
-        """S of them, as in the curve."""
+        """The S sites, in the order of the curve."""
         return self.curve.sites
 
     def first(self, position: int) -> Values:
-        """(S,) log-odds of the episode in row `position` at the inference of the probes, as `log_odds` has them.
+        """Return the log-odds (S,) of the episode in row `position` at the inference of the probes.
 
-        Those of the run's own probes are the stored out-of-fold ones; NaN for an episode without any.
+        They are those of `log_odds`. Of the run's own probes they are the stored out-of-fold ones; NaN for an
+        episode without any.
         """
         row = self.run.episodes.iloc[position]
         if self._readings is None:
@@ -87,10 +97,11 @@ class FrozenProbes:
         return np.asarray(self.curve.decisions[:, column] * toward(side_correct))
 
     def log_odds(self, position: int) -> tuple[Values, bool]:
-        """(K, S) log-odds of the episode in row `position`, by captured inference that it reached and site.
+        """Return the log-odds (K, S) of the episode in row `position`, by captured inference and site.
 
-        Toward the correct side; NaN where the inference is a later one, and its activations are left out, or lack
-        the view of the probe. The flag says whether no probe that gave them was trained on the episode's item.
+        Only the inferences that the episode reached are in it. Log-odds are toward the correct side. They are NaN
+        where the inference is a later one, and its activations are left out, or lack the view of the probe. The
+        flag tells whether no probe that gave them was trained on the episode's item.
         """
         row = self.run.episodes.iloc[position]
         side, item = str(row["side_correct"]), str(row["item_id"])
@@ -112,7 +123,7 @@ class FrozenProbes:
         return log_odds, fold is not None
 
     def _features(self, stream: str, probes: _StreamProbes, position: int, calls: int) -> Values:
-        """(K, S, D) of the view at every captured inference; NaN where the view is not stored of it."""
+        """Return the view (K, S, D) at every captured inference; NaN where it is not stored."""
         sites: tuple[Any, ...] = (slice(None), *probes.at)
         first: Values = self._rows[stream][position][:calls][(*sites, probes.view)].astype(np.float64)
         if len(first) == calls:
@@ -162,7 +173,13 @@ def toward(side_correct: str) -> float:
 
 
 def decisions_toward_correct(curve: ProbeCurve, places: Sequence[int], sides: Sequence[str]) -> Values:
-    """(S, E) held-out log-odds of some episodes of the curve, the correct side up; sides: (E,) the correct."""
+    """Return the held-out log-odds (S, E) of some episodes of the curve, the correct side up.
+
+    Args:
+        curve: Probes of one category in one view.
+        places: Positions of the E episodes in the curve.
+        sides: (E,) the correct sides.
+    """
     return np.asarray(curve.decisions[:, places] * np.array([toward(side) for side in sides]))
 
 
@@ -175,9 +192,10 @@ _UNSAFE = re.compile(r"[^A-Za-z0-9._-]+")
 
 @dataclass(frozen=True)
 class ViewedRun:
-    """A run, opened in one wording. key: its name in addresses and folders, unique among the runs of a page.
+    """A run, opened in one wording.
 
     Attributes:
+        key: Its name in addresses and folders, unique among the runs of a page.
         lender: A run of the same model whose probes are shown where this one has none.
         readings: First log-odds by category and number of the episode that these probes gave so far.
     """
@@ -199,7 +217,7 @@ class ViewedRun:
 
     @property
     def places(self) -> tuple[str, str]:
-        """Return the run's names on this machine, which no page shows."""
+        """The run's names on this machine, which no page shows."""
         return self.run.location.address, str(self.run.location)
 
     @property
@@ -219,7 +237,7 @@ class ViewedRun:
 
     @property
     def probed_rows(self) -> Mapping[str, RetentionRow]:
-        """The rows of the table that say which sites of the shown probes are best, by category."""
+        """The rows of the table that name the best sites of the shown probes, by category."""
         return self.lender.rows if self.lender is not None and self.is_lent else self.rows
 
     @property
@@ -229,7 +247,7 @@ class ViewedRun:
 
     @cached_property
     def captured_inferences(self) -> NDArray[np.intp]:
-        """(E,) how many captured inferences every episode reached."""
+        """The number (E,) of captured inferences that every episode reached."""
         return np.asarray(reached_calls(self.run).sum(axis=1))
 
     @property
@@ -238,7 +256,10 @@ class ViewedRun:
         return self.run.ask is not None
 
     def outcome_word(self, outcome: Any) -> Any:
-        """The outcome as the page names it: `unread` where no rule could read the answer of a VLM, not `oob`."""
+        """Return the page's name of the outcome.
+
+        It is `unread` instead of `oob` where no rule could read the answer of a VLM.
+        """
         return UNREAD if self.answers and outcome == "oob" else outcome
 
     @cached_property
@@ -253,28 +274,28 @@ class ViewedRun:
 
     @property
     def categories(self) -> tuple[str, ...]:
-        """Return the categories in the order of the episodes."""
+        """The categories in the order of the episodes."""
         return tuple(dict.fromkeys(self.run.episodes["category"].astype(str)))
 
     @property
     def probed_categories(self) -> tuple[str, ...]:
-        """Return the categories that have probes in the view that is shown."""
+        """The categories that have probes in the view that is shown."""
         return tuple(category for category in self.categories if self.curve(category) is not None)
 
     def curve(self, category: str) -> ProbeCurve | None:
-        """The probes of a category, None without any."""
+        """Return the probes of a category, None without any."""
         if self.results is None or self.view is None:
             return None
         return self.results.curves.get((category, self.view))
 
     @cached_property
     def patch_attention(self) -> dict[str, PatchAttention]:
-        """Return by category the stored attention on the patches of the cameras' pictures."""
+        """The stored attention on the patches of the cameras' pictures, by category."""
         return stored_patch_attention(self.run)
 
     @cached_property
     def target_curves(self) -> list[tuple[ProbeResults, str]]:
-        """Results and category of every target but the sides that was probed, in the first view of its probes."""
+        """Results and category of every probed target except the sides, in the first view of its probes."""
         results = [load_results(self.run, target=target) for target in stored_targets(self.run)]
         return [
             (probes, category)
@@ -290,12 +311,12 @@ class ViewedRun:
 
     @cached_property
     def refitted(self) -> Mapping[int, ProbeResults]:
-        """Return by captured inference the probes that were fitted to it with otherwise equal settings."""
+        """The probes that were fitted to a captured inference with otherwise equal settings, by inference."""
         return {} if self.own_results is None else load_results_by_call(self.run, self.own_results)
 
     @cached_property
     def probes(self) -> dict[str, FrozenProbes]:
-        """Return by category the probes of the table's inference."""
+        """The probes of the table's inference, by category."""
         results, view = self.results, self.view
         if results is None or view is None:
             return {}
@@ -318,9 +339,10 @@ class ViewedRun:
 
 
 def view_runs(runs: Sequence[Run], probes_of: Run | None = None) -> list[ViewedRun]:
-    """The runs as the viewer shows them: of several wordings the first, as in `retention_table`.
+    """Return the runs in the form of the viewer: of several wordings the first, as in `retention_table`.
 
     Args:
+        runs: The runs of the page.
         probes_of: A run whose probes are shown where a run of the same model has none.
 
     Raises:
@@ -354,7 +376,7 @@ def _with_lender(viewed: Sequence[ViewedRun], probes_of: Run) -> list[ViewedRun]
 
 
 def _difference(run: Run, lender: ViewedRun) -> str | None:
-    """Why probes of `lender` cannot read the activations of `run`; None if they can."""
+    """Return the reason why probes of `lender` cannot read the activations of `run`; None if they can."""
     other = lender.run
     if run.weights_sha256 != other.weights_sha256:
         return f"it has other weights, {str(run.weights_sha256)[:12]} instead of {str(other.weights_sha256)[:12]}"

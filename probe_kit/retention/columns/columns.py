@@ -1,8 +1,8 @@
 """The columns of the tables, each declared once: terminal, Markdown, LaTeX, report and glossary only render them.
 
-A column names the field that it shows (`part.field` of `RetentionRow`, which is also its place in JSON and in data
-frames), its heading, its entry in the glossary, its text, and what it sorts by. `TABLES` says which columns stand
-in which table. To add a column: compute the field where its part is made, and declare the column here.
+A column names the field that it shows, `part.field` of `RetentionRow`, which is also its place in JSON and in data
+frames. It also has a heading, an entry in the glossary, a text, and a sort key. `TABLES` lists the columns of each
+table. To add a column: compute the field where its part is made, and declare the column here.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -42,16 +42,16 @@ class Column:
 
     Attributes:
         key: The field that it shows, as `part.field`.
-        heading: With its unit, the same in all formats.
+        heading: Its heading with the unit, the same in all formats.
         help: Its entry in the glossary.
-        text: What a row shows; "–" or nothing where it has no value.
-        sort: What the report sorts by, the field itself by default.
-        difference: What a difference between runs shows.
+        text: The text of a row; "–" or nothing where it has no value.
+        sort: The value that the report sorts by, the field itself by default.
+        difference: The text of a difference between runs; None for an empty cell.
         heat: Whether the report and LaTeX colour it by `sort`, from 0 to 1.
-        averaged: Whether a category mean averages the field. also_averaged: further fields of the same column that
-            are averaged.
-        strong: Which rows are bold.
-        note: Shown in the report on pointing at the cell.
+        averaged: Whether a category mean averages the field.
+        also_averaged: Further fields of the same column that are averaged.
+        strong: Whether a row is bold; None for no row.
+        note: Text that the report shows on pointing at the cell.
         answers: Heading and help where the rows are of models that were asked, if these differ.
     """
 
@@ -69,7 +69,7 @@ class Column:
     answers: tuple[str, str] | None = None
 
     def worded(self, modes: Modes) -> "Column":
-        """The column with the words for rows of policies, of models that were asked, or of both."""
+        """Return the column with the words for rows of policies, of models that were asked, or of both."""
         if self.answers is None or modes == "acts":
             return self
         heading, meaning = self.answers
@@ -81,7 +81,7 @@ class Column:
         )
 
     def sort_value(self, row: RetentionRow) -> Any:
-        """Return what a row is sorted by in this column; None for last."""
+        """Return the value that a row is sorted by in this column; None for last."""
         return attrgetter(self.key)(row) if self.sort is None else self.sort(row)
 
 
@@ -90,8 +90,8 @@ class ColumnGroup:
     """Columns that answer one question.
 
     Attributes:
-        detail: Shown only where there is room, in Markdown and the report.
-        section: By which `--details` shows them.
+        detail: Whether it is shown only where there is room, in Markdown and the report.
+        section: The section of `--details` that shows them.
     """
 
     title: str
@@ -101,14 +101,14 @@ class ColumnGroup:
 
 
 def share(key: str, heading: str, meaning: str, **more: Any) -> Column:
-    """A column of a share in percent, averaged over categories."""
+    """Return a column of a share in percent, averaged over categories."""
     read = attrgetter(key)
     column = Column(key=key, heading=heading, help=meaning, text=lambda row: percent(read(row)), averaged=True)
     return replace(column, **more)
 
 
 def interval(key: str, ci: str, heading: str, meaning: str, **more: Any) -> Column:
-    """A column of a share in percent with its 95 % interval, averaged over categories."""
+    """Return a column of a share in percent with its 95 % interval, averaged over categories."""
     read, limits = attrgetter(key), attrgetter(ci)
 
     def text(row: RetentionRow) -> str:
@@ -118,7 +118,7 @@ def interval(key: str, ci: str, heading: str, meaning: str, **more: Any) -> Colu
 
 
 def p_value(key: str, heading: str, meaning: str, **more: Any) -> Column:
-    """A column of p-values with three decimals, bold below 0.05."""
+    """Return a column of p-values with three decimals, bold below 0.05."""
     read = attrgetter(key)
 
     def low(row: RetentionRow) -> bool:
@@ -130,7 +130,7 @@ def p_value(key: str, heading: str, meaning: str, **more: Any) -> Column:
 
 
 def _judged(column: Column) -> Column:
-    """The column, empty for a run that keeps no trajectories; `sr_idle` is known wherever they are."""
+    """Return the column, empty for a run that keeps no trajectories; `sr_idle` is known wherever they are."""
     text = column.text
     return replace(column, text=lambda row: "–" if row.rules.sr_idle is None else text(row))
 
@@ -372,7 +372,7 @@ RULES = tuple(
 
 
 def radius_columns(rows: Sequence[RetentionRow]) -> tuple[Column, ...]:
-    """A column of success rates per zone radius that any row was scored at."""
+    """Return a column of success rates per zone radius that any row was scored at."""
     return tuple(map(_radius, dict.fromkeys(radius for row in rows for radius in row.rules.sr_by_epsilon)))
 
 
@@ -592,7 +592,7 @@ METRIC = Column(
 
 
 def _of_label(part: str, name: str, meaning: str, text: Callable[[StreamPart], str], **more: Any) -> Column:
-    """A column of one stream's probes of a label; empty for a side, whose accuracy has columns of its own."""
+    """Return a column of one stream's probes of a label; empty for a side, which has columns of its own."""
     stream, read = part.partition(".")[0], attrgetter(part.partition(".")[0])
 
     def cell(row: RetentionRow) -> str:
@@ -622,7 +622,7 @@ GROUPS = Column(
 
 
 def _baseline(name: str) -> Column:
-    """A baseline's accuracy in percent, and whether it is above chance."""
+    """Return the column of a baseline's accuracy in percent, and whether it is above chance."""
 
     def text(row: RetentionRow) -> str:
         mark = f" {ABOVE_CHANCE}" if name in row.controls.leaks else ""
@@ -721,14 +721,14 @@ TABLES: Mapping[str, tuple[ColumnGroup, ...]] = {
         ),
     ),
 }
-"""By title of the table, its groups of columns in order."""
+"""The groups of columns of each table in order, by its title."""
 
 
 _OF_ONE_MODE: Mapping[str, Modes] = {"Success rate": "acts", "Accuracy of answers": "answers"}
 
 
 def all_columns(modes: Modes = "both") -> tuple[Column, ...]:
-    """Every column of the tables of such rows once, in order and with their words."""
+    """Return every column of the tables of such rows once, in order and with their words."""
     tables = [groups for title, groups in TABLES.items() if modes in ("both", _OF_ONE_MODE.get(title, modes))]
     every = [column.worded(modes) for groups in tables for group in groups for column in group.columns]
     # Both tables of behaviour share some.
@@ -736,7 +736,7 @@ def all_columns(modes: Modes = "both") -> tuple[Column, ...]:
 
 
 def averaged_fields() -> tuple[str, ...]:
-    """The fields that a category mean averages, as `part.field`."""
+    """Return the fields that a category mean averages, as `part.field`."""
     every = [
         field
         for column in all_columns()

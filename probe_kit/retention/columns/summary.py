@@ -36,17 +36,21 @@ from probe_kit.statistics.sufficiency import probe_command
 from probe_kit.train.results.control_scores import RANDOM_FEATURES, UNTRAINED
 
 MOST_WORDS = 25
-"""Of a sentence with the name of its category, as in all texts of the package; a number is a word."""
+"""Largest number of words of a sentence with the name of its category, as in all texts of the package.
+
+A number is a word.
+"""
 MOST_NUMBERS = 2
-"""Of a sentence; the rest stands in tables."""
+"""Largest number of numbers in a sentence; the others are in tables."""
 _CONTROLS = {RANDOM_FEATURES: "random features", UNTRAINED: "an untrained network"}
 
 
 def finding(row: RetentionRow, vlm: RetentionRow | None = None) -> str:
-    """Return what is found in a category: a verdict, a colon, and where on the way to the action it is lost.
+    """Return the finding of a category: a verdict, a colon, and where on the way to the action the answer is lost.
 
     Args:
-        vlm: The row of a VLM that answered the same questions.
+        row: The row of a policy, of a VLM or of a label.
+        vlm: The row of a VLM that answered the same questions; None without one.
     """
     if not row.is_side:
         return label_finding(row)
@@ -106,7 +110,7 @@ _READ = "probes read the answer in the backbone"
 
 
 def _in_action(row: RetentionRow) -> str:
-    """Return what probes show of the action stream, in the words of its verdict; *not shown* claims no absence."""
+    """Return the evidence of probes in the action stream by its verdict; *not shown* claims no absence."""
     if row.action.verdict is None:
         return ""
     words = " and" if _holds(row.action) else f", {'absent' if row.action.verdict == 'absent' else 'not shown'} in"
@@ -140,7 +144,7 @@ def _of_use(row: RetentionRow, vlm: RetentionRow | None, use: UseVerdict) -> str
 
 
 def _holds(part: StreamPart) -> bool:
-    """Return whether the answer is shown in a stream; one without a score shows nothing."""
+    """Whether the answer is shown in a stream; one without a score shows nothing."""
     return part.has_signal and part.score is not None
 
 
@@ -149,14 +153,19 @@ def _is_encoded(row: RetentionRow) -> bool:
 
 
 def _read_and(row: RetentionRow, action: str) -> list[str]:
-    """Return that probes read the answer and what the action does with it; else what is missing."""
+    """Return clauses: probes read the answer and whether the action follows it; else the missing evidence.
+
+    Args:
+        row: The row of one category of a policy.
+        action: Clause on whether the action follows, without its object.
+    """
     if _is_encoded(row):
         return [f"{_READ}, {action} it"]
     return [f"{action} the answer", *_missing(row)]
 
 
 def _missing(row: RetentionRow, answer: str = "it") -> list[str]:
-    """Return why the answer is not known to be in the backbone; nothing where it is."""
+    """Return the reason why the answer is not known to be in the backbone; nothing where it is."""
     if not is_probed(row):
         return [unprobed(row)]
     if _is_encoded(row):
@@ -165,7 +174,7 @@ def _missing(row: RetentionRow, answer: str = "it") -> list[str]:
 
 
 def _unread(row: RetentionRow) -> str:
-    """Return what is known of a backbone without signal."""
+    """Return the finding of probes in a backbone without signal."""
     part, items = row.backbone, row.success.n_items
     if part.score is None:
         return "too few groups of items to measure the answer in the backbone"
@@ -187,7 +196,7 @@ def _beside_guessing(row: RetentionRow) -> str:
 
 
 def _success(row: RetentionRow) -> str:
-    """Return how a policy does."""
+    """Return the success of a policy in words."""
     if row.success.sr is None:
         return "the model did not act" if row.run.capture_only else "success is not known"
     return f"success {whole_percent(row.success.sr)} %"
@@ -217,7 +226,7 @@ def _without_swap(row: RetentionRow, vlm: RetentionRow | None) -> str:
 
 
 def next_step(rows: Sequence[RetentionRow]) -> str:
-    """Return the command for what is open in the first run, and what it answers; empty without a policy."""
+    """Return the command for the open question of the first run, and its purpose; empty without a policy."""
     acts = [row for row in rows if row.is_side and row.category != MEAN and not is_vlm(row)]
     if not acts:
         return ""
@@ -238,7 +247,7 @@ def next_step(rows: Sequence[RetentionRow]) -> str:
 
 
 MARK = "✓"
-"""After a share: the stream exceeds chance and a control, or the regime of the behaviour is knowledge."""
+"""Mark after a share: the stream exceeds chance and a control, or the regime of the behaviour is knowledge."""
 _LEGENDS = {
     "metric": "Metric: of a label, balanced accuracy of classes, R² of quantities",
     "backbone above chance": "Above chance: score of sites that other groups chose minus its mean score with "
@@ -262,12 +271,16 @@ HEADING_HELP = {
     for heading, legend in (_LEGENDS | _TESTS).items()
     for meaning in [legend.partition(": ")[2]]
 } | {"verdict": "What all numbers of the category say together."}
-"""The same as entries of the glossary."""
+"""The meanings of the columns as entries of the glossary."""
 
 
 @dataclass(frozen=True)
 class CategorySummary:
-    """One category of a policy, or of a VLM alone; or a label. vlm: the VLM's row of the same category."""
+    """One category of a policy, or of a VLM alone; or a label.
+
+    Attributes:
+        vlm: The VLM's row of the same category; None without one.
+    """
 
     row: RetentionRow
     vlm: RetentionRow | None = None
@@ -297,12 +310,12 @@ class CategorySummary:
 
     @property
     def finding(self) -> str:
-        """The finding in one short sentence, to be set behind the category's name."""
+        """The finding in one short sentence, to follow the category's name."""
         return finding(self.row, self.vlm)
 
     @property
     def details(self) -> str:
-        """The conclusion from all numbers of the row, and what to do next; the numbers stand in tables."""
+        """The conclusion from all numbers of the row, and what to do next; the numbers are in tables."""
         return f"{self.name}{':' * self.row.is_side} {conclusion(self.row)}"
 
 
@@ -310,7 +323,10 @@ HEADINGS = (
     "metric", "backbone above chance", "action above chance",
     "VLM %", "backbone %", "action %", "success %", "retention", "verdict",
 )  # fmt: skip
-"""Columns in which no row has anything to show are left out: the first three are of labels, others of sides."""
+"""The columns of the summary: the first three are of labels, others of sides.
+
+Columns in which no row has anything to show are left out.
+"""
 
 
 def _is_marked(part: StreamPart) -> bool:
@@ -338,10 +354,12 @@ def _retention(row: RetentionRow) -> str:
 
 @dataclass(frozen=True)
 class RunSummary:
-    """A row and a sentence per category of a run. vlm: the model that was asked the same questions, or empty.
+    """A row and a sentence per category of a run.
 
     Attributes:
-        mean: Over the categories; None of labels, whose metrics differ.
+        run: Name of the run.
+        vlm: Name of the model that was asked the same questions, or empty.
+        mean: The mean over the categories; None of labels, whose metrics differ.
     """
 
     run: str
@@ -351,7 +369,7 @@ class RunSummary:
 
     @property
     def title(self) -> str:
-        """The names of the run and of the VLM beside it."""
+        """The names of the run and of its VLM."""
         return " · ".join(name for name in (self.run, self.vlm) if name)
 
     @property
@@ -413,7 +431,7 @@ def _row(category: CategorySummary, run: str) -> Row:
 
 
 def _marks(summaries: Sequence[RunSummary], table: Table) -> list[str]:
-    """Return what the mark says where it stands, and a warning where it cannot stand as no control was run."""
+    """Return the meaning of the mark if a cell has it, and a warning where no control allows it."""
     marked = any(MARK in text for line in table.texts for text in line)
     warning = chance_only(
         [category.row for run in summaries for category in run.categories if category.row.is_side]

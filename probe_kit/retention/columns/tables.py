@@ -1,4 +1,4 @@
-"""The tables of a retention table, of rows and of what was compared."""
+"""The tables of a retention table, of rows and of comparisons."""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
@@ -41,7 +41,7 @@ SUBJECTS = {
     "Retention": "retention",
     "Controls": "controls",
 }
-"""By title, what a table is about."""
+"""The subject of a table, by its title."""
 BEHAVIOUR = tuple(title for title, subject in SUBJECTS.items() if subject == "behaviour")
 """Tables that depend on no view of the probes."""
 
@@ -57,7 +57,9 @@ def retention_tables(
     A table without rows is left out, and a column in which no row has anything to show.
 
     Args:
-        unpaired: Why runs have no differences; notes of the last table of behaviour.
+        rows: Rows of all runs, with their means.
+        differences: Differences of runs or groups, shown below the rows of both.
+        unpaired: Reasons why runs have no differences; notes of the last table of behaviour.
         sections: Groups of columns that are shown, all by default.
     """
     once, probed = once_per_category(rows), [row for row in rows if row.view is not None]
@@ -100,7 +102,7 @@ def _differences(
 
 
 def once_per_category(rows: Sequence[RetentionRow]) -> list[RetentionRow]:
-    """Success rates do not depend on the view: the first row of each run and category."""
+    """Return the first row of each run and category, as success rates do not depend on the view."""
     # Twice reversed: of a key named twice a dict keeps the first place and the last value.
     return list({(row.run.location, row.category): row for row in reversed(rows)}.values())[::-1]
 
@@ -149,7 +151,7 @@ def _table(
 
 
 def _ordered(rows: Sequence[RetentionRow], differences: Sequence[Difference]) -> list[TableRow]:
-    """Return the lines by category, means last; in each the runs of a view, and behind them their differences."""
+    """Return the lines by category, means last; in each the runs of a view, followed by their differences."""
     categories = list(dict.fromkeys(row.category for row in rows))
     views = list(dict.fromkeys(row.view for row in rows))
     by_view = {view: at for at, view in enumerate(views)}
@@ -169,7 +171,7 @@ def _ordered(rows: Sequence[RetentionRow], differences: Sequence[Difference]) ->
 def _name_columns(
     title: str, rows: Sequence[RetentionRow], differences: Sequence[Difference]
 ) -> list[tuple[Heading, Callable[[TableRow], str]]]:
-    """Return the columns that tell rows apart: the category, and of several runs, views or calls which one."""
+    """Return the columns that distinguish rows: the category, and run, view or call where there are several."""
 
     def name(line: TableRow) -> str:
         return title_of(line.category) if isinstance(line, Difference) else name_of(line)
@@ -199,7 +201,7 @@ def _name_columns(
 
 
 def _title(title: str, rows: Sequence[RetentionRow]) -> str:
-    """Return what the table shows, of one view and one run by their names, and the suites."""
+    """Return the title of the table with the view and the run, if there is one of each, and the suites."""
     views, runs = ({row.view for row in rows}, {model_name(row): None for row in rows})
     view = f", view {rows[0].view}" if title not in BEHAVIOUR and len(views) == 1 else ""
     model = f"{next(iter(runs))} on " if len(runs) == 1 else ""
@@ -209,7 +211,7 @@ def _title(title: str, rows: Sequence[RetentionRow]) -> str:
 
 
 def cell_text(column: Column, line: TableRow) -> str:
-    """Return what stands in a column; nothing where differences have no such number."""
+    """Return the text of a column; nothing where differences have no such number."""
     if isinstance(line, RetentionRow):
         return column.text(line)
     return "" if column.difference is None else column.difference(line)
@@ -266,7 +268,7 @@ def _legend(title: str, rows: Sequence[RetentionRow]) -> list[str]:
 
 
 def _undefined(rows: Sequence[RetentionRow]) -> list[str]:
-    """Return why categories have no retention, each reason once with its categories."""
+    """Return the reasons why categories have no retention, each once with its categories."""
     reasons: dict[str, list[str]] = {}
     for row in rows:
         if not row.retention.defined and row.category != MEAN:
@@ -332,7 +334,12 @@ _LADDER = (
 
 
 def wording_tables(wordings: Sequence[Difference], names: Mapping[str, str]) -> list[Table]:
-    """The wordings of each run against each other. names: of runs, by location."""
+    """Return a table per run that compares its wordings.
+
+    Args:
+        wordings: Differences of two wordings of one run each.
+        names: Names of runs, by location.
+    """
     return [
         Table.of(
             f"Wordings, {names[str(run)]}",
@@ -357,14 +364,17 @@ def wording_tables(wordings: Sequence[Difference], names: Mapping[str, str]) -> 
 
 
 def _items(row: Difference) -> str:
-    """Return how many are compared, and of how many where some are left out."""
+    """Return how many items are compared, and of how many where some are left out."""
     if row.n_items is None:
         return "other items"
     return str(row.n_items) if row.of_items in (None, row.n_items) else f"{row.n_items} of {row.of_items}"
 
 
 def size_table(means: Sequence[RetentionRow]) -> list[Table]:
-    """Mean accuracy by model and prompt, a column per size of the picture; none for fewer than two VLM runs."""
+    """Return the mean accuracy by model and prompt, a column per size of the picture.
+
+    There is no table for fewer than two VLM runs.
+    """
     of_vlms = [row for row in once_per_category(means) if is_vlm(row) and row.category == MEAN]
     if len(of_vlms) < 2:
         return []
@@ -398,7 +408,7 @@ _SOURCES: Mapping[Relation, str] = {
 
 
 def vlm_vla_tables(differences: Sequence[Difference]) -> list[Table]:
-    """One table per pair of a VLM run and a policy run."""
+    """Return one table per pair of a VLM run and a policy run."""
     return [
         _vlm_vla_table(vlm, policy, list(rows))
         for (vlm, policy), rows in groupby(differences, key=lambda row: (row.group, row.minus))
@@ -445,7 +455,7 @@ _TESTS = "p: exact McNemar over items or over whole groups, the larger; (Holm) o
 
 
 def known_used_tables(joined: KnownUsedTable) -> list[Table]:
-    """Counts of items, which of them, tests, and counts of single episodes."""
+    """Return four tables: counts of items, their codes, tests, and counts of single episodes."""
     probes = f"probes in view {joined.view}" if joined.view else "no probes: answer and success only"
     title = f"Answer, probe, success: {joined.vlm} (by {joined.score}) · {joined.policy}"
     rows = joined.rows
@@ -505,7 +515,7 @@ def _episodes(rows: Sequence[CategoryCounts]) -> Columns:
 
 
 def _spelt(code: str) -> str:
-    """`101` as V p S: a capital for what is right, a small letter for what is not."""
+    """Return `101` as V p S: a capital for what is right, a small letter for what is not."""
     letters = zip("VPS", code, strict=True)
     return " ".join(letter if mark == "1" else letter.lower() for letter, mark in letters if mark != "-")
 

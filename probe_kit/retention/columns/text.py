@@ -29,17 +29,20 @@ RATE: Mapping[Modes, str] = {
 
 
 def modes_of(rows: Iterable[RetentionRow]) -> Modes:
-    """Return what all rows did, `both` for a mixture."""
+    """Return the mode of all rows, `both` for a mixture."""
     modes = {row.run.mode for row in rows}
     return "both" if len(modes) > 1 else "answers" if modes == {"answers"} else "acts"
 
 
 NOT_ACTED = "n/a"
-"""In place of a success rate, for a model that did not act."""
+"""The text in place of a success rate, for a model that did not act."""
 ABOVE_CHANCE = "above chance"
-"""How a cell ends that tables colour red: the suite gives the answer away without a model."""
+"""The end of a cell that tables colour red: the suite gives the answer away without a model."""
 P_DECIDES = "intervals are of another method than p: where one of the two excludes zero alone, p decides"
-"""The exact test under no difference has no inversion: it would be of zero width where all groups agree."""
+"""The note on intervals and p.
+
+The exact test under no difference has no inversion: it would be of zero width where all groups agree.
+"""
 _REGIMES = {
     Regime.KNOWLEDGE: "knowledge",
     Regime.NO_RELIABLE_KNOWLEDGE: "not reliable",
@@ -50,7 +53,7 @@ _REGIMES = {
 def site_text(layer: int | None, iteration: int | None = None, ties: int | None = None) -> str:
     """Return where the best site is: its layer, after @ the iteration where the stream has several.
 
-    After + stands how many other sites are as good.
+    After + follows the number of other sites that are as good.
     """
     if layer is None:
         return "–"
@@ -62,19 +65,19 @@ def site_text(layer: int | None, iteration: int | None = None, ties: int | None 
 
 
 def model_name(row: RetentionRow) -> str:
-    """The model, marked if its weights are random or it did not act, and its group if there is one."""
+    """Return the model, marked if its weights are random or it did not act, and its group if there is one."""
     return row.run.name if row.group is None else f"{row.group}: {row.run.name}"
 
 
 def success_interval(row: RetentionRow) -> str:
-    """SR in percent with its interval; n/a for a model that did not act, or for a rule that needs trajectories."""
+    """Return the SR in percent with its interval; n/a for a model that did not act or lacks trajectories."""
     if row.success.sr is None:
         return NOT_ACTED
     return with_limits(row.success.sr, row.success.ci, percent)
 
 
 def regime_value(row: RetentionRow) -> str:
-    """The regime in a word or two; in a mean the normalised score."""
+    """Return the regime in a word or two; in a mean the normalised score."""
     if row.success.sr is None:
         return "did not act" if row.run.capture_only else "n/a"
     if row.success.regime is None:
@@ -83,19 +86,19 @@ def regime_value(row: RetentionRow) -> str:
 
 
 def retention_value(row: RetentionRow) -> str:
-    """Retention with its interval; n/a where the backbone's signal is not shown."""
+    """Return the retention with its interval; n/a where the backbone's signal is not shown."""
     if not row.retention.defined:
         return "n/a"
     return with_limits(row.retention.value, row.retention.ci, number)
 
 
 def published_value(row: RetentionRow) -> str:
-    """The published ratio; a dash where retention is not defined."""
+    """Return the published ratio; a dash where retention is not defined."""
     return number(row.retention.published) if row.retention.defined else "–"
 
 
 def call_words(call: int) -> str:
-    """A captured inference in words: 0 is the only one before the arm has moved."""
+    """Return a captured inference in words: 0 is the only one before the arm has moved."""
     return f"call {call}" + (", before anything moves" if call == 0 else ", counted from 0")
 
 
@@ -118,7 +121,7 @@ def above_chance(part: StreamPart) -> str:
 
 
 def exceeds_text(part: StreamPart) -> str:
-    """The controls that the best site is shown to exceed, and those that it is not shown to exceed."""
+    """Return the controls that the best site is shown to exceed, and those that it is not shown to exceed."""
     outcomes = {name: better for name, better in part.exceeds.items() if better is not None}
     if set(outcomes) == {"chance"}:
         return "chance (no control was run)" if outcomes["chance"] else "not shown: chance"
@@ -131,7 +134,7 @@ def exceeds_text(part: StreamPart) -> str:
 
 
 def difference_name(row: Difference) -> str:
-    """Minuend and subtrahend, and that they ran other items, or how many they have in common if not all."""
+    """Return minuend and subtrahend, with a mark if they ran other items or have only some in common."""
     mark = "" if row.paired else " (other items)"
     if row.paired and row.n_items is not None and row.n_items != row.of_items:
         mark = f" ({row.n_items} of {row.of_items} items)"
@@ -139,14 +142,18 @@ def difference_name(row: Difference) -> str:
 
 
 def difference_test(row: Difference) -> str:
-    """p of a difference of success rates, and corrected by Holm."""
+    """Return p of a difference of success rates, and its Holm-corrected value."""
     return "" if row.p is None else f"{p_text(row.p)} ({p_text(row.p_holm)})"
 
 
 def models_test(test: ModelTest | None, write: Write) -> str:
-    """p over models, the least possible one, and Welch's interval in the format `write`; a dash for none.
+    """Return p over models, the least possible p, and Welch's interval; a dash for none.
 
     Empty without groups of models.
+
+    Args:
+        test: The test of a difference over models; None without groups of models.
+        write: Formats a limit of the interval.
     """
     if test is None:
         return ""
@@ -156,7 +163,7 @@ def models_test(test: ModelTest | None, write: Write) -> str:
 
 
 def models_p(test: ModelTest) -> str:
-    """p over models and the least possible one; a dash where spreads allow none."""
+    """Return p over models and the least possible p; a dash where spreads allow none."""
     return p_text(None) if test.p is None else f"{p_text(test.p)} ({p_text(test.smallest_p)})"
 
 
@@ -169,7 +176,7 @@ def title_of(category: str) -> str:
 
 
 def name_of(row: RetentionRow) -> str:
-    """Return what a row is about: its category, or its target where that is no side."""
+    """Return the name of a row: its category, or its target where that is no side."""
     return name_of_target(row.target, row.category)
 
 
@@ -214,7 +221,7 @@ TERMS = {
     "against": ("Before a verdict: the same, away from the correct picture."),
     "random weights": ("The model is untrained. It shows the numbers of a model that knows nothing."),
 }
-"""Terms that are no column."""
+"""Terms of the glossary that are no column."""
 
 VIEWER_WORDS = {
     "success": "The cube ends on the correct picture. Guessing reaches 50 %.",
@@ -254,7 +261,7 @@ def label_finding(row: RetentionRow) -> str:
 
 
 def _missing(row: RetentionRow) -> str:
-    """Return what is missing for retention to be defined."""
+    """Return the condition that is lacking for retention to be defined."""
     backbone = row.backbone
     if backbone.peak is None or row.action.peak is None:
         return f"no site of the {'backbone' if backbone.peak is None else 'action'} was probed"
@@ -270,7 +277,7 @@ def _missing(row: RetentionRow) -> str:
 
 
 def label_details(row: RetentionRow) -> str:
-    """Return the finding with its numbers, their uncertainty and sizes; to be set behind the name."""
+    """Return the finding with its numbers, their uncertainty and sizes; to follow the name."""
     where = f"(view {row.view})"
     if not row.retention.defined:
         return f"{where}: retention is not defined: {row.retention.reason}."
@@ -336,11 +343,11 @@ _BEHAVIOUR_HELP = {
     "undecided": "The numbers do not decide whether the answer is used; the sentence says what is missing.",
 }
 VERDICT_HELP = _READABLE_HELP | _BEHAVIOUR_HELP
-"""What each verdict says, as an entry of the glossary."""
+"""The meaning of each verdict, as an entry of the glossary."""
 
 
 def verdict(row: RetentionRow) -> str:
-    """Return what a row says: is the answer in the backbone, and does the policy act on it?
+    """Return the verdict of a row: is the answer in the backbone, and does the policy act on it?
 
     With a stored image swap the verdict is that of `probe_kit.intervene.classify_use`. Where the answer is neither
     used nor read in the backbone, and without an image swap, it is `readable`.
@@ -355,7 +362,7 @@ def _is_neither_used_nor_found(row: RetentionRow, use: UseVerdict) -> bool:
 
 
 def readable(row: RetentionRow) -> Readable:
-    """Return what the row says without an intervention: the backbone's evidence, and success beside it.
+    """Return the verdict of a row without an intervention: the backbone's evidence, and success.
 
     *Shown*: the backbone's best site exceeds chance, family-wise, and every control that was run. *Absent*: it is
     below a stated accuracy, else *not shown*. *Success*: SR in the regime of knowledge; *failure*: SR in that of
@@ -379,7 +386,7 @@ def readable(row: RetentionRow) -> Readable:
 
 
 def _success(row: RetentionRow) -> Literal["success", "failure", "success not shown"]:
-    """Return how a policy does against guessing."""
+    """Return the success of a policy against guessing."""
     if knows(row):
         return "success"
     return "failure" if row.success.regime == Regime.FAILURE else "success not shown"
@@ -394,11 +401,11 @@ def knows(row: RetentionRow) -> bool:
 
 _UNTESTED = f"{UNTESTED}: run `probe-kit intervene`"
 _LATER = "Yet the policy succeeds: actions after the first inference may follow."
-"""An image swap reads the actions of the first inference."""
+"""A note on the image swap, which reads the actions of the first inference."""
 
 
 def conclusion(row: RetentionRow) -> str:
-    """Return what follows from a row, and what to do next; of a label with its numbers."""
+    """Return the conclusion from a row, and what to do next; of a label with its numbers."""
     if not row.is_side:
         return label_details(row)
     if is_vlm(row):
@@ -421,7 +428,7 @@ def _used(row: RetentionRow, use: UseVerdict) -> str:
 
 
 def _finding(row: RetentionRow) -> str:
-    """Return the sentence of a row without one."""
+    """Return the sentence of a row without a stored image swap."""
     reading = readable(row)
     if not is_probed(row):
         return _unprobed(row)
@@ -435,14 +442,14 @@ def _finding(row: RetentionRow) -> str:
 
 
 def _unprobed(row: RetentionRow) -> str:
-    """Return the sentence of behaviour alone; empty where the other one has said all."""
+    """Return the sentence of behaviour alone; empty where the model did not act."""
     if row.success.sr is None:
         return ""
     return f"{_capital(_behaviour(row))}; {_UNTESTED}."
 
 
 def _nothing_shown(row: RetentionRow) -> str:
-    """Return the sentence of a backbone without signal: what is decided first, then what is open."""
+    """Return the sentence of a backbone without signal: the decided part first, then the open part."""
     absent = row.backbone.verdict == "absent"
     behaviour = _behaviour(row)
     backbone = _backbone(row)
@@ -470,7 +477,10 @@ def more_items(row: RetentionRow) -> str:
 
 
 def _items_for_success(success: SuccessRate) -> str:
-    """Return with how many items guessing would no longer explain the rate, if it stays; empty for one half."""
+    """Return the number of items with which guessing would no longer explain the rate, if it stays.
+
+    Empty for a rate of one half.
+    """
     if success.sr is None or not success.chance_margin or not success.n_items or success.sr == 0.5:
         return ""
     # The margin shrinks with the root of the number of items.
@@ -486,7 +496,7 @@ def _backbone(row: RetentionRow) -> str:
 
 
 def _behaviour(row: RetentionRow) -> str:
-    """Return in words how the policy does; empty if it did not act, or a swap says more."""
+    """Return the success of the policy in words; empty if it did not act, or an image swap says more."""
     if row.image_swap.use is not None or row.success.sr is None:
         return ""
     words = {
@@ -503,12 +513,12 @@ def is_probed(row: RetentionRow) -> bool:
 
 
 def unprobed(row: RetentionRow) -> str:
-    """Return why there are no numbers of the backbone: no probes are stored, or those of other categories are."""
+    """Return the reason why the backbone has no numbers: no probes are stored, or only of other categories."""
     return "the backbone was not probed" if row.run.probes is None else "the probes are not of this category"
 
 
 def chance_only(rows: Sequence[RetentionRow]) -> str:
-    """A warning that names the runs whose probes were compared with no control; empty where all were."""
+    """Return a warning that names the runs whose probes were compared with no control; empty where all were."""
     probed = [row for row in rows if is_probed(row)]
     names = list(dict.fromkeys(model_name(row) for row in probed if not row.backbone.is_controlled))
     if not names:
@@ -527,7 +537,7 @@ _MOSTLY = 0.5  # share of episodes above which something is said first
 
 
 def warnings_of(mean: RetentionRow, rows: Sequence[RetentionRow]) -> list[str]:
-    """Return what would be misread without a word about it, of a run's categories and their mean, in a view."""
+    """Return warnings about numbers that are easily misread, of a run's categories and their mean, in a view."""
     sentences = []
     if mean.run.random_weights:
         sentences.append("The weights are random: the model is untrained. Read every number as “knows nothing”.")
@@ -579,14 +589,14 @@ def _unmoved(mean: RetentionRow) -> list[str]:
 
 
 def _names(part: Sequence[RetentionRow], rows: Sequence[RetentionRow]) -> str:
-    """The shorter of the two lists: those that are in, or those that are not."""
+    """Return the shorter of two lists: the categories in `part`, or those that are not."""
     absent = [row for row in rows if row not in part]
     listed, prefix = (absent, "all but ") if len(absent) < len(part) else (part, "")
     return prefix + ", ".join(title_of(row.category) for row in listed)
 
 
 def _of(part: Sequence[RetentionRow], rows: Sequence[RetentionRow]) -> str:
-    """Return how many of the categories, and which if not all."""
+    """Return how many of the categories are in `part`, and their names if not all are."""
     noun = "category" if len(rows) == 1 else "categories"
     if len(part) == len(rows):
         return f"all {len(rows)} {noun}" if len(rows) > 1 else "the only category"

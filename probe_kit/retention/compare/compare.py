@@ -54,9 +54,9 @@ class CommonItems:
     """The episodes of one category that several runs have in common.
 
     Attributes:
-        episodes: (item, layout) of them.
-        n_items: Items of them.
-        of_items: Items of any of the runs.
+        episodes: The episodes as (item, layout).
+        n_items: Number of their items.
+        of_items: Number of items that any of the runs has.
         is_complete: Whether every run has these episodes and no others.
     """
 
@@ -66,18 +66,18 @@ class CommonItems:
     is_complete: bool
 
     def select(self, episodes: "pd.DataFrame") -> "pd.DataFrame":
-        """The rows of a table of episodes that are among these, with their index."""
+        """Return the rows of a table of episodes that are among these, with their index."""
         keys = zip(episodes["item_id"].astype(str), episodes["layout"].astype(str), strict=True)
         return episodes[[key in self.episodes for key in keys]]
 
     @property
     def is_many(self) -> bool:
-        """Whether at least 80 % of the items are in common, and so worth leaving out the others."""
+        """Whether at least 80 % of the items are in common, so that the others are worth leaving out."""
         return self.n_items >= MANY * self.of_items
 
 
 def common_items(runs: Sequence[RunReader]) -> dict[str, CommonItems]:
-    """Return by category that all runs have the episodes in common, of which there may be none.
+    """Return by category the items that all runs have in common, of which there may be none.
 
     Items are the same where id and content hash are equal. Runs of one suite need no hashes. Nothing is in common
     of runs of several suites if one of them holds no hashes, as arrays do.
@@ -91,12 +91,12 @@ def common_items(runs: Sequence[RunReader]) -> dict[str, CommonItems]:
 
 
 def has_item_content(run: RunReader) -> bool:
-    """Whether a run says what each of its items holds."""
+    """Whether a run declares the content of each of its items."""
     return _CONTENT in run.episodes and not bool(run.episodes[_CONTENT].isna().any())
 
 
 def wording_of(run: RunReader) -> str:
-    """The wordings of a run's episodes, comma-separated."""
+    """Return the wordings of a run's episodes, comma-separated."""
     wordings = run.episodes["wording"].unique() if "wording" in run.episodes else [OWN_WORDS]
     return ", ".join(map(str, wordings))
 
@@ -135,12 +135,11 @@ _FINEST = 1000
 def gains(first: "Sequence[pd.DataFrame]", second: "Sequence[pd.DataFrame]") -> dict[str, Any]:
     """Return an exact, two-sided test of both sides being right equally often, as fields of `Difference`.
 
-    Whole groups of items are turned together.
+    Whole groups of items are turned together. Empty unless every run of both sides has the same episodes.
 
     Args:
-        first: Tables of episodes, each of one run and category; runs of a side count by their mean. Empty unless
-            every run of both sides has the same episodes.
-        second: As `first`.
+        first: Tables of episodes, each of one run and category; runs of a side count by their mean.
+        second: Tables of the other side.
     """
     sides = [_of_side(tables) for tables in (first, second)]
     if None in sides:
@@ -162,7 +161,10 @@ def gains(first: "Sequence[pd.DataFrame]", second: "Sequence[pd.DataFrame]") -> 
 
 
 def _of_side(tables: "Sequence[pd.DataFrame]") -> tuple[dict[str, Fraction], dict[str, str]] | None:
-    """Per episode how much of it was right, averaged over runs, and its group; None if runs differ in episodes."""
+    """Return by episode the share that was right, averaged over runs, and its group.
+
+    None if runs differ in episodes.
+    """
     by_episode: dict[str, list[Fraction]] = {}
     units: dict[str, str] = {}
     for table in tables:
@@ -183,33 +185,36 @@ def _of_side(tables: "Sequence[pd.DataFrame]") -> tuple[dict[str, Fraction], dic
 class Difference:
     """`group` minus `minus` in one category and view, each the mean of its runs; 95 % intervals.
 
+    Intervals and p are of these models on other items. In a row of category `mean`, numbers are averages over the
+    `categories` that both groups have.
+
     Attributes:
-        group: Names of groups, or of single runs, whose locations are then `run` and `minus_run`. paired: whether
-            both ran the same items, which then count as pairs.
-        minus: As `group`.
+        group: Name of a group, or of a single run, whose location is then `run`.
+        minus: Name of the group or run that is subtracted; the run's location is then `minus_run`.
         view: None where the two have no probed view in common.
-        sr: Success rate and cross-fitted accuracies.
-        backbone: As `sr`.
-        action: As `sr`.
+        paired: Whether both ran the same items, which then count as pairs.
+        sr: Difference of the success rates.
+        backbone: Difference of the cross-fitted accuracies in the backbone.
+        action: Difference of the cross-fitted accuracies in the action.
         retention: None unless defined on both sides.
-        sr_models: Of other models, where a side is a group of several.
-        retention_models: As `sr_models`.
+        sr_models: Test with the model as the unit, where a side is a group of several.
+        retention_models: The same test of retention.
         call: The captured inference that both were probed at, None without probes or where they differ.
-        p: Of `sr`, exact, signs of whole groups of items flipped, in the row `mean` of all items at once; None
+        p: Exact p of `sr`, signs of whole groups of items flipped, in the row `mean` of all items at once; None
             unless paired.
-        p_holm: Over the categories of all pairs of the table, or over the pairs in rows `mean`. Intervals and p
-            are of these models on other items.
-        mode: What the models of both did.
-        n_items: Items that all runs of both sides have and that the numbers are of.
-        of_items: Items that any of them has. None where that is not known. n_groups: independent groups of items
-            whose signs `p` flips, None without a p.
-        sr_group: The two rates. only,
-        sr_minus: As `sr_group`.
-        only_minus: Episodes in which one side alone is right, or more often than the other; None unless paired.
-        same_frames: Of a VLM minus a policy, whether all began with the same frames, and whether the policy's
-            network grew from the weights that were asked; None of others, and where unknown. In a row of category
-            `mean`, numbers are averages over the `categories` that both groups have.
-        source: As `same_frames`.
+        p_holm: Corrected over the categories of all pairs of the table, or over the pairs in rows `mean`.
+        mode: Whether the models of both acted or answered.
+        n_items: Items that all runs of both sides have and that the numbers are of; None where that is not known.
+        of_items: Items that any of them has; None where that is not known.
+        n_groups: Independent groups of items whose signs `p` flips, None without a p.
+        sr_group: Success rate of `group`.
+        sr_minus: Success rate of `minus`.
+        only: Episodes in which `group` alone is right, or more often than the other; None unless paired.
+        only_minus: The same of `minus`.
+        same_frames: Of a VLM minus a policy, whether all began with the same frames; None of others, and where
+            unknown.
+        source: Of a VLM minus a policy, whether the policy's network grew from the weights that were asked; None
+            of others.
     """
 
     group: str
@@ -247,9 +252,10 @@ class Difference:
 
 @dataclass(frozen=True)
 class Side:
-    """One side of a comparison: what it is called, its runs and their rows, and where it lies if it is one run.
+    """One side of a comparison: its name, its runs and their rows.
 
     Attributes:
+        run: Location of the run, if the side is a single one.
         origins: See `compare_models`.
     """
 
@@ -261,7 +267,13 @@ class Side:
 
     @classmethod
     def of(cls, name: str, run: RunReader, rows: Sequence[RowWithEstimates]) -> "Side":
-        """Return a single run; rows: those of several runs, of which its own are taken."""
+        """Return the side of a single run.
+
+        Args:
+            name: Name of the run in tables.
+            run: The only run of the side.
+            rows: Rows of several runs, of which the run's own are taken.
+        """
         location = str(run.location)
         return cls(name, (run,), tuple(row for row in rows if row.row.run.location == location), location)
 
@@ -276,11 +288,14 @@ def compare(
 ) -> list[Difference]:
     """Return the first side minus the second, per view and category, and over all categories.
 
+    `p_holm` is not set: `with_holm` sets it, over all rows that are shown together.
+
     Args:
+        first: The side that the other one is subtracted from.
+        second: The side that is subtracted.
         of: Success rates, backbone, action and retention; or success rates (answers of a VLM) alone.
-        items: By category, what all runs have in common, see `common_items`.
-        others_too: Compare categories without such items, each side on its own. Holm's p is that of `with_holm`,
-            over all rows that are shown together.
+        items: Items that all runs have in common by category, see `common_items`; None computes them.
+        others_too: Compare categories without such items, each side on its own.
     """
     runs = [*first.runs, *second.runs]
     shared = common_items(runs) if items is None else items
@@ -326,7 +341,7 @@ def _on_common_items(
 ) -> Side:
     """Return the side on the items in common, with the draws of the first of `runs`.
 
-    Runs of several suites then have the same groups and are paired. Probes of other items have no part in it.
+    Runs of several suites then have the same groups and are paired. Probes of other items take no part in it.
     """
     seed_texts = {str(run.location): run.seed_text for run in runs}
     seed_text = runs[0].seed_text
@@ -349,13 +364,13 @@ def _on_common_items(
 
 
 Outcomes = Mapping[str, Sequence["pd.DataFrame"]]
-"""Per category, a table of outcomes of each run."""
+"""By category, a table of outcomes of each run."""
 RowsOfRuns = Mapping[str, Sequence[RowWithEstimates]]
-"""Per category, the row of each run."""
+"""By category, the row of each run."""
 
 
 def _outcomes(rows: Sequence[RowWithEstimates]) -> Outcomes:
-    """Once per run, whatever number of views it has."""
+    """Return the outcomes once per run, whatever number of views it has."""
     by_category: dict[str, dict[str, pd.DataFrame]] = {}
     for row in rows:
         if row.outcomes is not None:
@@ -364,7 +379,7 @@ def _outcomes(rows: Sequence[RowWithEstimates]) -> Outcomes:
 
 
 def _behaviour(views: Mapping[str | None, RowsOfRuns]) -> dict[str | None, RowsOfRuns]:
-    """Return what does not depend on the view, under the view None."""
+    """Return the parts that do not depend on the view, under the view None."""
     first = next(iter(views.values()), {})
     return {
         None: {
@@ -375,7 +390,7 @@ def _behaviour(views: Mapping[str | None, RowsOfRuns]) -> dict[str | None, RowsO
 
 
 def _by_view(rows: Sequence[RowWithEstimates]) -> dict[str | None, RowsOfRuns]:
-    """Rows per view and category."""
+    """Return the rows per view and category."""
     views: dict[str | None, dict[str, list[RowWithEstimates]]] = {}
     for row in rows:
         views.setdefault(row.row.view, {}).setdefault(row.row.category, []).append(row)
@@ -388,8 +403,9 @@ class _Gap:
 
     Attributes:
         rates: Success of either side, None where a run has none.
-        sr: Their difference.
-        accuracies: By stream. pooled: scores of either side, None without probes.
+        sr: Difference of the two rates.
+        accuracies: Differences of accuracy by stream.
+        pooled: Scores of either side, None without probes.
     """
 
     paired: bool
@@ -400,7 +416,7 @@ class _Gap:
 
     @classmethod
     def of(cls, minuends: Sequence[RowWithEstimates], subtrahends: Sequence[RowWithEstimates]) -> "_Gap":
-        """Means over the runs of either side; a number that a run lacks is left out."""
+        """Return the means over the runs of either side; a number that a run lacks is left out."""
         rates = mine, theirs = _rate(minuends), _rate(subtrahends)
         first, second = _pooled(minuends), _pooled(subtrahends)
         sr = None if mine is None or theirs is None else mine.minus(theirs)
@@ -494,7 +510,7 @@ def _mean_rate(rates: Sequence[Rate | None]) -> Rate | None:
 
 
 def _retention(gaps: Sequence[_Gap]) -> Ratio | None:
-    """The difference of the ratios of the sides' mean scores."""
+    """Return the difference of the ratios of the sides' mean scores."""
     pairs = [gap.pooled for gap in gaps if gap.pooled is not None]
     if not pairs:
         return None
@@ -507,8 +523,10 @@ def _retention(gaps: Sequence[_Gap]) -> Ratio | None:
 
 
 PairedRuns = tuple[list[Difference], tuple[str, ...]]
-"""Differences of runs or groups on the items that they have in common; and why others have none, and which items
-were left out, a sentence each."""
+"""Differences of runs or groups on the items that they have in common, and sentences.
+
+The sentences give the reasons why others have no difference, and the items that were left out.
+"""
 
 
 def compare_runs(
@@ -520,14 +538,15 @@ def compare_runs(
 ) -> PairedRuns:
     """Return every other run minus the run `against`, by default the first; VLM runs and policy runs apart.
 
+    Runs of one seed and wording are compared, on the items that both have. Success rates are those on these items
+    alone. Probes are compared where no run has other items.
+
     Args:
-        runs: In the order in which they were named.
-        rows: theirs.
-        against: A run's name in tables, its folder's name or its location.
+        runs: Runs of the table in the order in which they were named.
+        rows: The rows of these runs.
+        against: A run's name in tables, its folder's name or its location; None for the first run.
         vlm_vla: Whether VLM runs are compared with policy runs elsewhere.
-        pairs: By location, those that are compared instead, each the first minus the second. Runs of one seed and
-            wording are compared, on the items that both have: success rates on these alone, probes where no run
-            has other items.
+        pairs: Pairs of locations that are compared instead, each the first minus the second.
 
     Raises:
         UsageError: For a name that is none of the runs, or several.
@@ -558,11 +577,14 @@ def compare_groups(
 ) -> PairedRuns:
     """Return every group of runs minus every earlier one, or minus the group `against`; see `compare_runs`.
 
-    Two groups count as pairs in categories in which all of their runs have at least 80 % of the items in common,
-    and then on these items alone. In other categories each group has its own items.
+    Two groups count as pairs in categories in which all of their runs have at least 80 % of the items in common.
+    They are then compared on these items alone. In other categories each group has its own items.
 
     Args:
-        origins: See `origins_of`.
+        groups: Runs by the name of their group.
+        rows: The rows of these runs.
+        against: Name of a group; None compares every two groups.
+        origins: Declared origins by location, see `origins_of`.
 
     Raises:
         UsageError: For a group that is none of them, and a declared origin of no run.
@@ -584,7 +606,11 @@ def compare_groups(
 
 
 def group_pairs(groups: Sequence[str], against: str | None = None) -> list[tuple[str, str]]:
-    """Return every group with every earlier one, or every other group with `against`: minuend, subtrahend.
+    """Return pairs (minuend, subtrahend): every group with every earlier one, or every other group with `against`.
+
+    Args:
+        groups: Names of the groups in order.
+        against: Name of a group; None for every two groups.
 
     Raises:
         UsageError: For a group that is none of them.
@@ -603,8 +629,12 @@ def compare_with_vlms(
 ) -> list[Difference]:
     """Return every VLM run minus every acting one that it can be compared with, in answers and success alone.
 
-    A policy whose network grew from weights that were asked is not compared with VLMs of other weights. pairs:
-    locations of the VLM runs and policy runs that are compared instead.
+    A policy whose network grew from weights that were asked is not compared with VLMs of other weights.
+
+    Args:
+        runs: Runs of the table.
+        rows: The rows of these runs.
+        pairs: Pairs of locations, a VLM run's and a policy run's, that are compared instead.
     """
     vlms, policies = ([run for run in runs if run.answers == kind] for kind in (True, False))
     related = [(vlm, policy, grew_from(policy.run, vlm.run)) for vlm, policy in product(vlms, policies)]
@@ -662,11 +692,11 @@ class _InWording:
 def compare_wordings(runs: Sequence[RunReader]) -> list[Difference]:
     """Return every two wordings of each run against each other, the earlier one minus the later.
 
-    It separates not knowing from not being able: who places the cube by "the left picture" and not by what the
-    picture shows can act and does not know.
+    The comparison separates not knowing from not being able. A policy that places the cube by "the left picture",
+    and not by the content of the picture, can act and does not know.
 
     Args:
-        runs: Those that acted, judged by the rule of the table.
+        runs: Runs that acted, judged by the rule of the table.
     """
     settings = RowSettings(None, "all", ())
     differences: list[Difference] = []
@@ -733,7 +763,7 @@ def _run_called(name: str, runs: Sequence[TableRun]) -> TableRun:
 
 
 def _why_not(minuend: RunReader, subtrahend: RunReader, items: Mapping[str, CommonItems]) -> str:
-    """Why two runs cannot be paired, in words that follow a colon; empty if they can."""
+    """Return the reason why two runs cannot be paired, in words that follow a colon; empty if they can."""
     for what, read in _SAME.items():
         mine, theirs = read(minuend), read(subtrahend)
         if None not in (mine, theirs) and mine != theirs:
@@ -751,4 +781,4 @@ _SAME: Mapping[str, Callable[[RunReader], Any]] = {
     "seeds": lambda run: run.settings.get("seed"),
     "wordings": wording_of,
 }
-"""What two runs must share for the episodes of an item to be the same questions; None where unknown."""
+"""Settings that two runs must share for the episodes of an item to be the same questions; None where unknown."""

@@ -1,7 +1,7 @@
-"""Answer, probe, success: what a VLM answers, a probe reads and a policy does, question by question.
+"""Answer, probe, success: a VLM's answers, a probe's decisions and a policy's actions, question by question.
 
-answered: the VLM answers right. encoded: the probe's held-out decision is right, where probes beat chance,
-random-features and untrained. acted on: the cube ends right. The unit is the item, right in both layouts. A fixed
+Answered: the VLM answers right. Encoded: the probe's held-out decision is right, where probes beat chance,
+random-features and untrained. Acted on: the cube ends right. The unit is the item, right in both layouts. A fixed
 side is right in exactly one layout, so a bias never counts. Guessing is right in both for 25 % of items.
 """
 
@@ -47,12 +47,12 @@ class Comparison:
     """A test whether two of the three are right of equally many items.
 
     Attributes:
-        only_first: Items on which they differ.
-        only_second: As `only_first`.
+        only_first: Items that the first alone gets right.
+        only_second: Items that the second alone gets right.
         p_mcnemar: Exact over items.
         p_groups: The same, whole groups of items turned together.
         p: The larger of the two.
-        p_holm: Over all categories and pairs, of all joins that are shown together.
+        p_holm: Corrected over all categories and pairs, of all joins that are shown together.
     """
 
     first: str
@@ -70,17 +70,18 @@ class CategoryCounts:
     """One category, or all of them (`all`).
 
     Attributes:
-        answered_correctly: Items right in both layouts.
-        encoded: As `answered_correctly`.
-        acted_correctly: As `answered_correctly`.
+        answered_correctly: Items whose answer is right in both layouts.
+        encoded: Items whose probe is right in both layouts; None without probes.
+        acted_correctly: Items with success in both layouts.
         counts: Items by these three, such as `101` for answered, not encoded, acted on; without probes `1-1`.
-        guessed: As many as coins would give.
-        episodes: The same counts of single episodes; nothing is tested there. signal: whether the probes beat
-            chance and every control that was run, without which encoded means nothing; None without probes, or
-            over categories that differ in it.
-        not_acted_on: Of the items answered right and encoded those the action does not follow, with the exact 95 %
-            interval of their share; None without signal, and over all categories only of those with signal.
-        p_linked: Whether answered and acted on go together among encoded items: Fisher's exact test, over
+        guessed: The counts that coins would give.
+        episodes: The same counts of single episodes; nothing is tested there.
+        has_signal: Whether the probes beat chance and every control that was run, without which encoded means
+            nothing. None without probes, or over categories that differ in it.
+        not_acted_on: Of the items answered right and encoded, those that the action does not follow. None without
+            signal, and over all categories only of those with signal.
+        share_not_acted_on_ci: Exact 95 % interval of their share.
+        p_linked: Test whether answered and acted on go together among encoded items: Fisher's exact test, over
             categories a permutation within them.
     """
 
@@ -107,9 +108,10 @@ class KnownUsedTable:
     """A VLM run and a policy run joined, item by item.
 
     Attributes:
-        vlm: Labels of the runs.
-        policy: As `vlm`.
-        view: Of the probes; None without any.
+        vlm: Label of the VLM run.
+        policy: Label of the policy run.
+        score: The score by which the answers are read.
+        view: View of the probes; None without any.
         notes: Remarks on the join, a sentence each.
     """
 
@@ -126,7 +128,7 @@ class KnownUsedTable:
         return {"asked": plain.pop("vlm"), "acted": plain.pop("policy"), **plain}
 
     def to_frame(self) -> "pd.DataFrame":
-        """A row per category and code of the three: counts of items and episodes, and coins' share."""
+        """Return a row per category and code of the three: counts of items and episodes, and coins' share."""
         import pandas as pd
 
         return pd.DataFrame(
@@ -151,12 +153,14 @@ def match_runs(
     view: str | None = None,
     seed: int = 0,
 ) -> KnownUsedTable:
-    """Join a VLM run (as `scored` reads it) with a policy run and its probes.
+    """Join a VLM run with a policy run and its probes.
 
     Args:
+        vlm: The VLM run, as `scored` reads it.
+        policy: The policy run.
         results: Probes of the policy run; None joins known and used only.
-        view: One that was probed, by default the first.
-        seed: Of permutations.
+        view: A view that was probed, by default the first.
+        seed: Seed of permutations.
 
     Raises:
         UsageError: For runs of the wrong kinds or without a question in common.
@@ -191,7 +195,11 @@ def match_runs(
 
 @dataclass(frozen=True)
 class Joins:
-    """Every VLM run of a table joined with every policy run. refused: why others are not, a sentence each."""
+    """Every VLM run of a table joined with every policy run.
+
+    Attributes:
+        refused: Reasons why other pairs are not joined, a sentence each.
+    """
 
     tables: tuple[KnownUsedTable, ...]
     refused: tuple[str, ...]
@@ -200,8 +208,11 @@ class Joins:
 def join_runs(runs: Sequence[TableRun], results: Mapping[tuple[str, str], ProbeResults]) -> Joins:
     """Return answer, probe and success of every pair of a VLM run and a policy run.
 
+    Tests are corrected over all pairs.
+
     Args:
-        results: Of the runs of the table, by location and target. Tests are corrected over all pairs.
+        runs: Runs of the table.
+        results: Probe results of these runs, by location and target.
     """
     probes_of = {location: probes for (location, _), probes in results.items()}
     policies = [run for run in runs if not run.answers and run.is_judged]
@@ -217,7 +228,7 @@ def join_runs(runs: Sequence[TableRun], results: Mapping[tuple[str, str], ProbeR
 
 
 def correct_joins(joins: Sequence[KnownUsedTable]) -> list[KnownUsedTable]:
-    """The same joins, which are shown together, with `p_holm` over the lot.
+    """Return the same joins, which are shown together, with `p_holm` over all of them.
 
     The tests of all categories are one family; those over all categories are a summary and no part of it.
     """
@@ -236,7 +247,7 @@ def correct_joins(joins: Sequence[KnownUsedTable]) -> list[KnownUsedTable]:
 
 
 def _same_questions(vlm: RunReader, policy: RunReader) -> "pd.DataFrame":
-    """The episodes of both: columns of the policy run, and `outcome_asked`."""
+    """Return the episodes of both: columns of the policy run, and `outcome_asked`."""
     for run in (vlm, policy):
         if FIRST_FRAME not in run.episodes or run.episodes[FIRST_FRAME].isna().any():
             raise OtherFramesError(
@@ -273,7 +284,7 @@ def _same_questions(vlm: RunReader, policy: RunReader) -> "pd.DataFrame":
 
 
 def _encoded(pairs: "pd.DataFrame", results: ProbeResults, view: str) -> NDArray[np.float64]:
-    """(E,) whether the probe's decision is right, NaN where nothing was probed."""
+    """Return whether the probe's decision is right (E,), NaN where nothing was probed."""
     is_right: dict[str, bool] = {}
     for (_, name), curve in results.curves.items():
         if name == view:
@@ -282,10 +293,16 @@ def _encoded(pairs: "pd.DataFrame", results: ProbeResults, view: str) -> NDArray
 
 
 def encoded_decisions(curve: ProbeCurve) -> Bools:
-    """(E,) whether held-out decisions of the backbone's probe are right, at the site that the inner folds choose.
+    """Return whether held-out decisions of the backbone's probe are right (E,), at sites that inner folds choose.
 
     Of each outer fold it is the site that is best in its inner folds, the first one on ties. The best site of all
     would be chosen by the luck that it is scored by.
+
+    Args:
+        curve: Probes of one category in one view.
+
+    Raises:
+        UsageError: If no stream of the vision-language model was probed.
     """
     stream = curve.backbone_stream
     if stream is None:
@@ -310,7 +327,7 @@ def _signals(results: ProbeResults, view: str) -> dict[str, bool]:
 def _items(
     pairs: "pd.DataFrame", answered: Bools, used: Bools, encoded: NDArray[np.float64] | None
 ) -> "pd.DataFrame":
-    """A row per item: right in both layouts or not; its episodes' own marks as text."""
+    """Return a row per item: right in both layouts or not, and its episodes' own marks as text."""
     import pandas as pd
 
     episodes = pd.DataFrame(
@@ -331,7 +348,10 @@ def _items(
 
 
 def _only_probed(items: "pd.DataFrame") -> "tuple[pd.DataFrame, list[str]]":
-    """Without items that were left out when others of their category were probed, and a sentence about them."""
+    """Return the items without those that were left out when others of their category were probed.
+
+    A sentence about the dropped items goes with them, if there are some.
+    """
     probed = items["encoded"].notna()
     dropped = ~probed & probed.groupby(items["category"]).transform("any")
     if not dropped.any():
@@ -389,7 +409,7 @@ def _comparisons(
 
 
 def _readable_sites(answered: Bools, encoded: Bools | None, used: Bools) -> dict[str, Any]:
-    """Return counts of items that are answered right and encoded, by what the action does with them."""
+    """Return counts of items that are answered right and encoded, by whether the action follows."""
     if encoded is None:
         return {}
     both = answered & encoded
@@ -439,7 +459,7 @@ def _of_picture(vlm: RunReader) -> list[str]:
 
 
 def without_signal(rows: Sequence[CategoryCounts]) -> list[str]:
-    """A sentence about the categories whose probes have no signal; none if there is no such category."""
+    """Return a sentence about the categories whose probes have no signal; none if there is no such category."""
     dull = [row.category for row in rows if row.has_signal is False and row.category != OVERALL]
     if not dull:
         return []

@@ -1,4 +1,4 @@
-"""Models as the unit of a comparison: what a network grew from, and the test of two groups of models."""
+"""Models as the unit of a comparison: the origin of a network, and the test of two groups of models."""
 
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -18,7 +18,7 @@ from probe_kit.statistics.retention import Scores, retention
 # -- what a network grew from --------------------------------------------------------------------------------
 
 _STEP = re.compile(r"(?:^|.*(?:step|checkpoint|ckpt|iter|iteration)s?[-_=]?)0*(\d+)$", re.IGNORECASE)
-"""A folder of a training: `020000`, `checkpoint-500`, `step_20000`, `ckpt-3`."""
+"""The name of a folder of a training: `020000`, `checkpoint-500`, `step_20000`, `ckpt-3`."""
 _INNER = ("pretrained_model", "model", "params", "weights")
 """Folders that trainers put below that of a step. Others are not skipped: a folder above may be a date."""
 
@@ -27,10 +27,11 @@ Relation = Literal["yes", "no", "unknown"]
 
 
 def grew_from(policy: RunReader, vlm: RunReader) -> Relation:
-    """Compares hash, hub id and number of parameters on both cards; `unknown` where they are too little.
+    """Return whether the policy's network grew from the VLM's weights.
 
-    A family's name says which network it is and not which weights: another name is another source, the same name
-    is no evidence. A card names its commit behind an @; the source of a family is known by repository only.
+    Compares hash, hub id and number of parameters on both cards; `unknown` where they are too little. A family's
+    name identifies the network and not the weights: another name is another source, the same name is no evidence.
+    A card names its commit behind an @; the source of a family is known by repository only.
     """
     grown, vlm_card = card_of(policy), card_of(vlm)
     if grown.get("random_weights") or vlm_card.get("random_weights"):
@@ -46,7 +47,7 @@ def grew_from(policy: RunReader, vlm: RunReader) -> Relation:
 
 
 def card_of(run: RunReader) -> Mapping[str, Any]:
-    """Return what was really loaded; empty where a run has no certificate."""
+    """Return the card of the model that was really loaded; empty where a run has no certificate."""
     certificate: Mapping[str, Any] = run.certificate
     card: Mapping[str, Any] = certificate.get("policy") or {}
     return card
@@ -68,12 +69,17 @@ def split_checkpoint(checkpoint: str) -> tuple[str, int] | None:
 
 
 def origins_of(runs: Sequence[RunReader], declared: Mapping[str, str] | None = None) -> dict[str, str]:
-    """Return what the model of every run grew from, by location; runs of equal origin are of one model.
+    """Return the origin of every run's model, by location; runs of equal origin are of one model.
+
+    A run without a declared origin has the folder of its training where its checkpoint is one of several steps.
+    Otherwise it has its weights, or else its own location.
 
     Args:
-        declared: Origins by location, such as `finetuned_from` of a study. Other runs have the folder of their
-            training where their checkpoint is one of several steps, else their weights, else their own location.
-            Raises UsageError for a declared location that is none of the runs.
+        runs: The runs that are compared.
+        declared: Origins by location, such as `finetuned_from` of a study.
+
+    Raises:
+        UsageError: For a declared location that is none of the runs.
     """
     places = {str(run.location): run for run in runs}
     if strange := [location for location in declared or {} if location not in places]:
@@ -91,21 +97,23 @@ def _origin(run: RunReader) -> str:
 # -- two groups of models ------------------------------------------------------------------------------------
 
 Sides = tuple[Sequence[Sequence[RowWithEstimates]], Sequence[Sequence[RowWithEstimates]]]
-"""Of either side and per category, the row of each run."""
+"""For either side and per category, the row of each run."""
 
 
 @dataclass(frozen=True)
 class ModelTest:
     """Two groups of models compared with the model as the unit.
 
+    `p` and `smallest_p` are None where the smaller group has the larger spread, see `is_exchangeable`.
+
     Attributes:
-        n: Models of either group; runs of one origin are of one.
-        n_minus: As `n`.
-        difference: Of the groups' means, with Welch's 95 % interval.
-        p: Exact and two-sided, of exchanging the models' labels, which tests equal distributions and not only
+        n: Models of the first group; runs of one origin are of one.
+        n_minus: Models of the second group.
+        difference: Difference of the groups' means.
+        ci: Welch's 95 % interval of the difference.
+        p: Exact and two-sided p of exchanging the models' labels, which tests equal distributions and not only
             equal means.
-        smallest_p: The least that so few models allow. Both are None where the smaller group has the larger
-            spread, see `is_exchangeable`.
+        smallest_p: The least p that so few models allow.
     """
 
     n: int
@@ -120,6 +128,8 @@ class ModelTest:
         """Return the test of one value per model; None for two single models, or where one has no value.
 
         Args:
+            first: Values of the first group's models.
+            second: Values of the second group's models.
             largest: The difference that no two groups can exceed, see `welch_interval`.
         """
         if len(first) + len(second) < 3 or not (first and second and all(map(isfinite, (*first, *second)))):
@@ -139,10 +149,13 @@ def compare_models(
 ) -> ModelTest | None:
     """Return the test of two sides with a value per origin of models.
 
+    None where a model has no value, or is on both sides: its labels cannot be exchanged.
+
     Args:
-        origins: What the model of each run grew from, by location; by default its weights.
-        largest: See `ModelTest`. None where a model has no value, or is on both sides: its labels cannot be
-            exchanged.
+        rows: Rows of either side, by category and run.
+        origins: Origin of each run's model, by location; by default its weights.
+        value: The value of a run from its rows of all categories; None where it has none.
+        largest: The difference that no two groups can exceed, see `ModelTest.of`.
     """
     first, second = (_by_model(side, value) for side in rows)
     if first is None or second is None or first.keys() & second.keys():

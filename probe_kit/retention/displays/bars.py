@@ -42,7 +42,14 @@ _NEITHER = "#D9D9D9"
 
 @dataclass(frozen=True)
 class Bar:
-    """One bar: its name, what it is made of, and the text behind it. group: bars of one stand close together."""
+    """One bar.
+
+    Attributes:
+        name: Name on the left.
+        parts: The parts of the bar, from the left.
+        text: Text on its right; without parts, in its place.
+        group: Bars of one group are drawn close together.
+    """
 
     name: str
     parts: Sequence[Part]
@@ -53,18 +60,22 @@ class Bar:
 
 @dataclass(kw_only=True)
 class BarDisplay(Display):
-    """Bars of shares, one below the other. share_of: the name of the level axis."""
+    """Bars of shares, one below the other.
+
+    Attributes:
+        share_of: The name of the level axis.
+    """
 
     share_of: ClassVar[str] = "items (%)"
 
     @property
     @abstractmethod
     def rows(self) -> Sequence[Bar]:
-        """Return the bars, from above."""
+        """The bars, from above."""
 
     @property
     def heights(self) -> list[float]:
-        """Return where the middle of each bar is, from above."""
+        """The middle of each bar along the upright axis, from above."""
         groups = list(dict.fromkeys(bar.group for bar in self.rows))
         return [at + 0.5 * groups.index(bar.group) for at, bar in enumerate(self.rows)]
 
@@ -104,7 +115,7 @@ class PairedLayoutsDisplay(BarDisplay):
     """Items by outcome of their two layouts, per category.
 
     Knowledge puts items into "right in both"; a preference for a side puts them into "right in one", whatever its
-    strength. The p beside a bar is the exact test of right twice against wrong twice.
+    strength. The p on the right of a bar is the exact test of right twice against wrong twice.
     """
 
     items: dict[str, PairedItems]
@@ -118,7 +129,7 @@ class PairedLayoutsDisplay(BarDisplay):
 
     @property
     def rows(self) -> Sequence[Bar]:
-        """Return a bar per category."""
+        """A bar per category."""
         return [_paired_bar(title_of(category), paired) for category, paired in self.items.items()]
 
 
@@ -138,7 +149,7 @@ def _paired_bar(name: str, paired: PairedItems) -> Bar:
 
 @in_report(7)
 def layout_figures(source: FigureSource) -> Iterator[ReportFigure]:
-    """Yield one per run that acted."""
+    """Yield one figure per run that acted."""
     for drawn in source.runs:
         if (run := drawn.judged) is not None:
             yield ReportFigure(
@@ -161,7 +172,7 @@ _VERDICTS = (
 
 @dataclass(frozen=True)
 class RuleBar:
-    """One run by one rule: shares of episodes, and what doing nothing would score; None where it is n/a.
+    """One run by one rule: shares of episodes, and the score of doing nothing; None where it is n/a.
 
     Both are means over the categories, as in the tables.
     """
@@ -181,7 +192,11 @@ class OutcomeRulesDisplay(BarDisplay):
 
     @classmethod
     def from_runs(cls, runs: Sequence[RunReader]) -> Self:
-        """One that keeps no trajectories has a bar by `disc` alone. Raises UsageError without episodes."""
+        """Judge the episodes of runs by every rule; a run without trajectories has a bar by `disc` alone.
+
+        Raises:
+            UsageError: Without episodes.
+        """
         if not runs or any(run.episodes.empty for run in runs):
             raise UsageError("there are no episodes to judge; give runs that have some")
         labels = distinct_labels(runs)
@@ -190,12 +205,12 @@ class OutcomeRulesDisplay(BarDisplay):
 
     @property
     def rows(self) -> Sequence[Bar]:
-        """Return the bars with their names: the rule, of several runs behind the run."""
+        """The bars with their names: the rule, and the run before it where there are several."""
         several = len({bar.run for bar in self.bars}) > 1
         return [_rule_bar(f"{bar.run}  {bar.rule}" if several else bar.rule, bar) for bar in self.bars]
 
     def draw(self, axes: "Axes") -> None:
-        """Draw the bars, and a mark where doing nothing scores."""
+        """Draw the bars, and a mark at the score of doing nothing."""
         super().draw(axes)
         for height, bar in zip(self.heights, self.bars, strict=True):
             if bar.idle:
@@ -236,7 +251,7 @@ def _over_categories(run: RunReader, shares: "ArrayLike") -> float:
 
 @in_report(4)
 def rule_figures(source: FigureSource) -> Iterator[ReportFigure]:
-    """Yield one of all runs that keep trajectories."""
+    """Yield one figure of all runs that keep trajectories."""
     runs = [drawn.run for drawn in source.runs if drawn.run.has_trajectories and not drawn.run.episodes.empty]
     if runs:
         yield ReportFigure(
@@ -269,10 +284,10 @@ _LOOKS: Mapping[str, tuple[str, str]] = {
 
 @dataclass(kw_only=True)
 class KnownUsedDisplay(BarDisplay):
-    """A bar per category: shares of its items by what is known, encoded and used, in both layouts each.
+    """A bar per category: shares of its items by answered, encoded and acted on, in both layouts each.
 
     Attributes:
-        joined: What `probe_kit.retention.compare.known_used.match_runs` returns.
+        joined: The result of `probe_kit.retention.compare.known_used.match_runs`.
     """
 
     joined: KnownUsedTable
@@ -289,11 +304,11 @@ class KnownUsedDisplay(BarDisplay):
 
     @property
     def rows(self) -> Sequence[Bar]:
-        """Return a bar per category."""
+        """A bar per category."""
         return [_counted_bar(title_of(category), counts) for category, counts in self.counts.items()]
 
     def finish(self, figure: "Figure", grid: "Sequence[Axes]") -> None:
-        """Add the legend, and who was asked and who acted in place of one run's line."""
+        """Add the legend, and the names of both models in place of one run's line."""
         super().finish(figure, grid)
         probes = f"probes in view {self.joined.view}" if self.joined.view else "no probes"
         names = f"{self.joined.vlm} · {self.joined.policy}"
@@ -319,7 +334,7 @@ def words_of(code: str) -> str:
 
 @in_report(6)
 def known_used_figures(source: FigureSource) -> Iterator[ReportFigure]:
-    """Yield one per pair of a VLM run and a policy run."""
+    """Yield one figure per pair of a VLM run and a policy run."""
     for number, joined in enumerate(source.joins.tables, 1):
         yield known_used_figure(joined, number)
 

@@ -1,4 +1,4 @@
-"""Accuracy over the captured calls of an episode, and the same counted from what happens in it."""
+"""Accuracy over the captured calls of an episode, also counted from the events in it."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 
 Shares = NDArray[np.float64]
 EventCalls = Mapping[str, Mapping[str, int]]
-"""Per event, by episode id, the captured inference before it."""
+"""By event and episode id, the captured inference before it."""
 
 
 @dataclass(frozen=True)
@@ -56,13 +56,15 @@ class CallLine:
     """Held-out accuracy of a stream's best site by captured inference; arrays (C,), accuracies as shares.
 
     Attributes:
-        part: Of the model, see `Stream.part`.
-        accuracy: Of the sites that the inner folds choose, on the outer folds.
-        low: Its 95 % interval, NaN with too few groups.
-        high: As `low`.
+        part: Part of the model, see `Stream.part`.
+        calls: The captured inferences, counted from 0.
+        accuracy: Accuracy on the outer folds of the sites that the inner folds choose.
+        low: Lower end of its 95 % interval, NaN with too few groups.
+        high: Upper end of the interval.
         significant: Above chance against all sites of the stream, and above the controls that were run.
-        null: What the best site of permuted labels stays below in 95 %, NaN with few label permutations.
-        episodes: How many got that far.
+        null: The accuracy that the best site of permuted labels stays below in 95 %, NaN with few label
+            permutations.
+        episodes: Number of episodes that reached the inference.
     """
 
     stream: str
@@ -78,9 +80,13 @@ class CallLine:
 
 @dataclass(frozen=True)
 class AlignedLine:
-    """The same counted from an event of each episode: 0 is the last inference before the action that brought it
-    about. Sites are those that the inner folds of every call choose. There is no interval; (O,) offsets with at
-    least `FEWEST` episodes.
+    """Held-out accuracy of a stream's best sites, counted from an event of each episode.
+
+    Offset 0 is the last inference before the action that brought the event about. Sites are those that the inner
+    folds of every call choose. There is no interval.
+
+    Attributes:
+        offsets: (O,) offsets with at least `FEWEST` episodes.
     """
 
     stream: str
@@ -92,7 +98,11 @@ class AlignedLine:
 
 @dataclass(frozen=True)
 class EventTimes:
-    """At which captured inference an event fell due: median and quartiles over the episodes that have it."""
+    """The captured inference at which an event fell due: median and quartiles over the episodes that have it.
+
+    Attributes:
+        share: Share of all episodes that have the event.
+    """
 
     event: str
     median: float
@@ -102,7 +112,7 @@ class EventTimes:
 
 
 FEWEST = 10
-"""Episodes from which on an accuracy is shown."""
+"""Number of episodes from which on an accuracy is shown."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +121,7 @@ class CallCurves:
 
     Attributes:
         results: The probes by call.
-        events: When they fell due, as `event_calls` says; empty without trajectories.
+        events: The inferences before the events, from `event_calls`; empty without trajectories.
     """
 
     results: Mapping[int, ProbeResults]
@@ -123,7 +133,13 @@ class CallCurves:
     def of(
         cls, results: Mapping[int, ProbeResults], category: str, view: str, events: EventCalls | None = None
     ) -> Self:
-        """Read probes by call, as `load_results_by_call` gives them. events: as `event_calls` gives them.
+        """Read probes by call.
+
+        Args:
+            results: Probe results by call, from `load_results_by_call`.
+            category: A category that was probed at every call.
+            view: A view that was probed at every call.
+            events: The inferences before the events, from `event_calls`; None for no events.
 
         Raises:
             UsageError: For probes of a single call, or without that category and view.
@@ -139,20 +155,20 @@ class CallCurves:
 
     @property
     def streams(self) -> tuple[str, ...]:
-        """Return the streams that were probed at every call, in order."""
+        """The streams that were probed at every call, in order."""
         curves = list(self._curves.values())
         first = dict.fromkeys(site.stream for site in curves[0].sites)
         return tuple(name for name in first if all(curve.stream(name).size for curve in curves))
 
     def line(self, stream: str) -> CallLine:
-        """The stream's best site at each call."""
+        """Return the accuracy of the stream's best site at each call."""
         points = [self._point(call, curve, stream) for call, curve in self._curves.items()]
         accuracy, low, high, significant, null, episodes = map(np.array, zip(*points, strict=True))
         calls = np.array(list(self._curves), np.int64)
         return CallLine(stream, self._part(stream), calls, accuracy, low, high, significant, null, episodes)
 
     def aligned(self, stream: str, event: str) -> AlignedLine | None:
-        """The stream's best sites counted from an event; None where too few episodes have it."""
+        """Return the stream's best sites counted from an event; None where too few episodes have it."""
         pools: dict[int, list[bool]] = {}
         for call, curve in self._curves.items():
             right = curve.nested_correct(curve.stream(stream))
@@ -206,9 +222,9 @@ class CallCurves:
 
 
 def event_calls(run: Any) -> EventCalls:
-    """Per event, by episode id, the last inference before the action that brought it about.
+    """Return by event and episode id the last inference before the action that brought the event about.
 
-    Nothing for a run without trajectories. Inference c decides actions c · k + 1 to (c + 1) · k, with k actions
+    Empty for a run without trajectories. Inference c decides actions c · k + 1 to (c + 1) · k, with k actions
     executed per inference.
     """
     if not run.has_trajectories:
@@ -233,12 +249,12 @@ _PERMUTED = "best permuted probe, 95 %"
 class CallCurveDisplay(Display):
     """Held-out accuracy of each stream's best site by captured inference, for one category in one view.
 
-    Filled markers are above chance against all sites of their stream, and above the controls that were run; the
-    dotted line is what the best site of permuted labels stays below in 95 %. Upright lines: when the events of the
+    Filled markers are above chance against all sites of their stream, and above the controls that were run. The
+    best site of permuted labels stays below the dotted line in 95 %. Upright lines: when the events of the
     trajectories fell due, in the median, with quartiles. A site is chosen anew at each call.
 
     Attributes:
-        event: From which accuracies are counted instead, see `plot_aligned`.
+        event: The event from which accuracies are counted instead, see `plot_aligned`.
     """
 
     category: str
@@ -256,7 +272,13 @@ class CallCurveDisplay(Display):
         view: str | None = None,
         events: EventCalls | None = None,
     ) -> Self:
-        """Read probes by call (`load_results_by_call`). events: from `event_calls` of a run with trajectories.
+        """Read probes by call.
+
+        Args:
+            results: Probe results by call, from `load_results_by_call`.
+            category: The category that is drawn.
+            view: A probed view; None for the first.
+            events: Events of a run with trajectories, from `event_calls`.
 
         Raises:
             UnknownSiteError: For a view that was not probed.
@@ -280,7 +302,15 @@ class CallCurveDisplay(Display):
         )
 
     def plot_aligned(self, event: str, ax: "Axes | None" = None) -> Self:
-        """Draw the accuracies counted from an event. Raises UsageError if too few episodes have it."""
+        """Draw the accuracies counted from an event.
+
+        Args:
+            event: The event at offset 0.
+            ax: Axes to draw on; None makes a figure.
+
+        Raises:
+            UsageError: If too few episodes have it.
+        """
         if event not in self.aligned:
             events = ", ".join(self.aligned) or "none"
             raise UsageError(f"too few episodes have the event {event!r}, or no trajectories; there are: {events}")
@@ -342,7 +372,10 @@ def _draw(axes: "Axes", places: "ArrayLike", line: CallLine | AlignedLine) -> No
 def call_curves(
     results: Mapping[int, ProbeResults], view: str | None = None, events: EventCalls | None = None
 ) -> "Figure":
-    """Accuracy over captured calls for every category; arguments and errors as of `CallCurveDisplay`."""
+    """Return a figure of accuracy over captured calls, a panel per category.
+
+    Arguments and errors are those of `CallCurveDisplay.from_results`.
+    """
     names = next(iter(results.values())).settings.categories
     return in_panels([CallCurveDisplay.from_results(results, name, view, events) for name in names])
 
@@ -350,7 +383,7 @@ def call_curves(
 def aligned_curves(
     results: Mapping[int, ProbeResults], event: str, view: str | None = None, events: EventCalls | None = None
 ) -> "Figure":
-    """The same counted from an event, for every category in which enough episodes have it."""
+    """Return a figure of accuracies counted from an event, for every category in which enough episodes have it."""
     names = next(iter(results.values())).settings.categories
     displays = [CallCurveDisplay.from_results(results, name, view, events) for name in names]
     with_event = [display.around(event) for display in displays if event in display.aligned]
@@ -361,7 +394,7 @@ def aligned_curves(
 
 @in_report(12)
 def call_figures(source: FigureSource) -> Iterator[ReportFigure]:
-    """The figures that a report of these runs shows."""
+    """Yield a figure per run whose later inferences were probed as well."""
     for drawn in source.runs:
         # Only where a later inference was probed as well.
         if drawn.results is not None and len(calls := load_results_by_call(drawn.run, drawn.results)) > 1:

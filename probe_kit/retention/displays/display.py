@@ -1,4 +1,4 @@
-"""The displays' base, a panel alone or beside others; and the look that all figures share."""
+"""The displays' base, a panel alone or with others; and the look that all figures share."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -105,9 +105,9 @@ class ProvenanceLine:
 
     @property
     def parts(self) -> tuple[str, str, str, str, str, str, str]:
-        """Return the parts of the line, most important first; random weights are named in capitals.
+        """The parts of the line, most important first; random weights are named in capitals.
 
-        Model, suite, n, call, target, probes, weights; empty where there is nothing to say.
+        Model, suite, n, call, target, probes, weights; empty where there is nothing to name.
         """
         return (
             f"{self.model} {RANDOM}" if self.random_weights else self.model,
@@ -121,7 +121,7 @@ class ProvenanceLine:
 
     @property
     def line(self) -> str:
-        """Everything in one line, for a caption."""
+        """All parts in one line, for a caption."""
         return " · ".join(filter(None, [*self.parts, f"settings {self.settings[:SHOWN]}"]))
 
 
@@ -130,19 +130,19 @@ BLUE, VERMILION, GREEN, ORANGE = "#0072B2", "#D55E00", "#009E73", "#E69F00"
 SKY, PURPLE, BLACK, GREY = "#56B4E9", "#CC79A7", "#000000", "#8C8C8C"
 
 DPI = 150
-"""On a screen; files are saved at `PRINT_DPI`."""
+"""Resolution on a screen; files are saved at `PRINT_DPI`."""
 ACCURACY = (20.0, 109.0)
-"""Percent along the axis of held-out accuracies, the same in every figure of every run.
+"""Range in percent of the axis of held-out accuracies, the same in every figure of every run.
 
-Held-out accuracies below 50 % occur by chance, rarely below 20 %. Carets of the best sites stand above 100 %.
+Held-out accuracies below 50 % occur by chance, rarely below 20 %. Carets of the best sites are drawn above 100 %.
 """
 ABOVE_CHANCE = (-30.0, 51.0)
-"""The same of accuracies above chance, in points."""
+"""Range in points of the axis of accuracies above chance, the same in every figure."""
 _CAPTION_SIZE = 6.5
 _LEGEND_SIZE = 8.0
 """Both in points."""
 _LETTERS_PER_INCH = 16
-"""Letters of a legend's label on an inch, a low estimate."""
+"""Letters of a legend's label per inch, a low estimate."""
 _MARK = 8
 """Letters that the mark and the gaps of a legend's entry take."""
 _LEGEND_ROWS, _ROW_HEIGHT = 2, 0.17
@@ -166,7 +166,7 @@ PARTS = MappingProxyType(
         "bridge": Line(PURPLE, "D"),
     }
 )
-"""How the streams of one part of a model are drawn."""
+"""The look of the streams of one part of a model."""
 
 SERIES = (
     Line(BLUE, "o"),
@@ -177,7 +177,7 @@ SERIES = (
     Line(BLACK, "P", (0, (3, 1, 1, 1))),  # type: ignore[arg-type]
     Line(SKY, "X", "-"),
 )
-"""For models or roles, in order; an eighth one begins again."""
+"""The looks of models or roles, in order; an eighth one begins again."""
 
 
 def series(position: int) -> Line:
@@ -186,7 +186,7 @@ def series(position: int) -> Line:
 
 
 def darker(colour: str) -> str:
-    """A shade of `#RRGGBB` that text can be read in."""
+    """Return a shade of `#RRGGBB` that text can be read in."""
     return "#" + "".join(f"{int(colour[at : at + 2], 16) * 6 // 10:02X}" for at in (1, 3, 5))
 
 
@@ -199,9 +199,13 @@ def panels(
     share: bool = True,
     in_pyplot: bool = False,
 ) -> "tuple[Figure, list[Axes]]":
-    """A figure of `count` panels of `width` × `height` inches, at most three or `columns` in a row.
+    """Return a figure of `count` panels of `width` × `height` inches.
 
     Args:
+        count: Number of panels.
+        width: Width of a panel in inches.
+        height: Height of a panel in inches.
+        columns: Panels in a row; None for at most three.
         share: Whether panels share both axes.
         in_pyplot: Whether pyplot knows the figure, so that notebooks show it.
     """
@@ -227,7 +231,7 @@ def panels(
 
 
 def layer_axis(axes: "Axes", layers: int, label: bool = True) -> None:
-    """Whole layer numbers below the axes."""
+    """Write whole layer numbers below the axes."""
     from matplotlib.ticker import MaxNLocator
 
     axes.set_xlim(-0.06 * layers - 0.2, 1.06 * (layers - 1) + 0.2)
@@ -240,12 +244,12 @@ def layer_axis(axes: "Axes", layers: int, label: bool = True) -> None:
 
 
 def accuracy_axis(axes: "Axes") -> None:
-    """The fixed scale of accuracies; what lies below is marked at the lower edge by `mark_below`."""
+    """Set the fixed scale of accuracies; lower values are marked at the lower edge by `mark_below`."""
     axes.set_ylim(*ACCURACY)
 
 
 def mark_below(axes: "Axes", places: "ArrayLike", accuracy: "ArrayLike", colour: str) -> None:
-    """A mark at the lower edge, with the number, for every accuracy (percent) that the scale does not reach."""
+    """Mark every accuracy (percent) below the scale at the lower edge, with its number."""
     for at, value in zip(np.asarray(places), np.asarray(accuracy), strict=True):
         if value < ACCURACY[0]:
             axes.plot([at], [ACCURACY[0] + 1.5], ls="none", marker="v", ms=5, color=colour, gid="below")
@@ -256,13 +260,13 @@ def mark_below(axes: "Axes", places: "ArrayLike", accuracy: "ArrayLike", colour:
 
 
 def plain(axes: "Axes") -> None:
-    """No frame above and to the right, small tick labels."""
+    """Remove the frame above and to the right, and make tick labels small."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.tick_params(labelsize=8)
 
 
 def caption(figure: "Figure", *certificates: ProvenanceLine) -> None:
-    """Write under the figure what it is about: every model once, then the parts that all have in common.
+    """Write the origin of a figure below it: every model once, then the parts that all have in common.
 
     `figure.caption` has each certificate in full, with its settings.
     """
@@ -280,12 +284,15 @@ def footer(figure: "Figure", text: str) -> None:
 
 
 def legend_above(figure: "Figure", handles: "Sequence[Artist]", title: str = "") -> None:
-    """A legend along the upper side, in as many columns as the figure has room for; many rows make it higher.
+    """Draw a legend along the upper side, in as many columns as the figure has room for.
 
-    matplotlib fills a legend column by column, and leaves their number to its caller.
+    Many rows make the figure higher. matplotlib fills a legend column by column, and leaves their number to its
+    caller.
 
     Args:
-        title: Lines above it.
+        figure: The figure of all panels.
+        handles: Entries in order.
+        title: Lines above the entries; empty for none.
     """
     lengths = [len(str(handle.get_label())) + _MARK for handle in handles]
     room = _LETTERS_PER_INCH * figure.get_figwidth()
@@ -312,7 +319,7 @@ def legend_handles(*grid: "Axes") -> "dict[str, Artist]":
 
 
 def significance_handles() -> "list[Line2D]":
-    """The legend's entries for filled and open markers, which mean the same in every figure."""
+    """Return the legend's entries for filled and open markers, which mean the same in every figure."""
     from matplotlib.lines import Line2D
 
     return [
@@ -322,7 +329,7 @@ def significance_handles() -> "list[Line2D]":
 
 
 SIGNAL = f"above chance and every control run, p < {SIGNIFICANCE}"
-"""What every filled marker and every dot of a probe is; the same words in legends and captions."""
+"""The meaning of every filled marker and every dot of a probe; the same words in legends and captions."""
 FILLED = f"filled: shown ({SIGNAL})"
 OPEN = "open: not shown"
 
@@ -332,18 +339,18 @@ OPEN = "open: not shown"
 
 @dataclass(kw_only=True)
 class Display(ABC):
-    """One panel of numbers: on axes of its own, or beside others in one figure.
+    """One panel of numbers: on axes of its own, or one of several in a figure.
 
     A display that has been plotted shows its figure.
 
     Attributes:
-        title: Above the panel.
+        title: Text above the panel.
         measure: Name of the upright axis.
-        certificates: Where its numbers come from.
+        certificates: Origin of its numbers.
         figure_size: Inches of a panel by itself.
         is_level: Whether panels side by side have one range of the upright axis.
-        ax_: What `plot` drew on.
-        panel_size: Of one of several.
+        ax_: The axes that `plot` drew on.
+        panel_size: Inches of a panel among several.
         is_framed: Whether all spines are drawn.
     """
 
@@ -362,11 +369,11 @@ class Display(ABC):
         """Draw marks with labels for the legend, and the axes' scales."""
 
     def further_handles(self) -> "Sequence[Artist]":
-        """Return handles of the legend, behind those of what is drawn."""
+        """Return handles of the legend that follow those of the drawn marks."""
         return []
 
     def finish(self, figure: "Figure", grid: "Sequence[Axes]") -> None:
-        """Add to a figure of one or more panels what all of them share: a legend with every name once."""
+        """Add the parts that all panels of a figure share: a legend with every name once."""
         if every := [*legend_handles(*grid).values(), *self.further_handles()]:
             legend_above(figure, every)
 
@@ -388,7 +395,7 @@ class Display(ABC):
         self.ax_ = axes
 
     def annotate(self) -> None:  # noqa: B027 - most displays have nothing to write
-        """Write what needs the marks' final places: after the layout of a figure of its own, else at once."""
+        """Write texts that need the marks' final places: after the layout of a figure of its own, else at once."""
 
     def _repr_png_(self) -> "Picture | None":
         """Return the figure, whatever pyplot's backend is."""
@@ -416,9 +423,9 @@ def in_panels(
 
     Args:
         displays: One or more; None leaves a place empty.
-        size: Of a panel in inches, by default that of its kind.
-        columns: As in `panels`.
-        in_pyplot: As `columns`.
+        size: Size of a panel in inches, by default that of its kind.
+        columns: Panels in a row; None for at most three.
+        in_pyplot: Whether pyplot knows the figure, so that notebooks show it.
     """
     present = [display for display in displays if display is not None]
     first = present[0]
@@ -450,7 +457,17 @@ def draw_series(
     label: str,
     zorder: float = 2.0,
 ) -> None:
-    """A line, with filled markers where it is significant and open ones elsewhere. x, y, filled: (K,)."""
+    """Draw a line, with filled markers where it is significant and open ones elsewhere.
+
+    Args:
+        axes: Axes to draw on.
+        line: The look of the series.
+        x: (K,) places.
+        y: (K,) heights.
+        filled: (K,) whether a point is significant.
+        label: Entry in the legend.
+        zorder: Drawing order; larger is drawn on top.
+    """
     axes.plot(x, y, color=line.colour, ls=line.dash, lw=1.6, label=label, zorder=zorder)
     for is_filled in (True, False):
         axes.plot(
@@ -463,7 +480,11 @@ def draw_series(
 
 
 def known_view(results: ProbeResults, view: str | None) -> str:
-    """`view`, or the first probed one. Raises UnknownSiteError if it was not probed."""
+    """Return `view`, or the first probed one.
+
+    Raises:
+        UnknownSiteError: If it was not probed.
+    """
     probed = results.settings.views
     view = view or probed[0]
     if view not in probed:
@@ -472,7 +493,11 @@ def known_view(results: ProbeResults, view: str | None) -> str:
 
 
 def curve_of(results: ProbeResults, category: str, view: str) -> ProbeCurve:
-    """The probes of a category. Raises UnknownCategoryError if it was not probed."""
+    """Return the probes of a category.
+
+    Raises:
+        UnknownCategoryError: If it was not probed.
+    """
     if (category, view) not in results.curves:
         probed = ", ".join(results.settings.categories)
         raise UnknownCategoryError(f"category {category!r} was not probed; probed: {probed}")
@@ -480,20 +505,20 @@ def curve_of(results: ProbeResults, category: str, view: str) -> ProbeCurve:
 
 
 def probed_curve(results: ProbeResults, view: str | None, category: str | None) -> tuple[str, str, ProbeCurve]:
-    """Return category, view and curve, by default the first. Raises as `known_view` and `curve_of`."""
+    """Return category, view and curve, by default the first; raises as `known_view` and `curve_of`."""
     view, category = known_view(results, view), category or results.settings.categories[0]
     return category, view, curve_of(results, category, view)
 
 
 def scores_of(results: ProbeResults, category: str, view: str, stream: str | None = None) -> "pd.DataFrame":
-    """Rows of `results.scores` of one category in one view, and of one stream where it is named."""
+    """Return the rows of `results.scores` of one category in one view, and of one stream where it is named."""
     scores = results.scores
     selected = (scores["category"] == category) & (scores["view"] == view)
     return scores[selected if stream is None else selected & (scores["stream"] == stream)]
 
 
 def best_of(iterations: Iterations) -> Iterations:
-    """Return the choice for what has one line or one number: the best iteration in place of all."""
+    """Return the choice of iterations for a single line or number: the best iteration in place of all."""
     return "best" if iterations == "all" else iterations
 
 
@@ -501,7 +526,7 @@ def best_row(curve: ProbeCurve, stream: str) -> int:
     """Return the position of the site of a stream that has the largest score above its own chance.
 
     Raises:
-        UnknownSiteError: Without any.
+        UnknownSiteError: If no site of the stream was probed.
     """
     rows = curve.stream(stream)
     if not rows.size:

@@ -41,10 +41,12 @@ class FinalPositionsDisplay(Display):
     """Final places of the cube in metres: x away from the robot, y to its left.
 
     Attributes:
+        category: None for all categories.
         xy: (E, 2), NaN where the simulator broke.
         outcome: (E,) `correct`, `wrong` or `oob`.
+        never_moved: Number of episodes whose cube never left its start.
         scene: Tile places and sizes, zone radius and the start of the cube, as stored with the run.
-        rule: By which outcomes are.
+        rule: The rule by which outcomes are judged.
     """
 
     category: str | None
@@ -62,7 +64,9 @@ class FinalPositionsDisplay(Display):
         """Read the episodes of a run, all of them or those of one category.
 
         Args:
-            scene: `SceneSpec.to_json()`; that of the run by default.
+            run: A run that stores its scene and the final positions.
+            category: None for all.
+            scene: Result of `SceneSpec.to_json()`; that of the run by default.
 
         Raises:
             UsageError: If the run has no scene or no positions, or no such category.
@@ -125,7 +129,11 @@ class FinalPositionsDisplay(Display):
 
 
 def final_positions(run: RunReader) -> "Figure":
-    """Final places of the cube, a panel per category. Raises UsageError if the run stores none."""
+    """Return a figure of the final places of the cube, a panel per category.
+
+    Raises:
+        UsageError: If the run stores none.
+    """
     categories = [str(name) for name in run.episodes["category"].unique()]
     return in_panels([FinalPositionsDisplay.from_run(run, name) for name in categories])
 
@@ -139,7 +147,7 @@ def _reach(rule: OutcomeRule) -> float:
 
 
 def _window(scene: Mapping[str, Any], zone: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Corners (x, y) of what is shown."""
+    """Return the corners (x, y) of the part that is drawn."""
     reach = max(zone, scene["tile_side"] * 0.75)
     places = np.array([scene["tile_left"], scene["tile_right"], scene["cube_xy"]], float)
     margin = np.array([[reach], [reach], [_MARGIN]])
@@ -193,7 +201,7 @@ def _set_window(axes: "Axes", low: NDArray[np.float64], high: NDArray[np.float64
 
 @in_report(8)
 def position_figures(source: FigureSource) -> Iterator[ReportFigure]:
-    """The figures that a report of these runs shows."""
+    """Yield a figure per run that stores final positions."""
     for drawn in source.runs:
         run = drawn.judged
         if run is None:

@@ -1,4 +1,4 @@
-"""Stored interventions: where an answer passes and is read, attention, and how much of a direction turns."""
+"""Figures of stored interventions: where an answer passes and is read, attention, and doses of a direction."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Points:
-    """One line: percent by layer, and which points are significant, family-wise."""
+    """One line: percent by layer, and whether each point is significant, family-wise."""
 
     layers: NDArray[np.int64]
     percent: NDArray[np.float64]
@@ -62,12 +62,14 @@ class Points:
 class SiteEffectDisplay(Display):
     """Curves by backbone layer: held-out accuracy of probes, and the episodes that turn when tokens are exchanged.
 
+    Filled markers are significant, family-wise.
+
     Attributes:
         readable: Accuracy in percent.
         passes: By role, share of episodes in percent whose action turns to the side of the swapped images, minus
             those that turn from it.
         read: The same for the keys and values that the acting part reads of each block; None where it was not
-            tested. Filled: significant, family-wise.
+            tested.
     """
 
     measure: str = "% of episodes"
@@ -85,9 +87,17 @@ class SiteEffectDisplay(Display):
         view: str = "mean",
         stored: Mapping[str, Sequence[PatchEffect]] | None = None,
     ) -> Self:
-        """Read the stored interchange and probes of a run. stored: what `shown_passing` returns.
+        """Read the stored interchange and probes of a run.
 
-        Raises NoInterventionsError if none is stored of the category, UnknownCategoryError, UnknownSiteError.
+        Args:
+            run: The run that stores the interchange.
+            results: Probes of the run.
+            category: A category that was probed.
+            view: A view that was probed.
+            stored: Result of `shown_passing`; None reads it from the run.
+
+        Raises:
+            NoInterventionsError: If no interchange is stored of the category.
         """
         rows = (shown_passing(run) if stored is None else stored).get(category, [])
         if not rows:
@@ -114,7 +124,7 @@ class SiteEffectDisplay(Display):
         )  # fmt: skip
 
     def draw(self, axes: "Axes") -> None:
-        """A line for probes, one for every role, one for `kv`."""
+        """Draw a line for probes, one for every role, one for `kv`."""
         axes.axhline(100 * CHANCE, color="0.45", lw=1, ls=(0, (1, 1)), label="chance of probes")
         lines = {
             "readable (probe)": self.readable,
@@ -130,11 +140,15 @@ class SiteEffectDisplay(Display):
 
 
 def shown_passing(run: RunReader) -> dict[str, list[PatchEffect]]:
-    """Return by category what a figure by layers shows: the backbone at every role, `kv` as a whole.
+    """Return by category the effects that a figure by layers shows: the backbone at every role, `kv` as a whole.
 
-    Categories of which nothing of the two is stored are not there.
+    Categories of which nothing of the two is stored are not in it.
 
-    Raises RunDamagedError.
+    Args:
+        run: The run that stores the interventions.
+
+    Raises:
+        RunDamagedError: If stored effects were changed.
     """
     by_category = {
         category: [
@@ -149,7 +163,16 @@ def shown_passing(run: RunReader) -> dict[str, list[PatchEffect]]:
 
 
 def site_effect_curve(run: RunReader, results: ProbeResults, view: str = "mean") -> "Figure":
-    """A panel per category of which an interchange is stored. Raises NoInterventionsError if there is none."""
+    """Return a figure with a panel per category of which an interchange is stored.
+
+    Args:
+        run: The run that stores the interchange.
+        results: Probes of the run.
+        view: View of the probes.
+
+    Raises:
+        NoInterventionsError: If there is none.
+    """
     stored = shown_passing(run)
     names = [name for name in results.settings.categories if name in stored] or ["any"]
     return in_panels([SiteEffectDisplay.from_run(run, results, name, view, stored) for name in names])
@@ -169,7 +192,7 @@ def _stream(row: PatchEffect) -> str:
 
 @in_report(13)
 def site_effect_figures(source: FigureSource) -> Iterator[ReportFigure]:
-    """The figures that a report of these runs shows."""
+    """Yield a figure per run with a stored interchange of a probed category."""
     for drawn in source.runs:
         if drawn.results is None or not set(shown_passing(drawn.run)) & set(drawn.results.settings.categories):
             continue
@@ -194,13 +217,14 @@ _LABELS = {CORRECT: "correct picture's tile", OTHER: "other picture's tile", ACT
 class AttentionDisplay(Display):
     """A curve by block of the backbone: the share of attention in percent that lies on one role's tokens.
 
+    Descriptive: attended tokens need not be used, and no verdict reads this.
+
     Attributes:
-        blocks: (B,) those that are read.
-        roles: Names of R; of tiles by where the answer lies.
-        mean: (R, B) over iterations, heads and inferences.
-        iterations: (R, B, I) over heads and inferences.
-        heads: (R, B, H) over iterations and inferences. Descriptive: attended tokens need not be used, and no
-            verdict reads this.
+        blocks: (B,) blocks that are read.
+        roles: Names of the R roles; tiles are named by where the answer lies.
+        mean: (R, B) means over iterations, heads and inferences.
+        iterations: (R, B, I) means over heads and inferences.
+        heads: (R, B, H) means over iterations and inferences.
     """
 
     measure: str = "% of attention (describes, no cause)"
@@ -214,7 +238,12 @@ class AttentionDisplay(Display):
 
     @classmethod
     def from_run(cls, run: RunReader, category: str, stored: Mapping[str, AttentionShares] | None = None) -> Self:
-        """Read the newest attention that is stored of a category. stored: what `stored_attention` returns.
+        """Read the newest attention that is stored of a category.
+
+        Args:
+            run: The run that stores the attention.
+            category: The category that is drawn.
+            stored: Result of `stored_attention`; None reads it from the run.
 
         Raises:
             NoInterventionsError: If there is none.
@@ -248,7 +277,7 @@ class AttentionDisplay(Display):
         )
 
     def draw(self, axes: "Axes") -> None:
-        """A line for every role, with what iterations and heads there are around it."""
+        """Draw a line for every role, with the range of its iterations and its heads around it."""
         for position, role in enumerate(self.roles):
             line, x = series(position), self.blocks + 0.06 * (position - len(self.roles) / 2)
             reach = np.nanmin(self.iterations[position], axis=1), np.nanmax(self.iterations[position], axis=1)
@@ -267,7 +296,11 @@ class AttentionDisplay(Display):
 
 
 def attention_curve(run: RunReader) -> "Figure":
-    """A panel per category of which attention is stored. Raises NoInterventionsError if there is none."""
+    """Return a figure with a panel per category of which attention is stored.
+
+    Raises:
+        NoInterventionsError: If there is none.
+    """
     stored = stored_attention(run)
     return in_panels([AttentionDisplay.from_run(run, category, stored) for category in stored or ["any"]])
 
@@ -279,13 +312,17 @@ _HEAVIEST = 0.8
 
 
 def attention_on_picture(run: RunReader, category: str | None = None) -> "Figure":
-    """An episode's first inference: the attention on each patch over the picture, of all blocks and of each.
+    """Draw an episode's first inference: the attention on each patch over the picture, of all blocks and of each.
 
-    Means over heads and iterations; the strongest patch of a panel has the full colour.
+    Means over heads and iterations; the strongest patch of a panel has the full colour. The first episode with a
+    picture is drawn.
 
     Args:
-        category: By default the first one with stored patches, of whose episodes the first one with a picture is
-            drawn. Raises NoInterventionsError where patches or pictures are not stored.
+        run: The run that stores attention on patches, and pictures.
+        category: Category of the episode; None for the first one with stored patches.
+
+    Raises:
+        NoInterventionsError: If patches or pictures are not stored.
     """
     pictured = _first_pictured(run, category)
     if pictured is None:
@@ -327,7 +364,7 @@ _Pictured = tuple[str, Picture, Boxes, Percent]
 
 
 def _first_pictured(run: RunReader, category: str | None = None) -> _Pictured | None:
-    """The first episode with attention and a picture."""
+    """Return the first episode with attention and a picture."""
     stored = stored_patch_attention(run)
     patches = stored.get(category) if category is not None else next(iter(stored.values()), None)
     if patches is None:
@@ -346,7 +383,7 @@ def _first_pictured(run: RunReader, category: str | None = None) -> _Pictured | 
 
 @in_report(15, "sides", "labels")
 def attention_figures(source: FigureSource) -> Iterator[ReportFigure]:
-    """Yield the figures that a report of these runs shows, once per run."""
+    """Yield the figures of stored attention, once per run."""
     for drawn in {drawn.position: drawn for drawn in reversed(source.runs)}.values():
         if (pictured := _first_pictured(drawn.run)) is not None:
             yield ReportFigure(
@@ -371,16 +408,16 @@ class DoseResponseDisplay(Display):
     """A curve by coefficient: the share of episodes that turn to the target side, minus those that turn from it.
 
     Attributes:
+        position: The place that was steered, such as `backbone.02 image`.
         coefficients: (K,) in half class-mean differences, ascending, 0 among them.
-        net: (K,) percent, of all episodes and of those that are pushed to either side, one of which may be
-            saturated.
-        net_left: As `net`.
-        net_right: As `net`.
+        net: (K,) percent of all episodes.
+        net_left: (K,) percent of episodes that are pushed to the left, which may be saturated.
+        net_right: (K,) percent of episodes that are pushed to the right, which may be saturated.
         controls: (C, K) percent of random directions of the same norm, NaN at a coefficient at which none was
             played.
-        relative_change: (K,) how far tokens were moved, in their own norms; beyond two, an effect is little
-            evidence.
-        significant: (K,) beyond the controls, family-wise.
+        relative_change: (K,) distance by which tokens were moved, in their own norms; beyond two, an effect is
+            little evidence.
+        significant: (K,) whether the effect is beyond the controls, family-wise.
     """
 
     measure: str = "% of episodes that turn"
@@ -403,10 +440,13 @@ class DoseResponseDisplay(Display):
         position: str | None = None,
         stored: Mapping[str, Mapping[str, Sequence[PatchEffect]]] | None = None,
     ) -> Self:
-        """Read the steering that is stored of a category. position: one of several, as `backbone.02 image`.
+        """Read the steering that is stored of a category.
 
         Args:
-            stored: What `stored_steering` returns.
+            run: The run that stores the steering.
+            category: The category that is drawn.
+            position: One of several places, such as `backbone.02 image`; None for the first.
+            stored: Result of `stored_steering`; None reads it from the run.
 
         Raises:
             NoInterventionsError: If there is none.
@@ -442,7 +482,7 @@ class DoseResponseDisplay(Display):
         )
 
     def draw(self, axes: "Axes") -> None:
-        """A line for all episodes and one for either side, over the band of the controls."""
+        """Draw a line for all episodes and one for either side, over the band of the controls."""
         axes.axhline(0, color="0.45", lw=1, ls=(0, (1, 1)))
         if self.controls.size:
             # Nothing was added at coefficient 0, by a control either.
@@ -473,7 +513,11 @@ def _share(ratio: float) -> str:
 
 
 def dose_response(run: RunReader) -> "Figure":
-    """A panel per category and place that was steered. Raises NoInterventionsError if none is stored."""
+    """Return a figure with a panel per category and place that was steered.
+
+    Raises:
+        NoInterventionsError: If none is stored.
+    """
     stored = stored_steering(run)
     pairs: list[tuple[str, str | None]] = [
         (category, position) for category, by_position in stored.items() for position in by_position
@@ -484,7 +528,7 @@ def dose_response(run: RunReader) -> "Figure":
 
 @in_report(14)
 def dose_figures(source: FigureSource) -> Iterator[ReportFigure]:
-    """The figures that a report of these runs shows."""
+    """Yield a figure per run that stores steering."""
     for drawn in source.runs:
         if stored_steering(drawn.run):
             yield ReportFigure(

@@ -41,10 +41,11 @@ if TYPE_CHECKING:
 class IterationMapDisplay(Display):
     """Held-out accuracy at every layer and iteration of one stream, for one category in one view.
 
+    Colours run from chance to 100 % in every map of every run.
+
     Attributes:
-        layers: The numbers along both sides, (L,) and (I,). Colours run from chance to 100 % in every map of every
-            run.
-        iterations: As `layers`.
+        layers: (L,) numbers along the lower side.
+        iterations: (I,) numbers along the upright side.
         accuracy: (I, L) shares.
         significant: (I, L), above chance against the best site of the stream, and above the controls that were
             run.
@@ -66,7 +67,13 @@ class IterationMapDisplay(Display):
     def from_results(
         cls, results: ProbeResults, category: str, view: str | None = None, stream: str | None = None
     ) -> Self:
-        """Read stored probes; view: the first probed one by default; stream: where the action is made.
+        """Read stored probes of a side.
+
+        Args:
+            results: Probes of one run.
+            category: The category that is drawn.
+            view: A probed view; None for the first.
+            stream: A stream with iterations; None for the one where the action is made.
 
         Raises:
             UnknownSiteError: For a view that was not probed or a stream without iterations.
@@ -146,7 +153,12 @@ class IterationMapDisplay(Display):
 
 
 def iteration_maps(results: ProbeResults, view: str | None = None, stream: str | None = None) -> "Figure":
-    """A layer × iteration map of every category on one scale of colours.
+    """Return a figure with a layer × iteration map of every category on one scale of colours.
+
+    Args:
+        results: Probes of one run.
+        view: A probed view; None for the first.
+        stream: A stream with iterations; None for the one where the action is made.
 
     Raises:
         UnknownSiteError: For a view that was not probed or a stream without iterations.
@@ -160,7 +172,10 @@ _LEAST = 100 * CHANCE
 
 
 def _colours(part: str) -> "Colormap":
-    """White at chance, through the part's colour, to nearly black: lightness alone orders the cells."""
+    """Return colours from white at chance, through the part's colour, to nearly black.
+
+    Lightness alone orders the cells.
+    """
     from matplotlib.colors import LinearSegmentedColormap
 
     dark = "#331400" if part == "action" else "#001B2E"
@@ -170,7 +185,7 @@ def _colours(part: str) -> "Colormap":
 
 @in_report(10)
 def map_figures(source: FigureSource) -> Iterator[ReportFigure]:
-    """The figures that a report of these runs shows."""
+    """Yield a figure per probed view and iterative action stream of the runs."""
     for view in probed_views(source):
         scores = view.results.scores
         in_action = (scores["view"] == view.view) & (scores["part"] == "action")

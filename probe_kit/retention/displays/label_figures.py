@@ -41,9 +41,9 @@ class BestSiteDisplay(Display):
     """A panel of a label's probes at the best site of a stream: that of the largest score above its own chance.
 
     Attributes:
-        curve: Of this site alone.
+        curve: The probes of this site alone.
         signal: Whether it exceeds chance, family-wise, and every control that was run.
-        scores_of_controls: Those that it is compared with, the best first.
+        scores_of_controls: The controls that it is compared with, the best first.
     """
 
     target: str
@@ -61,7 +61,13 @@ class BestSiteDisplay(Display):
         view: str | None = None,
         category: str | None = None,
     ) -> Self:
-        """Read stored probes; view, category: the first probed one by default.
+        """Read stored probes of a label.
+
+        Args:
+            results: Probes of one run.
+            stream: The stream whose best site is drawn.
+            view: A probed view; None for the first.
+            category: A probed category; None for the first.
 
         Raises:
             UnknownSiteError: For a view or stream that was not probed.
@@ -85,7 +91,7 @@ class BestSiteDisplay(Display):
     @staticmethod
     @abstractmethod
     def why_not(curve: ProbeCurve) -> str:
-        """Return why labels have no such figure, and what was expected; empty where they have."""
+        """Return the reason why labels have no such figure, and the expected kind; empty where they have."""
 
     @property
     def site(self) -> str:
@@ -104,9 +110,9 @@ def _in_streams(
 # -- confusion of classes ------------------------------------------------------------------------------------
 
 _WITH_NUMBERS = 12
-"""Classes, more than which leave no room for numbers in the cells."""
+"""Largest number of classes that leaves room for numbers in the cells."""
 _LONGEST = 14
-"""Letters of a class that are shown."""
+"""Letters of a class's name that are shown."""
 
 
 @dataclass(kw_only=True)
@@ -118,12 +124,12 @@ class ClassConfusionDisplay(BestSiteDisplay):
 
     @staticmethod
     def why_not(curve: ProbeCurve) -> str:
-        """Quantities are not confused."""
+        """Return a reason for quantities, which are not confused."""
         return "" if curve.classes else "is continuous; expected classes to confuse"
 
     @property
     def counts(self) -> NDArray[np.int64]:
-        """(K, K) samples by true class, down, and predicted class, across."""
+        """The number of samples (K, K) by true class, down, and predicted class, across."""
         from sklearn.metrics import confusion_matrix
 
         classes = np.arange(len(self.curve.classes))
@@ -132,12 +138,12 @@ class ClassConfusionDisplay(BestSiteDisplay):
 
     @property
     def shares(self) -> NDArray[np.float64]:
-        """(K, K) of each true class; the mean of the diagonal is the balanced accuracy."""
+        """The shares (K, K) of each true class; the mean of the diagonal is the balanced accuracy."""
         shares: NDArray[np.float64] = self.counts / self.counts.sum(axis=1, keepdims=True).clip(1)
         return shares
 
     def draw(self, axes: "Axes") -> None:
-        """Shares of the true class as colours, and in percent."""
+        """Draw shares of the true class as colours, and in percent."""
         from matplotlib.colors import LinearSegmentedColormap
 
         shares, places = self.shares, range(len(self.curve.classes))
@@ -157,13 +163,16 @@ class ClassConfusionDisplay(BestSiteDisplay):
 
 
 def class_confusions(results: ProbeResults, view: str | None = None, category: str | None = None) -> "Figure":
-    """Confusion matrices, a panel per stream; arguments and errors as of `ClassConfusionDisplay`."""
+    """Return a figure of confusion matrices, a panel per stream.
+
+    Arguments and errors are those of `ClassConfusionDisplay.from_results`.
+    """
     return _in_streams(ClassConfusionDisplay, results, view, category)
 
 
 @in_report(17, "labels")
 def confusion_figures(source: FigureSource) -> Iterator[ReportFigure]:
-    """Yield the figures that a report of these labels shows: of those with classes."""
+    """Yield the confusion matrices of the probed views of labels with classes."""
     for view in probed_views(source):
         if view.curve.classes:
             yield view.figure(
@@ -177,7 +186,7 @@ def confusion_figures(source: FigureSource) -> Iterator[ReportFigure]:
 # -- predicted against true values ---------------------------------------------------------------------------
 
 _PIXELS_FROM = 2000
-"""Points, from which on a figure holds them as pixels."""
+"""Number of points from which on a figure holds them as pixels."""
 
 
 @dataclass(kw_only=True)
@@ -193,28 +202,28 @@ class PredictedValuesDisplay(BestSiteDisplay):
 
     @staticmethod
     def why_not(curve: ProbeCurve) -> str:
-        """Classes have no values."""
+        """Return a reason for classes, which have no values."""
         return "" if curve.task == "continuous" else "is of classes; expected a continuous one"
 
     @property
     def true(self) -> NDArray[np.float64]:
-        """(n,) labels in their own unit."""
+        """The labels (n,) in their own unit."""
         labels: NDArray[np.float64] = self.curve.labels
         return labels
 
     @property
     def predicted(self) -> NDArray[np.float64]:
-        """(n,) held-out predictions in the unit of the label."""
+        """The held-out predictions (n,) in the unit of the label."""
         predicted: NDArray[np.float64] = self.curve.decisions[0]
         return predicted
 
     @property
     def groups(self) -> NDArray[np.int64]:
-        """(n,) number of each sample's group, which is its colour."""
+        """The number (n,) of each sample's group, which is its colour."""
         return np.asarray(np.unique(self.curve.groups, return_inverse=True)[1], np.int64)
 
     def draw(self, axes: "Axes") -> None:
-        """A point per sample, and where prediction and label are equal."""
+        """Draw a point per sample, and the line on which prediction and label are equal."""
         low = float(min(self.true.min(), self.predicted.min()))
         high = float(max(self.true.max(), self.predicted.max()))
         axes.plot([low, high], [low, high], color="0.6", lw=0.9, ls="--", label="predicted = true")
@@ -226,13 +235,16 @@ class PredictedValuesDisplay(BestSiteDisplay):
 
 
 def predicted_values(results: ProbeResults, view: str | None = None, category: str | None = None) -> "Figure":
-    """Predicted against true, a panel per stream; arguments and errors as of `PredictedValuesDisplay`."""
+    """Return a figure of predicted against true values, a panel per stream.
+
+    Arguments and errors are those of `PredictedValuesDisplay.from_results`.
+    """
     return _in_streams(PredictedValuesDisplay, results, view, category)
 
 
 @in_report(18, "labels")
 def predicted_figures(source: FigureSource) -> Iterator[ReportFigure]:
-    """Yield the figures that a report of these labels shows: of continuous ones."""
+    """Yield predicted against true values of the probed views of continuous labels."""
     for view in probed_views(source):
         if not view.curve.classes:
             yield view.figure(
@@ -263,12 +275,12 @@ class StepScoresDisplay(BestSiteDisplay):
 
     @staticmethod
     def why_not(curve: ProbeCurve) -> str:
-        """A single step is no curve."""
+        """Return a reason for a single step, which is no curve."""
         return "has one step; expected several to show" if curve.steps.size < 2 else ""
 
     @property
     def steps(self) -> NDArray[np.int64]:
-        """Inferences, or places behind the event where windows begin."""
+        """The inferences, or places after the event where windows begin."""
         return self.curve.steps
 
     @property
@@ -283,7 +295,7 @@ class StepScoresDisplay(BestSiteDisplay):
 
     @cached_property
     def limits(self) -> NDArray[np.float64]:
-        """(2, W) the ends of the 95 % intervals over groups."""
+        """The ends (2, W) of the 95 % intervals over groups."""
         curve, balanced = self.curve, self.curve.step_scores(self.curve.scores[0])
         at_steps = [curve.places == step for step in curve.steps]
         intervals = [
@@ -294,7 +306,7 @@ class StepScoresDisplay(BestSiteDisplay):
 
     @property
     def controls(self) -> dict[str, NDArray[np.float64]]:
-        """The metric of the best control and of `step`, by name; of those that have it at each step."""
+        """The metric of the best control and of `step`, by name; only of controls that have it at each step."""
         scores = [score for score in self.scores_of_controls if len(score.by_step) == self.steps.size]
         return {
             score.name: np.array(score.by_step) for at, score in enumerate(scores) if at == 0 or score.name == STEP
@@ -305,7 +317,7 @@ class StepScoresDisplay(BestSiteDisplay):
         return significance_handles()
 
     def draw(self, axes: "Axes") -> None:
-        """The site's and the controls' scores."""
+        """Draw the scores of the site and of the controls."""
         from matplotlib.ticker import MaxNLocator
 
         (part,), score, (low, high) = self.curve.parts, self.score, self.limits
@@ -326,13 +338,16 @@ class StepScoresDisplay(BestSiteDisplay):
 
 
 def step_scores(results: ProbeResults, view: str | None = None, category: str | None = None) -> "Figure":
-    """Score of a label by step, a panel per stream; arguments and errors as of `StepScoresDisplay`."""
+    """Return a figure of a label's score by step, a panel per stream.
+
+    Arguments and errors are those of `StepScoresDisplay.from_results`.
+    """
     return _in_streams(StepScoresDisplay, results, view, category)
 
 
 @in_report(16, "labels")
 def step_figures(source: FigureSource) -> Iterator[ReportFigure]:
-    """Yield the figures that a report of these labels shows: of those with several steps."""
+    """Yield scores by step of the probed views of labels with several steps."""
     for view in probed_views(source):
         if view.curve.steps.size > 1:
             yield view.figure(

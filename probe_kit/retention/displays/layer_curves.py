@@ -1,4 +1,4 @@
-"""Layer curves: score by layer, the backbone beside where the action is made, a line per iteration."""
+"""Layer curves: score by layer, the backbone next to where the action is made, a line per iteration."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -54,7 +54,11 @@ Shares = NDArray[np.float64]
 
 
 def of_iterations(scores: "pd.DataFrame", iterations: Iterations) -> "pd.DataFrame":
-    """The rows of one stream that take part; all of a stream that runs once.
+    """Return the rows of one stream that take part; all of a stream that runs once.
+
+    Args:
+        scores: Rows of `ProbeResults.scores` of one stream.
+        iterations: The choice of iterations.
 
     Raises:
         UsageError: If the stream has no such iteration.
@@ -74,7 +78,7 @@ class LayerLine:
     """Held-out score by layer; arrays (L,), accuracies as shares or R², with their 95 % interval over groups.
 
     Attributes:
-        iteration: Of all values, None where the stream runs once or where every layer has its best one.
+        iteration: Iteration of all values, None where the stream runs once or where every layer has its best one.
         significant: Above chance, family-wise, and above the controls that were run.
     """
 
@@ -99,12 +103,12 @@ class StreamCurve(LayerLine):
     """One stream's held-out score by layer; arrays (L,), accuracies as shares or R².
 
     Attributes:
-        part: Of the model, see `Stream.part`.
-        sites: L best ones of the iterations that are shown, of a label by the score above their own chance. score:
-            of these.
+        part: Part of the model, see `Stream.part`.
+        sites: The L best sites among the iterations that are shown, of a label by the score above their own
+            chance; `score` is theirs.
         depth: The layer as a fraction.
-        iterations: How many are shown.
-        lines: What is drawn: one per iteration, or the best.
+        iterations: Number of iterations that are shown.
+        lines: The lines that are drawn: one per iteration, or the best.
         peaks: (layer, iteration) of the best sites, all of them where several tie.
     """
 
@@ -119,6 +123,10 @@ class StreamCurve(LayerLine):
     @classmethod
     def of_stream(cls, scores: "pd.DataFrame", iterations: Iterations = "best") -> Self:
         """Read the rows of one category, view and stream of `ProbeResults.scores`.
+
+        Args:
+            scores: Rows of one category, view and stream.
+            iterations: The choice of iterations; `all` gives a line for each.
 
         Raises:
             UsageError: If the stream has no such iteration.
@@ -146,12 +154,12 @@ class StreamCurve(LayerLine):
 
     @property
     def name(self) -> str:
-        """Return the name that people call the stream."""
+        """The common name of the stream."""
         return label_of(self.stream)
 
     @property
     def label(self) -> str:
-        """The name, and which iterations are shown if not all are."""
+        """The name, and the iterations that are shown if not all are."""
         if self.iterations > 1:
             return f"{self.name}, best iteration" if len(self.lines) == 1 else self.name
         step = self.lines[0].iteration
@@ -199,7 +207,13 @@ class Ground:
         )
 
     def draw(self, axes: "Axes", layers: NDArray[Any], scale: float) -> None:
-        """Draw the band, chance and the best control; scale: 100 for percent."""
+        """Draw the band, chance and the best control.
+
+        Args:
+            axes: Axes to draw on.
+            layers: (L,) layer numbers.
+            scale: Factor on scores, 100 for percent.
+        """
         wide = layers if layers.size > 1 else layers + np.array([-0.3, 0.3])
         if self.null_band is not None:
             low, high = (scale * np.broadcast_to(end, wide.shape) for end in self.null_band)
@@ -230,7 +244,7 @@ class LayerCurveDisplay(Display):
     control that was run.
 
     Attributes:
-        grounds: What the scores are compared with, one per stream.
+        grounds: Chance, band and control that the scores are compared with, one per stream.
     """
 
     target: str
@@ -249,15 +263,18 @@ class LayerCurveDisplay(Display):
         view: str | None = None,
         iterations: Iterations = "all",
     ) -> Self:
-        """Read stored probes; category, view: the first probed one by default.
+        """Read stored probes.
 
         Args:
+            results: Probes of one run.
+            category: A probed category; None for the first.
+            view: A probed view; None for the first.
             iterations: A line for each of `all`, for the `best` of every layer, for the `last` one or one by
                 number.
 
         Raises:
-            UnknownSiteError: For a view.
-            UnknownCategoryError: For a category, that was not probed.
+            UnknownSiteError: For a view that was not probed.
+            UnknownCategoryError: For a category that was not probed.
             UsageError: For an iteration that no stream has.
         """
         category, view, _ = probed_curve(results, view, category)
@@ -294,7 +311,7 @@ class LayerCurveDisplay(Display):
         ]
 
     def plot(self, ax: "Axes | None" = None) -> Self:
-        """Draw all streams on `ax`, or each beside the other on a figure of its own with legend and caption."""
+        """Draw all streams on `ax`, or each in a panel of its own on a figure with legend and caption."""
         if ax is not None:
             return super().plot(ax)
         panels_of = self.by_stream
@@ -335,20 +352,21 @@ def layer_curve(
 ) -> "Figure":
     """Return a figure of held-out score by layer for every category (`figure.savefig(…)`).
 
-    Backbone beside action, which has a line per iteration on one scale of colours;
+    The backbone is drawn next to the action, which has a line per iteration on one scale of colours. Bars: each
+    layer's 95 % interval, where the stream runs once. Filled markers are above chance against the best site of
+    their stream (family-wise p < 0.05), and above every control that was run. Grey: chance, and the band that
+    holds 95 % of the scores under label permutation. For a label, both are at the best site of each layer, and the
+    best control is drawn too.
 
     Args:
-        view: The first probed one by default.
-        iterations: `all`, or `best` for the best of every layer, `last`, or one by number. Bars: each layer's 95 %
-            interval, where the stream runs once. Filled markers are above chance against the best site of their
-            stream (family-wise p < 0.05), and above every control that was run. Grey: chance, and the band that
-            holds 95 % of the scores under label permutation; of a label at the best site of each layer, with the
-            best control.
-        categories: All by default.
+        results: Probes of one run.
+        view: A probed view; None for the first.
+        iterations: `all`, or `best` for the best of every layer, `last`, or one by number.
+        categories: The categories that are drawn; None for all.
 
     Raises:
         UnknownSiteError: For a view that was not probed.
-        UsageError: For an iteration.
+        UsageError: For an iteration that no stream has.
     """
     view, names = known_view(results, view), categories or results.settings.categories
     displays = [LayerCurveDisplay.from_results(results, name, view, iterations) for name in names]
@@ -413,12 +431,18 @@ def draw_line(
     bars: bool = True,
     scale: float = PERCENT,
 ) -> None:
-    """Draw one line; filled markers where it is significant. bars: each layer's own 95 % interval.
+    """Draw one line; filled markers where it is significant.
 
     A layer that was chosen, such as the best iteration's, has no interval of its own.
 
     Args:
-        scale: 100 for percent, on whose fixed axis scores that lie below are marked at the edge.
+        axes: Axes to draw on.
+        line: Scores by layer.
+        style: Colour, marker and dash.
+        name: Entry in the legend.
+        sidestep: Shift along the layers, so that bars of two lines do not hide each other.
+        bars: Whether each layer's own 95 % interval is drawn.
+        scale: Factor on scores; 100 for percent, on whose fixed axis lower scores are marked at the edge.
     """
     layers, scores = line.layers + sidestep, scale * line.score
     if bars:
@@ -438,7 +462,7 @@ def draw_line(
 
 
 def mark_peaks(axes: "Axes", curve: StreamCurve, sidestep: float = 0.0, scale: float = PERCENT) -> None:
-    """Mark every site that no other one of its stream beats, and above its error bar where it has one."""
+    """Mark every site that no other one of its stream exceeds, above its error bar where it has one."""
     from matplotlib.transforms import ScaledTranslation
 
     figure = axes.figure
@@ -468,7 +492,7 @@ def _peak_handle() -> "Line2D":
 
 @in_report(9, "sides", "labels")
 def layer_figures(source: FigureSource) -> Iterator[ReportFigure]:
-    """Yield the figures that a report of these runs or labels shows."""
+    """Yield the layer curves of the probed views of runs or labels."""
     for view in probed_views(source):
         if view.category is None:
             yield view.figure(

@@ -1,4 +1,4 @@
-"""The figures of reports and `--figures`: each with how to read it, and all that fit a table."""
+"""The figures of reports and `--figures`: each with its explanation, and all that fit a table."""
 
 import re
 from collections.abc import Callable, Iterator, Sequence
@@ -30,10 +30,12 @@ DOTS = f"Dots mark evidence: {SIGNAL}"
 
 @dataclass(frozen=True)
 class DrawnRun:
-    """A run of a table, of labels each with one. stem: beginning of its files' names.
+    """A run of a table; of labels, a run with one label each.
 
     Attributes:
-        position: Among the runs.
+        of_table: The run in the form that the table reads.
+        stem: Beginning of its files' names.
+        position: Position among the runs.
         results: Its probes, None without any.
     """
 
@@ -60,7 +62,12 @@ class DrawnRun:
 
 @dataclass(frozen=True)
 class FigureSource:
-    """The table and the runs that figures of a report are made of. table_runs: each once, runs: label by label."""
+    """The table and the runs that figures of a report are made of.
+
+    Attributes:
+        table_runs: Every run of the table once.
+        runs: The same runs, label by label.
+    """
 
     table: RetentionTable
     table_runs: tuple[TableRun, ...]
@@ -68,7 +75,11 @@ class FigureSource:
 
     @classmethod
     def of(cls, runs: Sequence[RunReader], table: RetentionTable) -> Self:
-        """Read runs of a table, label by label. Raises UsageError for one that it has no rows of."""
+        """Read runs of a table, label by label.
+
+        Raises:
+            UsageError: For a run that the table has no rows of.
+        """
         table_runs = table.runs_of(runs)
         numbered = list(enumerate(zip(table_runs, file_names([run.location.name for run in runs]), strict=True)))
         if table.is_of_sides:
@@ -90,7 +101,7 @@ class FigureSource:
     def figures(self) -> "list[ReportFigure]":
         """Return every figure that the runs and their table allow, those of all runs first. Nothing is drawn yet.
 
-        Of labels one after the other; `subject` is the label.
+        Figures of labels come one label after the other; their `subject` is the label.
         """
         figures = [figure for make in _makers(self.table.is_of_sides) for figure in make(self)]
         order = {target: at for at, target in enumerate(self.table.targets)}
@@ -105,11 +116,12 @@ class ReportFigure:
 
     Attributes:
         name: File stem.
-        subject: Which numbers it shows, such as `behaviour` or `probes`.
-        reading: How to read it, in plain language.
+        subject: The numbers that it shows, such as `behaviour` or `probes`.
+        reading: Explanation of the figure, in plain language.
         run: Its position among the runs, None if it shows all of them.
-        is_table: Its numbers are a table that is printed as such elsewhere.
-        is_detail: The main figures can be read without it.
+        draw: Makes the figure.
+        is_table: Whether its numbers are a table that is printed as such elsewhere.
+        is_detail: Whether the main figures can be read without it.
     """
 
     name: str
@@ -123,7 +135,7 @@ class ReportFigure:
 
     @contextmanager
     def drawn(self) -> "Iterator[Figure]":
-        """The figure, closed again afterwards, so that pyplot keeps none of many."""
+        """Yield the figure and close it afterwards, so that pyplot keeps none of many."""
         from matplotlib import pyplot as plt
 
         figure = self.draw()
@@ -137,9 +149,10 @@ Maker = Callable[[FigureSource], Iterator[ReportFigure]]
 
 
 def in_report(rank: int, *targets: Literal["sides", "labels"]) -> Callable[[Maker], Maker]:
-    """Mark a function that yields figures of reports and `--figures`. rank: in their order.
+    """Mark a function that yields figures of reports and `--figures`.
 
     Args:
+        rank: Its place in the order of the figures.
         *targets: The tables that it draws, those of sides by default.
     """
 
@@ -151,7 +164,12 @@ def in_report(rank: int, *targets: Literal["sides", "labels"]) -> Callable[[Make
 
 
 def figure_of(read: Callable[..., Any], *arguments: Any) -> "Figure":
-    """The figure of a display that draws on axes of its own. read: makes it of the arguments."""
+    """Return the figure of a display that draws on axes of its own.
+
+    Args:
+        read: Makes the display from the arguments.
+        *arguments: Arguments of `read`.
+    """
     from matplotlib.figure import Figure
 
     figure = read(*arguments).plot().ax_.figure
@@ -160,7 +178,7 @@ def figure_of(read: Callable[..., Any], *arguments: Any) -> "Figure":
 
 
 def in_view(title: str, view: str, views: Sequence[str]) -> str:
-    """The title, which names the view where there are several."""
+    """Return the title, with the view where there are several."""
     return f"{title}, view {view}" if len(views) > 1 else title
 
 
@@ -195,13 +213,15 @@ class ProbedView:
         *more: Any,
         is_detail: bool = False,
     ) -> ReportFigure:
-        """Return a figure of it for a report; those of other views than the first are details.
+        """Return a figure of these probes for a report; those of other views than the first are details.
 
         Args:
-            name: Of the figure in file names.
-            title: Without the view.
-            reading: How to read it, in plain language.
-            draw: Makes it of results, view and `more`.
+            name: Name of the figure in file names.
+            title: Title without the view.
+            reading: Explanation of the figure, in plain language.
+            draw: Makes the figure from results, view and `more`.
+            *more: Further arguments of `draw`.
+            is_detail: Whether the main figures can be read without it.
         """
         settings = self.results.settings
         views = settings.views
@@ -245,7 +265,11 @@ SUFFIXES = (".png", ".pdf")
 
 
 def collect_figures(runs: Sequence[RunReader], table: RetentionTable) -> list[ReportFigure]:
-    """Return the figures of runs, see `FigureSource.figures`. Raises UsageError for a run that has no rows."""
+    """Return the figures of runs, see `FigureSource.figures`.
+
+    Raises:
+        UsageError: For a run that has no rows in the table.
+    """
     return FigureSource.of(runs, table).figures()
 
 
@@ -260,7 +284,7 @@ def _makers(of_sides: bool) -> list[Maker]:
 
 
 def save_figures(exhibits: Sequence[ReportFigure], folder: Path) -> Iterator[Path]:
-    """Draw exhibits into `folder` as PNG and PDF, one after the other; gives the path of every PNG."""
+    """Draw exhibits into `folder` as PNG and PDF, one after the other; yield the path of every PNG."""
     folder.mkdir(parents=True, exist_ok=True)
     for exhibit in exhibits:
         path = folder / f"{exhibit.name}{SUFFIXES[0]}"
@@ -276,7 +300,7 @@ def caption_of(figure: "Figure") -> str:
 
 
 def _metadata(suffix: str, exhibit: ReportFigure, caption: str) -> dict[str, str | None]:
-    """The caption goes with the file, in what readers of its format show of it."""
+    """Return the caption as metadata of the file, under the keys that readers of its format show."""
     if suffix == ".pdf":
         # Without its date a figure of the same numbers has the same bytes.
         return {"Title": exhibit.title, "Subject": f"{caption}. {exhibit.reading}", "CreationDate": None}

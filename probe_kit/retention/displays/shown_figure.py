@@ -1,4 +1,4 @@
-"""A figure that notebooks show although pyplot does not know it and no `%matplotlib` was said."""
+"""A figure that notebooks show although pyplot does not know it and `%matplotlib` was not used."""
 
 from io import BytesIO
 from typing import Any
@@ -14,7 +14,7 @@ _PAGE_DPI = 90  # fewer than the picture has, so that it is sharp on fine screen
 
 
 def picture_of(figure: Figure) -> Picture:
-    """The figure as a notebook's front end takes it."""
+    """Return the figure in the form that a notebook's front end takes."""
     file = BytesIO()
     figure.savefig(file, format="png", dpi=_DPI)
     width, height = figure.get_size_inches()
@@ -25,7 +25,7 @@ class ShownFigure(Figure):
     """A matplotlib figure like any other, that also shows itself and saves fit for print.
 
     Attributes:
-        caption: What it is about, in full: model, weights, suite, sizes, probes, settings.
+        caption: Its origin in full: model, weights, suite, sizes, probes, settings.
     """
 
     caption: str = ""

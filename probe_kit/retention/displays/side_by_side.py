@@ -53,10 +53,11 @@ if TYPE_CHECKING:
 class CurvesDisplay(Display):
     """Held-out accuracy by layer, one line per name, for one category; of each layer the best iteration.
 
+    Along the lower side are layers, or depth as a fraction where curves differ in their number.
+
     Attributes:
-        curves: By name, such as a view or a run.
-        looks: What is drawn alike in all panels, in order. Along the lower side are layers, or depth as a fraction
-            where curves differ in their number.
+        curves: Curves by name, such as a view or a run.
+        looks: Names that are drawn alike in all panels, in order.
         has_bars: Whether layers have their 95 % intervals.
     """
 
@@ -99,7 +100,7 @@ def _curves(tables: "Mapping[str, pd.DataFrame]", iterations: Iterations) -> dic
 class RoleCurvesDisplay(CurvesDisplay):
     """Held-out accuracy by layer, one line per view of one stream, for one category.
 
-    curves: by view, such as `mean:language`; of iterative streams, the best of the iterations at each layer.
+    Curves are by view, such as `mean:language`; of iterative streams, the best of the iterations at each layer.
     """
 
     panel_size: ClassVar = (3.1, 2.5)
@@ -113,11 +114,18 @@ class RoleCurvesDisplay(CurvesDisplay):
         views: Sequence[str] | None = None,
         iterations: Iterations = "best",
     ) -> Self:
-        """Read stored probes; views: all probed ones of the stream by default. iterations: which take part.
+        """Read stored probes.
+
+        Args:
+            results: Probes of one run.
+            category: The category that is drawn.
+            stream: The stream that is drawn.
+            views: Views that are drawn; None for all probed ones of the stream.
+            iterations: Iterations that take part.
 
         Raises:
-            UnknownSiteError: If none of them was probed there.
-            UnknownCategoryError: For a category.
+            UnknownSiteError: If none of the views was probed in the stream.
+            UnknownCategoryError: For a category that was not probed.
         """
         candidates = tuple(views or results.settings.views)
         curve_of(results, category, results.settings.views[0])
@@ -135,7 +143,17 @@ def role_curves(
     views: Sequence[str] | None = None,
     iterations: Iterations = "best",
 ) -> "Figure":
-    """Curves of all probed views of one stream, a panel per category. Raises UnknownSiteError without any."""
+    """Return a figure of curves of all probed views of one stream, a panel per category.
+
+    Args:
+        results: Probes of one run.
+        stream: The stream that is drawn.
+        views: Views that are drawn; None for all probed ones of the stream.
+        iterations: Iterations that take part.
+
+    Raises:
+        UnknownSiteError: If none of the views was probed in the stream.
+    """
     categories = results.settings.categories
     return in_panels(
         [RoleCurvesDisplay.from_results(results, name, stream, views, iterations) for name in categories]
@@ -144,7 +162,7 @@ def role_curves(
 
 @in_report(11)
 def role_figures(source: FigureSource) -> Iterator[ReportFigure]:
-    """The figures that a report of these runs shows."""
+    """Yield a figure per run and stream that was probed in several views."""
     for drawn in source.runs:
         if drawn.results is None:
             continue
@@ -164,7 +182,12 @@ def role_figures(source: FigureSource) -> Iterator[ReportFigure]:
 
 @dataclass(frozen=True)
 class ModelCurve:
-    """Accuracy above chance by layer, and by depth as its fraction; (L,) each, averaged over categories."""
+    """Accuracy above chance by layer, and by depth as its fraction; (L,) each, averaged over categories.
+
+    Attributes:
+        above_chance: (L,) accuracy minus chance, as a share.
+        categories: Number of categories in the mean.
+    """
 
     model: str
     layers: NDArray[np.int64]
@@ -195,10 +218,14 @@ class ModelDepthDisplay(Display):
         iterations: Iterations = "best",
         names: Sequence[str] | None = None,
     ) -> Self:
-        """Read the stored probes of several runs; view: the first probed one of each by default.
+        """Read the stored probes of several runs.
 
         Args:
-            names: What runs are called, in order; by default as when they were probed.
+            results: Probes of a side, one per run.
+            stream: The stream that is drawn.
+            view: A probed view; None for the first one of each run.
+            iterations: Iterations that take part.
+            names: Names of the runs, in order; None for their labels when they were probed.
 
         Raises:
             UnknownSiteError: For a view that was not probed.
@@ -251,7 +278,17 @@ def model_depths(
     iterations: Iterations = "best",
     names: Sequence[str] | None = None,
 ) -> "Figure":
-    """Backbones, and where actions are made, on one scale. Raises UsageError if no run has either."""
+    """Return a figure of backbones, and of where actions are made, on one scale.
+
+    Args:
+        results: Probes of a side, one per run.
+        view: A probed view; None for the first one of each run.
+        iterations: Iterations that take part.
+        names: Names of the runs, in order; None for their labels when they were probed.
+
+    Raises:
+        UsageError: If no run has either part.
+    """
     parts = {
         (str(part), str(name))
         for probes in results
@@ -265,7 +302,7 @@ def model_depths(
 
 
 def _draw_fractions(axes: "Axes", last: int) -> None:
-    """Depth as a fraction along the upper side."""
+    """Draw depth as a fraction along the upper side."""
     above = axes.secondary_xaxis(
         "top",
         functions=(
@@ -295,7 +332,7 @@ def _depth_curve(results: ProbeResults, stream: str, view: str, iterations: Iter
 
 @in_report(3)
 def depth_figures(source: FigureSource) -> Iterator[ReportFigure]:
-    """The figures that a report of these runs shows."""
+    """Yield a figure of all probed runs, if there are several."""
     results = [run.results for run in source.runs if run.results is not None]
     if len(results) > 1:
         names = [run.name for run in source.runs if run.results is not None]
@@ -323,18 +360,20 @@ def curves_side_by_side(
     iterations: Iterations = "best",
     categories: Sequence[str] | None = None,
 ) -> "Figure":
-    """Layer curves of several runs: a panel per category and part of the model, a line per run.
+    """Return a figure of layer curves of several runs: a panel per category and part of the model, a line per run.
 
-    Of iterative streams the best of the iterations at each layer counts. Lines have no intervals: the table says
+    Of iterative streams the best of the iterations at each layer counts. Lines have no intervals: the table shows
     whether two runs differ. Along the lower side layers, or depth as a fraction where runs differ in their number.
 
     Args:
-        names: Of the runs, in order.
-        view: One that some of them were probed in.
-        categories: That are shown, all by default.
+        results: Probes of a side, one per run.
+        names: Names of the runs, in order.
+        view: A view that some of them were probed in.
+        iterations: Iterations that take part.
+        categories: The categories that are drawn; None for all.
 
     Raises:
-        UsageError: If none was.
+        UsageError: If no run was probed in the view.
     """
     probed = {name: probes for name, probes in zip(names, results, strict=True) if view in probes.settings.views}
     lines = tuple(ProvenanceLine.of_results(probes, view) for probes in probed.values())
@@ -364,10 +403,12 @@ def _of_part(results: ProbeResults, category: str, view: str, part: str) -> "pd.
 
 
 def maps_side_by_side(results: Sequence[ProbeResults], names: Sequence[str], view: str) -> "Figure":
-    """Layer × iteration maps of where the action is made: a row per category, a column per run, one scale.
+    """Return layer × iteration maps of where the action is made: a row per category, a column per run, one scale.
 
     Args:
-        names: Of the runs, in order.
+        results: Probes of a side, one per run.
+        names: Names of the runs, in order.
+        view: A view that at least two of them were probed in.
 
     Raises:
         UsageError: If fewer than two runs have iterations in that view.
@@ -399,7 +440,7 @@ def has_maps(results: ProbeResults, view: str) -> bool:
 
 @in_report(5)
 def side_by_side_figures(source: FigureSource) -> Iterator[ReportFigure]:
-    """The figures that a report of these runs shows."""
+    """Yield curves and maps of the runs that were probed in a view, if there are several."""
     probed = [(run.results, run.name) for run in source.runs if run.results is not None]
     views = list(dict.fromkeys(view for results, _ in probed for view in results.settings.views))
     for view in views:

@@ -1,4 +1,4 @@
-"""Figures of a whole table: numbers on heat colours, and success against what probes read."""
+"""Figures of a whole table: numbers on heat colours, and success against probe accuracy."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -48,10 +48,12 @@ class Cell:
 class HeatTableDisplay(Display):
     """A table drawn as a figure; the numbers are `cells[row][column].values`.
 
+    The display has one certificate per row.
+
     Attributes:
-        rows: Their names.
-        columns: As `rows`.
-        parts: Names of the values side by side in a cell. certificates: one per row.
+        rows: Names of the rows.
+        columns: Names of the columns.
+        parts: Names of the values side by side in a cell.
     """
 
     rows: tuple[str, ...]
@@ -79,7 +81,7 @@ class HeatTableDisplay(Display):
 
     @classmethod
     def _of(cls, rows: Sequence[RetentionRow], cell: Callable[[RetentionRow], Cell]) -> Self:
-        """One line per run and view, one column per category of any of them."""
+        """Return a display with one line per run and view, one column per category of any of them."""
         if not rows:
             raise UsageError(f"{cls.heading}: the table has no rows to show")
         lines: dict[tuple[str | None, str, str | None], dict[str, RetentionRow]] = {}
@@ -139,7 +141,7 @@ class HeatTableDisplay(Display):
             axes.axvline(len(self.columns) - 1, color="0.35", lw=0.9)
 
     def _key(self) -> "list[Patch]":
-        """The colours and the numbers that they stand for."""
+        """Return the colours and the numbers that they stand for."""
         from matplotlib.patches import Patch
 
         bounds = [0.0, *(bound for bound, _, _ in HEAT[:-1])]
@@ -156,7 +158,11 @@ class SuccessTableDisplay(HeatTableDisplay):
 
     @classmethod
     def from_table(cls, table: RetentionTable) -> Self:
-        """Read the retention table of any runs. Raises UsageError if it is empty."""
+        """Read the retention table of any runs.
+
+        Raises:
+            UsageError: If it is empty.
+        """
         return cls._of_behaviour(
             table, lambda row: Cell((row.success.sr,), row.success.regime == Regime.KNOWLEDGE)
         )
@@ -176,7 +182,11 @@ class SideTableDisplay(HeatTableDisplay):
 
     @classmethod
     def from_table(cls, table: RetentionTable) -> Self:
-        """Read the retention table of any runs. Raises UsageError if it is empty."""
+        """Read the retention table of any runs.
+
+        Raises:
+            UsageError: If it is empty.
+        """
         return cls._of_behaviour(table, lambda row: Cell((row.success.sr_left, row.success.sr_right)))
 
 
@@ -190,7 +200,11 @@ class RetentionTableDisplay(HeatTableDisplay):
 
     @classmethod
     def from_table(cls, table: RetentionTable) -> Self:
-        """Read a retention table with probes. Raises UsageError if no run was probed."""
+        """Read a retention table with probes.
+
+        Raises:
+            UsageError: If no run was probed.
+        """
 
         def cell(row: RetentionRow) -> Cell:
             values = (row.retention.value, row.retention.published) if row.retention.defined else (None, None)
@@ -207,7 +221,7 @@ def _line_name(line: dict[str, RetentionRow], rows: Sequence[RetentionRow]) -> s
 
 @in_report(1)
 def table_figures(source: FigureSource) -> Iterator[ReportFigure]:
-    """The figures that a report of these runs shows."""
+    """Yield the tables of success, sides and retention, as far as the rows have such numbers."""
     table = source.table
     acted = [row for row in table.rows if row.success.sr is not None]
     modes = modes_of(acted)
@@ -232,7 +246,7 @@ Point = tuple[float, float]
 Box = tuple[float, float, float, float]
 
 _SIZE = 7.5
-"""Of letters, in points."""
+"""Size of letters, in points."""
 # Of one line of text, in points. Estimated: measured widths exist only once the figure is drawn.
 _HEIGHT, _CHARACTER = 1.15 * _SIZE, 0.56 * _SIZE
 _REACHES = (6.0, 13.0, 22.0, 32.0)  # from the point, in points
@@ -248,7 +262,11 @@ def place_labels(
     """Write each name near its point (data coordinates) in its ink, with a thin line where it had to move away.
 
     Args:
-        lines: Level or upright ones by their ends, such as error bars, which names avoid where they can.
+        axes: Axes that hold the points.
+        points: Points in data coordinates.
+        names: The name of each point.
+        inks: The colour of each name.
+        lines: Level or upright lines by their ends, such as error bars, which names avoid where they can.
     """
     unit = axes.figure.dpi / 72  # pixels per point of type
     anchors = [axes.transData.transform(point) / unit for point in points]
@@ -288,12 +306,12 @@ def _box(x: float, y: float, width: float, reach: float, side: tuple[int, int]) 
 
 
 def _outside(box: Box, frame: Box) -> float:
-    """Area of `box` that is not in `frame`, in square points."""
+    """Return the area of `box` that is not in `frame`, in square points."""
     return (box[2] - box[0]) * (box[3] - box[1]) - _covered(box, [frame])
 
 
 def _covered(box: Box, boxes: Sequence[Box]) -> float:
-    """Area that `box` shares with others, in square points."""
+    """Return the area that `box` shares with others, in square points."""
     return sum(
         max(0.0, min(box[2], other[2]) - max(box[0], other[0]))
         * max(0.0, min(box[3], other[3]) - max(box[1], other[1]))
@@ -336,7 +354,12 @@ class KnowledgeActionDisplay(Display):
     def from_table(
         cls, table: RetentionTable, stream: Literal["backbone", "expert"] = "backbone", view: str | None = None
     ) -> Self:
-        """Read a retention table; view: the first one of each run by default.
+        """Read a retention table.
+
+        Args:
+            table: The table of runs with probes.
+            stream: The stream whose probes are drawn.
+            view: A probed view; None for the first one of each run.
 
         Raises:
             UsageError: If no run was probed in that stream and view.
@@ -446,7 +469,7 @@ def _draw_model(axes: "Axes", points: Sequence[GapPoint], position: int, model: 
 
 
 def _bars(point: GapPoint) -> "list[tuple[tuple[float, float], tuple[float, float]]]":
-    """The ends of a point's error bars, in percent."""
+    """Return the ends of a point's error bars, in percent."""
     x, y = 100 * point.accuracy, 100 * point.sr
     across, up = _arms(point.accuracy, point.accuracy_ci), _arms(point.sr, point.sr_ci)
     level = [] if across is None else [((x - across[0][0], y), (x + across[1][0], y))]
@@ -465,7 +488,7 @@ _DOES: dict[Modes, str] = {"acts": "succeeds", "answers": "says it", "both": "su
 
 @in_report(2)
 def gap_figures(source: FigureSource) -> Iterator[ReportFigure]:
-    """The figures that a report of these runs shows."""
+    """Yield a figure of all probed runs with a success rate."""
     acted = [row for row in source.table.rows if row.success.sr is not None]
     modes = modes_of(acted)
     if any(row.backbone.score is not None for row in acted):

@@ -1,4 +1,4 @@
-"""Episodes as the report's grid needs them: what was asked, how it ended, first and last frame."""
+"""Episodes in the form of the report's grid: the question, the outcome, first and last frame."""
 
 from base64 import b64encode
 from collections.abc import Iterator, Mapping, Sequence
@@ -12,20 +12,22 @@ from probe_kit.runs.thumbnails import count_ends, read_thumbnail
 PICTURES = 4000
 """Episodes a report shows with pictures, over all runs; one full suite of 3,440 makes about 10 MB of them."""
 PICTURE_BYTES = 16_000_000
-"""Of all pictures of a report together, as WebP; in the page they take a third more."""
+"""Bytes of all pictures of a report together, as WebP; in the page they take a third more."""
 BLOCK = 48
-"""Pictures that the page decodes at a time, when the first of them is looked at."""
+"""Number of pictures that the page decodes at a time, when the first of them is viewed."""
 
 
 @dataclass(frozen=True)
 class EpisodeGrid:
-    """cards: one per episode, with how many `frames` it shows and the place of its `picture`, None without one.
+    """The cards and pictures of the report's grid.
 
-    Where only the first frame is shown, it may be the left `half` of that picture.
+    Where only the first frame is shown, it may be the left `half` of a picture.
 
     Attributes:
-        pictures: base64 of the WebPs, each once, in blocks of `BLOCK`.
-        note: What was left out and why, or empty.
+        cards: One per episode, with the number of `frames` it shows and the place of its `picture`, None without
+            one.
+        pictures: Base64 of the WebPs, each once, in blocks of `BLOCK`.
+        note: The number of pictures that were left out and the reason, or empty.
     """
 
     cards: tuple[dict[str, Any], ...]
@@ -34,7 +36,7 @@ class EpisodeGrid:
     block: int = BLOCK
 
     def picture(self, card: Mapping[str, Any]) -> str:
-        """The base64 of a card's WebP."""
+        """Return the base64 of a card's WebP."""
         block, at = divmod(int(card["picture"]), self.block)
         return self.pictures[block][at]
 
@@ -60,9 +62,15 @@ def episode_grid(
     pictures: int = PICTURES,
     picture_bytes: int = PICTURE_BYTES,
 ) -> EpisodeGrid:
-    """All episodes of all runs; with more pictures than that, only every k-th item keeps its own.
+    """Return all episodes of all runs; with more pictures than the limits, only every k-th item keeps its own.
 
     Both layouts of an item keep theirs or neither, so that they can be compared.
+
+    Args:
+        runs: Runs in the order of the page.
+        names: The name of each run.
+        pictures: Largest number of episodes with pictures.
+        picture_bytes: Largest number of bytes of all pictures, as WebP.
     """
     total = sum(len(run.episodes) for run in runs)
     stride = max(1, -(-total // pictures))
@@ -128,7 +136,7 @@ def _with_pictures(listed: Sequence[_Listed], stride: int) -> list[_Listed]:
 
 
 def _fitting(listed: Sequence[_Listed], step: int, most: int) -> int:
-    """The smallest multiple of `step` that keeps at most so many bytes of pictures, or no more than one item's."""
+    """Return the smallest multiple of `step` that keeps at most so many bytes of pictures, or one item's."""
     last = max((episode.rank for episode in listed), default=0) + step
     for stride in range(step, last, step):
         pictures = {picture for picture, _ in _without_repeats(_with_pictures(listed, stride)).values()}

@@ -73,13 +73,21 @@ _ANSWERS = {
     "oob": "no answer could be read",
 }
 _OPENING = "opening"
-"""The subject of the figure beside the summary."""
+"""The subject of the figure next to the summary."""
 _TASKS: dict[Task, str] = {"binary": "binary", "classes": "categorical", "continuous": "continuous"}
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure in the page. run: its name, empty for a figure of all runs. caption: what it is about, in full."""
+    """A figure in the page.
+
+    Attributes:
+        run: Name of its run, empty for a figure of all runs.
+        reading: Explanation of the figure, in plain language.
+        source: The figure as a data URI.
+        caption: Its origin in full.
+        extra: Whether it is folded.
+    """
 
     title: str
     run: str
@@ -90,7 +98,7 @@ class Picture:
 
 
 PicturesBySubject = Mapping[str, Sequence[Sequence[Picture]]]
-"""By subject the figures of each kind, those of several runs side by side."""
+"""By subject, the figures of each kind, those of several runs side by side."""
 
 
 def write_report(
@@ -103,8 +111,10 @@ def write_report(
     """Write the report of `runs` as one HTML file, whole or not at all, and return its path.
 
     Args:
-        table: Their retention table, of sides with its defaults if it is not given.
-        pictures: At most so many episodes show their frames; a page of labels shows none.
+        runs: The runs that the report shows.
+        path: The HTML file.
+        table: Retention table of the runs; None makes that of sides with its defaults.
+        pictures: Largest number of episodes that show their frames; a page of labels shows none.
 
     Raises:
         UsageError: Without runs, and for a run that the table was not made of.
@@ -167,7 +177,7 @@ def report_html(
 
 
 def _sides(source: FigureSource, pictures_of: PicturesBySubject) -> dict[str, Any]:
-    """Return what the page shows of sides alone, such as success, episodes and answers."""
+    """Return the parts of the page that only sides have, such as success, episodes and answers."""
     table = source.table
     modes = modes_of(table.all_rows)
     warnings: dict[tuple[str | None, str], list[tuple[str, str]]] = {}
@@ -204,9 +214,9 @@ def _sides(source: FigureSource, pictures_of: PicturesBySubject) -> dict[str, An
 
 
 def opening_row(source: FigureSource) -> tuple[RetentionRow, DrawnRun] | None:
-    """The category to open with, and its run: one that the backbone holds and the action does not, if any.
+    """Return the category to open with, and its run: one that the backbone holds and the action does not, if any.
 
-    Of runs with probes the first category with signal is next, and then the first at all; None without rows.
+    Among runs with probes the first category with signal is next, and then the first at all; None without rows.
     """
     drawn_of = {drawn.of_table.location: drawn for drawn in source.runs}
     rows = [category.row for run in source.table.summary for category in run.categories]
@@ -218,9 +228,9 @@ def opening_row(source: FigureSource) -> tuple[RetentionRow, DrawnRun] | None:
 
 
 def _question(row: RetentionRow, name: str, grid: EpisodeGrid) -> Mapping[str, Any] | None:
-    """The first episode of the row's category with a picture, of this run by its name; None without one.
+    """Return the first episode of the row's category with a picture, of this run by its name; None without one.
 
-    Its card, its picture as a data URI, and how it ended, in words.
+    The result holds its card, its picture as a data URI, and its outcome in words.
     """
     for card in grid.cards:
         if card["run"] == name and card["category"] == row.category and card["picture"] is not None:
@@ -235,7 +245,7 @@ def _question(row: RetentionRow, name: str, grid: EpisodeGrid) -> Mapping[str, A
 def _opening_curves(
     opening: tuple[RetentionRow, DrawnRun] | None, iterations: Iterations
 ) -> Iterator[ReportFigure]:
-    """Yield accuracy by layer of the row's category; nothing where it was not probed."""
+    """Yield a figure of accuracy by layer of the row's category; nothing where it was not probed."""
     if opening is None:
         return
     row, drawn = opening
@@ -251,7 +261,7 @@ def _opening_curves(
 
 
 def _together(display: LayerCurveDisplay) -> "Figure":
-    """All streams on the same axes, with a legend and no more."""
+    """Draw all streams on the same axes, with a legend and no more."""
     figure, (axes,) = panels(1, 4.7, 2.0)
     display.plot(axes)
     axes.set_title("", loc="left")
@@ -273,12 +283,15 @@ def _labels(
 ) -> list[dict[str, Any]]:
     """Return a section per label of the table.
 
-    Its rows of the table and what they say, its figures, its best sites beside their controls, a table per run,
-    and what the probes say.
+    A section holds the label's rows of the table and their sentences, and its figures. It also holds the best
+    sites with their controls, a table per run, and sentences on the probes.
 
     Args:
-        names: Of the runs.
-        of_run: Name of the run where sections are of one.
+        table: A retention table of labels.
+        runs: Runs of the table.
+        names: The name of each run.
+        pictures_of: Figures by subject, see `arranged`.
+        of_run: Name of the run where sections are of a single one.
     """
     sections: list[dict[str, Any]] = []
     for target in table.targets:
@@ -309,7 +322,7 @@ def _labels(
 def _stored_labels(
     runs: Sequence[RunReader], names: Sequence[str], places: tuple[str, ...]
 ) -> list[dict[str, Any]]:
-    """A section per run and label column of which the run has probes; none for other runs."""
+    """Return a section per run and label column of which the run has probes; none for other runs."""
     sections = []
     for run, name in zip(runs, names, strict=True):
         if targets := list(stored_targets(run)):
@@ -333,7 +346,7 @@ _ASSETS = {"css": "page.css", "js": "page.js", "episodes_js": "episodes.js"}
 
 
 def render(template: str, places: tuple[str, ...], **content: Any) -> str:
-    """The page; no text in it holds `places` or another absolute path of this machine."""
+    """Return the page; no text in it holds `places` or another absolute path of this machine."""
     from markupsafe import Markup
 
     assets = {name: Markup((_HERE / file).read_text(encoding="utf-8")) for name, file in _ASSETS.items()}
@@ -341,25 +354,30 @@ def render(template: str, places: tuple[str, ...], **content: Any) -> str:
 
 
 SVG_LIMIT = 150_000
-"""Bytes; a figure of more is kept as pixels."""
+"""Bytes of an SVG above which a figure is kept as pixels."""
 PIXELS_PER_INCH = 200
-"""Of figures that are kept as pixels."""
+"""Resolution of figures that are kept as pixels."""
 _SVG, _XLINK = "http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"
 _ROUNDED = ("d", "x", "y")
 """Attributes in points, of which a hundredth cannot be seen."""
 _FONTS = re.compile(r"'[^;]*sans-serif")
 """The fonts of a text, the first of them matplotlib's; a page has those of the machine that shows it."""
 _IN_URI = " !$'()*+,-./:;=?@[]_`{|}~"
-"""What a URI in double quotes may hold as it is."""
+"""Characters that a URI in double quotes may hold as they are."""
 
 
 def arranged(
     figures: Sequence[ReportFigure], names: Sequence[str], places: tuple[str, ...] = ()
 ) -> PicturesBySubject:
-    """Draw figures, by subject and kind. names: of the runs. places: see `data_uri`.
+    """Draw figures, by subject and kind.
 
     Tables are left out, which the page prints as such. All but the first of a kind and run are extra, to be
-    unfolded, and so are those of single runs that another figure shows side by side.
+    unfolded. Figures of single runs that another figure shows side by side are extra too.
+
+    Args:
+        figures: Figures of all runs.
+        names: The name of each run.
+        places: Paths that are shortened in texts, see `data_uri`.
     """
     subjects: dict[str, dict[str, list[Picture]]] = {}
     together = {
@@ -380,15 +398,19 @@ def arranged(
 
 
 def _kind(figure: ReportFigure) -> str:
-    """Its title before the first comma; behind it stands the category or the view."""
+    """Return the title before the first comma, which the category or the view follows."""
     return figure.title.partition(",")[0]
 
 
 def data_uri(exhibit: ReportFigure, places: tuple[str, ...] = ()) -> tuple[str, str]:
-    """The drawn figure as SVG, or WebP if that would be large, with its caption. A figure gives the same bytes.
+    """Return the drawn figure as SVG, or WebP if that would be large, with its caption.
 
-    Its ground is transparent, so that the page's colour is behind it. Of `places` and other absolute paths in
-    its words the last part is left.
+    A figure gives the same bytes every time. Its ground is transparent, so that the page's colour shows through.
+    Of `places` and other absolute paths in its words the last part is left.
+
+    Args:
+        exhibit: The figure that is drawn.
+        places: Absolute paths of runs.
     """
     import matplotlib as mpl
     from matplotlib.text import Text
@@ -411,12 +433,12 @@ def data_uri(exhibit: ReportFigure, places: tuple[str, ...] = ()) -> tuple[str, 
 
 
 def encode(kind: str, content: bytes) -> str:
-    """A data URI of bytes of some media type."""
+    """Return a data URI of bytes of some media type."""
     return f"data:{kind};base64,{b64encode(content).decode()}"
 
 
 def compact_svg(svg: bytes) -> bytes:
-    """The same drawing without metadata, comments, line breaks, names that nothing uses, and fine decimals."""
+    """Return the same drawing without metadata, comments, line breaks, unused names and fine decimals."""
     ElementTree.register_namespace("", _SVG)
     ElementTree.register_namespace("xlink", _XLINK)
     root = ElementTree.fromstring(svg)
@@ -436,7 +458,7 @@ def compact_svg(svg: bytes) -> bytes:
 
 
 def _rounded(numbers: str) -> str:
-    """Numbers and letters of a path, of two decimals each and without needless spaces."""
+    """Return the numbers and letters of a path, of two decimals each and without needless spaces."""
     short = re.sub(r"-?\d+\.\d+(?!e)", lambda match: f"{float(match[0]):.2f}".rstrip("0").rstrip("."), numbers)
     return re.sub(r"\s*([A-Za-z])\s*", r"\1", re.sub(r"\s+", " ", short)).strip()
 
@@ -447,9 +469,9 @@ PAPER = "arXiv:2606.19297"
 
 
 def provenance(name: str, run: RunReader, results: Sequence[ProbeResults]) -> dict[str, Any]:
-    """Return what a run says about itself and its probes; runs that were not made by probe_kit say less.
+    """Return the origin of a run's numbers and its probes; runs that were not made by probe_kit have less of it.
 
-    Its name, its line, facts by name, and documents by name as pretty JSON.
+    The result holds its name, its line, facts by name, and documents by name as pretty JSON.
     """
     settings, certificate = run.settings, run.certificate
     facts = {
@@ -489,7 +511,7 @@ def provenance(name: str, run: RunReader, results: Sequence[ProbeResults]) -> di
 
 
 def _protocol(settings: Mapping[str, Any]) -> dict[str, str]:
-    """The protocol that a run follows, how it differs from the default, and how the run differs from it."""
+    """Return the protocol of a run, its differences from the default, and the run's deviations from it."""
     protocol = settings.get("protocol")
     if not protocol:
         return {}
@@ -509,7 +531,7 @@ def _listed(pairs: Mapping[str, Sequence[str | None]]) -> str:
 
 
 def citation(runs: Sequence[RunReader]) -> tuple[str, str]:
-    """A sentence for a methods section, and BibTeX; of the protocol only for runs of its scene."""
+    """Return a sentence for a methods section, and BibTeX; of the protocol only for runs of its scene."""
     lines = "; ".join(ProvenanceLine.of_run(run).line.replace(" · ", ", ") for run in runs)
     of_scene = any(SIDE in run.episodes for run in runs)
     protocol = f" under the Act2Answer protocol ({PAPER})" if of_scene else ""
@@ -561,7 +583,7 @@ class Words:
 
 
 def words_of(tables: Sequence[Table]) -> Words:
-    """The words of all columns of `tables` and of the verdicts in them, and terms that are neither."""
+    """Return the words of all columns of `tables` and of the verdicts in them, and terms that are neither."""
     cells = {cell.value for table in tables for row in table.rows for cell in row.cells}
     groups: dict[str, dict[tuple[str, str], None]] = {}
     for table in tables:
@@ -584,7 +606,7 @@ def words_of(tables: Sequence[Table]) -> Words:
 
 
 def _word(cell: str) -> str:
-    """A verdict without direction, side and bound: `used` of `against: used (left)`."""
+    """Return a verdict without direction, side and bound: `used` of `against: used (left)`."""
     return cell.removeprefix("against: ").partition(" (")[0]
 
 

@@ -1,1 +1,1 @@
-"""Rows of the retention table, and how they are built."""
+"""Rows of the retention table, and functions that build them."""

@@ -71,7 +71,7 @@ class RowWithEstimates:
 
     Attributes:
         rates: Shares of episodes by name, such as `sr`.
-        streams: Scores, None without probes.
+        streams: Cross-fitted scores, None without probes.
         outcomes: The episodes of its success rate, if it has one.
     """
 
@@ -86,8 +86,11 @@ class RowSettings:
     """The settings of a table.
 
     Attributes:
+        views: Views of the probes; None for all.
+        iterations: Iterations of the action's stream that take part.
         epsilons: Zone radii in metres for `sr_by_epsilon`, which belong to the rule `disc`.
         absent_below: Accuracy below which a stream's best site counts as absent.
+        categories: Categories that have rows; None for all.
     """
 
     views: Sequence[str] | None
@@ -98,9 +101,14 @@ class RowSettings:
 
 
 def run_rows(table_run: TableRun, results: ProbeResults | None, settings: RowSettings) -> list[RowWithEstimates]:
-    """One row per category and view of a run, in the order of its episodes; without `results`, success rates only.
+    """Return one row per category and view of a run, in the order of its episodes.
 
-    Probes of a target that is no side have rows without success.
+    Without `results`, rows have success rates only. Probes of a target that is no side have rows without success.
+
+    Args:
+        table_run: The run with its outcomes by the table's rule.
+        results: Its probes; None without any.
+        settings: Views, categories and limits of the table.
 
     Raises:
         UnknownSiteError: For a view that was not probed.
@@ -163,10 +171,12 @@ def _row(
 
 
 def add_image_swap(row: RetentionRow, evidence: StoredEvidence, tie: str = "") -> RetentionRow:
-    """The row with the effect of the image swap on its category, judged by its own probes.
+    """Return the row with the effect of the image swap on its category, judged by its own probes.
 
     Args:
-        tie: Of the row's category and view, see `evidence.stored_ties`.
+        row: A row with its probes.
+        evidence: Stored interventions of the row's run.
+        tie: The tie of the row's category and view, see `evidence.stored_ties`.
     """
     of_category = evidence.swaps.get(row.category)
     if of_category is None:
@@ -211,7 +221,7 @@ def _answers(run: RunReader, episodes: "pd.DataFrame") -> AnswerStats:
 
 
 def _no_success(table_run: TableRun, episodes: "pd.DataFrame") -> SuccessRate:
-    """Return an empty rate, of a model that did not act or a run that keeps nothing to judge by."""
+    """Return an empty rate, for a model that did not act or a run without trajectories to judge by."""
     captured_only = table_run.is_captured_only
     reason = "" if captured_only else "n/a: the run keeps no trajectories, which this outcome rule needs"
     items, groups = int(episodes["item_id"].nunique()), np.unique(units_of(episodes)).size
@@ -224,12 +234,14 @@ _PARTS = ("success", "rules", "answers", "backbone", "action", "controls", "imag
 
 
 def mean_row(estimated: Sequence[RowWithEstimates], averaged: Sequence[str]) -> RetentionRow:
-    """The category average of rows of one run and view; retention is the ratio of the mean scores.
+    """Return the category average of rows of one run and view; retention is the ratio of the mean scores.
+
+    Intervals are of independent categories, see `mean_interval` and `Scores.mean`.
 
     Args:
+        estimated: Rows of one run and view, with their estimates.
         averaged: Fields that are averaged over the categories that have them, as `part.field`; the columns declare
-            them, see `probe_kit.retention.columns.columns`. Intervals: of independent categories, see
-            `mean_interval` and `Scores.mean`.
+            them, see `probe_kit.retention.columns.columns`.
     """
     rows = [part.row for part in estimated]
     of_streams = [part.streams for part in estimated if part.streams is not None]
@@ -306,7 +318,7 @@ def _rules(
 
 
 def _left_out(rows: Sequence[RetentionRow]) -> tuple[str, ...]:
-    """Probed categories in which retention is not defined."""
+    """Return the probed categories in which retention is not defined."""
     return tuple(row.category for row in rows if row.view is not None and not row.retention.defined)
 
 
@@ -333,7 +345,7 @@ def _rate_limits(estimated: Sequence[RowWithEstimates], name: str) -> Limits | N
 
 
 def _mean(rows: Sequence[RetentionRow], path: str) -> Any:
-    """Average of a field, as `part.field`, over the rows that have it; None if none has."""
+    """Return the average of a field, as `part.field`, over the rows that have it; None if none has."""
     read = attrgetter(path)
     values = [value for row in rows if (value := read(row)) is not None]
     return fmean(values) if values else None
@@ -345,7 +357,7 @@ def _sum(values: Sequence[int | None]) -> int | None:
 
 
 def _mean_by_key(columns: Sequence[dict[str, float]]) -> dict[str, float]:
-    """Average per key, for the keys that all have."""
+    """Return the average per key, for the keys that all have."""
     return {key: fmean(column[key] for column in columns) for key in columns[0] if all(key in c for c in columns)}
 
 
@@ -353,7 +365,7 @@ def _mean_by_key(columns: Sequence[dict[str, float]]) -> dict[str, float]:
 
 
 LEAST_EXCESS = 0.05
-"""R² above chance that the backbone must have; a ratio of less is the ratio of two errors."""
+"""Least R² above chance of a backbone; a ratio with less in the denominator is the ratio of two errors."""
 STEP = "step"
 """The control that labels of several inferences need: the number of the inference alone may say as much."""
 NO_STEP = "n/a (control step was not run)"
@@ -369,8 +381,11 @@ def with_probes(
     """Return the row with the parts of its category's probes, and their scores; None where there are none.
 
     Args:
-        absent_below: See `verdict`.
-        seed_text: Of the run; scores on equal groups of one are paired.
+        row: A row with its category and view.
+        results: Probes of the row's run.
+        iterations: Iterations of the action's stream that take part.
+        absent_below: Accuracy below which a stream without signal counts as absent, see `verdict`.
+        seed_text: Seed text of the run; scores on equal groups of one are paired.
     """
     curve = None if row.view is None else results.curves.get((row.category, row.view))
     if row.view is None or curve is None:
@@ -488,7 +503,7 @@ def _controls(
 
 
 def number_or_none(value: float) -> float | None:
-    """Return None in place of NaN, as rows hold a number that there is not."""
+    """Return the number, or None in place of NaN, as rows hold undefined numbers."""
     return None if isnan(value) else value
 
 
@@ -496,10 +511,12 @@ def number_or_none(value: float) -> float | None:
 
 
 def with_reason(row: RetentionRow, results: ProbeResults, tests: int = 1) -> RetentionRow:
-    """Return a row of a label that says whether there is something to retain, and else what is missing.
+    """Return a row of a label that states whether there is something to retain, and else the missing condition.
 
     Args:
-        tests: The number that p is corrected for.
+        row: A row of a label, with its probes.
+        results: Probes of the label.
+        tests: Number of tests that p is corrected for.
     """
     note, reason = _missing(row, results, tests)
     return replace(row, retention=replace(row.retention, defined=not note, note=note, reason=reason))
@@ -518,7 +535,7 @@ def with_corrected_p(
 
 
 def _missing(row: RetentionRow, results: ProbeResults, tests: int) -> tuple[str, str]:
-    """Return why there is nothing to retain, in few words and in full; two empty texts where there is."""
+    """Return the reason why there is nothing to retain, in few words and in full; two empty texts otherwise."""
     settings, backbone = results.settings, row.backbone
     if backbone.peak is None or row.action.peak is None:
         part = "backbone" if backbone.peak is None else "action"
@@ -566,7 +583,7 @@ def _missing(row: RetentionRow, results: ProbeResults, tests: int) -> tuple[str,
 
 
 Results = Mapping[tuple[str, str], ProbeResults]
-"""By the location of a run and the target."""
+"""Probe results, by the location of a run and the target."""
 
 
 def target_row(
@@ -574,8 +591,15 @@ def target_row(
 ) -> RetentionRow:
     """Return the row of a target, also of a side, in one category and view, without success.
 
+    Args:
+        table_run: The run of the row.
+        results: Probes of the target.
+        category: A probed category.
+        view: A probed view.
+        iterations: Iterations of the action's stream that take part.
+
     Raises:
-        UnknownSiteError: If it was not probed.
+        UnknownSiteError: If category or view was not probed.
     """
     settings = results.settings
     if (category, view) not in results.curves:

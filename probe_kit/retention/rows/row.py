@@ -15,7 +15,7 @@ from probe_kit.train.results.control_scores import has_signal
 from probe_kit.train.results.probe_results import ProbeResults
 
 Mode = Literal["answers", "acts"]
-"""What the model of a run does: it answers questions about pictures (a VLM run), or acts (a policy run)."""
+"""The task of a run's model: it answers questions about pictures (a VLM run), or acts (a policy run)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,12 +24,12 @@ class RunInfo:
 
     Attributes:
         location: Folder or URL.
-        settings: sha256 of the run's settings.
+        settings: The sha256 of the run's settings.
         probes: Key of its probe results.
-        label: What the run is called in tables and legends.
+        label: Name of the run in tables and legends.
         action_stream: `expert`, or `action` in a policy without one, whose iterations are action tokens.
         call: The captured inference that was probed, from 0.
-        capture_only: Activations were captured and the model did not act.
+        capture_only: Whether activations were captured and the model did not act.
     """
 
     location: str
@@ -77,19 +77,22 @@ class RunInfo:
 
 @dataclass(frozen=True, kw_only=True)
 class AnswerStats:
-    """The way in which the model of a VLM run was asked, and what else its answers say; all None for a policy run.
+    """The prompt of a VLM run, and further numbers of its answers; all None for a policy run.
+
+    `share_by_clause` and `accuracy_strict` are None for runs that do not store them.
 
     Attributes:
         asked_for: `target`, `distractor` or `absent`.
-        score: By which of its scores `success.sr` is. accuracy_text,
-        accuracy_logits: Shares that are right by each score.
-        accuracy_order_balanced: As `accuracy_logits`.
-        share_unparsable: Answers in text that could not be parsed.
-        share_by_clause: Those that were found among other words; accuracy_strict: accuracy_text with these as
-            unparsable, where they are many; both None for runs that do not store it.
+        score: The score by which `success.sr` is judged.
+        accuracy_text: Share that is right by text.
+        accuracy_logits: Share that is right by logits.
+        accuracy_order_balanced: Share that is right by logits averaged over both orders of the options.
+        share_unparsable: Share of answers in text that could not be parsed.
+        share_by_clause: Share of answers that were found among other words.
+        accuracy_strict: The accuracy by text with these as unparsable, where they are many.
         option_mass: Mean probability of the admissible answers together.
         letter_bias: Mean logit by which the option named first is preferred.
-        share_near_tie: Choices that rounding may have made.
+        share_near_tie: Share of choices that rounding may have made.
     """
 
     prompt: str | None = None
@@ -113,12 +116,13 @@ class SwapEffect:
     """Effect of exchanging the two pictures, if `probe-kit intervene` was run.
 
     Attributes:
-        follow_rate: Shares of episodes.
-        reversal_rate: As `follow_rate`.
-        net_follow_rate: Their difference.
+        follow_rate: Share of episodes in which the action goes to the correct picture, and to the other side once
+            the two are swapped.
+        reversal_rate: Share of episodes in which it does the reverse.
+        net_follow_rate: Difference of the two shares.
         reach_share: Displacement toward the correct picture in units of the policy's reach.
         follow_p: Exact, one-sided; see `intervene.ImageSwapEffect`.
-        use: The verdict of that, the row's own probes and stored interchanges.
+        use: The verdict from this effect, the row's own probes and stored interchanges.
     """
 
     follow_rate: float | None = None
@@ -145,29 +149,29 @@ class SwapEffect:
 class StreamPart:
     """The scores of probes of one stream.
 
-    Of a target that is no side, peak is the metric of the site with the largest score above its own chance, and
-    chance the mean score of the label permutations there.
+    Of a target that is no side, peak is the metric of the site with the largest score above its own chance. Its
+    chance is the mean score of the label permutations there. Score, verdict, at_most, selectivity and
+    minus_untrained are of sides alone.
 
     Attributes:
         score: Accuracy of the sites that the inner folds choose, on the outer folds; balanced between the sides,
             so that chance is one half.
-        ci: Its 95 % interval.
-        peak: Accuracy of the site that is best on all of them, which is too high by the luck of being chosen.
+        ci: The 95 % interval of `score`.
+        peak: Accuracy of the site that is best on all groups, which is too high by the luck of being chosen.
         above: Score above chance of the sites that the inner folds choose, on the outer folds.
-        above_ci: Its 95 % interval, Student's. Score, verdict, at_most, selectivity and minus_untrained are of
-            sides alone.
+        above_ci: The 95 % interval of `above`, Student's.
         at_most: An upper 95 % limit of the best site's accuracy.
         verdict: `shown` (family-wise above chance, and above every control that was run), `absent` (not shown,
             `at_most` below a bound, and the bound findable by so many items), or `not shown`.
         site: The first of the best sites, a place without an interval of its own.
-        layer: As `site`.
-        depth: As `site`.
-        ties: How many others are as accurate.
-        p_fwe: Of that site, family-wise.
+        layer: Layer of that site.
+        depth: Depth of that site as a fraction.
+        ties: Number of other sites that are as accurate.
+        p_fwe: Family-wise p of that site.
         exceeds: Whether it is better than `chance` and each control; None for one that was not run.
         selectivity: Its accuracy above that of the same probe on random labels of items.
-        minus_untrained: How much more accurate it is than the untrained network's best.
-        remedy: What to do where no p can be below 0.05; empty where one can.
+        minus_untrained: Its accuracy minus that of the untrained network's best site.
+        remedy: The remedy where no p can be below 0.05; empty where one can.
     """
 
     stream: str | None = None
@@ -217,11 +221,12 @@ class BackbonePart(StreamPart):
 class ActionPart(StreamPart):
     """The scores of probes where the action is made; see `StreamPart`.
 
+    The attributes are None where the stream runs once.
+
     Attributes:
         iteration: The flow-matching step or action token of the site.
-        first_peak: Of the best layer at the first iteration, which has seen no action. All three are None where
-            the stream runs once.
-        first_layer: As `first_peak`.
+        first_peak: Accuracy of the best layer at the first iteration, which has seen no action.
+        first_layer: The best layer at the first iteration.
     """
 
     iteration: int | None = None
@@ -240,8 +245,8 @@ class RetentionPart:
         published: The ratio of the peaks; in a mean the mean of these ratios over the categories whose backbone
             signal is shown; of sides alone.
         defined: Whether the backbone's signal is shown, in a mean in any category.
-        note: Why not, in few words.
-        reason: Of a target that is no side the same with what was found, what was expected and what to do.
+        note: Reason why it is not defined, in few words.
+        reason: Of a target that is no side, the same reason with the finding, the expectation and the remedy.
     """
 
     value: float | None = None
@@ -258,11 +263,11 @@ class ControlScores:
 
     Attributes:
         n_groups: Independent groups of items.
-        n_samples: Episodes, or inferences of them, that were probed. missing: by side, the share of items without
-            their episode of that side.
+        n_samples: Episodes, or inferences of them, that were probed.
+        missing: By side, the share of items without their episode of that side.
         probe_minus_sr: Backbone score − success rate.
         baselines: Accuracy of each control that never sees the model.
-        leaks: Those above chance.
+        leaks: Names of those above chance.
         untrained: Name of the untrained network's run.
     """
 
@@ -281,13 +286,15 @@ MEAN = "mean"
 
 @dataclass(frozen=True, kw_only=True)
 class RetentionRow:
-    """One row of the retention table: its parts. A part with nothing to say holds defaults.
+    """One row of the retention table: its parts. A part without values holds defaults.
+
+    In a row of category `mean`, numbers are averages over `categories` and retention leaves out `left_out`.
 
     Attributes:
-        view: How tokens became one vector, None without probes.
-        target: What the probes decode; task: its kind.
-        group: Of several groups of runs, this run's. In a row of category `mean`, numbers are averages over
-            `categories` and retention leaves out `left_out`.
+        view: The way in which tokens became one vector, None without probes.
+        target: The target that the probes decode.
+        task: Kind of the target.
+        group: Of several groups of runs, this run's.
     """
 
     category: str
@@ -309,7 +316,7 @@ class RetentionRow:
 
     @property
     def key(self) -> tuple[str | None, str]:
-        """Group and location of its run, which tell runs of a table apart."""
+        """Group and location of its run, which distinguish the runs of a table."""
         return self.group, self.run.location
 
     @property
