@@ -42,9 +42,10 @@ class Interruptions:
 def contained(limit: float | None = None) -> Iterator[Interruptions]:
     """Run a policy's code in the body; afterwards this process is as it was.
 
+    A process that the body forked ends here: it would play on beside its parent, into the same run.
+
     Args:
-        limit: Seconds after which the process is ended by SIGALRM, which no code can hold up; None for no limit. A
-            process that the body forked ends here: it would play on beside its parent, into the same run.
+        limit: Seconds after which the process is ended by SIGALRM, which no code can hold up; None for no limit.
     """
     process = os.getpid()
     try:
@@ -76,7 +77,7 @@ def begin_randomness(seed: int) -> None:
 
 
 def copied(observations: Sequence[Observation]) -> list[Observation]:
-    """Observations whose arrays may be written to: those of the stage stay as they are."""
+    """Return observations whose arrays may be written to: those of the stage stay as they are."""
     return [
         replace(
             observation,
@@ -108,7 +109,7 @@ def _kept_randomness() -> Iterator[None]:
 
 @contextmanager
 def _kept_surroundings() -> Iterator[None]:
-    """Torch's default dtype, the working directory and the environment variables."""
+    """Restore torch's default dtype, the working directory and the environment variables after the body."""
     import torch
 
     dtype, folder, variables = torch.get_default_dtype(), os.open(".", os.O_RDONLY), dict(os.environ)
@@ -124,7 +125,7 @@ def _kept_surroundings() -> Iterator[None]:
 
 
 class _Quoted(TextIOBase):
-    """Writes to another stream, what a terminal would obey as visible signs."""
+    """Writes to another stream; control characters that a terminal would obey become visible signs."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -215,11 +216,15 @@ def with_origin(reason: str, model: str, location: str) -> str:
 
 @contextmanager
 def while_acting(model: str, location: str, limit: float | None = None) -> Iterator[None]:
-    """Errors of a policy's code in the body. Raises PolicyFailedError naming the model, or an error of ours.
+    """Turn errors of a policy's code in the body into errors of ours.
 
     Args:
-        location: Where its checkpoint lies, for what is found out about it this late.
-        limit: As `contained` has it.
+        model: Name of the model.
+        location: The place of its checkpoint, for errors of the checkpoint that show this late.
+        limit: Seconds after which the process is ended, as in `contained`; None for no limit.
+
+    Raises:
+        PolicyFailedError: For any error but one of ours, which is raised as it is; it names the model.
     """
     with contained(limit) as interruptions:
         try:
@@ -238,9 +243,15 @@ def while_acting(model: str, location: str, limit: float | None = None) -> Itera
 
 @contextmanager
 def while_loading(model: str, location: str) -> Iterator[None]:
-    """Errors of a loader's code in the body. Raises CheckpointError naming model and checkpoint, or one of ours.
+    """Turn errors of a loader's code in the body into errors of ours.
 
-    A loader that ends the process raises PolicyFailedError.
+    Args:
+        model: Name of the model.
+        location: The folder or hub id of its checkpoint.
+
+    Raises:
+        CheckpointError: For any error but one of ours, which is raised as it is; it names model and checkpoint.
+        PolicyFailedError: For a loader that ends the process.
     """
     try:
         with _said_when_asked_for("bitsandbytes"), naming_checkpoint(model, location):
@@ -258,7 +269,8 @@ def while_loading(model: str, location: str) -> Iterator[None]:
 
 @contextmanager
 def _said_when_asked_for(library: str) -> Iterator[None]:
-    """No warnings of a library that others import wherever it is installed; who asks for it gets its errors."""
+    """Silence warnings of a library that others import wherever it is installed; code that asks for it gets its errors.
+    """
     logger = logging.getLogger(library)
     before = logger.level
     logger.setLevel(logging.ERROR)
@@ -269,7 +281,7 @@ def _said_when_asked_for(library: str) -> Iterator[None]:
 
 
 def in_words(error: BaseException) -> str:
-    """Class and first line."""
+    """Return the class and the first line of an error."""
     if isinstance(error, SystemExit):
         return f"it called sys.exit({error.code!r})"
     first = (str(error).strip().splitlines() or ["no message"])[0]
