@@ -360,7 +360,9 @@ class Family:
         return location is None or is_complete(location)
 
     def bytes_to_fetch(self, checkpoint: str | None, options: Mapping[str, Any]) -> int | None:
-        """Return the bytes of weights that have to be downloaded, as an index in the cache has them; None without one.
+        """Return the bytes of weights that have to be downloaded, as an index in the cache has them.
+
+        None where there is no index, and for an embedded checkpoint.
         """
         location = self.location(checkpoint, options.get(SIZE))
         return None if location is None else bytes_to_fetch(location)
@@ -402,12 +404,13 @@ class Family:
     def whose_units(
         self, checkpoint: str | None, options: Mapping[str, Any] = MappingProxyType({}), fetch: bool = True
     ) -> str:
-        """Return the data set or robot whose units the actions get, and what says so; "" for a family with one way.
+        """Return the data set or robot whose units the actions get, and what says so; "" where there is one way.
 
         Args:
             checkpoint: Folder or hub id; None for the default one.
             options: The options of the family, by name.
-            fetch: Download small files that are not here; without it, nothing is said of a checkpoint on the hub.
+            fetch: Download small files that are not here; without it, the answer is "" for a checkpoint on the
+                hub.
 
         Raises:
             UsageError: Where several are there and none was chosen.

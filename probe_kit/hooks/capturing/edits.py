@@ -98,8 +98,7 @@ class TokenSelection:
 
     @classmethod
     def of(cls, mask: NDArray[np.bool_], device: str) -> Self:
-        """Return the selection of the tokens that a mask (T,) marks, with positions on the device of the stream.
-        """
+        """Return the selection of the tokens that a mask (T,) marks, as positions on the stream's device."""
         import torch
 
         positions = np.flatnonzero(mask)
@@ -121,8 +120,7 @@ class TokenEdit(Protocol):
     """A change of the tokens of a site."""
 
     def __call__(self, site: Site, activation: "Tensor", where: TokenIndex) -> "Tensor":
-        """Return (1, T', D) of as many float32 tokens, at the positions `where`, and leave `activation` as it is.
-        """
+        """Return (1, T', D) of as many float32 tokens, at positions `where`, and leave `activation` as it is."""
 
 
 @dataclass(frozen=True)

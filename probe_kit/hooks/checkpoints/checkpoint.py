@@ -202,8 +202,7 @@ class HubName(NamedTuple):
 
 
 def hub_name(checkpoint: str) -> HubName | None:
-    """Return the parts of `owner/repo`, `owner/repo/folder` and either with `@revision`; None for any other text.
-    """
+    """Return the parts of `owner/repo`, `owner/repo/folder` and either with `@revision`; None for other text."""
     name, at, revision = checkpoint.partition("@")
     parts = name.split("/")
     if (
@@ -430,7 +429,7 @@ def chosen_dtype(requested: str | None, stored: object, offered: Collection[str]
 
     Args:
         requested: The dtype that was asked for; None for none.
-        stored: The entry of the configuration; a value such as None or "" says nothing.
+        stored: The entry of the configuration; None or "" where it has none.
         offered: The dtypes that the family can run in.
 
     Raises:

@@ -32,8 +32,7 @@ _WITHOUT_EFFECT = (
     "lora_dropout", "layers_to_transform", "layers_pattern", "megatron_core", "qalora_group_size",
     "runtime_config", "eva_config", "loftq_config", "velora_config",
 )  # fmt: skip
-"""Fields of training, speed, and rules for choosing modules: the tensors themselves say which modules they change.
-"""
+"""Fields of training, speed, and rules for choosing modules: the tensors themselves say which ones they change."""
 _INERT: Mapping[str, tuple[Any, ...]] = {
     "init_lora_weights": (True, False, None, "gaussian", "eva", "orthogonal"),
     "revision": (None, "", "main"),

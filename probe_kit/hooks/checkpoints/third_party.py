@@ -269,7 +269,9 @@ def while_loading(model: str, location: str) -> Iterator[None]:
 
 @contextmanager
 def _said_when_asked_for(library: str) -> Iterator[None]:
-    """Silence warnings of a library that others import wherever it is installed; code that asks for it gets its errors.
+    """Silence the warnings of a library that others import wherever it is installed.
+
+    Code that asks for the library gets its errors.
     """
     logger = logging.getLogger(library)
     before = logger.level

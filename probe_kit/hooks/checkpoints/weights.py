@@ -170,8 +170,7 @@ RANDOM_MARK = "probe_kit.weights"
 _WRAPPERS = (
     "_orig_mod", "_fsdp_wrapped_module", "_checkpoint_wrapped_module", "_forward_module", "_ddp_module", "module",
 )  # fmt: skip
-"""The names that torch.compile, FSDP, activation checkpoints, DeepSpeed, lightning and DDP give the module in them.
-"""
+"""The names that torch.compile, FSDP, activation checkpoints, DeepSpeed, lightning and DDP give to a module."""
 _FEWEST = 2
 """The smallest number of names that can have something in common."""
 

@@ -450,8 +450,7 @@ def _alike(subject: Subject, candidates: Sequence[Observation]) -> tuple[Observa
 
 
 def _require_moves(subject: Subject, first: Observation, second: Observation, role: str) -> None:
-    """Check that between two observations with the same roles, only the embeddings of `role` differ, and some do.
-    """
+    """Check that between two observations with the same roles, only embeddings of `role` differ, and some do."""
     stream = subject.probed_backbone
     before: Roles = subject.roles_of([first])[stream.name][0]
     site, embeddings = stream.sites()[0], []

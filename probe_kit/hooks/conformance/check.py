@@ -183,8 +183,7 @@ def tried(name: str, sentence: str, change: str, body: Callable[[], object], pac
 
 
 def _in_words(error: BaseException, package: str) -> str:
-    """Return the whole text of an error of ours, the first line of any other, and the adapter's line that it passed.
-    """
+    """Return the whole text of an error of ours, the first line of any other, and the adapter's line it passed."""
     cause = error.__cause__
     if isinstance(error, ProbeKitError) and cause is not None and not isinstance(cause, ProbeKitError):
         return _in_words(cause, package) if place_of(cause, package) else f"{type(error).__name__}: {error}"

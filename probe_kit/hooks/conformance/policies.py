@@ -226,8 +226,7 @@ def the_prompt_has_keys_and_values_for_every_token_of_the_backbone(subject: Poli
     "Tap the keys and values that the acting part reads, after rotation; correct `first_affected_token`.",
 )
 def all_keys_and_values_of_another_picture_give_that_pictures_actions(subject: PolicySubject) -> None:
-    """Keep state, words and noise the same; what chose the first token is replaced along with the keys and values.
-    """
+    """Keep state, words and noise the same; what chose the first token is replaced along with keys and values."""
     policy, kv, observation = subject.policy, _prompt_kv(subject), subject.single[0]
     other = replace(observation, image=255 - observation.image)
     acting = [site for site in policy.sites() if policy.streams[site.stream].part == "action"]
@@ -467,8 +466,7 @@ def _lateral(actions: Tensor) -> Tensor:
 
 
 def _some_sites(policy: Policy) -> list[Site]:
-    """Return one site in the backbone, the keys and values of the first block, and one where the action is made.
-    """
+    """Return a site in the backbone, the keys and values of the first block, and a site of the acting stream."""
     acting = [site for site in policy.sites() if policy.streams[site.stream].part == "action"]
     backbone = next(site for site in policy.sites() if policy.streams[site.stream].part == "backbone")
     kv = [] if policy.prompt_kv is None else [Site(policy.prompt_kv.name, 0, quantity) for quantity in KV]

@@ -305,8 +305,7 @@ class AnswerSubject(Subject):
 
 
 def example_observations(instructions: Sequence[str], cameras: Sequence[str] = ()) -> list[Observation]:
-    """Return one observation per instruction: noise pictures, plausible states and intrinsics, from a fixed seed.
-    """
+    """Return observations, one per instruction: noise pictures, plausible states, intrinsics, of a fixed seed."""
     rng = np.random.default_rng(0)
     size = (48, 64, 3)
     intrinsics = np.array([[60, 0, 32], [0, 60, 24], [0, 0, 1]], np.float32)

@@ -245,8 +245,7 @@ def chosen_tokens(name: str, layers: int, width: int, iterations: int, sums: boo
 def expert(
     layers: int, width: int, iterations: int, tokens: int, roles: tuple[str, ...], **fields: Any
 ) -> DeclaredStream:
-    """A flow or diffusion transformer, with its tokens at every iteration; `fields` are other fields of `Stream`.
-    """
+    """A flow or diffusion transformer, with its tokens at every iteration; `fields` are others of `Stream`."""
     shape = {"name": "expert", "part": "action", **fields}
     return DeclaredStream(Stream(layers=layers, width=width, iterations=iterations, **shape), tokens, roles)
 

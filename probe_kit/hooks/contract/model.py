@@ -386,8 +386,7 @@ class Policy(Model):
         return self
 
     def laid_out(self, states: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return states of the arm (n, 8) as (n, D), in the order and count that this checkpoint was given them.
-        """
+        """Return states of the arm (n, 8) as (n, D), in the order and count in which a checkpoint reads them."""
         return states
 
     @property
