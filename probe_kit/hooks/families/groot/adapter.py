@@ -80,8 +80,7 @@ class Groot(PackedPolicy):
         weights_seed: int = 0,
         **options: Any,
     ) -> Self:
-        """Load a checkpoint as `LerobotPolicy.load`; dtype bfloat16 is lerobot's autocast around float32 weights.
-        """
+        """Load as `LerobotPolicy.load` does; dtype bfloat16 is lerobot's autocast around float32 weights."""
         policy = super().load(checkpoint, device, dtype, random_weights, weights_seed, **options)
         execute = min(int(policy.network._action_queue_steps), policy.chunk)
         policy.card = replace(policy.card, chunk=policy.chunk, execute=execute, batch=1)

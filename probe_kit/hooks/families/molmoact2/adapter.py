@@ -320,8 +320,7 @@ class MolmoAct2(PackedPolicy):
         return {"vlm": Path(self.config.checkpoint_path)}
 
     def own_units(self, feature: str, kind: str) -> FramedUnits | None:
-        """Return the units of lerobot's steps: numbers that a mask leaves unscaled, clamps, and frames of joints.
-        """
+        """Return the units of lerobot's steps: numbers that a mask leaves unscaled, clamps, frames of joints."""
         units, config = super().own_units(feature, kind), self.config
         if units is None:
             return None
@@ -354,7 +353,9 @@ class MolmoAct2(PackedPolicy):
         return self.config.chunk_size, self.config.expected_max_action_dim
 
     def record_attention(self, note: Note) -> AbstractContextManager[None]:
-        """Record attention that is computed once more: block n of the expert on the keys of block n of the backbone.
+        """Record attention that is computed once more.
+
+        Block n of the expert attends to the keys of block n of the backbone.
         """
         blocks = self.network._backbone().action_expert.blocks
         return recording_weights([block.cross_attn for block in blocks], note, _on_the_prompt)
@@ -399,7 +400,7 @@ class MolmoAct2(PackedPolicy):
         }
 
     def tap(self, site: Site) -> Tap:
-        """Return the first norm of the block the site enters, the final norm, or what a block adds behind its gate.
+        """Return the first norm of the block the site enters, the final norm, or what a block adds, gated.
 
         Raises:
             CaptureError: If CUDA graphs are on.

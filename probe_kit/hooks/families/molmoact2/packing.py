@@ -175,8 +175,7 @@ class Packing:
     """The packing of lerobot: pictures, words and state become the inputs of the network."""
 
     def __init__(self, config: Any, actions: int) -> None:
-        """Make the packing step of lerobot from its configuration; `actions` is the count of numbers of an action.
-        """
+        """Make the packing step of lerobot from its configuration; `actions` counts the numbers of an action."""
         self.step = MolmoAct2PackInputsProcessorStep(
             checkpoint_path=config.checkpoint_path,
             action_mode="continuous",
@@ -225,7 +224,9 @@ class Packing:
         return PackedRow(inputs, self._labels(inputs, list(pictures)))
 
     def _labels(self, inputs: dict[str, Tensor], cameras: Sequence[str]) -> list[str]:
-        """Return the labels: a patch is its camera's; the instruction is `language`, the state's tokens are `state`.
+        """Return the labels: a patch is its camera's; the instruction is `language`.
+
+        The state's tokens are `state`.
         """
         pieces = self.tokenizer.convert_ids_to_tokens(inputs["input_ids"][0].tolist())
         labels = label_groups([piece.replace("\u0120", " ").replace("\u010a", "\n") for piece in pieces], _PROMPT)

@@ -255,8 +255,7 @@ class Xvla(DenoisingPolicy):
         return (*super()._notes(), f"pictures {how}")
 
     def look(self, camera: str, images: Sequence[NDArray[np.uint8]]) -> Tensor:
-        """Return pictures (B, 3, H, W) in [0, 1]: squashed where that is chosen; lerobot's network pads any other.
-        """
+        """Return pictures (B, 3, H, W) in [0, 1]: squashed where that is chosen; lerobot pads any other."""
         if self.config.picture == "squashed":
             size = tuple(self.config.resize_imgs_with_padding)
             images = [

@@ -434,8 +434,7 @@ class StatePrompt(LerobotPolicy):
         ]
 
     def text_labels(self, ids: Sequence[int], valid: Sequence[bool]) -> list[str]:
-        """Return labels: `language` for the instruction, `state` for the digits, `special` for the words around.
-        """
+        """Return labels: `language` for the instruction, `state` for the digits, `special` for words around."""
         special = frozenset(self.tokenizer.all_special_ids)
         pieces = [
             "" if number in special or not is_text else piece.replace("\u2581", " ")
