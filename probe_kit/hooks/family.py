@@ -177,7 +177,7 @@ class Family:
             )
 
     def known_words(self) -> list[str]:
-        """Every word that an instruction of an embedded model may hold, sorted; none of a family of any text."""
+        """Return every word that an instruction of an embedded model may hold, sorted; none for any text."""
         words = import_module(self.vocabulary).known_words() if self.vocabulary else ()
         return sorted(word for word in words if word.strip())
 
@@ -495,11 +495,11 @@ class Family:
         return self.location(checkpoint, loader_options.pop(SIZE, None)), loader_options
 
     def renames(self) -> tuple[tuple[str, str], ...]:
-        """Pairs that turn names of tensors in released files into the network's; empty if they are the same."""
+        """Return pairs that turn names of tensors in released files into the network's; empty if they agree."""
         return () if self.stored_names is None else tuple(imported(self.stored_names))
 
     def missing(self) -> str:
-        """Requirements that this machine lacks, the default checkpoint included; empty if it is ready."""
+        """Return requirements that this machine lacks, the default checkpoint included; empty if it is ready."""
         lacking = [f"extra {extra}" for extra in dict.fromkeys(extra for _, extra in self._missing_packages())]
         if self.needs_checkpoint:
             lacking.append("a checkpoint of yours (--checkpoint)")

@@ -48,7 +48,7 @@ class Outputs:
 
 @dataclass(frozen=True)
 class RecordedRun:
-    """One inference on recorded inputs.
+    """The result of one inference on recorded inputs.
 
     Attributes:
         activations: The activations of every stream.

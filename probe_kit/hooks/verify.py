@@ -28,7 +28,7 @@ REFERENCE_FILE, CHECKPOINT_FOLDER = "reference.npz", "checkpoint"
 
 @dataclass(frozen=True)
 class Comparison:
-    """One recorded output beside ours; `error` is the largest absolute difference, None if not compared."""
+    """A recorded output and ours; `error` is the largest absolute difference, None if not compared."""
 
     output: str
     status: Status

@@ -36,9 +36,9 @@ Read = tuple[int, int]
 
 @dataclass
 class AttentionMass:
-    """Shares of attention, by (block of the backbone whose keys are read, iteration).
+    """The shares of attention, by (block of the backbone whose keys are read, iteration).
 
-    Not causal: a token can receive attention without being used. Serves an optional display only.
+    They are not causal: a token can receive attention without being used. They serve an optional display only.
 
     Attributes:
         by_head: (B, H, T) float32, a mean over acting positions; what is missing to 1 lies on the acting part's
@@ -95,7 +95,7 @@ def capture_attention(policy: Policy) -> Iterator[AttentionMass]:
 
     Raises:
         UnsupportedInterventionError: For a family without attention recording.
-        CaptureError: If none occurred.
+        CaptureError: If no attention was recorded, or that of a block twice in an iteration.
     """
     policy.interventions.check("attention", policy.card.family)
     mass = AttentionMass()
@@ -219,7 +219,7 @@ def _labels(roles: Roles) -> list[str]:
 
 @dataclass(frozen=True)
 class _Attention:
-    """One attention of a model.
+    """An attention that a model computed.
 
     Attributes:
         weights: Makes the pattern (B, H, S, T) float32.
@@ -231,7 +231,7 @@ class _Attention:
 
 
 class _AttentionCalls(TorchFunctionMode):
-    """Sees torch's calls while a model runs, and changes none; `last` is the attention that was computed last."""
+    """A mode that sees torch's calls while a model runs, and changes none; `last` is the latest attention."""
 
     def __init__(self) -> None:
         super().__init__()

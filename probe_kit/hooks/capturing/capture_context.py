@@ -213,7 +213,10 @@ class ActivationCache(Mapping[Site, Tensor]):
 Reduce = Callable[[Site, Tensor], Tensor]
 EditFunction = Callable[[Tensor], Tensor]
 Handle = Callable[[Site, Tap, Tensor], Tensor | None]
-"""Receives what passes at a site; what it returns, unless None or of a keyword, passes on in its place."""
+"""A function that receives what passes at a site.
+
+What it returns, unless None or of a keyword, passes on in its place.
+"""
 _captured_now: WeakSet[Model] = WeakSet()
 
 
@@ -224,8 +227,8 @@ def capture(model: Model, sites: Iterable[Site], reduce: Reduce | None = None) -
     Args:
         model: The model that runs inside the context.
         sites: The sites to capture; each is captured once, however often it is named.
-        reduce: Called with (site, (B, T, D)) on the device at the moment it fires, gives what to keep of the site,
-            such as a pooled view; it must return a new tensor. None keeps a copy.
+        reduce: Gives what to keep of a site, such as a pooled view. It is called with (site, (B, T, D)) on the
+            device at the moment the site fires, and must return a new tensor. None keeps a copy.
 
     Raises:
         SiteNeverFiredError: If a site fired less often than its tap promises.
@@ -376,7 +379,7 @@ def _check_non_finite(cache: ActivationCache) -> None:
 # -- gradients ------------------------------------------------------------------------------------------------
 
 Metric = Callable[[Tensor], Tensor]
-"""Maps actions (B, chunk, 7), in metres and radians, to a number."""
+"""A function from actions (B, chunk, 7), in metres and radians, to a number."""
 
 
 def gradients_at(

@@ -38,13 +38,14 @@ Vectors = Mapping[str, NDArray[np.float32]]
 
 @dataclass(frozen=True)
 class Edit:
-    """One change of some sites, applied row by row.
+    """A change of some sites, applied row by row.
 
     Attributes:
         kind: `zero` sets to zero; `add` adds `strength` times a direction; `remove` takes away `strength` times
             the component along it; `replace` goes the share `strength` of the way to a source, token by token.
         roles: The roles of the tokens that change, such as `language` or `image`; None for all but padding.
         vector: `vector_hash` of the direction (D,) or source (T, D); "" for `zero`.
+        strength: A finite number; 1 is the whole change.
 
     Raises:
         UsageError: For a combination that means nothing.
@@ -72,7 +73,7 @@ class Edit:
 
 
 def vector_hash(vector: NDArray[np.floating]) -> str:
-    """Hex sha256 of shape and float32 bytes: the name of a direction or source."""
+    """Return the hex sha256 of shape and float32 bytes: the name of a direction or source."""
     values = np.ascontiguousarray(vector, np.float32)
     return hashlib.sha256(str(values.shape).encode() + values.tobytes()).hexdigest()
 
@@ -284,7 +285,7 @@ LOG_FIELDS = ("fires", "no_op_fires", "norm", "change", "largest_change")
 
 @dataclass(frozen=True)
 class LogEntry:
-    """One firing of an edit: tokens edited, their mean norm before, and how far they moved (mean, largest)."""
+    """A firing of an edit: tokens edited, their mean norm before, and how far they moved (mean, largest)."""
 
     site: str
     tokens: int

@@ -25,7 +25,7 @@ from probe_kit.models.bounds import check_sizes
 PATIENCE = 5.0
 """Seconds without a reply after which the hub counts as unreachable."""
 OFFLINE_WAY_OUT = "Connect to the network once, or fill the cache with `hf download`"
-"""What to do where the hub cannot be asked."""
+"""The advice where the hub cannot be asked."""
 _WITHOUT_NETWORK = ContextVar("without_network", default=False)
 
 
@@ -181,7 +181,7 @@ SMALL_FILES = ("*.json", "*.model", "*.txt", "*.jinja", "adapter_model.safetenso
 COMMIT_DIGITS = 40
 """The number of digits of a commit's full name."""
 RUN_WEIGHTS = "checkpoints/latest-checkpoint.pt"
-"""Where a folder of a training run of Prismatic keeps its weights."""
+"""The file in which a folder of a training run of Prismatic keeps its weights."""
 
 
 class NotCachedError(LookupError):
@@ -216,7 +216,7 @@ def hub_name(checkpoint: str) -> HubName | None:
 
 
 def without_revision(checkpoint: str | None) -> str | None:
-    """A hub id without its revision; anything else as it is."""
+    """Return a hub id without its revision; anything else as it is."""
     if checkpoint is None or not is_on_hub(checkpoint):
         return checkpoint
     return checkpoint.partition("@")[0]
@@ -388,13 +388,13 @@ def hub_files(checkpoint: str) -> list[str]:
 
 
 def _possible(folder: Path) -> Path:
-    """The folder, if its files can be read and no configuration asks for a network beyond all sizes.
+    """Return the folder, if its files can be read and no configuration asks for a network beyond all sizes.
 
-    A configuration that is none is left to its loader, which names it.
+    A configuration that cannot be read as JSON or YAML is left to its loader, which names it.
 
     Raises:
-        CheckpointError: For those, and for a file beside the weights that is a pipe, a device or huge: libraries
-            read such files without a bound.
+        CheckpointError: For a network beyond all sizes, and for a file beside the weights that is a pipe, a device
+            or huge: libraries read such files without a bound.
     """
     for file in sorted(path for pattern in ("*", "*/*") for path in folder.glob(pattern)):
         if file.suffix in _READ and not file.is_dir() and file.exists():
@@ -466,7 +466,8 @@ def is_weights(path: Path) -> bool:
 
 
 def content_hashes(files: Mapping[str, Path]) -> dict[str, str]:
-    """Return `file <name>` → sha256 of its bytes, for `Card.settings`: where a checkpoint lies does not matter."""
+    """Return `file <name>` → sha256 of its bytes, for `ModelCard.settings`; a checkpoint's place does not matter.
+    """
     return {f"file {name}": hashlib.sha256(read_regular(path)).hexdigest() for name, path in files.items()}
 
 

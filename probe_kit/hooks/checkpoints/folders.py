@@ -122,8 +122,8 @@ def adapter_in(folder: Path) -> AdapterFiles | None:
     """The LoRA adapter in a checkpoint's folder; None where there is none.
 
     Raises:
-        CheckpointError: For an adapter that cannot be merged exactly, for one of which a file is missing, and for
-            weights beside it of which no file says whether they are the base's or merged.
+        CheckpointError: For an adapter that cannot be merged exactly, for one that lacks a file, and for weights
+            beside it that may be the base's or merged.
     """
     folder = _JOINED.get(str(folder), folder)
     file = folder / ADAPTER_FILE

@@ -32,7 +32,10 @@ _ENDING = (signal.SIGINT, signal.SIGTERM)
 
 
 class Interruptions:
-    """Interruptions of this process while a policy worked, as policies can raise KeyboardInterrupt themselves."""
+    """A record of interruptions of this process while a policy worked.
+
+    It tells them from a KeyboardInterrupt that the policy raises itself.
+    """
 
     def __init__(self) -> None:
         self.asked = False
@@ -67,7 +70,7 @@ def contained(limit: float | None = None) -> Iterator[Interruptions]:
 def begin_randomness(seed: int) -> None:
     """Let the global random numbers of Python, NumPy and torch begin at `seed` (63 bits).
 
-    So a policy that draws from them depends on its episodes alone, and not on what was played before.
+    A policy that draws from them then depends on its episodes alone, and not on what was played before.
     """
     import torch
 
@@ -192,7 +195,7 @@ _LONGEST = 300
 def naming_checkpoint(model: str, location: str) -> Iterator[None]:
     """Put the model and the checkpoint's folder or hub id into the body's errors about weights, files and words.
 
-    What a message already names is not said twice.
+    A name that a message holds already is not repeated.
     """
     try:
         yield

@@ -190,10 +190,10 @@ class Weights:
     adapter: Adapter | None = None
 
     def sha256(self) -> str:
-        """Hex sha256 over (name, dtype, shape, bytes) of every tensor, in name order.
+        """Return the hex sha256 over (name, dtype, shape, bytes) of every tensor, in name order.
 
-        Of base and adapter where there is one, and over the settings that scale what it adds: their merge is
-        rounded, and its last bits may differ between machines.
+        Where there is an adapter, it is over the tensors of base and adapter, and over the settings that scale
+        what the adapter adds. Their merge is rounded, and its last bits may differ between machines.
         """
         digest = hashlib.sha256()
         tensors = dict(self.tensors)
@@ -223,7 +223,7 @@ class WeightsAudit:
     adapter: str = ""
 
     def to_json(self) -> dict[str, Any]:
-        """The audit as stored with a run."""
+        """Return the audit as stored with a run."""
         return asdict(self)
 
 

@@ -390,11 +390,11 @@ def _edits_from(
 # -- gradients ------------------------------------------------------------------------------------------------
 
 CLOSE = 0.01
-"""Relative difference of a gradient from a central difference."""
+"""The largest relative difference of a gradient from a central difference."""
 _AGREED = 0.001
 """Relative difference of two central differences below which a shorter step has nothing to decide."""
 STEPS = (1e-2, 3e-3, 1e-3)
-"""Lengths of steps, relative to the activation's own norm, until two agree; of all, the two that agree best."""
+"""The lengths of steps, relative to the activation's norm, until two agree; of all, the two that agree best."""
 _ADVICE = (
     "Let `differentiable` compute what `act` computes: pass by `no_grad` and `inference_mode`, detach nothing, "
     "and keep in-place writes away from tensors that sites tap."

@@ -278,7 +278,7 @@ class AnswerSubject(Subject):
         return [Prompt(observation, observation.instruction, self.letters) for observation in observations]
 
     def run(self, observations: Sequence[Observation]) -> NDArray[np.float32]:
-        """The logits of the options."""
+        """Return the logits of the options."""
         return self.ask(self.questions_of(observations))
 
     def roles_of(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
@@ -286,7 +286,7 @@ class AnswerSubject(Subject):
         return self.answer_model.asked_roles(self.led(self.questions_of(observations)))
 
     def read(self, questions: Sequence[Prompt]) -> Reading:
-        """One prefill of the questions."""
+        """Read the questions in one prefill."""
         return self.answer_model.read(self.led(questions))
 
     def ask(self, questions: Sequence[Prompt]) -> NDArray[np.float32]:
@@ -322,6 +322,6 @@ def example_observations(instructions: Sequence[str], cameras: Sequence[str] = (
 
 
 def examples_for(model: Model, *instructions: str) -> list[Observation]:
-    """Observations that hold what the model needs."""
+    """Return observations that hold what the model needs."""
     cameras = [need.removeprefix("camera.") for need in sorted(model.card.needs) if need.startswith("camera.")]
     return example_observations(instructions, cameras)

@@ -174,7 +174,7 @@ class ProtocolRow:
         return next((row for row in self.rows if row.checkpoint == _bare(checkpoint)), self)
 
     def options_for(self, checkpoint: str | None) -> dict[str, Any]:
-        """The options with `checkpoint`, None for the protocol's own."""
+        """Return the options with `checkpoint`; None takes the protocol's own."""
         checkpoint_options = self.of_checkpoint if _bare(checkpoint) in (None, self.checkpoint) else {}
         return {**checkpoint_options, **self.options}
 
@@ -259,8 +259,11 @@ def answering(layers: int, width: int, tokens: int, sums: bool = True) -> tuple[
 
 InterventionKind = Literal["swap", "edit", "kv", "attention", "tiles", "gradients"]
 Readout = Literal["first-chunk", "per-step"]
-"""first-chunk: lateral displacement by the first inference's actions, none of them executed.
-per-step: its sum over every inference of the unedited episode; only the clean actions are executed."""
+"""The readout with which interventions of a family are compared.
+
+`first-chunk` is the lateral displacement by the first inference's actions, none of them executed. `per-step` is
+its sum over every inference of the unedited episode; only the clean actions are executed.
+"""
 _VALUES: Mapping[str, tuple[str, tuple[str, ...]]] = MappingProxyType(
     {"kv": ("--sites", ("kv.*",)), "tiles": ("--roles", ("image.left", "image.right"))}
 )
@@ -375,4 +378,4 @@ class Interventions:
 
 
 ALL_EDITS = Interventions()
-"""Default of a family: image swaps, and edits at every site."""
+"""The default of a family: image swaps, and edits at every site."""

@@ -155,11 +155,11 @@ class Model(ABC):
     """A network whose activations can be captured: what capture, edits, verification and the store need.
 
     Attributes:
-        streams: Stored by an extraction.
-        further_streams: Captured by naming their sites only, such as vision towers.
+        streams: The streams that an extraction stores, by name.
+        further_streams: The streams that are captured by naming their sites only, such as vision towers.
         prompt_kv: The keys and values of the prompt that the acting part reads, block by block, as a stream of the
-            quantities `KV`; captured and edited by naming their sites, such as `kv.02.values`; None where a family
-            has none. Its tokens are the backbone's.
+            quantities `KV`. They are captured and edited by naming their sites, such as `kv.02.values`. The tokens
+            are the backbone's. None where a family has none.
         role_names: Per stream, every role its tokens can play.
         absent_inputs: Inputs that it never reads by design: `instruction`, `state`, `picture` or `picture.CAMERA`.
     """
@@ -195,7 +195,7 @@ class Model(ABC):
         return None
 
     def token_ids(self, instructions: Sequence[str]) -> list[tuple[int, ...]] | None:
-        """Per instruction, the ids that reach the network as its prompt; None if the model cannot say."""
+        """Return per instruction the ids that reach the network as its prompt; None if the model cannot say."""
         del instructions
         return None
 
@@ -205,7 +205,7 @@ class Model(ABC):
         Its commit then stands in the card.
 
         Raises:
-            CheckpointError: For what is not here.
+            CheckpointError: For a file that is not here.
         """
         return
 
@@ -324,15 +324,15 @@ class Policy(Model):
         return None
 
     def zero_filled_inputs(self) -> tuple[str, ...]:
-        """Inputs that `infer_without_acting` replaces by zeros, because the checkpoint expects others there."""
+        """Return inputs that `infer_without_acting` replaces by zeros: the checkpoint expects others there."""
         return ()
 
     def infer_without_acting(
         self, observations: Sequence[Observation], seeds: Sequence[int]
     ) -> NDArray[np.float32]:
-        """One inference as `act` makes it, whatever its output means: (B, chunk, any width) float32.
+        """Run one inference as `act` makes it, whatever its output means: (B, chunk, any width) float32.
 
-        For a policy with an `embodiment_mismatch`, which `act` refuses.
+        It serves a policy with an `embodiment_mismatch`, which `act` refuses.
         """
         return self.act(observations, seeds)
 
@@ -355,9 +355,9 @@ class Policy(Model):
     def differentiable(self, observations: Sequence[Observation], seeds: Sequence[int]) -> Tensor:
         """The actions of `act` with a graph behind them: (B, chunk, 7) in metres and radians, as float32.
 
-        For `hooks.gradients_at`. Weights need no gradient, no module is compiled, attention is eager, and numbers
-        equal those of `act` to 1e-5 in float32. A number without a slope, such as a gripper that is open or
-        closed, has gradient zero.
+        It serves `hooks.gradients_at`. Weights need no gradient, no module is compiled, attention is eager, and
+        numbers equal those of `act` to 1e-5 in float32. A number without a slope, such as a gripper that is open
+        or closed, has gradient zero.
 
         Raises:
             UnsupportedInterventionError: For a family that does not declare gradients.
@@ -424,16 +424,18 @@ class Policy(Model):
         return False
 
     def predict(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
-        """One chunk of actions per recorded observation, in the checkpoint's own units and width.
+        """Return one chunk of actions per recorded observation, in the checkpoint's own units and width.
+
+        States are taken as recorded. Nothing is claimed about whether the actions fit an arm.
 
         Returns:
-            (B, chunk, D) float32. It makes no claim that the actions fit an arm; states are taken as recorded.
+            (B, chunk, D) float32.
         """
         return self.act(observations, seeds)
 
     @abstractmethod
     def act(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
-        """One chunk of actions per observation.
+        """Return one chunk of actions per observation.
 
         All randomness of a row comes from its seed.
 
@@ -511,7 +513,7 @@ class Reading:
 
 
 NEAR_TIE: Mapping[str, float] = MappingProxyType({"float32": 1e-4, "bfloat16": 0.1})
-"""Per dtype, margins below which another batch or machine may turn a choice round.
+"""The margins per dtype below which another batch or machine may turn a choice round.
 
 Measured on small models, batches against single rows: logits move by 1e-5 in float32, margins by 0.03 in bfloat16.
 """
@@ -541,7 +543,7 @@ class AnswerModel(Model):
 
     @abstractmethod
     def read(self, questions: Sequence[Prompt]) -> Reading:
-        """One prefill of all questions, which must have equally many options: every tap fires as promised.
+        """Read all questions, which must have equally many options, in one prefill: every tap fires as promised.
 
         Questions with and without a picture are not mixed in one call.
 

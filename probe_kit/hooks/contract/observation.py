@@ -16,8 +16,8 @@ class Observation:
 
     Attributes:
         image: (H, W, 3) uint8, the third-person camera.
-        state: (8,) float32: TCP x, y, z in metres in the robot base frame, roll, pitch, yaw in radians relative to
-            the gripper pointing down, 0, gripper openness in [0, 1].
+        state: (8,) float32: TCP x, y, z in metres in the robot base frame; roll, pitch, yaw in radians relative to
+            the gripper pointing down; 0; gripper openness in [0, 1].
         intrinsics: (3, 3) float32 pinhole matrix in pixels of `image`, x to the right and y down; None if unknown.
         cameras: Further pictures (H, W, 3) uint8 by the name of their camera.
     """
@@ -55,9 +55,9 @@ ARM_NUMBERS = 8
 """The count of numbers of `Observation.state`."""
 OPENNESS = ("measured", "release")
 CLOSED, OPENED = 0.015, 0.037
-"""Finger joints of the WidowX in metres."""
+"""The finger joints of the WidowX in metres, closed and open."""
 _EMPTY, _GRIPPER = 6, 7
-"""Places in `Observation.state`: a zero that stands for nothing, and the openness."""
+"""The places in `Observation.state` of a zero that stands for nothing, and of the openness."""
 
 
 def laid_out(state: NDArray[np.float32], numbers: int, openness: str = "measured") -> NDArray[np.float32]:

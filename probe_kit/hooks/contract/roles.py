@@ -104,8 +104,8 @@ def prepare_pool(roles: Iterable[Roles], views: Sequence[str], device: torch.dev
     """Bring to `device` what `pool` needs for these roles, which otherwise happens while the model runs.
 
     Raises:
-        EmptyRoleError: As `pool` does.
-        UnknownSiteError: As `pool` does.
+        EmptyRoleError: For a view without a token, as in `pool`.
+        UnknownSiteError: For an unknown view, as in `pool`.
     """
     indexed_device = torch.device(device)
     if indexed_device.type == "cuda" and indexed_device.index is None:

@@ -171,7 +171,7 @@ class InternVLA(QwenVLA):
     # -- acting ------------------------------------------------------------------------------------------
 
     def act(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
-        """One chunk of actions per observation; see the contract."""
+        """Return one chunk of actions per observation; see the contract."""
         if (reason := self.embodiment_mismatch()) is not None:
             raise CheckpointError(reason)
         return open_or_closed(self.units.restore(self.infer_without_acting(observations, seeds)))

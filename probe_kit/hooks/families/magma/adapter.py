@@ -411,7 +411,7 @@ def load_magma(
         dtype: float32 or bfloat16; None takes what the checkpoint says.
         random_weights: Whether the weights are drawn instead of read.
         unnorm_key: Data set whose units the actions get; None for the only one.
-        statistics: File with action statistics; None for the checkpoint's.
+        statistics: File with action statistics; None for the checkpoint's, or else the package's.
         shrink: Side to which pictures are shrunk first; 0 for whole pictures.
         prompt: Order of the turns: `magma`, or `act2answer` for the user's first.
         temperature: 0 for the likeliest token; above, tokens are drawn.

@@ -43,7 +43,7 @@ class ActionTokens:
 
     Attributes:
         vocabulary: Number of text ids, without the padding of the embedding.
-        bins: Number of ids that name bins; the edges of the intervals between them.
+        bins: Number of these ids, and of the edges between which the bins lie.
     """
 
     vocabulary: int
@@ -60,7 +60,7 @@ class ActionTokens:
         return np.asarray(self.centres[np.clip(self.vocabulary - 1 - ids, 0, self.bins - 2)])
 
     def is_action(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return, per id, True where it names a bin."""
+        """Return per id True where it names a bin."""
         return np.asarray((ids >= self.vocabulary - self.bins) & (ids < self.vocabulary))
 
 

@@ -121,10 +121,10 @@ class FastTokenizer:
         return int(self.pieces.get_vocab_size())
 
     def decode(self, ids: Sequence[int], horizon: int, dimensions: int) -> DecodedChunk:
-        """The chunk (horizon, dimensions) of its ids.
+        """The chunk (horizon, dimensions) of its ids, decoded as in lerobot's relaxed decoding.
 
-        Ids that it does not have and bytes that make no character are left out, missing coefficients are zero, and
-        surplus ones are cut, as in lerobot's relaxed decoding. Each is a problem: lerobot says so only in its log.
+        Ids that it does not have and bytes that make no character are left out. Missing coefficients are zero, and
+        surplus ones are cut. Each is a problem: lerobot says so only in its log.
         """
         problems = []
         fast_ids = [number for number in ids if 0 <= number < self.size]
@@ -222,7 +222,7 @@ _NO_TOKENIZER = SimpleNamespace(from_pretrained=lambda *_, **__: None)
 
 
 def build_pi0_fast(config: PI0FastConfig, size: PaliGemmaSize | None = None, device: str = "cpu") -> PI0FastPolicy:
-    """A `PI0FastPolicy` without tokenizers; see `build_resized`."""
+    """Build a `PI0FastPolicy` without tokenizers; see `build_resized`."""
     with replaced(modeling_pi0_fast, {"AutoProcessor": _NO_TOKENIZER, "AutoTokenizer": _NO_TOKENIZER}):
         policy = build_resized(PI0FastPolicy, config, size, device)
     joint: Any = policy.model.paligemma_with_expert
@@ -384,7 +384,7 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
         )
 
     def parts(self) -> dict[str, Path]:
-        """The FAST tokenizer."""
+        """Return the folder of the FAST tokenizer."""
         return {"fast": inside_or_hub(self.folder, self.config.action_tokenizer_name, FILES)}
 
     @cached_property
@@ -415,7 +415,7 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
             return decode_tokens(self.network.model, pictures, text, bounds, least, most, choose)
 
     def chunks(self, ids: Tensor) -> list[DecodedChunk]:
-        """The normalised chunk in every row of (B, n) ids.
+        """Return the normalised chunk in every row of (B, n) ids.
 
         It has as many actions as the network was trained to put out. lerobot decodes as many as it executes, which
         is another transform where the two numbers differ.

@@ -88,7 +88,7 @@ _FEATURIZERS = ("featurizer", "fused_featurizer")
 def read_release(file: Path, config: PrismaticConfig) -> Weights:
     """The tensors of a model of the release under the network's names.
 
-    Towers that the file does not hold are read from timm's files on the hub, and their positions resampled to the
+    Towers that the file does not hold are read from timm's files on the hub. Their positions are resampled to the
     model's picture as timm does it.
 
     Args:

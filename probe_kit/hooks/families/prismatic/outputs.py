@@ -62,7 +62,7 @@ class _Asked:
 
     @cached_property
     def captured(self) -> list[tuple[ActivationCache, Prefill]]:
-        """Every row alone, with everything that is stored of it."""
+        """The activations and the prefill of every row alone, with everything that is stored of it."""
         runs = (watch(self.model, partial(self.model.prefill, [question])) for question in self.questions)
         return [(activations, prefill) for prefill, activations, _ in runs]
 

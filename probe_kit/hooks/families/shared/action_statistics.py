@@ -15,12 +15,12 @@ from probe_kit.models.checkpoint_files import chosen_name
 DIMENSIONS = 7
 """The count of numbers of an action: an end-effector's delta, and the gripper last."""
 GRIPPER_OPEN = 0.5
-"""The data sets have 1 for an open gripper and 0 for a closed one."""
+"""The threshold of the gripper: the data sets have 1 for an open gripper and 0 for a closed one."""
 
 
 @dataclass(frozen=True)
 class ActionStatistics:
-    """Per dimension the 1 % and 99 % quantiles of a data set.
+    """The 1 % and 99 % quantiles of a data set, per dimension.
 
     Attributes:
         key: Name of the data set.

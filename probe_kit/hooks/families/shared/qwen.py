@@ -29,7 +29,7 @@ def merger_norm(tower: Any) -> Any:
 
 
 class ByPicture:
-    """Vision towers that run over the patches of all pictures at once."""
+    """A vision tower that runs over the patches of all pictures at once."""
 
     _grid: Tensor | None = None
     """The patches of each picture under way along time, height and width, (pictures, 3)."""
@@ -58,7 +58,7 @@ class QwenVision(ByPicture):
 
     @property
     def tower(self) -> Any:
-        """Qwen's vision tower."""
+        """The vision tower of Qwen."""
         return self.vlm.model.visual
 
     @cached_property
@@ -87,7 +87,7 @@ USER, ASSISTANT = "<|im_start|>user\n", "<|im_end|>\n<|im_start|>assistant\n"
 
 
 def qwen_frame(system: str = "") -> Frame:
-    """Qwen's chat of one turn."""
+    """Return Qwen's chat of one turn, behind the `system` turn."""
     return Frame(f"{system}{USER}<|vision_start|>", "<|vision_end|>", f"{system}{USER}", ASSISTANT)
 
 

@@ -183,11 +183,11 @@ def attach_prompt_kv(joint: Any, blocks: int) -> PromptKV:
 # -- attention ------------------------------------------------------------------------------------------------
 
 Note = Callable[[int, int, Tensor], None]
-"""Takes a block, an iteration, and weights (B, H, S, K)."""
+"""A function that takes a block, an iteration, and weights (B, H, S, K)."""
 
 
 Weights = Callable[[Any, tuple[Any, ...], dict[str, Any], Any], Tensor]
-"""Computes the weights of one call from the module, its inputs, its keywords and its output."""
+"""A function that gives the weights of one call, of the module, its inputs, its keywords and its output."""
 _OTHER_STEPS = ("q_norm", "attn_logit_softcapping")
 """The attributes of attentions of transformers that do more than project, rotate and scale."""
 

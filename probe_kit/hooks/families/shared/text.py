@@ -40,7 +40,7 @@ class TokenizerFile:
             )
 
     def check_vocabulary(self, vocabulary: int) -> None:
-        """Raise CheckpointError for ids that a model of so many does not have."""
+        """Raise CheckpointError for ids that a model with `vocabulary` of them does not have."""
         if (highest := max(self.tokenizer.get_vocab(with_added_tokens=True).values())) >= vocabulary:
             raise CheckpointError(
                 f"{self.file} has ids up to {highest}; this model has {vocabulary}. The tokenizer belongs to "

@@ -470,7 +470,11 @@ def recorded_texts(folder: Path) -> list[str]:
 
 
 def questions_of(folder: Path, recorded: Arrays, model: VisionLanguageModel) -> list[Prompt]:
-    """Return the recorded questions with their pictures; raises as `recorded_texts`."""
+    """Return the recorded questions with their pictures.
+
+    Raises:
+        UsageError: Where the whole prompts do not lie beside the reference.
+    """
     letters = tuple(model.lead + letter for letter in LETTERS)
     pictures = [recorded[f"in_picture_{int(number)}"] for number in recorded["in_rows_picture"]]
     return [
@@ -499,18 +503,18 @@ class Reference:
 
     @cached_property
     def batch(self) -> LeftPacked:
-        """All rows."""
+        """All rows as one batch."""
         return self.model.packed([self.model.prompt(question) for question in self.questions])
 
     @cached_property
     def captured(self) -> tuple[ActivationCache, Prefill]:
-        """One pass over all rows, with everything that is stored of it."""
+        """The activations and the result of one pass over all rows, with everything that is stored of it."""
         prefill, activations, _ = watch(self.model, lambda: self.model.prefill(self.questions))
         return activations, prefill
 
     @cached_property
     def alone(self) -> list[Prefill]:
-        """Every row by itself."""
+        """The prefill of every row by itself."""
         return [self.model.prefill([question]) for question in self.questions]
 
     @cached_property
@@ -519,7 +523,7 @@ class Reference:
         return replace(self.questions[0], pictured=False)
 
     def produced(self) -> dict[str, Produce]:
-        """Functions that make every output the adapter can make, whether recorded or not."""
+        """Return functions that make every output the adapter can make, whether recorded or not."""
         return {**self._inputs(), **self._pixels(), **self._streams(), **self._answers()}
 
     def _inputs(self) -> dict[str, Produce]:
@@ -568,7 +572,7 @@ class Reference:
         }
 
     def vision(self) -> NDArray[Any]:
-        """The input of every block of the tower for the first row's picture."""
+        """Return the input of every block of the tower for the first row's picture."""
         sites = self.model.further_streams["vision"].sites()[:-1]
         with capture(self.model, sites) as activations:
             self.model.prefill(self.questions[:1])
@@ -588,7 +592,7 @@ class Reference:
         }
 
     def _greedy(self) -> NDArray[np.int64]:
-        """Greedy ids behind every row, padded behind its end."""
+        """Return greedy ids behind every row, padded behind its end."""
         length = self.recorded["greedy_ids"].shape[1]
         with torch.inference_mode():
             answers = self.captured[1].speak(length, self.model.text.ends).numpy()

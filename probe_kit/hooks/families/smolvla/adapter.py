@@ -81,7 +81,7 @@ def locate_vlm(config: SmolVLAConfig, folder: Path) -> str:
 
 
 def current_smolvla_keys(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The same tensors without the statistics that old files kept among the weights."""
+    """Return the same tensors without the statistics that old files kept among the weights."""
     return {name: tensor for name, tensor in tensors.items() if not name.startswith(STATISTICS)}
 
 

@@ -158,7 +158,7 @@ class Xiaomi(QwenVLA):
     # -- acting ------------------------------------------------------------------------------------------
 
     def act(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
-        """One chunk of actions per observation; see the contract."""
+        """Return one chunk of actions per observation; see the contract."""
         units = self.units
         return open_or_closed(units.restore(self.infer_without_acting(observations, seeds))[..., :DIMENSIONS])
 

@@ -96,16 +96,20 @@ class LerobotFlow(DenoisingPolicy):
     @property
     @abstractmethod
     def iterations(self) -> int:
-        """Flow-matching steps per inference."""
+        """The number of flow-matching steps per inference."""
 
     @property
     def _kv_width(self) -> int:
-        """Heads times size of a head of the backbone's keys."""
+        """The number of heads times size of a head of the backbone's keys."""
         projection: Any = self.stacks["backbone"].layers[0]
         return int(projection.self_attn.k_proj.out_features)
 
     def denoise(self, batch: Mapping[str, Tensor], noise: Tensor) -> Tensor:
-        """Return the actions as the base does; raises ObservationError as `check_pictures` does."""
+        """Return the actions as the base does.
+
+        Raises:
+            ObservationError: For pictures that `check_pictures` refuses.
+        """
         self.check_pictures(batch)
         with _with_graph(self.network.model):
             chunk: Tensor = undecorated(self.network.predict_action_chunk)(batch, noise=noise)

@@ -1,6 +1,6 @@
 """Base adapter of lerobot's policies: loading, batches, units, prompts, roles.
 
-Never lerobot's own `from_pretrained`: it returns partly or fully random models without an error.
+The `from_pretrained` of lerobot is never used: it returns partly or fully random models without an error.
 """
 
 from abc import abstractmethod
@@ -155,7 +155,7 @@ class LerobotPolicy(Policy):
     @classmethod
     @abstractmethod
     def build(cls, config: Any, folder: Path) -> Any:
-        """The network with uninitialised weights."""
+        """Build the network with uninitialised weights."""
 
     @classmethod
     def current_keys(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -320,7 +320,7 @@ class LerobotPolicy(Policy):
         return values
 
     def further_settings(self) -> dict[str, str]:
-        """Settings that numbers depend on besides weights and side files; empty where a checkpoint holds all."""
+        """Return settings that numbers depend on besides weights and side files; empty where files hold all."""
         return {}
 
     def side_files(self) -> dict[str, Path]:
@@ -352,7 +352,7 @@ class LerobotPolicy(Policy):
     # -- acting ------------------------------------------------------------------------------------------
 
     def act(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
-        """One chunk of actions per observation; see the contract."""
+        """Return one chunk of actions per observation; see the contract."""
         self.check_acting(observations, seeds)
         return self.action_units.restore(self.put_out(self.batch(observations), seeds))
 
@@ -384,7 +384,7 @@ class LerobotPolicy(Policy):
         return self.put_out(self.batch(observations, zeros), seeds)
 
     def predict(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
-        """One chunk per recorded observation, by the checkpoint's own statistics; see the contract."""
+        """Return one chunk per recorded observation, by the checkpoint's own statistics; see the contract."""
         self.check(observations, seeds)
         states = np.stack([np.asarray(observation.state, np.float32) for observation in observations])
         if states.shape[1] != self.state_numbers:
@@ -435,7 +435,7 @@ class LerobotPolicy(Policy):
         return self._action_misfit() or self._state_misfit()
 
     def zero_filled_inputs(self) -> tuple[str, ...]:
-        """The state, where it has other numbers than the arm's, or no units."""
+        """Return the state, where it has other numbers than the arm's, or no units."""
         return ("state",) if self._state_misfit() else ()
 
     def configured_mismatch(self) -> str | None:
@@ -605,7 +605,11 @@ class LerobotPolicy(Policy):
         return self.units_of("action", "ACTION")
 
     def units_of(self, feature: str, kind: str) -> Normaliser:
-        """The units of one feature, STATE or ACTION."""
+        """Return the units of one feature, STATE or ACTION.
+
+        Raises:
+            CheckpointError: If nothing says them.
+        """
         if (units := self.own_units(feature, kind)) is not None:
             return units
         raise CheckpointError(
@@ -614,7 +618,11 @@ class LerobotPolicy(Policy):
         )
 
     def own_units(self, feature: str, kind: str) -> Normaliser | None:
-        """The units in the checkpoint's processor files or old buffers; None if it normalises nothing."""
+        """Return the units in the checkpoint's processor files or old buffers; None if it normalises nothing.
+
+        Raises:
+            CheckpointError: For statistics that are missing, or of another count of numbers.
+        """
         pipeline = PREPROCESSOR if kind == "STATE" else POSTPROCESSOR
         self._check_steps(self.folder, pipeline)  # behind the policy only actions depend on them
         if (self.folder / f"{pipeline}.json").is_file():
@@ -689,15 +697,15 @@ class LerobotPolicy(Policy):
     def replay(self, batch: dict[str, Tensor], recorded: Arrays) -> dict[str, NDArray[Any]]:
         """Return what the network puts out with the randomness of a golden reference.
 
-        `actions` (B, chunk, action numbers), and what else only this inference has.
+        These are `actions` (B, chunk, action numbers), and quantities that only this inference has.
         """
 
     def watched(self) -> dict[str, nn.Module]:
-        """Modules whose outputs a golden reference holds, by the name of the quantity."""
+        """Return modules whose outputs a golden reference holds, by the name of the quantity."""
         return {}
 
     def watched_inputs(self) -> dict[str, nn.Module]:
-        """Modules whose inputs `further_outputs` reads, by any name."""
+        """Return modules whose inputs `further_outputs` reads, by any name."""
         return {}
 
     def recorded_padding(self, recorded: Arrays) -> NDArray[np.bool_]:

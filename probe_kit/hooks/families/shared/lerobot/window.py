@@ -74,7 +74,10 @@ def read_window(folder: Path, camera: str, size: tuple[int, int] | None = None) 
 
 
 def squashed(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
-    """Resize (H, W, 3) uint8 to `size` (height, width), proportions given up, by the filter of INT-ACT."""
+    """Resize (H, W, 3) uint8 to `size` (height, width), proportions given up.
+
+    The filter is that of INT-ACT's client.
+    """
     height, width = size
     resized: NDArray[np.uint8] = np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_LANCZOS4))
     return resized
