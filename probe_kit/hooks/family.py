@@ -81,8 +81,8 @@ class Family:
         hub: The repositories that the default checkpoint is loaded from, hub ids with a file each whose presence
             tells; default its config.json.
         packages: Modules of an extra that it needs, with the name of that extra.
-        config_types: The values that `type` or `model_type` in the config.json of its checkpoints may have; empty
-            if they have none, and then only the loader recognises one.
+        config_types: The values that `type` or `model_type` in the config.json of its checkpoints may have. It is
+            empty if they have none, and then only the loader recognises one.
         instead: For other such types that people may take for one of them, what to do.
         needs_checkpoint: Whether nothing is there by default, so that a checkpoint has to be named.
         protocols: Published protocols that use the family, by name, with what they use it with.
@@ -91,12 +91,12 @@ class Family:
         sizes: Hub ids of the released sizes by name, the default one first; `size` is then an option, instead of a
             checkpoint.
         interventions: The interventions that its policy supports.
-        declared: Streams of the released sizes, by name of the size, which is empty where there is one; a plan is
+        declared: Streams of the released sizes, by name of the size, which is empty where there is one. A plan is
             made of them where no weights are read.
         words: `module:function(checkpoint, instructions, **options)` that raises InstructionError for what cannot
             be read, from the checkpoint's small files alone; see `check_instructions`.
         units: `module:function(checkpoint, **options)` that says whose units the actions get, and where they
-            stand, from the small files; it raises UsageError where that has to be chosen.
+            stand, from the small files. It raises UsageError where that has to be chosen.
         of_default: Options that belong to the default checkpoint, and to no other; they count where they are not
             given.
         files: Patterns of the files of a hub repository that are needed.
@@ -264,8 +264,8 @@ class Family:
             random_weights: As for `load`; then no weights are looked for.
             options: As for `load`.
             weights_seed: As for `load`; it belongs to random weights.
-            fetch: Download a checkpoint that is on the hub, and look for its weights; else only files that are
-                here are looked at, and no weights.
+            fetch: Download a checkpoint that is on the hub, and look for its weights. Without it, only files that
+                are here are looked at, and no weights.
 
         Returns:
             The options as the loader gets them.

@@ -104,7 +104,7 @@ def same_bits(array: NDArray[np.float32], other: NDArray[np.float32]) -> bool:
 class ActivationCache(Mapping[Site, Tensor]):
     """The captured activations of one inference, a mapping from sites in the order in which they fired.
 
-    `activations[site]` is what `capture` kept of it, (B, T, D) on the model's device unless it was reduced; the
+    `activations[site]` is what `capture` kept of it, (B, T, D) on the model's device unless it was reduced. The
     name of a site does as well as the site. The attribute `fires` says how often each tapped module was called.
     """
 
@@ -433,7 +433,7 @@ def flowing_tensors(model: Model, sites: Iterable[Site]) -> Iterator[FlowingTens
     """Keep what passes at `sites` while the model runs once with a graph.
 
     An input is kept as the very tensor that flows, so that the norm and the path around the block both count. Of
-    an output, and of `kv`, a copy passes on: what read the tensor before does not count, and what is added to it
+    an output, and of `kv`, a copy passes on. What read the tensor before does not count, and what is added to it
     in place does not reach it. The first tensor of all becomes a leaf: nothing above it is kept.
     """
     flowing = FlowingTensors()

@@ -409,7 +409,7 @@ class _ActiveEdits:
     """Edits of one inference.
 
     They are measured after the inference, all at once. An inference drives everything else out of the processor's
-    caches, so that every single call here costs ten times what it costs in a loop: they are few.
+    caches, so that every single call here costs ten times what it costs in a loop. Therefore they are few.
 
     Attributes:
         fired: By firing the site and the tokens (1, T', D) before and after it.

@@ -394,7 +394,7 @@ def _possible(folder: Path) -> Path:
 
     Raises:
         CheckpointError: For a network beyond all sizes, and for a file beside the weights that is a pipe, a device
-            or huge: libraries read such files without a bound.
+            or huge. Libraries read such files without a bound.
     """
     for file in sorted(path for pattern in ("*", "*/*") for path in folder.glob(pattern)):
         if file.suffix in _READ and not file.is_dir() and file.exists():
@@ -466,8 +466,7 @@ def is_weights(path: Path) -> bool:
 
 
 def content_hashes(files: Mapping[str, Path]) -> dict[str, str]:
-    """Return `file <name>` → sha256 of its bytes, for `ModelCard.settings`; a checkpoint's place does not matter.
-    """
+    """Return `file <name>` → sha256 of its bytes, for `ModelCard.settings`: a checkpoint's place has no effect."""
     return {f"file {name}": hashlib.sha256(read_regular(path)).hexdigest() for name, path in files.items()}
 
 

@@ -451,8 +451,8 @@ def _refuse_wrapped(weights: Weights, tensors: Mapping[str, Tensor], state: Mapp
 def _wrapper(stored: Sequence[str], model: Sequence[str]) -> str:
     """The prefix that stands in the names of a file and in none of the model's; empty where there is none.
 
-    Wrappers of torch and of training libraries put their name before all names or between their parts; a module
-    of a larger one has the name that it has there in front.
+    Wrappers of torch and of training libraries put their name before all names or between their parts. A module of
+    a larger one has the name that it has there in front.
     """
     common = _common_path(stored) if len(stored) >= _FEWEST else ""
     if common and not any(name.startswith(f"{common.partition('.')[0]}.") for name in model):

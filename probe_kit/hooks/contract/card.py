@@ -80,14 +80,14 @@ class ModelCard:
         chunk: Actions per inference; 0 for a model that does not act.
         execute: Actions of a chunk that are executed before the next inference; 0 for a model that does not act.
         settings: Everything outside the weights that actions, answers or activations depend on, such as the prompt
-            and the contents of every file a loader reads; part of a run's identity.
+            and the contents of every file a loader reads. They are part of a run's identity.
         exact: False if the weights that ran are only near those of the file, as after quantisation.
         weights_seed: Seed of an untrained network; None for weights from a file.
         batch: The largest number of observations per call, None for any; 1 where batching changes the numbers.
         needs: The parts that every observation must hold besides picture, state and instruction; see
             `Observation.lacks`.
         ensemble: Exponent of the weights with which the plans of overlapping chunks for one step are averaged, the
-            newest with the largest weight; None executes the head of the newest chunk.
+            newest with the largest weight. None executes the head of the newest chunk.
         source: The family of the VLM whose network this policy grew from, if it is one of ours.
         source_weights: The weights of that family; None where they are unknown, as for a checkpoint that is not
             the family's own.

@@ -144,7 +144,7 @@ class ProtocolRow:
         execute: Actions executed per inference.
         options: Options of the family, whatever the checkpoint.
         of_checkpoint: The options that only the protocol's own checkpoint needs.
-        rotation: `roll-pitch-yaw` passes the angles of an action on; `axis-angle` passes axis times angle of the
+        rotation: `roll-pitch-yaw` passes the angles of an action on. `axis-angle` passes axis times angle of the
             same turn on, which the controller then reads as angles.
         unmatched: The parts of the protocol that cannot be done here.
         variant: The name of this checkpoint among several, as in labels.
@@ -298,12 +298,12 @@ class Interventions:
 
     Attributes:
         edits: Per stored stream the quantities that can be rewritten; None for all that its streams have.
-        unread: Streams whose end nothing that acts reads: an edit of the last residual or the final norm there
+        unread: Streams whose end nothing that acts reads. An edit of the last residual or the final norm there
             leaves the actions bit for bit, which makes it a control.
         prompt_kv: Whether it keeps keys and values of the prompt that the acting stream reads, see
             `Model.prompt_kv`.
-        first_affected_token: The first output that an edit of backbone or `kv` reaches through `kv`: 0, or 1 where
-            the prompt's own pass already chooses the first token.
+        first_affected_token: The first output that an edit of backbone or `kv` reaches through `kv`. It is 0, or 1
+            where the prompt's own pass already chooses the first token.
         attention: Whether it records the acting stream's attention to every token of the prompt.
         tiles: Whether it says which of the picture's tokens come of which patches, see `Model.patch_order`.
         gradients: Whether `Policy.differentiable` gives its actions with a graph.

@@ -95,18 +95,19 @@ EVERY = slice(None)
 class Tap:
     """An input or output of `module`, called `fires` times per inference, at which a site is read and written.
 
-    The residual stream is read at inputs, not outputs: some families drive their layers piecewise or add in place,
+    The residual stream is read at inputs, not outputs. Some families drive their layers piecewise or add in place,
     and then a layer's output is never seen or seen too late. The first submodule of a block is always called with
     the residual stream itself, so writing into that tensor writes the stream.
 
     Attributes:
         tokens: The positions of that (B, T, D) tensor which belong to the site, where one call serves two streams.
         rows: The block of the batch which belongs to the site, where one call serves several.
-        first: Calls of `module` in an inference that come before those of this stream and are passed over.
+        first: Number of calls of `module` in an inference that come before those of this stream and are passed
+            over.
         argument: Name of the keyword that carries the tensor, where the module is not called with it in first
             place.
-        view: Brings what passes to (B, T, D) where it has another form; it must share memory, so that an edit of
-            the result edits what passes.
+        view: Brings what passes to (B, T, D) where it has another form. The result must share memory, so that an
+            edit of it edits what passes.
         more: Whether an inference may call `module` further times, which belong to no site: where the model itself
             decides how many tokens it puts out.
     """
@@ -304,7 +305,7 @@ class Policy(Model):
     Attributes:
         interventions: The interventions that it supports; a family says the same before it is loaded.
         draws_noise: Whether noise of the seed enters every inference, as in a flow; None if undeclared.
-        flagged: (B,) rows of the last `act` in which the network put out something that is no action; what the row
+        flagged: (B,) rows of the last `act` in which the network put out something that is no action. What the row
             then does is the family's choice. None for a family that cannot tell.
     """
 
@@ -441,7 +442,7 @@ class Policy(Model):
 
         Returns:
             (B, chunk, 7) float32: xyz delta in metres and roll-pitch-yaw delta in radians in the robot base frame,
-            gripper 1 = open and 0 = closed, at 5 Hz.
+            gripper 1 = open and 0 = closed. The rate is 5 Hz.
 
         Raises:
             InstructionError: For an instruction that the policy cannot take in whole.

@@ -49,8 +49,8 @@ class Site:
             final norm. `attention` and `mlp` are what block `layer` adds to it, as it is added: behind a norm,
             gate or scale, where the family has one. `final_norm` is its normed end. `heads` is what the block's
             attention heads read, see `HEADS`. A family may declare further quantities.
-        iteration: Flow-matching step, counted from 0 (pure noise); for action tokens, the token; the camera, for
-            `vision` with several of them; None where the stream runs once.
+        iteration: Flow-matching step, counted from 0 (pure noise); for action tokens, the token; for `vision` with
+            several cameras, the camera. None where the stream runs once.
     """
 
     stream: str
@@ -89,9 +89,9 @@ class Stream:
         layers: Number of residual sites, one more than the number of blocks.
         width: Features per token.
         iterations: Flow-matching steps or action tokens per inference, or None where the stream runs once.
-        part: The part of the model it belongs to: `backbone` (VLM), `action` (where the action is made: an expert,
-            or the positions that choose action tokens), `vision`, or `bridge` between them. None takes the part
-            that the name tells.
+        part: The part of the model it belongs to: `backbone` (VLM), `action`, `vision`, or `bridge` between them.
+            The action is made in `action`: an expert, or the positions that choose action tokens. None takes the
+            part that the name tells.
         label: The name that people read; "" takes the name in plain words.
         quantities: The quantities that can be captured of it; `residual` always.
         probed: Whether peaks, retention and default probes use it; False for the unconditional half of guidance.

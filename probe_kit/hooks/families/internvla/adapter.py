@@ -2,7 +2,7 @@
 
 Backbone: the chat with one picture. Bridge: queries that read the backbone's last states and DINOv2's features.
 Expert: what the queries found, then the noisy actions, at every DDIM step. Under guidance the head runs every row
-twice; `expert` is the half that has the condition, `expert_unconditional` the one that has none, which only serves
+twice. `expert` is the half that has the condition, `expert_unconditional` the one that has none, which only serves
 to be subtracted.
 
 References of `verify`: B batch, V views, P prompt positions, L backbone layers, S DDIM steps, C conditions, A

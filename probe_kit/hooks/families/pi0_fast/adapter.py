@@ -246,7 +246,7 @@ def decode_tokens(
 ) -> Tensor:
     """Return ids (B, n) of `least` to `most` tokens: until every row has put out the end.
 
-    A row that has ended is decoded with the others, so that no row depends on another one; what it puts out behind
+    A row that has ended is decoded with the others, so that no row depends on another one. What it puts out behind
     its end means nothing.
 
     Args:

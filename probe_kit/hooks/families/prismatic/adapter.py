@@ -1,7 +1,8 @@
 """The adapter for Prismatic vision-language models: packing, streams, taps, roles. OpenVLA builds on it.
 
-One stack serves two streams, distinguished by position: `backbone` is the prompt without its last token, the other
-one the positions whose logits choose the output: the prompt's last token, then every token fed back but the last.
+One stack serves two streams, distinguished by position: `backbone` is the prompt without its last token. The other
+one has the positions whose logits choose the output: the prompt's last token, then every token fed back but the
+last.
 """
 
 from abc import abstractmethod

@@ -1,6 +1,6 @@
 """The text side of a model: a checkpoint's `tokenizer.json`, and the text around a question or an instruction.
 
-The file is read by the `tokenizers` library itself: transformers 5 rebuilds Llama's tokenizer by rules of its own,
+The file is read by the `tokenizers` library itself. transformers 5 rebuilds Llama's tokenizer by rules of its own,
 while the released models were trained with what the file says.
 """
 

@@ -1,8 +1,8 @@
 """The adapter for SpatialVLA: packing, streams, taps, roles, cameras, actions.
 
-Sequence: the picture's patches, beginning of sequence, instruction, new line. One stack has two streams,
-by position: `backbone` is the prompt without the new line, `action` the positions whose logits choose an
-action token: the new line, then every token fed back but the last. Three tokens are a step, several steps a chunk.
+Sequence: the picture's patches, beginning of sequence, instruction, new line. One stack has two streams, by
+position: `backbone` is the prompt without the new line. `action` has the positions whose logits choose an action
+token: the new line, then every token fed back but the last. Three tokens are a step, several steps a chunk.
 """
 
 from collections.abc import Mapping, Sequence
@@ -186,7 +186,7 @@ class Speech:
 
         Raises:
             InstructionError: For text that the tokenizer reads as a picture or an action, or that takes the new
-                line into itself: the model chooses its action there.
+                line into itself. The model chooses its action there.
         """
         text = self.template.replace(SLOT, instruction.lower() if self.lowercase else instruction)
         ids = self.tokenizer.encode(text + _END)

@@ -2,7 +2,7 @@
 
 Backbone: the chat with one picture. Expert: a sink, the state, the action chunk; each layer reads the keys and
 values of one of the backbone's last layers. The expert's stream is normalised twice in every layer, so nothing in
-it only adds: `residual` is the stream entering a layer, normed by the layer before; `attention` and `mlp` are what
+it only adds. `residual` is the stream entering a layer, normed by the layer before. `attention` and `mlp` are what
 its halves add, gated; `middle` is the normed sum between them.
 
 References of `verify`: B batch, P prompt positions, L backbone layers, T expert positions, S Euler steps.

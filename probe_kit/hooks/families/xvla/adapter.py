@@ -1,7 +1,7 @@
 """The adapter for X-VLA.
 
 Backbone: Florence-2's encoder over the first camera's picture and the text. Expert: one sequence of the noisy
-actions, the end of the backbone, the further cameras and the robot's soft prompts, at every denoising step; all
+actions, the end of the backbone, the further cameras and the robot's soft prompts, at every denoising step. All
 attend to all. Florence-2 norms behind each addition, so nothing in the backbone's stream only adds.
 
 lerobot's `predict_action_chunk` ignores the noise it is given and draws its own for a whole batch at once.

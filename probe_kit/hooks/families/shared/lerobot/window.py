@@ -23,7 +23,7 @@ class PictureWindow:
     Attributes:
         crop: Top, left, height, width in pixels of the camera; None for the whole picture.
         size: (height, width) after; None leaves the size.
-        camera: (height, width) of the pictures that `crop` was chosen on; others are brought to it first, with
+        camera: (height, width) of the pictures that `crop` was chosen on. Others are brought to it first, with
             their proportions kept by padding, as pi0 brings pictures to its own resolution. None for any.
     """
 
