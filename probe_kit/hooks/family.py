@@ -177,7 +177,7 @@ class Family:
             )
 
     def known_words(self) -> list[str]:
-        """Return every word that an instruction of an embedded model may hold, sorted; none for any text."""
+        """Return the words that an instruction may hold, sorted; empty for a family that reads any text."""
         words = import_module(self.vocabulary).known_words() if self.vocabulary else ()
         return sorted(word for word in words if word.strip())
 

@@ -14,7 +14,7 @@ from probe_kit.hooks.contract.sites import Stream
 
 @dataclass(frozen=True)
 class DefaultScene:
-    """The scene in which a family acts unless other fields are asked for.
+    """The scene of a family by default.
 
     Attributes:
         preset: Name of the preset of the scene, as in `SceneSpec.preset`.
@@ -310,7 +310,7 @@ class Interventions:
         readout: `first-chunk` where the first chunk shows where the hand will go; `per-step` where an inference
             gives one action in discrete bins. Conditions are then evaluated at every call of an unedited episode,
             not executed.
-        instead: By kind of intervention that is not supported, why not and what to do.
+        instead: The reason and the advice for each kind of intervention that is not supported.
 
     Raises:
         UsageError: For advice on a kind of intervention that does not exist.

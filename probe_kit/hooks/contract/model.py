@@ -180,7 +180,7 @@ class Model(ABC):
 
     @abstractmethod
     def roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
-        """Per stored stream, the roles of every token position of every row, from the model's own packing."""
+        """Return per stored stream the roles of every position of every row, from the model's own packing."""
 
     @abstractmethod
     def tap(self, site: Site) -> Tap:
@@ -387,7 +387,7 @@ class Policy(Model):
         return self
 
     def laid_out(self, states: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return states of the arm (n, 8) as (n, D), in the order and count in which a checkpoint reads them."""
+        """Return states (n, 8) of the scene's arm as (n, D), in the order and count that a checkpoint reads."""
         return states
 
     @property
@@ -523,7 +523,7 @@ Measured on small models, batches against single rows: logits move by 1e-5 in fl
 class AnswerModel(Model):
     """A model that answers questions in text.
 
-    Answering a call is one inference, as `capture` counts it.
+    A call of `read` is one inference, as `capture` counts it.
 
     Attributes:
         whole_prompt: Whether the backbone's stream has the last position of the prompt, where the answer begins.

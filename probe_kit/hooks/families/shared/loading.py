@@ -219,7 +219,7 @@ def _check_filled(network: nn.Module, source: str) -> None:
 
 
 def _stored_dtype(weights: Weights) -> str:
-    """Return `bfloat16` if every floating tensor of the file has it, else `float32`: no number is rounded."""
+    """Return `bfloat16` if every floating tensor of the file has it, else `float32`: no unasked rounding."""
     kinds = {tensor.dtype for tensor in weights.tensors.values() if tensor.is_floating_point()}
     return "bfloat16" if kinds == {torch.bfloat16} else "float32"
 
