@@ -338,7 +338,7 @@ class Policy(Model):
         return self.act(observations, seeds)
 
     def record_attention(self, note: Callable[[int, int, Tensor], None]) -> AbstractContextManager[None]:
-        """A context in which `note` receives the attention of the acting stream; see `hooks.attention`.
+        """A context in which `note` receives the attention of the acting stream; see `hooks.capture_attention`.
 
         Args:
             note: Called with a block of the backbone, an iteration, and weights (B, H, S, T): of S acting

@@ -125,7 +125,7 @@ def token_stack(layers: Any, norm: Any, width: int, iterations: int | None, **ta
 
 
 def flow_stacks(backbone: Any, expert: Any, vision: Any, iterations: int) -> dict[str, Stack]:
-    """The three stacks of a flow policy; the vision tower's iterations are the cameras, see `LerobotFlow`."""
+    """The three stacks of a flow policy; the vision tower's iterations are the cameras, see `LerobotPolicy`."""
     return {
         "backbone": Stack(backbone.layers, backbone.norm, backbone.config.hidden_size, None),
         "expert": Stack(expert.layers, expert.norm, expert.config.hidden_size, iterations),
