@@ -60,41 +60,43 @@ SIZE = "size"
 class Family:
     """A model family by name.
 
+    Functions are named as `module:function` and are imported only when used.
+
     Attributes:
         default_checkpoint: Hub id, or None for the embedded one.
-        loader: `module:function`, imported only when used. loader(checkpoint, device, dtype, random_weights) gives
-            a Model, and takes `weights_seed` if its untrained networks can differ; outputs(loader, folder,
-            recorded arrays) gives the `Outputs` that a golden reference is compared with; full_size() gives the
-            network of the released size on the meta device; it takes the name of one where there are `sizes`.
+        loader: `loader(checkpoint, device, dtype, random_weights)` gives a Model, and takes `weights_seed` if its
+            untrained networks can differ.
         streams: Layers and iterations in words, of a family that declares none.
-        outputs: As `loader`.
-        full_size: As `loader`.
+        outputs: `outputs(loader, folder, recorded arrays)` gives the `Outputs` that a golden reference is compared
+            with; None for a family that compares nothing.
+        full_size: `full_size()` gives the network of the released size on the meta device; it takes the name of
+            one where there are `sizes`.
         stored_names: `module:constant`, how names of tensors in released files become those of the network, see
             `probe_kit.models.checkpoint_files`.
-        options: What else the loader takes as keyword arguments.
-        acts: Whether it is a Policy, an AnswerModel.
-        reads: As `acts`.
+        options: Further keyword arguments that the loader takes.
+        acts: Whether it is a Policy.
+        reads: Whether it is an AnswerModel.
         unstored: Tensors of a checkpoint that the network does not have, by name or prefix ending in a dot;
             `verify --keys` prints them.
-        hub: What the default checkpoint is loaded from, hub ids with a file each whose presence tells; default its
-            config.json.
+        hub: The repositories that the default checkpoint is loaded from, hub ids with a file each whose presence
+            tells; default its config.json.
         packages: Modules of an extra that it needs, with the name of that extra.
-        config_types: What `type` or `model_type` in the config.json of its checkpoints may be; empty if they have
-            none, and then only the loader knows one when it sees it.
+        config_types: The values that `type` or `model_type` in the config.json of its checkpoints may have. It is
+            empty if they have none, and then only the loader recognises one.
         instead: For other such types that people may take for one of them, what to do.
-        needs_checkpoint: Nothing is there by default.
+        needs_checkpoint: Whether nothing is there by default, so that a checkpoint has to be named.
         protocols: Published protocols that use the family, by name, with what they use it with.
         source: Name of the VLM whose network this policy grew from, if it is one of ours.
         source_weights: The weights from which the default checkpoint, and those of protocols, grew.
         sizes: Hub ids of the released sizes by name, the default one first; `size` is then an option, instead of a
             checkpoint.
-        interventions: What of them its policy supports.
-        declared: Streams of the released sizes, by name of the size, which is empty where there is one; a plan is
+        interventions: The interventions that its policy supports.
+        declared: Streams of the released sizes, by name of the size, which is empty where there is one. A plan is
             made of them where no weights are read.
         words: `module:function(checkpoint, instructions, **options)` that raises InstructionError for what cannot
             be read, from the checkpoint's small files alone; see `check_instructions`.
         units: `module:function(checkpoint, **options)` that says whose units the actions get, and where they
-            stand, from the small files; it raises UsageError where that has to be chosen.
+            stand, from the small files. It raises UsageError where that has to be chosen.
         of_default: Options that belong to the default checkpoint, and to no other; they count where they are not
             given.
         files: Patterns of the files of a hub repository that are needed.
@@ -104,7 +106,10 @@ class Family:
             configuration.
         home: The scene it acts in, or is asked about, when none is named.
         vocabulary: Module with `known_words` and `words_in`, of a family whose default checkpoint knows few words;
-            empty for one that reads any text. Raises UsageError if an option is not declared as an `Option`.
+            empty for one that reads any text.
+
+    Raises:
+        UsageError: If an option is not declared as an `Option`.
     """
 
     name: str
@@ -172,7 +177,7 @@ class Family:
             )
 
     def known_words(self) -> list[str]:
-        """Every word that an instruction of an embedded model may hold, sorted; none of a family of any text."""
+        """Return the words that an instruction may hold, sorted; empty for a family that reads any text."""
         words = import_module(self.vocabulary).known_words() if self.vocabulary else ()
         return sorted(word for word in words if word.strip())
 
@@ -185,15 +190,21 @@ class Family:
         options: Mapping[str, Any] = MappingProxyType({}),
         weights_seed: int = 0,
     ) -> "Model":
-        """Load a model; `checkpoint` None means the default one.
+        """Load a model.
+
+        Switches off torch's fused encoder in this process, because hooks would change its rounding.
 
         Args:
+            checkpoint: Folder or hub id; None loads the default one.
+            device: Device in torch's spelling, such as `cuda:0`.
+            dtype: One of `DTYPES`; None leaves the choice to the loader.
+            random_weights: Whether the network stays untrained.
             options: By name, as text or values.
-            weights_seed: Of an untrained network's weights. Switches off torch's fused encoder in this process,
-                because hooks would change its rounding.
+            weights_seed: Seed of an untrained network's weights.
 
         Raises:
             UsageError: For an option it lacks, and for a device, dtype or seed that cannot be used.
+            CheckpointError: For a checkpoint that is not there or cannot be loaded.
         """
         loader_options = self.check(checkpoint, device, dtype, random_weights, options, weights_seed)
         location = self.location(checkpoint, loader_options.pop(SIZE, None))
@@ -244,16 +255,26 @@ class Family:
         weights_seed: int = 0,
         fetch: bool = True,
     ) -> dict[str, Any]:
-        """Everything about `load` that can be wrong without weights, in a second instead of a minute.
-
-        Raises UsageError, MissingExtraError, CheckpointError or WeightsError as loading would.
+        """Check everything about `load` that can be wrong without weights, in a second instead of a minute.
 
         Args:
-            fetch: Download a checkpoint that is on the hub, and look for its weights; else only files that are
-                here are looked at, and no weights.
+            checkpoint: As for `load`.
+            device: As for `load`; its presence is checked with `fetch` only.
+            dtype: As for `load`.
+            random_weights: As for `load`; then no weights are looked for.
+            options: As for `load`.
+            weights_seed: As for `load`; it belongs to random weights.
+            fetch: Download a checkpoint that is on the hub, and look for its weights. Without it, only files that
+                are here are looked at, and no weights.
 
         Returns:
             The options as the loader gets them.
+
+        Raises:
+            UsageError: As loading would, for an argument that cannot be used.
+            MissingExtraError: As loading would, for a package that is not installed.
+            CheckpointError: As loading would, for a checkpoint that is not there or not of this family.
+            WeightsError: As loading would, for missing weights and for two sets of them.
         """
         loader_options = check_options(self.name, self.options, options)
         if weights_seed and not random_weights:
@@ -284,7 +305,7 @@ class Family:
         return {**(self.of_default if is_default else {}), **loader_options}
 
     def declared_streams(self, options: Mapping[str, Any]) -> tuple[DeclaredStream, ...] | None:
-        """The streams of the size that `options` choose; None for a family that declares none."""
+        """Return the streams of the size that `options` choose; None for a family that declares none."""
         size = check_options(self.name, self.options, options).get(SIZE)
         return self.declared.get(size or next(iter(self.declared), ""))
 
@@ -297,17 +318,22 @@ class Family:
     def weights_bytes(
         self, options: Mapping[str, Any], dtype: Dtype = "float32", parameters: int | None = None
     ) -> int | None:
-        """Bytes of so many parameters; by default of the released size that `options` choose.
+        """Return the bytes of the weights of the released size that `options` choose.
+
+        Args:
+            options: The options of the family, by name.
+            dtype: The dtype of the weights.
+            parameters: Another count of parameters; None takes that of the released size.
 
         Returns:
-            None where that is not declared.
+            None where the count is not declared.
         """
         size = check_options(self.name, self.options, options).get(SIZE)
         count = parameters or self.parameters.get(size or next(iter(self.parameters), ""))
         return None if count is None else count * {"float32": 4, "bfloat16": 2}[dtype]
 
     def memory_bytes(self, options: Mapping[str, Any], dtype: Dtype, parameters: int | None = None) -> int | None:
-        """Bytes of these weights in memory when `dtype` is chosen."""
+        """Return the bytes that `weights_bytes` gives for the weights in memory when `dtype` is chosen."""
         return self.weights_bytes(options, "float32" if self.always_float32 else dtype, parameters)
 
     def outline(
@@ -329,12 +355,15 @@ class Family:
             return outline_of(self.name, load, str(location), folder, dtype, values)
 
     def is_here(self, checkpoint: str | None, options: Mapping[str, Any]) -> bool:
-        """Whether a checkpoint with its weights is in a folder or in the hub's cache. Asks no network."""
+        """Whether a checkpoint with its weights is in a folder or in the hub's cache; asks no network."""
         location = self.location(checkpoint, options.get(SIZE))
         return location is None or is_complete(location)
 
     def bytes_to_fetch(self, checkpoint: str | None, options: Mapping[str, Any]) -> int | None:
-        """Bytes of the weights that have to be downloaded, as an index in the cache has them; None without one."""
+        """Return the bytes of weights that have to be downloaded, as an index in the cache has them.
+
+        None where there is no index, and for an embedded checkpoint.
+        """
         location = self.location(checkpoint, options.get(SIZE))
         return None if location is None else bytes_to_fetch(location)
 
@@ -360,6 +389,9 @@ class Family:
         """Raise InstructionError for an instruction that the model cannot read, before its network is loaded.
 
         Args:
+            checkpoint: Folder or hub id; None for the default one.
+            instructions: The texts to read.
+            options: The options of the family, by name.
             fetch: Download small files that are not here; without it, nothing is checked then.
         """
         location, loader_options = self._located(checkpoint, options)
@@ -372,10 +404,13 @@ class Family:
     def whose_units(
         self, checkpoint: str | None, options: Mapping[str, Any] = MappingProxyType({}), fetch: bool = True
     ) -> str:
-        """The data set or robot whose units the actions get, and what says so; empty where the family has one way.
+        """Return the data set or robot whose units the actions get, and what says so; "" where there is one way.
 
         Args:
-            fetch: Download small files that are not here; without it, nothing is said of a checkpoint on the hub.
+            checkpoint: Folder or hub id; None for the default one.
+            options: The options of the family, by name.
+            fetch: Download small files that are not here; without it, the answer is "" for a checkpoint on the
+                hub.
 
         Raises:
             UsageError: Where several are there and none was chosen.
@@ -390,7 +425,12 @@ class Family:
             )
 
     def check_intervention(self, kind: InterventionKind) -> None:
-        """Raises UnsupportedInterventionError, before anything is loaded, for what the family does not support."""
+        """Refuse, before anything is loaded, what the family does not support.
+
+        Raises:
+            UnsupportedInterventionError: For a kind that the family does not support, and for a family that does
+                not act.
+        """
         if not self.acts:
             raise UnsupportedInterventionError(
                 f"{self.name} does not support interventions ({kind}): it answers and does not act, and "
@@ -401,13 +441,17 @@ class Family:
     def interventions_json(self) -> dict[str, Any] | None:
         """The supported interventions as plain values; None for a family that does not act.
 
-        asked_as: the same in the words of `probe-kit intervene`, values by option.
+        The key `asked_as` has the same in the words of `probe-kit intervene`, values by option.
         """
         interventions = self.interventions
         return {**interventions.to_json(), "asked_as": interventions.asked_as()} if self.acts else None
 
     def location(self, checkpoint: str | None, size: str | None = None) -> str | None:
-        """The checkpoint to load: `checkpoint`, that of a `size`, or the default. Raises UsageError for both."""
+        """Return the checkpoint to load: `checkpoint`, that of a `size`, or the default.
+
+        Raises:
+            UsageError: If both a checkpoint and a size are given.
+        """
         if size is None:
             return checkpoint or self.default_checkpoint
         if checkpoint is not None:
@@ -432,7 +476,11 @@ class Family:
             raise UsageError(f"{self.name} has no {purpose.replace('_', '-')}; it cannot be verified this way")
 
     def function(self, purpose: Literal["outputs", "full_size"]) -> Callable[..., Any]:
-        """The family's function for `purpose`. Raises UsageError if it has none."""
+        """The family's function for `purpose`.
+
+        Raises:
+            UsageError: If it has none.
+        """
         self.check_purpose(purpose)
         return self._imported(getattr(self, purpose))
 
@@ -447,11 +495,11 @@ class Family:
         return self.location(checkpoint, loader_options.pop(SIZE, None)), loader_options
 
     def renames(self) -> tuple[tuple[str, str], ...]:
-        """Pairs that turn names of tensors in released files into the network's; empty if they are the same."""
+        """Return pairs that turn names of tensors in released files into the network's; empty if they agree."""
         return () if self.stored_names is None else tuple(imported(self.stored_names))
 
     def missing(self) -> str:
-        """Requirements that this machine lacks, the default checkpoint included; empty if it is ready."""
+        """Return requirements that this machine lacks, the default checkpoint included; empty if it is ready."""
         lacking = [f"extra {extra}" for extra in dict.fromkeys(extra for _, extra in self._missing_packages())]
         if self.needs_checkpoint:
             lacking.append("a checkpoint of yours (--checkpoint)")
@@ -477,7 +525,7 @@ class Family:
 
 
 def _unguarded(model: "Model") -> tuple[str, ...]:
-    """A note on states that are read and compared with no statistics."""
+    """A note on states that are read and compared with no statistics; empty where there are none."""
     from probe_kit.hooks.contract.model import Policy
 
     if not isinstance(model, Policy) or model.state_numbers is None or (why := model.unguarded_state) is None:
@@ -486,7 +534,7 @@ def _unguarded(model: "Model") -> tuple[str, ...]:
 
 
 def _notes(notes: Iterable[str]) -> tuple[str, ...]:
-    """Every note once, with the names that adapters' folders have."""
+    """Return every note once, with the names that adapters' folders have."""
     return tuple(dict.fromkeys(map(with_adapters_named, notes)))
 
 

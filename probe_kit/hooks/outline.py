@@ -30,8 +30,8 @@ class Outline:
     """A model on the meta device, with streams, roles and units but without numbers.
 
     Attributes:
-        model: None where it could not be built.
-        reason: Why not.
+        model: The model; None where it could not be built.
+        reason: The reason why it could not; "" for a model that was built.
         complete: Whether its weights are here too, so that no file of statistics can be missing.
     """
 
@@ -45,7 +45,7 @@ class Outline:
         return "" if self.model is None else self.model.card.checkpoint
 
     def misfit(self) -> str | None:
-        """Why a policy cannot move an arm here, as far as the files that are here say; None if it can."""
+        """Return why a policy cannot move an arm here, as far as the files that are here say; None if it can."""
         from probe_kit.hooks.contract.model import Policy
 
         if not isinstance(self.model, Policy):
@@ -58,11 +58,15 @@ def outline_of(
 ) -> Outline:
     """The outline of the checkpoint at `location`, whose configuration lies in `folder`.
 
+    No network is asked and no weights are read. Raises what loading raises for a checkpoint in a folder.
+
     Args:
-        name: Of the family.
-        load: Its loader.
-        options: As the loader gets them. No network is asked and no weights are read. Raises what loading raises
-            for a checkpoint in a folder.
+        name: Name of the family.
+        load: Loader of the family.
+        location: Folder or hub id, as the loader gets it.
+        folder: The folder of the configuration, whose state is part of the key of the cache.
+        dtype: The dtype asked for; None leaves the choice to the loader.
+        options: The options as the loader gets them.
     """
     complete = is_complete(location)
     key = (name, location, dtype, repr(sorted(options.items())), complete, file_state(folder))
@@ -116,7 +120,7 @@ def _local(location: str) -> Path | None:
 
 
 def is_complete(location: str) -> bool:
-    """Whether a checkpoint with its weights, and those of an adapter's base, is here. Asks no network."""
+    """Whether a checkpoint with its weights, and those of an adapter's base, is here; asks no network."""
     folder = _local(location)
     if folder is None:
         return False
@@ -134,7 +138,7 @@ def _has_weights(location: str) -> bool:
 
 
 def bytes_to_fetch(location: str) -> int | None:
-    """Bytes of the weights that the cache lacks, of an adapter its base's; None where no index says it."""
+    """Return the bytes of weights that the cache lacks, of an adapter its base's; None where no index says it."""
     folder = _local(location)
     if folder is not None and (base := _base(folder)) is not None:
         folder = _local(base)

@@ -26,12 +26,13 @@ class Outputs:
     """The quantities that a family compares with a golden reference; see `Family.outputs`.
 
     Attributes:
-        produced: How each is made, by name; a recorded one that is missing here is listed as not compared. inputs:
-            recorded names that went in, besides those that begin with `in_`.
-        tolerance: Of a quantity whose values are below one; larger values may differ by as much of the largest
-            one.
+        produced: The function that makes each quantity, by name; a recorded one that is missing here is listed as
+            not compared.
+        tolerance: The tolerance of a quantity whose values are below one; larger values may differ by as much of
+            the largest one.
+        inputs: Recorded names that went in, besides those that begin with `in_`.
         remade: Inputs that the adapter makes too, by the name in `produced`.
-        tolerances: Of single quantities.
+        tolerances: The tolerances of single quantities.
         absolute: Quantities whose tolerance is the same for larger values.
         valid: Per quantity a mask over its leading axes behind the first, where only some positions mean anything.
     """
@@ -47,7 +48,12 @@ class Outputs:
 
 @dataclass(frozen=True)
 class RecordedRun:
-    """One inference on recorded inputs. activations: of every stream. calls: of watched modules, see `watch`."""
+    """The result of one inference on recorded inputs.
+
+    Attributes:
+        activations: The activations of every stream.
+        calls: The calls of watched modules, see `watch`.
+    """
 
     batch: Mapping[str, Tensor]
     recorded: Arrays
@@ -55,7 +61,7 @@ class RecordedRun:
     calls: Mapping[str, list[Any]]
 
     def outputs(self, name: str) -> NDArray[Any]:
-        """(calls, …): what a watched module put out."""
+        """Return what a watched module put out, stacked over its calls, (calls, …)."""
         return numpy_of(torch.stack(self.calls[name]))
 
 
@@ -80,8 +86,10 @@ def watch[Result](
     """Run an inference and capture `compared_sites` and the calls of modules.
 
     Args:
-        modules: Those whose outputs are listed.
-        entered: Those whose positional inputs and keywords are listed.
+        model: The model that `run` runs.
+        run: Runs one inference.
+        modules: The modules whose outputs are listed, by the name of their list; None for none.
+        entered: The modules whose positional inputs and keywords are listed; None for none.
 
     Returns:
         What `run` returns, the activations, and the lists by the name of the module.
@@ -125,15 +133,17 @@ def stacked(activations: ActivationCache, stream: Stream, quantity: str = "resid
 def generation_outputs(model: Any, stream: str, activations: ActivationCache, decoded: Any) -> dict[str, Produce]:
     """Return the quantities of a decoder whose prompt and output tokens are two streams of one stack.
 
+    States are laid out as transformers counts them: the stream at every block, and normed at the end.
+
     Args:
-        stream: Of the output tokens.
-        activations: With `compared_sites`.
-        decoded: Ids (B, N) and logits (B, N, V). States are laid out as transformers counts them: the stream at
-            every block, and normed at the end.
+        model: A model whose stream of the prompt is `backbone` and whose network has a `language_model`.
+        stream: Name of the stream of the output tokens.
+        activations: The activations of one inference, with `compared_sites`.
+        decoded: The decoded tokens: `ids` (B, N) and `logits` (B, N, V).
     """
 
     def column(name: str, iteration: int | None) -> Tensor:
-        """(L+1, 1, positions, D)."""
+        """Return the states of one stream, (L+1, 1, positions, D)."""
         blocks = model.streams[name].layers - 1
         layers = [activations[Site(name, layer, iteration=iteration)] for layer in range(blocks)]
         return torch.stack([*layers, activations[Site(name, blocks, "final_norm", iteration)]])

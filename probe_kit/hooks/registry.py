@@ -39,7 +39,7 @@ FOLDERS = (
     "internvl",
     "ovis2_5",
 )
-"""In the order in which `probe-kit models` lists them."""
+"""The folders of our families, in the order in which `probe-kit models` lists them."""
 
 
 class BrokenFamilyWarning(UserWarning):
@@ -47,7 +47,7 @@ class BrokenFamilyWarning(UserWarning):
 
 
 def known_families() -> dict[str, Family]:
-    """All families by name. Third parties add theirs as entry points that name a `Family`.
+    """All families by name; third parties add theirs as entry points that name a `Family`.
 
     Imports the modules of all of them, of which some import torch; `get_family` imports one. A family that cannot
     be loaded is left out with a BrokenFamilyWarning that says what to change.
@@ -96,7 +96,7 @@ def entry_module(name: str) -> str | None:
 
 
 def get_family(name: str) -> Family | None:
-    """The family called `name`, or None. Of third parties' modules only that of `name` is imported.
+    """Return the family called `name`, or None; of third parties' modules only that of `name` is imported.
 
     One that cannot be loaded is None as well, with a BrokenFamilyWarning that says what to change.
     """
@@ -108,7 +108,7 @@ def get_family(name: str) -> Family | None:
 
 
 def find_family(name: str, suggestions: tuple[str, ...] = ()) -> Family:
-    """The family called `name`. suggestions: further names to suggest if there is none.
+    """The family called `name`; `suggestions` are further names to suggest if there is none.
 
     Raises:
         UnknownModelError: If there is none, or if it cannot be loaded.
@@ -122,7 +122,11 @@ def find_family(name: str, suggestions: tuple[str, ...] = ()) -> Family:
 
 
 def _get(name: str) -> Family | None:
-    """The family called `name`. Raises UnknownModelError for one of a third party that cannot be loaded."""
+    """Return the family called `name`, or None.
+
+    Raises:
+        UnknownModelError: For a family of a third party that cannot be loaded.
+    """
     if (ours := own_families().get(name)) is not None:
         return ours
     entries = [entry for entry in family_entries() if entry.name == name]
@@ -157,10 +161,20 @@ def load_model(
 ) -> "Model":
     """Load the model `name`, from `checkpoint` (folder or hub id) or the family's default.
 
-    Raises UnknownModelError, UsageError, CheckpointError or WeightsError.
-
     Args:
-        **options: What only some families have, such as `unnorm_key`; see `Family.options`.
+        name: Name of the family, as `probe-kit models` lists it.
+        checkpoint: Folder or hub id; None loads the family's default.
+        device: Device in torch's spelling, such as `cuda:0`.
+        dtype: `float32` or `bfloat16`; None leaves the choice to the loader.
+        random_weights: Whether the network stays untrained.
+        weights_seed: Seed of an untrained network's weights.
+        **options: Options that only some families have, such as `unnorm_key`; see `Family.options`.
+
+    Raises:
+        UnknownModelError: For a family that does not exist or cannot be loaded.
+        UsageError: For an option that the family lacks, and for a device, dtype or seed that cannot be used.
+        CheckpointError: For a checkpoint that is not there or cannot be loaded.
+        WeightsError: For weights that are not exactly the network's.
     """
     return find_family(name).load(checkpoint, device, dtype, random_weights, options, weights_seed)
 
@@ -174,7 +188,11 @@ def load_policy(
     weights_seed: int = 0,
     **options: Any,
 ) -> "Policy":
-    """Load a model that acts; as `load_model`. Raises UsageError for one that answers only."""
+    """Load a model that acts, with the arguments and errors of `load_model`.
+
+    Raises:
+        UsageError: For a model that answers only.
+    """
     from probe_kit.hooks.contract.model import Policy
 
     if not find_family(name).acts:

@@ -1,4 +1,4 @@
-"""`probe-kit verify`: compares an adapter with outputs recorded from the original implementation."""
+"""Compare an adapter with outputs recorded from the original implementation, as `probe-kit verify` does."""
 
 import zlib
 from collections.abc import Mapping
@@ -28,7 +28,7 @@ REFERENCE_FILE, CHECKPOINT_FOLDER = "reference.npz", "checkpoint"
 
 @dataclass(frozen=True)
 class Comparison:
-    """One recorded output beside ours; `error` is the largest absolute difference, None if not compared."""
+    """A recorded output and ours; `error` is the largest absolute difference, None if not compared."""
 
     output: str
     status: Status
@@ -78,7 +78,10 @@ def _compared(name: str, theirs: NDArray[Any], outputs: "Outputs") -> Comparison
 
 
 def _allowed(theirs: NDArray[Any], tolerance: float) -> float:
-    """Absolute plus relative to the largest recorded value; ids, masks and counts must be equal."""
+    """Return the tolerance, absolute plus relative to the largest recorded value.
+
+    Ids, masks and counts must be equal.
+    """
     if not np.issubdtype(theirs.dtype, np.floating):
         return 0.0
     size = np.abs(theirs.astype(np.float64))
@@ -86,7 +89,7 @@ def _allowed(theirs: NDArray[Any], tolerance: float) -> float:
 
 
 def _largest_error(ours: NDArray[Any], theirs: NDArray[Any], valid: NDArray[np.bool_] | None) -> float:
-    """NaN on either side counts as infinitely wrong."""
+    """Return the largest absolute difference; NaN on either side counts as infinitely wrong."""
     difference = np.abs(ours.astype(np.float64) - theirs.astype(np.float64))
     if valid is not None:
         difference = difference[..., valid, :]
@@ -97,11 +100,15 @@ def _largest_error(ours: NDArray[Any], theirs: NDArray[Any], valid: NDArray[np.b
 def verify_reference(family: str, folder: Path) -> Verification:
     """Compare an adapter with `folder/reference.npz`, on the model in `folder/checkpoint`.
 
+    Raises what checking and loading raise, too.
+
+    Args:
+        family: Name of the family.
+        folder: The golden reference.
+
     Raises:
-        UnknownModelError: For a folder without a reference or a family that compares nothing, and whatever
-            checking and loading raise.
-        UsageError: For a folder without a reference or a family that compares nothing, and whatever checking and
-            loading raise.
+        UnknownModelError: For a family that does not exist.
+        UsageError: For a folder without a reference or a family that compares nothing.
     """
     declared, file = find_family(family), folder / REFERENCE_FILE
     if not file.is_file():
@@ -119,7 +126,11 @@ def verify_reference(family: str, folder: Path) -> Verification:
 
 
 def _read_arrays(file: Path) -> dict[str, NDArray[Any]]:
-    """The arrays of an .npz file. Raises UsageError if it is damaged or holds something else than numbers."""
+    """Return the arrays of an .npz file.
+
+    Raises:
+        UsageError: If it is damaged or holds something else than numbers.
+    """
     try:
         with open_arrays(file) as arrays:
             return {name: arrays[name] for name in arrays.files}
@@ -132,11 +143,14 @@ def _read_arrays(file: Path) -> dict[str, NDArray[Any]]:
 def verify_keys(family: str, file: Path) -> Verification:
     """Build the full-size model on the meta device and compare names, shapes and dtypes with a recorded list.
 
+    Keys that the family declares as `unstored` may be recorded; they are listed as not compared. A name that
+    stands for another one's tensor, such as tied output weights, may be absent. Of several released sizes the one
+    that the list differs least from is meant.
+
     Args:
+        family: Name of the family.
         file: JSON, or gzipped JSON, with `keys`: {name: {"shape": [...], "dtype": "float32"}}, under the network's
-            names or those of released files. Keys that the family declares as `unstored` may be recorded; they are
-            listed as not compared. A name that stands for another one's tensor, such as tied output weights, may
-            be absent. Of several released sizes the one that the list differs least from is meant.
+            names or those of released files.
     """
     declared = find_family(family)
     declared.check_purpose("full_size")
@@ -183,7 +197,11 @@ def _differences(network: Any, theirs: Mapping[str, Described], unstored: tuple[
 
 
 def _read_key_list(file: Path) -> dict[str, Any]:
-    """The `keys` of a list, each with shape and dtype. Raises UsageError for anything else."""
+    """Return the `keys` of a list, each with shape and dtype.
+
+    Raises:
+        UsageError: For anything else.
+    """
     if not file.is_file():
         raise UsageError(f"key list {file} does not exist")
     try:

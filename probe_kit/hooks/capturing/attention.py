@@ -36,23 +36,27 @@ Read = tuple[int, int]
 
 @dataclass
 class AttentionMass:
-    """Shares of attention, by (block of the backbone whose keys are read, iteration).
+    """The shares of attention, by (block of the backbone whose keys are read, iteration).
+
+    They are not causal: a token can receive attention without being used. They serve an optional display only.
 
     Attributes:
         by_head: (B, H, T) float32, a mean over acting positions; what is missing to 1 lies on the acting part's
-            own tokens. Not causal: a token can receive attention without being used. Serves an optional display
-            only.
+            own tokens.
     """
 
     by_head: dict[Read, NDArray[np.float32]] = field(default_factory=dict)
 
     @property
     def by_read(self) -> dict[Read, NDArray[np.float32]]:
-        """(B, T) float32, a mean over heads as well."""
+        """The shares (B, T) float32, a mean over heads as well."""
         return {read: mass.mean(axis=1) for read, mass in self.by_head.items()}
 
     def heads_on(self, tokens: NDArray[np.bool_]) -> dict[Read, NDArray[np.float64]]:
-        """The share on some tokens by head, (B, H); tokens: (T,) or (B, T) bool, such as the patches of a tile.
+        """The share on some tokens by head, (B, H).
+
+        Args:
+            tokens: (T,) or (B, T) bool, such as the patches of a tile.
 
         Raises:
             RolesMismatchError: For another number of tokens.
@@ -69,11 +73,19 @@ class AttentionMass:
         return shares
 
     def on(self, tokens: NDArray[np.bool_]) -> dict[Read, NDArray[np.float64]]:
-        """The same as a mean over heads, (B,). Raises RolesMismatchError for another number of tokens."""
+        """The share on some tokens, (T,) or (B, T) bool, as a mean over heads, (B,).
+
+        Raises:
+            RolesMismatchError: For another number of tokens.
+        """
         return {read: share.mean(axis=1) for read, share in self.heads_on(tokens).items()}
 
     def of_role(self, roles: Sequence[Roles], role: str) -> dict[Read, NDArray[np.float64]]:
-        """The share on the tokens of one role, (B,). roles: the backbone's, one per row."""
+        """The share on the tokens of one role, (B,); `roles` are the backbone's, one per row.
+
+        Raises:
+            RolesMismatchError: For roles of another length.
+        """
         return self.on(np.stack([row.mask(role) for row in roles]))
 
 
@@ -83,7 +95,7 @@ def capture_attention(policy: Policy) -> Iterator[AttentionMass]:
 
     Raises:
         UnsupportedInterventionError: For a family without attention recording.
-        CaptureError: If none occurred.
+        CaptureError: If no attention was recorded, or that of a block twice in an iteration.
     """
     policy.interventions.check("attention", policy.card.family)
     mass = AttentionMass()
@@ -102,9 +114,9 @@ def capture_attention(policy: Policy) -> Iterator[AttentionMass]:
 
 
 MOST_BYTES = 2_000_000_000
-"""Of all patterns of one capture together, as float32 on the host."""
+"""The largest size of all patterns of one capture together, as float32 on the host."""
 TOLERANCE: Mapping[torch.dtype, float] = {torch.float32: 1e-4, torch.float16: 5e-3, torch.bfloat16: 3e-2}
-"""By how much what a pattern gives may differ from what the heads read, as a share of its largest number."""
+"""The largest difference of what a pattern gives from what the heads read, as a share of its largest number."""
 _FUSED: Callable[..., Any] = functional.scaled_dot_product_attention
 _SOFTMAX = (functional.softmax, torch.softmax, Tensor.softmax)
 _MATMUL = (torch.matmul, Tensor.matmul, Tensor.__matmul__)
@@ -116,9 +128,13 @@ def capture_patterns(
 ) -> Iterator[ActivationCache]:
     """Capture the attention patterns of blocks while the model runs once; its output stays bit-identical.
 
+    The pattern of a site is (B, H, S, T) float32 on the host. Its rows sum to 1, or to 0 where a position attends
+    to nothing.
+
     Args:
-        sites: Of the quantity `heads`; the pattern of a site is (B, H, S, T) float32 on the host, and its rows sum
-            to 1, or to 0 where a position attends to nothing.
+        model: The model that runs inside the context.
+        sites: Sites of the quantity `heads`.
+        most_bytes: The largest size of all patterns together.
 
     Raises:
         UnknownSiteError: For another quantity.
@@ -151,10 +167,17 @@ def capture_patterns(
 def attended_roles(model: Model, roles: Mapping[str, Sequence[Roles]], site: Site, tokens: int) -> list[Roles]:
     """The roles of the T = `tokens` positions that a site attends to, per row.
 
+    A stream that acts reads the backbone's positions, then its own. Where a decoder puts out tokens, it reads
+    those that came before.
+
     Args:
-        roles: Of every stream, as `Model.token_roles` or `AnswerModel.asked_roles` says them. A stream that acts
-            reads the backbone's positions, then its own; where a decoder puts out tokens, those that came before.
-            Raises RolesMismatchError for a number of tokens that fits neither.
+        model: The model that was inferred.
+        roles: The roles of every stream, as `Model.token_roles` or `AnswerModel.asked_roles` says them.
+        site: A site of the stream that attends.
+        tokens: The number T of positions in the pattern of that site.
+
+    Raises:
+        RolesMismatchError: For a stream without roles, or a number of tokens that fits neither.
     """
     stream, backbone = model.stream_of(site), first_of("backbone", model.streams.values())
     acting = first_of("action", model.streams.values())
@@ -176,7 +199,10 @@ def attended_roles(model: Model, roles: Mapping[str, Sequence[Roles]], site: Sit
 
 
 def _joined(before: Roles, behind: Roles, tokens: int) -> Roles | None:
-    """`before`, and `behind` once or, of a single position, as often as there is room; None if they do not fit."""
+    """The roles of `before`, then `behind`: once or, of a single position, as often as `tokens` in all have room.
+
+    The result is None if they do not fit.
+    """
     labels = _labels(before)
     missing, repeated = tokens - len(labels), _labels(behind)
     if missing < 0 or (missing not in (0, len(repeated)) and len(repeated) != 1):
@@ -193,14 +219,19 @@ def _labels(roles: Roles) -> list[str]:
 
 @dataclass(frozen=True)
 class _Attention:
-    """One attention of a model. weights: makes (B, H, S, T) float32. values: (B, G, T, E), H a multiple of G."""
+    """An attention that a model computed.
+
+    Attributes:
+        weights: Makes the pattern (B, H, S, T) float32.
+        values: (B, G, T, E), H a multiple of G.
+    """
 
     weights: Callable[[], Tensor]
     values: Tensor
 
 
 class _AttentionCalls(TorchFunctionMode):
-    """Sees torch's calls while a model runs, and changes none. last: the attention that was computed last."""
+    """A mode that sees torch's calls while a model runs, and changes none; `last` is the latest attention."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -241,7 +272,7 @@ def _fused(
     scale: float | None = None,
     **_: Any,
 ) -> _Attention | None:
-    """torch's fused attention of queries (B, H, S, E), keys and values (B, G, T, E); None of other shapes."""
+    """The fused attention of torch: queries (B, H, S, E), keys and values (B, G, T, E); None of other shapes."""
     if query.dim() != 4 or dropout_p:
         return None
 
@@ -260,12 +291,16 @@ def _fused(
 
 
 def _of_every_head(heads: Tensor, count: int) -> Tensor:
-    """(B, H, T, E) of (B, G, T, E), each of the G repeated for the heads that share it."""
+    """Return keys or values (B, G, T, E) as (B, H, T, E), each of the G repeated for the heads that share it."""
     return heads.repeat_interleave(count // heads.shape[1], dim=1)
 
 
 def _pattern_of(model: Model, site: Site, calls: _AttentionCalls, read: Tensor) -> Tensor:
-    """(B, H, S, T) of the positions of a site. read: (B, S, H · E) what its heads read."""
+    """Return the pattern (B, H, S, T) of the positions of a site, whose heads read `read` (B, S, H · E).
+
+    Raises:
+        CaptureError: If torch computed no attention, or one that does not give what the heads read.
+    """
     tap, stream = model.tap(site), model.stream_of(site)
     if calls.last is None:
         raise CaptureError(

@@ -55,7 +55,7 @@ def switch_off_fused_encoder() -> None:
 
 @contextmanager
 def without_fused_encoder() -> Iterator[None]:
-    """The same inside the body; afterwards it is as it was."""
+    """Let encoders run their submodules inside the body; afterwards the setting is as it was."""
     before = torch.backends.mha.get_fastpath_enabled()
     torch.backends.mha.set_fastpath_enabled(False)
     try:
@@ -65,11 +65,14 @@ def without_fused_encoder() -> Iterator[None]:
 
 
 def reason_of_change(infer: Infer, plain: NDArray[np.float32], infer_captured: Infer) -> str:
-    """Why an inference under capture differs from `plain`, and what to change, as sentences.
+    """Return why an inference under capture differs from `plain`, and what to change, as sentences.
+
+    Both inferences are repeated at most once.
 
     Args:
-        infer: The inference without hooks, whose output `plain` is, of any shape.
-        infer_captured: The same with hooks. Both are repeated at most once.
+        infer: The inference without hooks.
+        plain: The output of that inference, of any shape.
+        infer_captured: The same inference with hooks.
     """
     if not same_bits(infer(), plain):
         return (
@@ -91,7 +94,7 @@ def reason_of_change(infer: Infer, plain: NDArray[np.float32], infer_captured: I
 
 
 def same_bits(array: NDArray[np.float32], other: NDArray[np.float32]) -> bool:
-    """Equal shape, type and bytes; NaN equals itself."""
+    """Whether shape, type and bytes are equal; NaN equals itself."""
     return array.shape == other.shape and array.dtype == other.dtype and array.tobytes() == other.tobytes()
 
 
@@ -101,8 +104,8 @@ def same_bits(array: NDArray[np.float32], other: NDArray[np.float32]) -> bool:
 class ActivationCache(Mapping[Site, Tensor]):
     """The captured activations of one inference, a mapping from sites in the order in which they fired.
 
-    `activations[site]` is what `capture` kept of it, (B, T, D) on the model's device unless it was reduced; the
-    name of a site does as well as the site. fires: how often each tapped module was called.
+    `activations[site]` is what `capture` kept of it, (B, T, D) on the model's device unless it was reduced. The
+    name of a site does as well as the site. The attribute `fires` says how often each tapped module was called.
     """
 
     def __init__(self) -> None:
@@ -110,7 +113,11 @@ class ActivationCache(Mapping[Site, Tensor]):
         self.fires: dict[str, int] = {}
 
     def __getitem__(self, site: Site | str) -> Tensor:
-        """Raises UnknownSiteError for a site that was not captured or a name that is none."""
+        """The activation kept of a site.
+
+        Raises:
+            UnknownSiteError: For a site that was not captured or a name that is none.
+        """
         activation = self._kept.get(Site.parse(site) if isinstance(site, str) else site)
         if activation is None:
             raise UnknownSiteError(f"{site} was not captured; the cache holds {self._contents() or 'nothing yet'}")
@@ -137,7 +144,7 @@ class ActivationCache(Mapping[Site, Tensor]):
         return self[site] if site in self else default  # noqa: SIM401  (this is `get`)
 
     def stack(self, stream: str, quantity: str = "residual") -> Tensor:
-        """All of one stream and quantity as one tensor.
+        """Return all of one stream and quantity as one tensor.
 
         Returns:
             (layers, B, T, D), or (layers, iterations, B, T, D) where sites have iterations; layers and iterations
@@ -169,7 +176,7 @@ class ActivationCache(Mapping[Site, Tensor]):
         return stacked[:, 0] if iterations == {None} else stacked
 
     def _streams(self) -> list[tuple[str, str, int, int, tuple[int, ...], str]]:
-        """Per stream and quantity: layers, iterations (0: none), shape of a site, dtype and device."""
+        """Return per stream and quantity: layers, iterations (0: none), shape of a site, dtype and device."""
         by_stream: dict[tuple[str, str], list[Site]] = {}
         for site in self._kept:
             by_stream.setdefault((site.stream, site.quantity), []).append(site)
@@ -206,7 +213,10 @@ class ActivationCache(Mapping[Site, Tensor]):
 Reduce = Callable[[Site, Tensor], Tensor]
 EditFunction = Callable[[Tensor], Tensor]
 Handle = Callable[[Site, Tap, Tensor], Tensor | None]
-"""Receives what passes at a site; what it returns, unless None or of a keyword, passes on in its place."""
+"""A function that receives what passes at a site.
+
+What it returns, unless None or of a keyword, passes on in its place.
+"""
 _captured_now: WeakSet[Model] = WeakSet()
 
 
@@ -214,13 +224,17 @@ _captured_now: WeakSet[Model] = WeakSet()
 def capture(model: Model, sites: Iterable[Site], reduce: Reduce | None = None) -> Iterator[ActivationCache]:
     """Capture `sites` while the model runs once.
 
-    Raises SiteNeverFiredError or SiteFiredTooOftenError if a site fired another number of times than its tap
-    promises, NonFiniteActivationError if a copy holds NaN or infinity, CaptureError if this model is being
-    captured already or a tapped module is compiled.
-
     Args:
-        reduce: What to keep of a site, called with (site, (B, T, D)) on the device at the moment it fires, such as
-            a pooled view; it must return a new tensor. None keeps a copy.
+        model: The model that runs inside the context.
+        sites: The sites to capture; each is captured once, however often it is named.
+        reduce: Gives what to keep of a site, such as a pooled view. It is called with (site, (B, T, D)) on the
+            device at the moment the site fires, and must return a new tensor. None keeps a copy.
+
+    Raises:
+        SiteNeverFiredError: If a site fired less often than its tap promises.
+        SiteFiredTooOftenError: If a site fired more often than its tap promises.
+        NonFiniteActivationError: If a copy holds NaN or infinity.
+        CaptureError: If this model is being captured already or a tapped module is compiled.
     """
     if model in _captured_now:
         raise CaptureError("this model is being captured already; leave the first capture before the next")
@@ -245,9 +259,11 @@ def capture(model: Model, sites: Iterable[Site], reduce: Reduce | None = None) -
 def edit(model: Model, edits: Mapping[Site, EditFunction]) -> Iterator[None]:
     """Replace activations while the model runs once, at exactly the place where `capture` reads them.
 
+    A capture entered inside this context reads the replacements.
+
     Args:
-        edits: Per site a function from the activation (B, T, D) to its replacement, of the same shape and dtype. A
-            capture entered inside this context reads the replacements.
+        model: The model that runs inside the context.
+        edits: Per site a function from the activation (B, T, D) to its replacement, of the same shape and dtype.
 
     Raises:
         CaptureError: If a replacement has another shape or dtype, and for fires as `capture` does.
@@ -343,7 +359,13 @@ class _CountingHook:
 
 
 def _check_non_finite(cache: ActivationCache) -> None:
-    """One question to the device for all sites, not one each: every answer waits for what it has in hand."""
+    """Check that every kept activation is finite.
+
+    One question goes to the device for all sites, not one each: every answer waits for the work in its queue.
+
+    Raises:
+        NonFiniteActivationError: For the first site that holds NaN or infinity.
+    """
     finite = [torch.isfinite(activation).all() for activation in cache._kept.values()]
     if not finite or bool(torch.stack([flag.to(finite[0].device) for flag in finite]).all()):
         return
@@ -357,7 +379,7 @@ def _check_non_finite(cache: ActivationCache) -> None:
 # -- gradients ------------------------------------------------------------------------------------------------
 
 Metric = Callable[[Tensor], Tensor]
-"""From (B, chunk, 7) actions, metres and radians, to a number."""
+"""A function from actions (B, chunk, 7), in metres and radians, to a number."""
 
 
 def gradients_at(
@@ -367,12 +389,20 @@ def gradients_at(
     sites: Iterable[Site],
     metric: Metric,
 ) -> tuple[float, ActivationCache]:
-    """The metric of one inference, and its gradient at every site: (B, T, D) float32, zero where nothing reads it.
+    """Return the metric of one inference, and its gradient at every site.
 
-    Costs about three inferences, however many sites.
+    The gradients are (B, T, D) float32, zero where nothing reads the site. Costs about three inferences, however
+    many sites.
+
+    Args:
+        policy: A policy of a family that declares gradients.
+        observations: The B rows of the inference.
+        seeds: One seed per observation.
+        sites: The sites whose gradients are wanted.
+        metric: The number of the actions (B, chunk, 7) whose gradient is taken.
 
     Raises:
-        UnsupportedInterventionError: And what `capture` raises.
+        UnsupportedInterventionError: For a family that does not declare gradients, and what `capture` raises.
     """
     policy.interventions.check("gradients", policy.card.family)
     with flowing_tensors(policy, sites) as flowing:
@@ -387,7 +417,7 @@ class FlowingTensors:
     passed: dict[Site, tuple[Tap, Tensor]] = field(default_factory=dict)
 
     def gradients_of(self, value: Tensor) -> ActivationCache:
-        """The gradient of a number at every site. Frees the graph."""
+        """Return the gradient of a number at every site, and free the graph."""
         gradients = ActivationCache()
         tensors = [tensor for _, tensor in self.passed.values()]
         slopes: Sequence[Tensor | None] = [None] * len(tensors)
@@ -403,7 +433,7 @@ def flowing_tensors(model: Model, sites: Iterable[Site]) -> Iterator[FlowingTens
     """Keep what passes at `sites` while the model runs once with a graph.
 
     An input is kept as the very tensor that flows, so that the norm and the path around the block both count. Of
-    an output, and of `kv`, a copy passes on: what read the tensor before does not count, and what is added to it
+    an output, and of `kv`, a copy passes on. What read the tensor before does not count, and what is added to it
     in place does not reach it. The first tensor of all becomes a leaf: nothing above it is kept.
     """
     flowing = FlowingTensors()

@@ -33,19 +33,22 @@ if TYPE_CHECKING:
 
 Kind = Literal["zero", "add", "remove", "replace"]
 Vectors = Mapping[str, NDArray[np.float32]]
-"""Directions (D,) and sources (T, D) by their `vector_hash`."""
+"""The directions (D,) and sources (T, D) by their `vector_hash`."""
 
 
 @dataclass(frozen=True)
 class Edit:
-    """One change of some sites, applied row by row.
+    """A change of some sites, applied row by row.
 
     Attributes:
         kind: `zero` sets to zero; `add` adds `strength` times a direction; `remove` takes away `strength` times
             the component along it; `replace` goes the share `strength` of the way to a source, token by token.
-        roles: Of the tokens that change, such as `language` or `image`; None for all but padding.
-        vector: `vector_hash` of the direction (D,) or source (T, D); "" for `zero`. Raises UsageError for a
-            combination that means nothing.
+        roles: The roles of the tokens that change, such as `language` or `image`; None for all but padding.
+        vector: `vector_hash` of the direction (D,) or source (T, D); "" for `zero`.
+        strength: A finite number; 1 is the whole change.
+
+    Raises:
+        UsageError: For a combination that means nothing.
     """
 
     kind: Kind
@@ -70,7 +73,7 @@ class Edit:
 
 
 def vector_hash(vector: NDArray[np.floating]) -> str:
-    """Hex sha256 of shape and float32 bytes: the name of a direction or source."""
+    """Return the hex sha256 of shape and float32 bytes: the name of a direction or source."""
     values = np.ascontiguousarray(vector, np.float32)
     return hashlib.sha256(str(values.shape).encode() + values.tobytes()).hexdigest()
 
@@ -78,20 +81,25 @@ def vector_hash(vector: NDArray[np.floating]) -> str:
 # -- changes of tokens ----------------------------------------------------------------------------------------
 
 TokenIndex = Union["Tensor", slice]
-"""Positions of tokens: a slice of neighbours, which copies nothing, or (T',) indices."""
+"""The positions of tokens: a slice of neighbours, which copies nothing, or (T',) indices."""
 EVERY = slice(None)
 
 
 @dataclass(frozen=True)
 class TokenSelection:
-    """Some tokens of a stream. count: how many it has, all rows of a batch together. where: which of them."""
+    """Some tokens of a stream.
+
+    Attributes:
+        count: The number of tokens of the stream, all rows of a batch together.
+        where: The positions of the selected ones among them.
+    """
 
     count: int
     where: TokenIndex
 
     @classmethod
     def of(cls, mask: NDArray[np.bool_], device: str) -> Self:
-        """mask: (T,). device: of the stream."""
+        """Return the selection of the tokens that a mask (T,) marks, as positions on the stream's device."""
         import torch
 
         positions = np.flatnonzero(mask)
@@ -103,7 +111,7 @@ class TokenSelection:
 
 
 def selected(activation: "Tensor", where: TokenIndex) -> "Tensor":
-    """(1, T', D) of (1, T, D), a view where they are neighbours."""
+    """Return (1, T', D) of (1, T, D), a view where the positions are neighbours."""
     if where is EVERY:
         return activation
     return activation[:, where] if isinstance(where, slice) else activation.index_select(1, where)
@@ -113,7 +121,7 @@ class TokenEdit(Protocol):
     """A change of the tokens of a site."""
 
     def __call__(self, site: Site, activation: "Tensor", where: TokenIndex) -> "Tensor":
-        """Return (1, T', D) of as many float32 tokens, and leave `activation` as it is. where: their positions."""
+        """Return (1, T', D) of as many float32 tokens, at positions `where`, and leave `activation` as it is."""
 
 
 @dataclass(frozen=True)
@@ -124,7 +132,11 @@ class ReplaceWith:
     tokens: int
 
     def __call__(self, site: Site, activation: "Tensor", where: TokenIndex) -> "Tensor":
-        """The source's."""
+        """Return the tokens of the source.
+
+        Raises:
+            CaptureError: For a source with another number of tokens.
+        """
         del activation
         other = self.source[site]
         if other.shape[1] != self.tokens:
@@ -136,9 +148,11 @@ class ReplaceWith:
 
 @dataclass(frozen=True)
 class ReplaceInSubspace:
-    """Replace the component within a subspace by another inference's. basis: (K, D) orthonormal.
+    """Replace the component within a subspace by another inference's.
 
     Attributes:
+        tokens: The number of tokens of the site.
+        basis: (K, D), orthonormal.
         complement: The other way round: all but that component is replaced.
     """
 
@@ -160,7 +174,13 @@ class ReplaceInSubspace:
 
 @dataclass(frozen=True)
 class OfOneHead:
-    """Another edit, of the features of one head; those of the other heads stay. heads: side by side in a token."""
+    """Change the features of one head by another edit; those of the other heads stay.
+
+    Attributes:
+        change: The edit whose result the head gets.
+        head: Number of the head, counted from 0.
+        heads: Number of heads side by side in a token.
+    """
 
     change: TokenEdit
     head: int
@@ -182,7 +202,11 @@ class AddVector:
     vector: NDArray[np.float32]
 
     def __call__(self, site: Site, activation: "Tensor", where: TokenIndex) -> "Tensor":
-        """Return the activation plus the vector. Raises CaptureError for more tokens than vectors."""
+        """Return the activation plus the vector.
+
+        Raises:
+            CaptureError: For more tokens than vectors.
+        """
         import torch
 
         del site, where
@@ -207,14 +231,23 @@ class Identity:
 
 @dataclass(frozen=True)
 class DeclaredEdit:
-    """The change that an `Edit` declares. vector: (D,) or (T, D), None for `zero`. tokens: T, of every row."""
+    """The change that an `Edit` declares.
+
+    Attributes:
+        vector: The direction (D,) or source (T, D); None for `zero`.
+        tokens: The number T of tokens of every row.
+    """
 
     edit: Edit
     vector: NDArray[np.float32] | None
     tokens: int
 
     def __call__(self, site: Site, activation: "Tensor", where: TokenIndex) -> "Tensor":
-        """Raises UsageError for a vector of another shape."""
+        """Return the tokens after the declared change.
+
+        Raises:
+            UsageError: For a vector of another shape.
+        """
         import torch
 
         if self.vector is None:
@@ -235,7 +268,7 @@ class DeclaredEdit:
         return removed
 
     def _of_rows(self, other: "Tensor", activation: "Tensor", where: TokenIndex) -> "Tensor":
-        """(1, T', D): the source's tokens at positions that count through all rows of a batch."""
+        """Return the source's tokens (1, T', D) at positions that count through all rows of a batch."""
         import torch
 
         if isinstance(where, slice):
@@ -252,7 +285,7 @@ LOG_FIELDS = ("fires", "no_op_fires", "norm", "change", "largest_change")
 
 @dataclass(frozen=True)
 class LogEntry:
-    """One firing of an edit: tokens edited, their mean norm before, and how far they moved (mean, largest)."""
+    """A firing of an edit: tokens edited, their mean norm before, and how far they moved (mean, largest)."""
 
     site: str
     tokens: int
@@ -283,7 +316,7 @@ class EditLog:
         return sum(entry.largest == 0 for entry in self.entries)
 
     def row(self) -> NDArray[np.float64]:
-        """(5,) as stored, see `LOG_FIELDS`; `norm` and `change` are means over fires."""
+        """Return the log (5,) as stored, see `LOG_FIELDS`; `norm` and `change` are means over fires."""
         per = max(self.fires, 1)
         norm, moved = (sum(getattr(entry, name) for entry in self.entries) for name in ("norm", "moved"))
         largest = max((entry.largest for entry in self.entries), default=0.0)
@@ -295,6 +328,12 @@ def apply_patch(
     policy: "Policy", sites: Sequence[Site], tokens: TokenSelection, change: TokenEdit
 ) -> Iterator[EditLog]:
     """Change the tokens of some sites while the policy infers once, for one observation.
+
+    Args:
+        policy: The policy that infers inside the context.
+        sites: The sites that are changed, all in the same way.
+        tokens: The tokens that are changed at each site.
+        change: The change of these tokens.
 
     Raises:
         CaptureError: For another number of tokens, and what `hooks.edit` raises, such as for a site that fires
@@ -308,7 +347,7 @@ def apply_patch(
 def apply_patches(
     model: "Model", changes: Mapping[Site, Sequence[tuple[TokenSelection, TokenEdit]]]
 ) -> Iterator[EditLog]:
-    """The same at several sites, each with tokens and changes of its own, in their order."""
+    """Change several sites as `apply_patch` does, each with tokens and changes of its own, in their order."""
     from probe_kit.hooks.capturing.capture_context import edit
 
     log, active = EditLog(), _ActiveEdits()
@@ -323,9 +362,15 @@ def apply_edits(
 ) -> Iterator[EditLog]:
     """Apply `edits` while the model runs once on `observations`; several at one site act in their order.
 
+    Args:
+        model: The model that runs inside the context.
+        edits: The declared changes.
+        observations: The observations on which the model runs; the roles of their tokens say which tokens change.
+        vectors: The arrays that the edits name by their hash; None where no edit names one.
+
     Raises:
-        UsageError: For a vector that is missing, has another hash or does not fit.
-        UnknownSiteError: For a site without roles, and what `hooks.edit` raises.
+        UsageError: For a vector that is missing, has another hash or does not fit, and for a site without roles.
+        UnknownSiteError: For a site that the model does not have, and what `hooks.edit` raises.
     """
     roles, arrays = model.token_roles(observations), dict(vectors or {})
     changes: dict[Site, list[tuple[TokenSelection, TokenEdit]]] = defaultdict(list)
@@ -361,10 +406,13 @@ def _tokens(row: "Roles", roles: tuple[str, ...] | None) -> NDArray[np.bool_]:
 
 @dataclass
 class _ActiveEdits:
-    """Edits of one inference. fired: by firing the site and the tokens (1, T', D) before and after it.
+    """Edits of one inference.
 
     They are measured after the inference, all at once. An inference drives everything else out of the processor's
-    caches, so that every single call here costs ten times what it costs in a loop: they are few.
+    caches, so that every single call here costs ten times what it costs in a loop. Therefore they are few.
+
+    Attributes:
+        fired: By firing the site and the tokens (1, T', D) before and after it.
     """
 
     fired: "list[tuple[Site, Tensor, Tensor]]" = field(default_factory=list)
@@ -372,7 +420,11 @@ class _ActiveEdits:
     def apply(
         self, site: Site, changes: Sequence[tuple[TokenSelection, TokenEdit]], activation: "Tensor"
     ) -> "Tensor":
-        """(B, T, D) as it is to pass; the tokens of all rows are one sequence. Raises CaptureError for a shape."""
+        """Return the activation (B, T, D) as it is to pass; the tokens of all rows are one sequence.
+
+        Raises:
+            CaptureError: For a shape with another number of tokens.
+        """
         shape = activation.shape
         for number, (tokens, change) in enumerate(changes):
             if shape[0] * shape[1] != tokens.count:
@@ -397,7 +449,7 @@ class _ActiveEdits:
         return changed
 
     def measured(self) -> list[LogEntry]:
-        """An entry per firing. One transfer for those of one shape: a GPU waits at each."""
+        """Return an entry per firing, with one transfer for those of one shape: a GPU waits at each."""
         import torch
 
         by_shape: dict[torch.Size, list[int]] = {}

@@ -22,12 +22,21 @@ from probe_kit.hooks.contract.sites import HEADS, Site
 
 
 def project_heads(model: Model, cache: ActivationCache, site: Site | str) -> Tensor:
-    """(H, B, T, D): what the output projection makes of every head alone, without its bias.
+    """Return what the output projection makes of every head alone, without its bias.
+
+    The sum over heads, plus the bias, is the projection's output. That is the site `attention`, where the family
+    has no norm, scale or gate behind the projection.
 
     Args:
-        cache: Holds `site`, of the quantity `heads`. The sum over heads, plus the bias, is the projection's
-            output: the site `attention`, where the family has no norm, scale or gate behind the projection. Raises
-            UnknownSiteError for another quantity, or a site that was not captured.
+        model: The model whose activations the cache holds.
+        cache: The activations of one inference, with those of `site`.
+        site: A site of the quantity `heads`, or its name.
+
+    Returns:
+        (H, B, T, D), in the dtype and on the device of the captured activation.
+
+    Raises:
+        UnknownSiteError: For another quantity, or a site that was not captured.
     """
     heads_site = Site.parse(site) if isinstance(site, str) else site
     if heads_site.quantity != HEADS:
@@ -56,7 +65,7 @@ class LogitLens:
     Attributes:
         layers: (L,) of the residuals; the last one is the output of the model, if its last residual was captured.
         ids: (L, B, K) of tokens; the same tokens in every layer if they were given, else the likeliest first.
-        logits: As `ids`.
+        logits: (L, B, K) of these tokens.
     """
 
     layers: tuple[int, ...]
@@ -73,13 +82,16 @@ def logit_lens(
     stream: str = "",
     iteration: int | None = None,
 ) -> LogitLens:
-    """Final norm and head of the model, applied to every captured residual of one stream.
+    """Apply the final norm and head of the model to every captured residual of one stream.
 
     Args:
-        ids: Tokens whose logits are wanted; without, the k likeliest of every layer.
+        model: The model whose activations the cache holds.
+        cache: The activations of one inference, with residuals of the stream.
+        ids: Tokens whose logits are wanted; None takes the k likeliest of every layer.
+        k: Count of the likeliest tokens; without effect where `ids` are given.
         at: Position in the stream.
-        stream: Default the one whose last residual chooses tokens.
-        iteration: Of the stream; default the first.
+        stream: Name of the stream; "" takes the one whose last residual chooses tokens.
+        iteration: Iteration of the stream; None takes the first.
 
     Raises:
         UnsupportedInterventionError: For a model that puts out no tokens.

@@ -25,7 +25,7 @@ from probe_kit.models.bounds import check_sizes
 PATIENCE = 5.0
 """Seconds without a reply after which the hub counts as unreachable."""
 OFFLINE_WAY_OUT = "Connect to the network once, or fill the cache with `hf download`"
-"""What to do where the hub cannot be asked."""
+"""The advice where the hub cannot be asked."""
 _WITHOUT_NETWORK = ContextVar("without_network", default=False)
 
 
@@ -40,7 +40,7 @@ def without_network() -> Iterator[None]:
 
 
 def unreachable() -> str:
-    """Why the hub cannot be asked now; empty if it answers, whatever it says.
+    """Return why the hub cannot be asked now; empty if it answers, whatever it says.
 
     A proxy that the environment names is used. Nothing is sent when the hub's own offline mode is on.
     """
@@ -73,7 +73,7 @@ def _silence(address: str) -> str:
 
 
 def hub_reason(error: Exception) -> str:
-    """Why the hub delivers nothing, in words: its client reports several reasons by one exception."""
+    """Return why the hub delivers nothing, in words: its client reports several reasons by one exception."""
     from huggingface_hub import errors, get_token
 
     cause = _cause(error)
@@ -177,11 +177,11 @@ _WEIGHTS = ("model.safetensors", "model-", "adapter_model", "pytorch_model")
 _CONFIGURATIONS = ("*config*.json", "dims.json", "*.yaml", "*.yml")
 PATTERNS = ("*.json", "*.safetensors", "*.model", "*.txt", "*.jinja")
 SMALL_FILES = ("*.json", "*.model", "*.txt", "*.jinja", "adapter_model.safetensors")
-"""Those of them that hold no weights, but for an adapter's."""
+"""The patterns of files that hold no weights, but for an adapter's."""
 COMMIT_DIGITS = 40
-"""Of a commit's full name."""
+"""The number of digits of a commit's full name."""
 RUN_WEIGHTS = "checkpoints/latest-checkpoint.pt"
-"""Where a folder of a training run of Prismatic keeps its weights."""
+"""The file in which a folder of a training run of Prismatic keeps its weights."""
 
 
 class NotCachedError(LookupError):
@@ -189,7 +189,12 @@ class NotCachedError(LookupError):
 
 
 class HubName(NamedTuple):
-    """A checkpoint on the hub. folder: inside the repository; revision: branch, tag or commit; empty for none."""
+    """A checkpoint on the hub.
+
+    Attributes:
+        folder: Folder inside the repository; empty for none.
+        revision: Branch, tag or commit; empty for none.
+    """
 
     repository: str
     folder: str = ""
@@ -197,7 +202,7 @@ class HubName(NamedTuple):
 
 
 def hub_name(checkpoint: str) -> HubName | None:
-    """The parts of `owner/repo`, `owner/repo/folder` and either with `@revision`; None for what is no hub id."""
+    """Return the parts of `owner/repo`, `owner/repo/folder` and either with `@revision`; None for other text."""
     name, at, revision = checkpoint.partition("@")
     parts = name.split("/")
     if (
@@ -211,21 +216,27 @@ def hub_name(checkpoint: str) -> HubName | None:
 
 
 def without_revision(checkpoint: str | None) -> str | None:
-    """A hub id without its revision; anything else as it is."""
+    """Return a hub id without its revision; anything else as it is."""
     if checkpoint is None or not is_on_hub(checkpoint):
         return checkpoint
     return checkpoint.partition("@")[0]
 
 
 def pinned(checkpoint: str) -> str:
-    """A hub id with the commit that the cache has of its revision; anything else as it is. Asks no network."""
+    """Return a hub id with the commit that the cache has of its revision; anything else as it is.
+
+    Asks no network.
+    """
     parts = hub_name(checkpoint) if is_on_hub(checkpoint) else None
     snapshot = None if parts is None else _snapshot(parts)
     return checkpoint if snapshot is None else f"{without_revision(checkpoint)}@{snapshot.name}"
 
 
 def cached_folder(checkpoint: str) -> Path | None:
-    """The folder of a hub id in the hub's cache; None where it has nothing of it. Asks no network."""
+    """The folder of a hub id in the hub's cache; None where it has nothing of it.
+
+    Asks no network.
+    """
     parts = hub_name(checkpoint) if is_on_hub(checkpoint) else None
     snapshot = None if parts is None else _snapshot(parts)
     if parts is None or snapshot is None:
@@ -266,12 +277,14 @@ def is_on_hub(checkpoint: str) -> bool:
 
 
 def plain_folder(checkpoint: str, patterns: Sequence[str] = PATTERNS) -> Path:
-    """The local folder of a folder path or hub id such as `lerobot/pi0_base`, or `owner/repo/folder` for one model
+    """The local folder of a folder path or hub id.
 
-    of a repository that holds several; `@revision` behind it names a branch, a tag or a commit.
+    A hub id is a name such as `lerobot/pi0_base`, or `owner/repo/folder` for one model of a repository that holds
+    several. `@revision` behind it names a branch, a tag or a commit.
 
     Args:
-        patterns: Which files of a hub repository, or of its folder, are needed; no others are downloaded.
+        checkpoint: Folder path or hub id.
+        patterns: The files of a hub repository, or of its folder, that are needed; no others are downloaded.
 
     Raises:
         CheckpointError: If the folder is not there or the hub cannot deliver it.
@@ -286,7 +299,11 @@ def plain_folder(checkpoint: str, patterns: Sequence[str] = PATTERNS) -> Path:
 
 
 def _fetched(checkpoint: str, patterns: Sequence[str]) -> Path:
-    """The folder of a hub id, of which the cache has a copy then. Raises CheckpointError."""
+    """The folder of a hub id, of which the cache has a copy then.
+
+    Raises:
+        CheckpointError: If the hub cannot deliver it and the cache has no copy.
+    """
     parts = hub_name(checkpoint)
     if parts is None:
         raise CheckpointError(_not_here(checkpoint))
@@ -312,7 +329,11 @@ def _with_pin(parts: HubName) -> HubName:
 
 
 def _downloaded(checkpoint: str, parts: HubName, patterns: Sequence[str]) -> Path:
-    """The folder of a commit, with the files of these patterns. Raises CheckpointError."""
+    """The folder of a commit, with the files of these patterns.
+
+    Raises:
+        CheckpointError: If the hub cannot deliver it.
+    """
     from huggingface_hub import snapshot_download
     from huggingface_hub.errors import HfHubHTTPError, LocalEntryNotFoundError, RepositoryNotFoundError
 
@@ -338,12 +359,12 @@ def _not_here(checkpoint: str) -> str:
 
 
 def hub_files(checkpoint: str) -> list[str]:
-    """Paths of the files of a hub id, sorted: as the hub lists them, or as the cache has them out of its reach.
+    """Return paths of the files of a hub id, sorted: as the hub lists them, or as the cache has them offline.
 
     Of `owner/repo/folder`, below that folder. Nothing is downloaded.
 
     Raises:
-        CheckpointError: For what is no hub id, and for a repository that neither has.
+        CheckpointError: For a text that is no hub id, and for a repository that neither has.
     """
     parts = hub_name(checkpoint)
     if parts is None:
@@ -367,13 +388,13 @@ def hub_files(checkpoint: str) -> list[str]:
 
 
 def _possible(folder: Path) -> Path:
-    """The folder, if its files can be read and no configuration asks for a network beyond all sizes.
+    """Return the folder, if its files can be read and no configuration asks for a network beyond all sizes.
 
-    A configuration that is none is left to its loader, which names it.
+    A configuration that cannot be read as JSON or YAML is left to its loader, which names it.
 
     Raises:
-        CheckpointError: For those, and for a file beside the weights that is a pipe, a device or huge: libraries
-            read such files without a bound.
+        CheckpointError: For a network beyond all sizes, and for a file beside the weights that is a pipe, a device
+            or huge. Libraries read such files without a bound.
     """
     for file in sorted(path for pattern in ("*", "*/*") for path in folder.glob(pattern)):
         if file.suffix in _READ and not file.is_dir() and file.exists():
@@ -393,18 +414,27 @@ def _possible(folder: Path) -> Path:
 
 
 def _content(file: Path) -> Any:
-    """Raises ValueError for what is not JSON or YAML."""
+    """The content of a JSON or YAML file.
+
+    Raises:
+        ValueError: For a file that is neither.
+    """
     if file.suffix == ".json":
         return load_json(file)
     return load_yaml(file)
 
 
 def chosen_dtype(requested: str | None, stored: object, offered: Collection[str]) -> str:
-    """The dtype that was asked for, or else what a checkpoint's configuration says; float32 where neither does.
+    """Return the dtype that was asked for, or else what a checkpoint's configuration says; float32 without either.
+
+    Args:
+        requested: The dtype that was asked for; None for none.
+        stored: The entry of the configuration; None or "" where it has none.
+        offered: The dtypes that the family can run in.
 
     Raises:
-        UsageError: For another one that was asked for.
-        CheckpointError: For one that is stored.
+        UsageError: For a requested dtype that is not offered.
+        CheckpointError: For a stored dtype that is not offered.
     """
     if requested is not None:
         if requested not in offered:
@@ -419,10 +449,9 @@ def chosen_dtype(requested: str | None, stored: object, offered: Collection[str]
 
 
 def side_files(folder: Path, prefix: str = "") -> dict[str, Path]:
-    """The files of `folder` besides weights and documents, by name: all that a loader may read there.
+    """Return the files of `folder` besides weights and documents, by name: all that a loader may read there.
 
-    Args:
-        prefix: Put before every name, to tell folders apart.
+    `prefix` is put before every name, to tell folders apart.
     """
     return {
         f"{prefix}{path.name}": path
@@ -437,19 +466,27 @@ def is_weights(path: Path) -> bool:
 
 
 def content_hashes(files: Mapping[str, Path]) -> dict[str, str]:
-    """`file <name>` → sha256 of its bytes, for `Card.settings`: where a checkpoint lies does not matter."""
+    """Return `file <name>` → sha256 of its bytes, for `ModelCard.settings`: a checkpoint's place has no effect."""
     return {f"file {name}": hashlib.sha256(read_regular(path)).hexdigest() for name, path in files.items()}
 
 
 def shard_name(name: object) -> str:
-    """A file's name as an index gives it. Raises ValueError for a path: shards lie beside their index."""
+    """Return a file's name as an index gives it.
+
+    Raises:
+        ValueError: For a path: shards lie beside their index.
+    """
     if not isinstance(name, str) or name in ("", ".", "..") or Path(name).name != name or "\\" in name:
         raise ValueError(f"{name!r} is no name of a file beside it")
     return name
 
 
 def listed_shards(index: Path) -> list[str]:
-    """Names of the files that an index of shards lists, sorted. Raises ValueError for one that is none."""
+    """Return the names of the files that an index of shards lists, sorted.
+
+    Raises:
+        ValueError: For a file that is no index of shards.
+    """
     try:
         return sorted({shard_name(name) for name in load_json(index)["weight_map"].values()})
     except (OSError, KeyError, TypeError, AttributeError) as error:
@@ -479,7 +516,7 @@ def check_unambiguous(folder: Path) -> None:
 
 
 def missing_bytes(folder: Path) -> int | None:
-    """Bytes of the weights that an index of shards lists and the folder lacks; None where no index says it.
+    """Return the bytes of weights that an index of shards lists and the folder lacks; None where no index says it.
 
     An index has the size of all tensors, `total_size`.
     """

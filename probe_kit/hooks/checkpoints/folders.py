@@ -32,19 +32,24 @@ _WITHOUT_EFFECT = (
     "lora_dropout", "layers_to_transform", "layers_pattern", "megatron_core", "qalora_group_size",
     "runtime_config", "eva_config", "loftq_config", "velora_config",
 )  # fmt: skip
-"""Training, speed, and rules for choosing modules: the tensors themselves say which modules they change."""
+"""Fields of training, speed, and rules for choosing modules: the tensors themselves say which ones they change."""
 _INERT: Mapping[str, tuple[Any, ...]] = {
     "init_lora_weights": (True, False, None, "gaussian", "eva", "orthogonal"),
     "revision": (None, "", "main"),
 }
 """Fields with the values under which a merge is exact. Other initialisations change the base's weights."""
 _NOTHING: tuple[Any, ...] = (None, False, "", [], {})
-"""What switches every other field off."""
+"""The values that switch every other field off."""
 
 
 @dataclass(frozen=True)
 class AdapterFiles:
-    """A LoRA adapter. settings: of its `adapter_config.json`. weights: the file of its tensors."""
+    """A LoRA adapter in a folder.
+
+    Attributes:
+        settings: The content of its `adapter_config.json`.
+        weights: The file of its tensors.
+    """
 
     folder: Path
     settings: Mapping[str, Any]
@@ -58,8 +63,7 @@ class AdapterFiles:
     def base_folder(self, patterns: Sequence[str] = PATTERNS) -> Path:
         """The folder of the base's checkpoint; a relative path may start at the adapter.
 
-        Args:
-            patterns: The files that are needed of a base on the hub.
+        `patterns` are the files that are needed of a base on the hub.
 
         Raises:
             CheckpointError: If it is not there, or is an adapter itself.
@@ -79,7 +83,11 @@ def with_adapters_named(text: str) -> str:
 
 
 def base_folder_of(folder: Path, settings: Mapping[str, Any], patterns: Sequence[str] = PATTERNS) -> Path:
-    """The folder of the base of the adapter in `folder`, with these settings; see `AdapterFiles.base_folder`."""
+    """The folder of the base of the adapter in `folder`, with these settings; see `AdapterFiles.base_folder`.
+
+    Raises:
+        CheckpointError: If it is not there, or is an adapter itself.
+    """
     base = str(settings["base_model_name_or_path"])
     sibling = folder / base
     try:
@@ -100,7 +108,11 @@ def base_folder_of(folder: Path, settings: Mapping[str, Any], patterns: Sequence
 
 
 def adapter_settings(file: Path) -> dict[str, Any]:
-    """The content of an `adapter_config.json` of an adapter that can be merged. Raises CheckpointError."""
+    """The content of an `adapter_config.json` of an adapter that can be merged.
+
+    Raises:
+        CheckpointError: For a file that cannot be read, and for an adapter that cannot be merged exactly.
+    """
     settings = dict(read_json_object(file, CheckpointError, "Download the adapter again"))
     _check_settings(file, settings)
     return settings
@@ -110,8 +122,8 @@ def adapter_in(folder: Path) -> AdapterFiles | None:
     """The LoRA adapter in a checkpoint's folder; None where there is none.
 
     Raises:
-        CheckpointError: For an adapter that cannot be merged exactly, for one of which a file is missing, and for
-            weights beside it of which no file says whether they are the base's or merged.
+        CheckpointError: For an adapter that cannot be merged exactly, for one that lacks a file, and for weights
+            beside it that may be the base's or merged.
     """
     folder = _JOINED.get(str(folder), folder)
     file = folder / ADAPTER_FILE
@@ -185,7 +197,7 @@ def _check_own_base(adapter: AdapterFiles) -> None:
 # -- folders --------------------------------------------------------------------------------------------------
 
 CONFIGURATIONS = (CONFIG_FILE, "config.yaml")
-"""Either holds the configuration of a network."""
+"""The files that can hold the configuration of a network; one of them does."""
 _READ_TOGETHER = (
     (("policy_preprocessor.json",), ("policy_preprocessor",)),
     (("policy_postprocessor.json",), ("policy_postprocessor",)),
@@ -196,7 +208,7 @@ _READ_TOGETHER = (
 )
 """Files that decide, with the beginnings of names that are read with them: of the adapter alone or its base."""
 _BESIDE = ("dims.json", "tokenizer")
-"""What some layouts keep beside the folder of a checkpoint."""
+"""The names that some layouts keep beside the folder of a checkpoint."""
 _RUNS = "checkpoints"
 _DONE: dict[tuple[object, ...], Path] = {}
 
@@ -204,9 +216,12 @@ _DONE: dict[tuple[object, ...], Path] = {}
 def checkpoint_folder(checkpoint: str, patterns: Sequence[str] = PATTERNS) -> Path:
     """The folder of a checkpoint, by path or hub id; that of an adapter alone is joined with its base's files.
 
+    A file of the adapter replaces the base's, so its statistics win. The joined folder holds links and is removed
+    at the end of the process.
+
     Args:
-        patterns: See `plain_folder`; also of a base on the hub. A file of the adapter replaces the base's, so its
-            statistics win. The joined folder holds links and is removed at the end of the process.
+        checkpoint: Folder path or hub id.
+        patterns: The files that are needed of a hub repository, see `plain_folder`; also of a base on the hub.
 
     Raises:
         CheckpointError: As `plain_folder` does, and for a base that is not there or has no configuration either.
@@ -229,10 +244,15 @@ def checkpoint_folder(checkpoint: str, patterns: Sequence[str] = PATTERNS) -> Pa
 
 
 def inside_or_hub(folder: Path, name: str, patterns: Sequence[str] = SMALL_FILES) -> Path:
-    """The folder that a checkpoint names: inside its own, anywhere, or on the hub. patterns: the files to fetch.
+    """The folder that a checkpoint names: inside its own, anywhere, or on the hub.
+
+    Args:
+        folder: The folder of the checkpoint.
+        name: The name that the checkpoint gives: a folder inside its own, a path or a hub id.
+        patterns: The files to fetch.
 
     Raises:
-        CheckpointError: For one that is not there.
+        CheckpointError: For a folder that is not there.
     """
     inside = folder / name
     return inside if inside.is_dir() else checkpoint_folder(name, patterns)
@@ -255,7 +275,7 @@ def _existing(folder: Path) -> Iterable[Path]:
 
 
 def _join(folder: Path, base: Path) -> Path:
-    """A new folder of links, with the name that the adapter's has."""
+    """Return a new folder of links, with the name that the adapter's has."""
     root = Path(tempfile.mkdtemp(prefix="probe-kit-adapter-"))
     atexit.register(shutil.rmtree, root, ignore_errors=True)
     joined = root / (folder.resolve().name or "adapter")
@@ -290,12 +310,13 @@ def _is_replaced(name: str, adapter_names: Sequence[str]) -> bool:
 def check_files(
     folder: Path, types: Sequence[str], weights: bool = True, instead: Sequence[tuple[str, str]] = ()
 ) -> None:
-    """Look at what can be wrong with a checkpoint before anything heavy is imported.
+    """Check what can be wrong with a checkpoint before anything heavy is imported.
 
     Args:
-        types: What `type` or `model_type` of its config may be.
-        weights: Whether its weights will be read. instead: for other types that people may take for one of them,
-            what to do.
+        folder: The folder of the checkpoint.
+        types: The values that `type` or `model_type` of its config may have.
+        weights: Whether its weights will be read.
+        instead: For other types that people may take for one of them, what to do.
 
     Raises:
         CheckpointError: For a missing or unreadable config or one of another model, and for a LoRA adapter that
@@ -330,7 +351,7 @@ def _type_of(config: Any) -> Any:
 
 
 def _way_to_weights(folder: Path) -> str:
-    """Advice where weights are missing; an adapter in a folder below is no weights of this one."""
+    """Return advice where weights are missing; an adapter in a folder below is no weights of this one."""
     if is_in_cache(folder):
         return (
             "Either the repository lacks them, or its copy in the cache is incomplete: compare with the files on "

@@ -32,7 +32,10 @@ _ENDING = (signal.SIGINT, signal.SIGTERM)
 
 
 class Interruptions:
-    """Interruptions of this process while a policy worked, as policies can raise KeyboardInterrupt themselves."""
+    """A record of interruptions of this process while a policy worked.
+
+    It tells them from a KeyboardInterrupt that the policy raises itself.
+    """
 
     def __init__(self) -> None:
         self.asked = False
@@ -42,9 +45,10 @@ class Interruptions:
 def contained(limit: float | None = None) -> Iterator[Interruptions]:
     """Run a policy's code in the body; afterwards this process is as it was.
 
+    A process that the body forked ends here: it would play on beside its parent, into the same run.
+
     Args:
-        limit: Seconds after which the process is ended by SIGALRM, which no code can hold up; None for no limit. A
-            process that the body forked ends here: it would play on beside its parent, into the same run.
+        limit: Seconds after which the process is ended by SIGALRM, which no code can hold up; None for no limit.
     """
     process = os.getpid()
     try:
@@ -66,7 +70,7 @@ def contained(limit: float | None = None) -> Iterator[Interruptions]:
 def begin_randomness(seed: int) -> None:
     """Let the global random numbers of Python, NumPy and torch begin at `seed` (63 bits).
 
-    So a policy that draws from them depends on its episodes alone, and not on what was played before.
+    A policy that draws from them then depends on its episodes alone, and not on what was played before.
     """
     import torch
 
@@ -76,7 +80,7 @@ def begin_randomness(seed: int) -> None:
 
 
 def copied(observations: Sequence[Observation]) -> list[Observation]:
-    """Observations whose arrays may be written to: those of the stage stay as they are."""
+    """Return observations whose arrays may be written to: those of the stage stay as they are."""
     return [
         replace(
             observation,
@@ -108,7 +112,7 @@ def _kept_randomness() -> Iterator[None]:
 
 @contextmanager
 def _kept_surroundings() -> Iterator[None]:
-    """Torch's default dtype, the working directory and the environment variables."""
+    """Restore torch's default dtype, the working directory and the environment variables after the body."""
     import torch
 
     dtype, folder, variables = torch.get_default_dtype(), os.open(".", os.O_RDONLY), dict(os.environ)
@@ -124,7 +128,7 @@ def _kept_surroundings() -> Iterator[None]:
 
 
 class _Quoted(TextIOBase):
-    """Writes to another stream, what a terminal would obey as visible signs."""
+    """Writes to another stream; control characters that a terminal would obey become visible signs."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -191,7 +195,7 @@ _LONGEST = 300
 def naming_checkpoint(model: str, location: str) -> Iterator[None]:
     """Put the model and the checkpoint's folder or hub id into the body's errors about weights, files and words.
 
-    What a message already names is not said twice.
+    A name that a message holds already is not repeated.
     """
     try:
         yield
@@ -215,11 +219,15 @@ def with_origin(reason: str, model: str, location: str) -> str:
 
 @contextmanager
 def while_acting(model: str, location: str, limit: float | None = None) -> Iterator[None]:
-    """Errors of a policy's code in the body. Raises PolicyFailedError naming the model, or an error of ours.
+    """Turn errors of a policy's code in the body into errors of ours.
 
     Args:
-        location: Where its checkpoint lies, for what is found out about it this late.
-        limit: As `contained` has it.
+        model: Name of the model.
+        location: The place of its checkpoint, for errors of the checkpoint that show this late.
+        limit: Seconds after which the process is ended, as in `contained`; None for no limit.
+
+    Raises:
+        PolicyFailedError: For any error but one of ours, which is raised as it is; it names the model.
     """
     with contained(limit) as interruptions:
         try:
@@ -238,9 +246,15 @@ def while_acting(model: str, location: str, limit: float | None = None) -> Itera
 
 @contextmanager
 def while_loading(model: str, location: str) -> Iterator[None]:
-    """Errors of a loader's code in the body. Raises CheckpointError naming model and checkpoint, or one of ours.
+    """Turn errors of a loader's code in the body into errors of ours.
 
-    A loader that ends the process raises PolicyFailedError.
+    Args:
+        model: Name of the model.
+        location: The folder or hub id of its checkpoint.
+
+    Raises:
+        CheckpointError: For any error but one of ours, which is raised as it is; it names model and checkpoint.
+        PolicyFailedError: For a loader that ends the process.
     """
     try:
         with _said_when_asked_for("bitsandbytes"), naming_checkpoint(model, location):
@@ -258,7 +272,10 @@ def while_loading(model: str, location: str) -> Iterator[None]:
 
 @contextmanager
 def _said_when_asked_for(library: str) -> Iterator[None]:
-    """No warnings of a library that others import wherever it is installed; who asks for it gets its errors."""
+    """Silence the warnings of a library that others import wherever it is installed.
+
+    Code that asks for the library gets its errors.
+    """
     logger = logging.getLogger(library)
     before = logger.level
     logger.setLevel(logging.ERROR)
@@ -269,7 +286,7 @@ def _said_when_asked_for(library: str) -> Iterator[None]:
 
 
 def in_words(error: BaseException) -> str:
-    """Class and first line."""
+    """Return the class and the first line of an error."""
     if isinstance(error, SystemExit):
         return f"it called sys.exit({error.code!r})"
     first = (str(error).strip().splitlines() or ["no message"])[0]

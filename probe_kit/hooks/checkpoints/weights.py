@@ -37,7 +37,7 @@ class Adapter:
 
     @property
     def folder(self) -> Path:
-        """Its folder."""
+        """The folder of the adapter."""
         return self.files.folder
 
     @property
@@ -48,7 +48,7 @@ class Adapter:
     def merged(
         self, module: nn.Module, tensors: Mapping[str, Tensor], name_in_module: Callable[[str], str] = str
     ) -> dict[str, Tensor]:
-        """`tensors` with the adapter in them: W + s B A in float32, rounded once to the weight's own dtype.
+        """Return `tensors` with the adapter in them: W + s B A in float32, rounded once to the weight's own dtype.
 
         Args:
             module: The network that they belong to, on any device; it stays as it is.
@@ -81,7 +81,11 @@ class Adapter:
         return merged
 
     def _sorted(self) -> tuple[dict[str, dict[str, Tensor]], dict[str, Tensor]]:
-        """Low-rank factors per module, and whole tensors that replace the base's. Raises WeightsError."""
+        """Return low-rank factors per module, and whole tensors that replace the base's.
+
+        Raises:
+            WeightsError: For tensors that are neither, NaN or infinite ones, and ones that are missing.
+        """
         if damaged := [name for name, tensor in self.tensors.items() if not torch.isfinite(tensor).all()]:
             raise WeightsError(f"{self.folder}: NaN or infinite tensors in the adapter: {_few(damaged)}")
         factors: dict[str, dict[str, Tensor]] = {}
@@ -166,17 +170,18 @@ RANDOM_MARK = "probe_kit.weights"
 _WRAPPERS = (
     "_orig_mod", "_fsdp_wrapped_module", "_checkpoint_wrapped_module", "_forward_module", "_ddp_module", "module",
 )  # fmt: skip
-"""What torch.compile, FSDP, activation checkpoints, DeepSpeed, lightning and DDP call the module inside them."""
+"""The names that torch.compile, FSDP, activation checkpoints, DeepSpeed, lightning and DDP give to a module."""
 _FEWEST = 2
-"""Names that can have something in common."""
+"""The smallest number of names that can have something in common."""
 
 
 @dataclass(frozen=True)
 class Weights:
-    """The tensors of a checkpoint as its files hold them; `random`: the weights are untrained.
+    """The tensors of a checkpoint as its files hold them.
 
     Attributes:
-        adapter: What `load_weights` merges into them, if anything.
+        random: Whether the weights are untrained.
+        adapter: The adapter that `load_weights` merges into them; None for none.
     """
 
     tensors: Mapping[str, Tensor]
@@ -185,10 +190,10 @@ class Weights:
     adapter: Adapter | None = None
 
     def sha256(self) -> str:
-        """Hex sha256 over (name, dtype, shape, bytes) of every tensor, in name order.
+        """Return the hex sha256 over (name, dtype, shape, bytes) of every tensor, in name order.
 
-        Of base and adapter where there is one, and over the settings that scale what it adds: their merge is
-        rounded, and its last bits may differ between machines.
+        Where there is an adapter, it is over the tensors of base and adapter, and over the settings that scale
+        what the adapter adds. Their merge is rounded, and its last bits may differ between machines.
         """
         digest = hashlib.sha256()
         tensors = dict(self.tensors)
@@ -207,7 +212,7 @@ class WeightsAudit:
     """The result of loading: `tensors` in the model equal the file, the `allowed_missing` ones do not.
 
     Attributes:
-        adapter: What was merged into the file's tensors, in words; empty for nothing.
+        adapter: The adapter that was merged into the file's tensors, in words; empty for none.
     """
 
     sha256: str
@@ -218,17 +223,18 @@ class WeightsAudit:
     adapter: str = ""
 
     def to_json(self) -> dict[str, Any]:
-        """The audit as stored with a run."""
+        """Return the audit as stored with a run."""
         return asdict(self)
 
 
 def read_weights(folder: Path, unlisted: Iterable[str] = ()) -> Weights:
     """Read `model.safetensors`, every shard of `model.safetensors.index.json`, or the only `.pt` file.
 
-    Of a LoRA adapter its tensors and those of its base, which `load_weights` merges. A `.pt` file is read with
-    `weights_only=True`: it cannot run code.
+    Of a LoRA adapter its tensors and those of its base are read, which `load_weights` merges. A `.pt` file is read
+    with `weights_only=True`: it cannot run code.
 
     Args:
+        folder: The folder of the checkpoint or of the adapter.
         unlisted: Tensors that shards may hold although the index does not name them.
 
     Raises:
@@ -243,7 +249,11 @@ def read_weights(folder: Path, unlisted: Iterable[str] = ()) -> Weights:
 
 
 def with_adapter(base: Weights, files: AdapterFiles) -> Weights:
-    """The base's weights with an adapter to be merged. Raises WeightsError if its file cannot be read."""
+    """Return the base's weights with an adapter to be merged.
+
+    Raises:
+        WeightsError: If the adapter's file cannot be read.
+    """
     path = files.weights
     if path.suffix == ".bin":
         tensors = dict(read_pickle(path).tensors)
@@ -305,7 +315,7 @@ def _read_file(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
 _KINDS = (
     torch.float64, torch.float32, torch.float16, torch.bfloat16, torch.int64, torch.int32, torch.uint8, torch.bool
 )  # fmt: skip
-"""What weights, and buffers such as positions and masks, are made of."""
+"""The dtypes of weights, and of buffers such as positions and masks."""
 
 
 def check_kinds(tensors: Mapping[str, Tensor], path: Path) -> None:
@@ -319,7 +329,11 @@ def check_kinds(tensors: Mapping[str, Tensor], path: Path) -> None:
 
 
 def unpickled(path: Path) -> Any:
-    """The content of a `.pt` file, read with `weights_only=True`: it cannot run code. Raises WeightsError."""
+    """The content of a `.pt` file, read with `weights_only=True`: it cannot run code.
+
+    Raises:
+        WeightsError: For a file that cannot be read as plain tensors, or holds them compressed.
+    """
     _check_not_compressed(path)
     try:
         return torch.load(path, map_location="cpu", weights_only=True)
@@ -343,7 +357,11 @@ def _check_not_compressed(path: Path) -> None:
 
 
 def read_pickle(path: Path) -> Weights:
-    """Read the state dict in one `.pt` file; see `unpickled`. Raises WeightsError if it is none."""
+    """Read the state dict in one `.pt` file; see `unpickled`.
+
+    Raises:
+        WeightsError: If the file holds no state dict.
+    """
     content = unpickled(path)
     if not isinstance(content, dict) or not all(isinstance(value, Tensor) for value in content.values()):
         raise WeightsError(
@@ -364,6 +382,7 @@ def load_weights(
     """Copy `tensors` into `module` and prove that they arrived.
 
     Args:
+        module: The network, on any device.
         weights: The files, which give the audit its hash.
         tensors: The same content under the module's names.
         allowed_missing: Parameters that inference never reads and the file may lack.
@@ -432,8 +451,8 @@ def _refuse_wrapped(weights: Weights, tensors: Mapping[str, Tensor], state: Mapp
 def _wrapper(stored: Sequence[str], model: Sequence[str]) -> str:
     """The prefix that stands in the names of a file and in none of the model's; empty where there is none.
 
-    Wrappers of torch and of training libraries put their name before all names or between their parts; a module
-    of a larger one has the name that it has there in front.
+    Wrappers of torch and of training libraries put their name before all names or between their parts. A module of
+    a larger one has the name that it has there in front.
     """
     common = _common_path(stored) if len(stored) >= _FEWEST else ""
     if common and not any(name.startswith(f"{common.partition('.')[0]}.") for name in model):

@@ -81,7 +81,7 @@ def a_far_longer_neighbour_changes_nothing(subject: AnswerSubject) -> None:
     "Build the prompt without picture positions where `Prompt.pictured` is False; keep no state between calls.",
 )
 def without_a_picture_nothing_of_it_is_left(subject: AnswerSubject) -> None:
-    """Also right behind questions about pictures: no state may stay from call to call."""
+    """Check it also right behind questions about pictures: no state may stay from call to call."""
     in_words_alone = [replace(question, pictured=False) for question in subject.questions_of_batch]
     other = [
         replace(question, observation=replace(question.observation, image=255 - question.observation.image))

@@ -355,7 +355,11 @@ def the_last_row_of_the_logit_lens_is_the_output(subject: Subject) -> None:
 
 
 def _streams_with_heads(subject: Subject) -> list[Stream]:
-    """Raises SkipTest if there are none."""
+    """Return the streams that declare heads.
+
+    Raises:
+        SkipTest: If there are none.
+    """
     streams = [stream for stream in subject.model.every_stream().values() if stream.heads]
     if not streams:
         raise SkipTest(f"{subject.model.card.family} declares no heads")
@@ -429,7 +433,7 @@ def another_instruction_moves_language_positions_only(subject: Subject) -> None:
 
 
 def _alike(subject: Subject, candidates: Sequence[Observation]) -> tuple[Observation, Observation]:
-    """The first two whose instructions have equally many tokens."""
+    """Return the first two observations whose instructions have equally many tokens."""
     name = subject.probed_backbone.name
     for observation, other in combinations(candidates, 2):
         if (
@@ -446,7 +450,7 @@ def _alike(subject: Subject, candidates: Sequence[Observation]) -> tuple[Observa
 
 
 def _require_moves(subject: Subject, first: Observation, second: Observation, role: str) -> None:
-    """Between two observations with the same roles, only the embeddings of `role` differ, and some do."""
+    """Check that between two observations with the same roles, only embeddings of `role` differ, and some do."""
     stream = subject.probed_backbone
     before: Roles = subject.roles_of([first])[stream.name][0]
     site, embeddings = stream.sites()[0], []

@@ -1,4 +1,4 @@
-"""One check of the contract; how it fails: what was seen, expected and to be changed; and what came of it."""
+"""One check of the contract, and its outcome: what was seen, what was expected and what is to be changed."""
 
 import os
 import traceback
@@ -34,9 +34,9 @@ class CheckFailedError(AssertionError):
     """An adapter does not do what a check expects.
 
     Args:
-        actual: In words.
-        expected: As `actual`.
-        change: What to do; empty where the advice of the check itself fits.
+        actual: The behaviour that was seen, in words.
+        expected: The behaviour that was expected, in words.
+        change: Advice on what to do; empty where the advice of the check itself fits.
     """
 
     def __init__(self, actual: str, expected: str, change: str = "") -> None:
@@ -49,9 +49,9 @@ class Check:
     """A promise that every adapter keeps.
 
     Attributes:
-        name: Of the function.
+        name: Name of the function.
         sentence: The promise.
-        change: Where to look in an adapter that does not keep it.
+        change: The place to look at in an adapter that does not keep it.
         body: Takes a `Subject`; raises CheckFailedError, or SkipTest where the promise is not about this adapter.
     """
 
@@ -64,7 +64,7 @@ class Check:
         return self.name
 
     def __call__(self, subject: Any) -> None:
-        """Check a `Subject`. Raises as `body` does, and whatever the adapter raises."""
+        """Check a `Subject`; raises as `body` does, and whatever the adapter raises."""
         try:
             self.body(subject)
         except CheckFailedError as failed:
@@ -94,7 +94,7 @@ def require(condition: bool, actual: str, expected: str, change: str = "") -> No
 
 
 def require_bits(actual: NDArray[Any], expected: NDArray[Any], name: str, like: str) -> None:
-    """Raise CheckFailedError unless two arrays are equal, bit for bit. name, like: what they are."""
+    """Raise CheckFailedError unless two arrays are equal, bit for bit; `name` and `like` say what they are."""
     if np.array_equal(actual, expected, equal_nan=True):
         return
     if actual.shape != expected.shape:
@@ -137,10 +137,10 @@ class Outcome:
 
     Attributes:
         sentence: The promise that was checked.
-        actual: Of a failure, in words.
-        expected: As `actual`.
-        change: As `actual`.
-        reason: Of a skip.
+        actual: The behaviour that was seen, in words; "" for a check that did not fail.
+        expected: The behaviour that was expected, in words; "" for a check that did not fail.
+        change: Advice on what to change; "" for a check that did not fail.
+        reason: The reason of a skip; "" for a check that was not skipped.
     """
 
     name: str
@@ -157,10 +157,16 @@ class Outcome:
 
 
 def tried(name: str, sentence: str, change: str, body: Callable[[], object], package: str) -> Outcome:
-    """Run a check; whatever the adapter raises is a failure. Ctrl-C is raised.
+    """Run a check; whatever the adapter raises is a failure.
+
+    Ctrl-C is raised. Changes of the adapter in this process are put back.
 
     Args:
-        package: Of the adapter, to name the place of its error. What it changes in this process is put back.
+        name: Name of the check.
+        sentence: The promise that is checked.
+        change: Advice on what to change, where the failure brings none of its own.
+        body: Runs the check.
+        package: Package of the adapter, to name the place of its error.
     """
     try:
         with contained() as interruptions:
@@ -177,7 +183,7 @@ def tried(name: str, sentence: str, change: str, body: Callable[[], object], pac
 
 
 def _in_words(error: BaseException, package: str) -> str:
-    """All of an error of ours, the first line of any other, and the line of the adapter that it passed."""
+    """Return the whole text of an error of ours, the first line of any other, and the adapter's line it passed."""
     cause = error.__cause__
     if isinstance(error, ProbeKitError) and cause is not None and not isinstance(cause, ProbeKitError):
         return _in_words(cause, package) if place_of(cause, package) else f"{type(error).__name__}: {error}"
@@ -203,6 +209,6 @@ def place_of(error: BaseException, package: str) -> str:
 
 
 def package_of(loader: str) -> str:
-    """The package of a family's `loader`: `my_vla` of `my_vla.loading:load`."""
+    """Return the package of a family's `loader`: `my_vla` of `my_vla.loading:load`."""
     module = loader.partition(":")[0]
     return module.rpartition(".")[0] or module

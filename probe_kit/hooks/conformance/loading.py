@@ -39,7 +39,7 @@ def the_card_names_the_weights(subject: Subject) -> None:
     "Put `content_hashes(side_files(folder))` into the card's settings.",
 )
 def every_file_that_is_read_reaches_the_card(subject: Subject) -> None:
-    """A space at the end of a configuration makes another identity."""
+    """Check that a space at the end of a configuration makes another identity."""
     copied = _copy(subject)
     configuration = next((copied / name for name in CONFIGURATIONS if (copied / name).is_file()), None)
     if configuration is None:
@@ -118,7 +118,7 @@ def weights_of_a_file_have_no_seed(subject: Subject) -> None:
     "Load with `read_weights` and `load_weights`, which compare every name, shape and value.",
 )
 def weights_that_are_not_exactly_the_models_are_refused(subject: Subject) -> None:
-    """One tensor is missing, extra, of another shape, or NaN."""
+    """Load checkpoints in which one tensor is missing, extra, of another shape, or NaN."""
     for damage, words in _DAMAGES.items():
         copied = _copy(subject)
         _damage(copied, damage)
@@ -147,7 +147,10 @@ def _copy(subject: Subject) -> Path:
     """Return a copy of the checkpoint, beside links to what lies beside the original.
 
     Some layouts name files outside their folder, such as sizes, a tokenizer or a vision-language model at
-    `../vlm`. Raises SkipTest where the family loads by no name.
+    `../vlm`.
+
+    Raises:
+        SkipTest: Where the family loads by no name.
     """
     source, folder = subject.checkpoint, subject.folder
     assert subject.family

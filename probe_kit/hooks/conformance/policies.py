@@ -1,7 +1,7 @@
 """Checks of policies: actions, seeds, and the interventions that `Policy.interventions` declares.
 
-Every declared one runs and does what it says; every other one is refused by name. All hold by construction,
-whatever the weights are.
+Every declared intervention runs and does what it says; every other one is refused by name. All checks hold by
+construction, whatever the weights are.
 """
 
 from collections.abc import Sequence
@@ -100,7 +100,11 @@ def every_observation_needs_its_seed(subject: PolicySubject) -> None:
 
 
 def _acting(subject: PolicySubject) -> Policy:
-    """The policy. Raises SkipTest for one whose actions do not fit this arm."""
+    """The policy of the subject.
+
+    Raises:
+        SkipTest: For a policy whose actions do not fit this arm.
+    """
     if (mismatch := subject.policy.embodiment_mismatch()) is not None:
         raise SkipTest(f"its actions do not fit this arm: {mismatch}")
     return subject.policy
@@ -222,7 +226,7 @@ def the_prompt_has_keys_and_values_for_every_token_of_the_backbone(subject: Poli
     "Tap the keys and values that the acting part reads, after rotation; correct `first_affected_token`.",
 )
 def all_keys_and_values_of_another_picture_give_that_pictures_actions(subject: PolicySubject) -> None:
-    """State, words and noise are the same. What chose the first token goes along with it."""
+    """Keep state, words and noise the same; what chose the first token is replaced along with keys and values."""
     policy, kv, observation = subject.policy, _prompt_kv(subject), subject.single[0]
     other = replace(observation, image=255 - observation.image)
     acting = [site for site in policy.sites() if policy.streams[site.stream].part == "action"]
@@ -386,11 +390,11 @@ def _edits_from(
 # -- gradients ------------------------------------------------------------------------------------------------
 
 CLOSE = 0.01
-"""Relative difference of a gradient from a central difference."""
+"""The largest relative difference of a gradient from a central difference."""
 _AGREED = 0.001
-"""Relative difference of two central differences between which a shorter step has nothing to decide."""
+"""Relative difference of two central differences below which a shorter step has nothing to decide."""
 STEPS = (1e-2, 3e-3, 1e-3)
-"""Lengths of steps, relative to the activation's own norm, until two agree; of all, the two that agree best."""
+"""The lengths of steps, relative to the activation's norm, until two agree; of all, the two that agree best."""
 _ADVICE = (
     "Let `differentiable` compute what `act` computes: pass by `no_grad` and `inference_mode`, detach nothing, "
     "and keep in-place writes away from tensors that sites tap."
@@ -429,7 +433,7 @@ def gradients_at_sites_are_central_differences(subject: PolicySubject) -> None:
 
 
 def _require_slope(subject: PolicySubject, site: Site, slope: Tensor, norm: float) -> None:
-    """Along its own direction, in which it is steepest, a gradient is its norm."""
+    """Check that along its own direction, in which it is steepest, a gradient is its norm."""
     steepness = float(slope.norm())
     require(steepness > 0, f"no gradient at {site}", "one: the acting part reads it")
     direction = slope / steepness
@@ -448,7 +452,7 @@ def _require_slope(subject: PolicySubject, site: Site, slope: Tensor, norm: floa
 
 
 def _difference(subject: PolicySubject, site: Site, direction: Tensor, step: float) -> float:
-    """(metric at + step − metric at − step) / (2 · step)."""
+    """Return the central difference (metric at + step − metric at − step) / (2 · step)."""
     values = []
     for sign in (1.0, -1.0):
         with edit(subject.policy, {site: partial(torch.add, sign * step * direction)}):
@@ -457,12 +461,12 @@ def _difference(subject: PolicySubject, site: Site, direction: Tensor, step: flo
 
 
 def _lateral(actions: Tensor) -> Tensor:
-    """Metres in y by the whole chunk of the first row."""
+    """Return the displacement in y, in metres, by the whole chunk of the first row."""
     return actions[0, :, 1].sum()
 
 
 def _some_sites(policy: Policy) -> list[Site]:
-    """One in the backbone, the keys and values of the first block, and one where the action is made."""
+    """Return a site in the backbone, the keys and values of the first block, and a site of the acting stream."""
     acting = [site for site in policy.sites() if policy.streams[site.stream].part == "action"]
     backbone = next(site for site in policy.sites() if policy.streams[site.stream].part == "backbone")
     kv = [] if policy.prompt_kv is None else [Site(policy.prompt_kv.name, 0, quantity) for quantity in KV]

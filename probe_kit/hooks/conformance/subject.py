@@ -28,25 +28,33 @@ LARGEST_COPY = 1_000_000_000
 INSTRUCTIONS = tuple(
     f"Put the cube on the {name}" for name in ("star", "red shape", "cube", "blue shape", "green shape", "arrow")
 )
-"""Of different lengths; several have equally many letters, words or tokens."""
+"""Instructions of different lengths; several have equally many letters, words or tokens."""
 NONE: Mapping[str, Any] = MappingProxyType({})
 
 
 class Subject:
     """An adapter under check; a context that removes what its checks wrote.
 
-    family: its name; empty for a model that no registry loads, whose checks of loading are skipped. checkpoint:
-    a folder or hub id, None for the default. options: of loading. other_options: values of options that are not in
-    use; switches and closed lists of values need none. instructions: at least two; the first two differ in length,
-    and two have equally many tokens. model: one that is loaded; else a check that asks for it loads it.
-    tolerance: of a batch against its rows one by one, and of sums against the stream, float32.
-    Raises UsageError for options that the family does not have.
+    Args:
+        family: Name of the family; empty for a model that no registry loads, whose checks of loading are skipped.
+        checkpoint: A folder or hub id; None for the default.
+        options: Options of loading, by name.
+        other_options: Values of options that are not in use; switches and closed lists of values need none.
+        instructions: At least two; the first two differ in length, and two have equally many tokens.
+        model: A model that is loaded; None lets a check that asks for it load it.
+        device: Device on which the model is loaded.
+        dtype: The dtype in which the model is loaded; None leaves the choice to the loader.
+        tolerance: The tolerance of a batch against its rows one by one, and of sums against the stream, in
+            float32.
+
+    Raises:
+        UsageError: For options that the family does not have.
     """
 
     acting: ClassVar[bool]
     """Whether it is checked as a policy."""
     attention_tolerance: ClassVar[float] = 1e-4
-    """By how much shares of attention may add up to more than 1; they are means of rounded numbers."""
+    """The amount by which shares of attention may add up to more than 1; they are means of rounded numbers."""
     letters: ClassVar[tuple[str, ...]] = ("A", "B")
     """The options of questions."""
 
@@ -97,14 +105,22 @@ class Subject:
 
     @property
     def family(self) -> Family:
-        """The family of the registry. Raises SkipTest if none was named."""
+        """The family of the registry.
+
+        Raises:
+            SkipTest: If none was named.
+        """
         if not self.name:
             raise SkipTest("no family was named")
         return find_family(self.name)
 
     @cached_property
     def checkpoint(self) -> Path:
-        """A folder that may be copied and loaded. Raises SkipTest where there is none, or a large one."""
+        """A folder that may be copied and loaded.
+
+        Raises:
+            SkipTest: Where there is none, or a large one.
+        """
         location = self.family.location(self.given_checkpoint, self.options.get(SIZE))
         if location is None:
             raise SkipTest("the family brings its own weights; give --checkpoint to check how it loads")
@@ -150,12 +166,12 @@ class Subject:
 
     @property
     def observations(self) -> list[Observation]:
-        """Two whose instructions differ in length."""
+        """Two observations whose instructions differ in length."""
         return self.alike[:2]
 
     @cached_property
     def alike(self) -> list[Observation]:
-        """One per instruction; at least two have equally many tokens."""
+        """The observations, one per instruction; at least two have equally many tokens."""
         return examples_for(self.model, *self.instructions)
 
     @property
@@ -183,16 +199,16 @@ class Subject:
     # -- how it is run ------------------------------------------------------------------------------------
 
     def run(self, observations: Sequence[Observation]) -> NDArray[np.float32]:
-        """One inference: a row of numbers per observation."""
+        """Run one inference, which gives a row of numbers per observation."""
         raise NotImplementedError
 
     def run_row(self, observation: Observation, row: int) -> NDArray[np.float32]:
-        """Return the numbers that `run` gives for row `row` of a batch, of an inference of that row alone."""
+        """Return the numbers that `run` gives for row `row` of a batch, from an inference of that row alone."""
         del row
         return np.asarray(self.run([observation])[0])
 
     def roles_of(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
-        """Roles of what `run` makes of these observations."""
+        """The roles of what `run` makes of these observations."""
         return self.model.roles(observations)
 
 
@@ -217,7 +233,7 @@ class PolicySubject(Subject):
         return model
 
     def run(self, observations: Sequence[Observation]) -> NDArray[np.float32]:
-        """Actions from the seeds 0, 1 …; what the network puts out where they do not fit this arm."""
+        """Return actions from the seeds 0, 1 …; what the network puts out where they do not fit this arm."""
         return self._infer(observations, range(len(observations)))
 
     def run_row(self, observation: Observation, row: int) -> NDArray[np.float32]:
@@ -262,15 +278,15 @@ class AnswerSubject(Subject):
         return [Prompt(observation, observation.instruction, self.letters) for observation in observations]
 
     def run(self, observations: Sequence[Observation]) -> NDArray[np.float32]:
-        """The logits of the options."""
+        """Return the logits of the options."""
         return self.ask(self.questions_of(observations))
 
     def roles_of(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
-        """Roles of the questions about these observations."""
+        """The roles of the questions about these observations."""
         return self.answer_model.asked_roles(self.led(self.questions_of(observations)))
 
     def read(self, questions: Sequence[Prompt]) -> Reading:
-        """One prefill of the questions."""
+        """Read the questions in one prefill."""
         return self.answer_model.read(self.led(questions))
 
     def ask(self, questions: Sequence[Prompt]) -> NDArray[np.float32]:
@@ -289,7 +305,7 @@ class AnswerSubject(Subject):
 
 
 def example_observations(instructions: Sequence[str], cameras: Sequence[str] = ()) -> list[Observation]:
-    """One observation per instruction: noise pictures, plausible states and intrinsics, from a fixed seed."""
+    """Return observations, one per instruction: noise pictures, plausible states, intrinsics, of a fixed seed."""
     rng = np.random.default_rng(0)
     size = (48, 64, 3)
     intrinsics = np.array([[60, 0, 32], [0, 60, 24], [0, 0, 1]], np.float32)
@@ -306,6 +322,6 @@ def example_observations(instructions: Sequence[str], cameras: Sequence[str] = (
 
 
 def examples_for(model: Model, *instructions: str) -> list[Observation]:
-    """Observations that hold what the model needs."""
+    """Return observations that hold what the model needs."""
     cameras = [need.removeprefix("camera.") for need in sorted(model.card.needs) if need.startswith("camera.")]
     return example_observations(instructions, cameras)

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def layers_text(stream: "Stream", unit: str = "iterations") -> str:
-    """`expert 4 layers x 10 iterations`. unit: the name of an iteration."""
+    """Return text such as `expert 4 layers x 10 iterations`; `unit` is the name of an iteration in the plural."""
     times = "" if stream.iterations in (None, 1) else f" x {stream.iterations} {unit}"
     return f"{stream.name} {stream.layers} layers{times}"
 
@@ -23,12 +23,12 @@ def streams_text(streams: "Iterable[Stream]") -> str:
 
 
 def parameters_text(parameters: int) -> str:
-    """`0.82 million`, `3.5 billion`."""
+    """Return a count in words, such as `0.82 million` or `3.5 billion`."""
     return f"{parameters / 1e9:.1f} billion" if parameters >= 1e9 else f"{parameters / 1e6:.2f} million"
 
 
 def model_text(name: str, card: "ModelCard", streams: "Mapping[str, Stream]") -> str:
-    """One line: family, size, where it runs, streams; random weights in capitals."""
+    """A model in one line: family, size, where it runs, streams; random weights in capitals."""
     random = ", RANDOM WEIGHTS" if card.random_weights else ""
     size = f"{parameters_text(card.parameters)} parameters"
     return (
@@ -37,7 +37,7 @@ def model_text(name: str, card: "ModelCard", streams: "Mapping[str, Stream]") ->
 
 
 def model_html(card: "ModelCard", streams: "Mapping[str, Stream]") -> str:
-    """The card's facts as a table."""
+    """The card's facts as a table in HTML."""
     facts = {
         "checkpoint": card.checkpoint,
         "weights": "RANDOM, untrained" if card.random_weights else f"sha256 {card.weights_sha256[:12]}",
@@ -62,8 +62,8 @@ class SourceWeights:
     """The identity of the weights that a policy's network grew from; None for an unknown part.
 
     Attributes:
-        checkpoint: Their hub id.
-        sha256: As `ModelCard.weights_sha256`.
+        checkpoint: Hub id of these weights.
+        sha256: Their hash, computed as `ModelCard.weights_sha256`.
         parameters: Their count in memory.
     """
 
@@ -77,18 +77,19 @@ class ModelCard:
     """The identity of a loaded model: weights, settings and shape.
 
     Attributes:
-        chunk: Actions per inference and how many of them are executed; 0 for a model that does not act.
-        execute: As `chunk`.
+        chunk: Actions per inference; 0 for a model that does not act.
+        execute: Actions of a chunk that are executed before the next inference; 0 for a model that does not act.
         settings: Everything outside the weights that actions, answers or activations depend on, such as the prompt
-            and the contents of every file a loader reads; part of a run's identity.
+            and the contents of every file a loader reads. They are part of a run's identity.
         exact: False if the weights that ran are only near those of the file, as after quantisation.
-        weights_seed: Of an untrained network; None for weights from a file.
+        weights_seed: Seed of an untrained network; None for weights from a file.
         batch: The largest number of observations per call, None for any; 1 where batching changes the numbers.
-        needs: What every observation must hold besides picture, state and instruction; see `Observation.lacks`.
+        needs: The parts that every observation must hold besides picture, state and instruction; see
+            `Observation.lacks`.
         ensemble: Exponent of the weights with which the plans of overlapping chunks for one step are averaged, the
-            newest with the largest weight; None executes the head of the newest chunk.
+            newest with the largest weight. None executes the head of the newest chunk.
         source: The family of the VLM whose network this policy grew from, if it is one of ours.
-        source_weights: Of that family, the weights; None where they are unknown, as for a checkpoint that is not
+        source_weights: The weights of that family; None where they are unknown, as for a checkpoint that is not
             the family's own.
         repositories: Commits of further repositories of the hub that were read, by name: of the base of an
             adapter, a vision-language model or a tokenizer.

@@ -14,7 +14,12 @@ from probe_kit.hooks.contract.sites import Stream
 
 @dataclass(frozen=True)
 class DefaultScene:
-    """preset: of `SceneSpec.preset`. changes: its fields that differ, also when other fields are asked for."""
+    """The scene of a family by default.
+
+    Attributes:
+        preset: Name of the preset of the scene, as in `SceneSpec.preset`.
+        changes: Fields that differ from the preset, by name; they hold also when other fields are asked for.
+    """
 
     preset: str
     changes: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
@@ -25,9 +30,9 @@ class DefaultScene:
 
 
 RELEASED = DefaultScene("act2answer")
-"""Of every family that declares no other: policies and VLMs of one study get the same first frames."""
+"""The scene of every family that declares no other: policies and VLMs of one study get the same first frames."""
 EMBEDDED = DefaultScene("act2answer", MappingProxyType({"early_stop": True, "max_steps": 40}))
-"""Of the embedded models, whose demonstrations took at most 40 actions."""
+"""The scene of the embedded models, whose demonstrations took at most 40 actions."""
 
 
 # -- options --------------------------------------------------------------------------------------------------
@@ -37,7 +42,7 @@ _WORDS = {"true": True, "yes": True, "on": True, "1": True, "false": False, "no"
 _EXPECTED = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
 
 LARGEST = 1 << 31
-"""Of a number that is an option; larger ones, and NaN, are mistakes."""
+"""The largest number that an option can be; larger ones, and NaN, are mistakes."""
 
 Kind = type[bool] | type[int] | type[float] | type[str]
 
@@ -47,9 +52,9 @@ class Option:
     """One option of a family.
 
     Attributes:
-        kind: Bool, int, float or str.
+        kind: The type of its value: bool, int, float or str.
         help: One line for `probe-kit models NAME`.
-        default: As people read it.
+        default: The default as people read it.
         choices: The admissible values; empty for any of the kind.
         is_path: Whether it may name a file or folder, which a run finds again wherever its command was typed.
     """
@@ -62,7 +67,11 @@ class Option:
     is_path: bool = False
 
     def value(self, raw: Any) -> Any:
-        """Return `raw`, text or already of the kind, as the loader gets it. Raises UsageError."""
+        """Return `raw`, text or already of the kind, as the loader gets it.
+
+        Raises:
+            UsageError: If it is not of the kind or not among the choices.
+        """
         value = self._read(raw)
         if self.choices and value not in self.choices:
             allowed = ", ".join(map(str, self.choices))
@@ -86,7 +95,11 @@ class Option:
 
 
 def read_pairs(pairs: Sequence[str]) -> dict[str, str]:
-    """`key=value` texts as a dict. Raises UsageError for another form and for a key given twice."""
+    """Return `key=value` texts as a dict, with underscores for the hyphens of a key.
+
+    Raises:
+        UsageError: For a text of another form and for a key given twice.
+    """
     options: dict[str, str] = {}
     for pair in pairs:
         key, equals, value = pair.partition("=")
@@ -100,7 +113,11 @@ def read_pairs(pairs: Sequence[str]) -> dict[str, str]:
 
 
 def check_options(family: str, declared: Sequence[Option], options: Mapping[str, Any]) -> dict[str, Any]:
-    """The given options as the loader gets them. Raises UsageError for one that the family does not declare."""
+    """Return the given options as the loader gets them.
+
+    Raises:
+        UsageError: For an option that the family does not declare, and for a value that the option does not admit.
+    """
     by_name = {option.name: option for option in declared}
     for name in sorted(options):
         if name not in by_name:
@@ -114,7 +131,7 @@ def check_options(family: str, declared: Sequence[Option], options: Mapping[str,
 # -- protocols ------------------------------------------------------------------------------------------------
 
 Rotation = Literal["roll-pitch-yaw", "axis-angle"]
-"""What reaches the controller as the rotation of an action; see `ProtocolRow.rotation`."""
+"""The form in which the rotation of an action reaches the controller; see `ProtocolRow.rotation`."""
 ROTATIONS: tuple[Rotation, ...] = get_args(Rotation)
 PLAIN: Rotation = "roll-pitch-yaw"
 
@@ -125,12 +142,12 @@ class ProtocolRow:
 
     Attributes:
         execute: Actions executed per inference.
-        options: Of the family, whatever the checkpoint.
-        of_checkpoint: The ones that only the protocol's own checkpoint needs.
-        rotation: `roll-pitch-yaw` passes the angles of an action on; `axis-angle` passes axis times angle of the
+        options: Options of the family, whatever the checkpoint.
+        of_checkpoint: The options that only the protocol's own checkpoint needs.
+        rotation: `roll-pitch-yaw` passes the angles of an action on. `axis-angle` passes axis times angle of the
             same turn on, which the controller then reads as angles.
-        unmatched: What of the protocol cannot be done here.
-        variant: Which of several checkpoints it is, as in labels.
+        unmatched: The parts of the protocol that cannot be done here.
+        variant: The name of this checkpoint among several, as in labels.
         alternatives: Rows of the others; without a checkpoint, the row that holds them is used.
     """
 
@@ -150,14 +167,14 @@ class ProtocolRow:
         return (self, *self.alternatives)
 
     def of(self, checkpoint: str | None) -> "ProtocolRow":
-        """The row of `checkpoint`, at any revision.
+        """Return the row of `checkpoint`, at any revision.
 
-        This one for None, and for a checkpoint that the protocol does not use.
+        It is this row for None, and for a checkpoint that the protocol does not use.
         """
         return next((row for row in self.rows if row.checkpoint == _bare(checkpoint)), self)
 
     def options_for(self, checkpoint: str | None) -> dict[str, Any]:
-        """The options with `checkpoint`, None for the protocol's own."""
+        """Return the options with `checkpoint`; None takes the protocol's own."""
         checkpoint_options = self.of_checkpoint if _bare(checkpoint) in (None, self.checkpoint) else {}
         return {**checkpoint_options, **self.options}
 
@@ -199,9 +216,9 @@ class DeclaredStream:
     """A stream of a family at a released size.
 
     Attributes:
-        tokens: At a picture of 640 × 480 and an instruction of ten words, about; sizes of runs are estimated by
-            it.
-        roles: What its tokens can be.
+        tokens: The approximate count at a picture of 640 × 480 and an instruction of ten words; sizes of runs are
+            estimated by it.
+        roles: The roles that its tokens can play.
     """
 
     stream: Stream
@@ -216,7 +233,7 @@ class DeclaredStream:
 def backbone(
     layers: int, width: int, tokens: int, *more: str, camera: str = "primary", sums: bool = True
 ) -> DeclaredStream:
-    """A language model that reads one picture and text. more: roles beside those."""
+    """A language model that reads one picture and text; `more` are roles besides those of picture and text."""
     return DeclaredStream(Stream("backbone", layers, width, sums=sums), tokens, (f"image.{camera}", *TEXT, *more))
 
 
@@ -228,7 +245,7 @@ def chosen_tokens(name: str, layers: int, width: int, iterations: int, sums: boo
 def expert(
     layers: int, width: int, iterations: int, tokens: int, roles: tuple[str, ...], **fields: Any
 ) -> DeclaredStream:
-    """A flow or diffusion transformer, with its tokens at every iteration. fields: those of `Stream`."""
+    """A flow or diffusion transformer, with its tokens at every iteration; `fields` are others of `Stream`."""
     shape = {"name": "expert", "part": "action", **fields}
     return DeclaredStream(Stream(layers=layers, width=width, iterations=iterations, **shape), tokens, roles)
 
@@ -242,8 +259,11 @@ def answering(layers: int, width: int, tokens: int, sums: bool = True) -> tuple[
 
 InterventionKind = Literal["swap", "edit", "kv", "attention", "tiles", "gradients"]
 Readout = Literal["first-chunk", "per-step"]
-"""first-chunk: lateral displacement by the first inference's actions, none of them executed.
-per-step: its sum over every inference of the unedited episode; only the clean actions are executed."""
+"""The readout with which interventions of a family are compared.
+
+`first-chunk` is the lateral displacement by the first inference's actions, none of them executed. `per-step` is
+its sum over every inference of the unedited episode; only the clean actions are executed.
+"""
 _VALUES: Mapping[str, tuple[str, tuple[str, ...]]] = MappingProxyType(
     {"kv": ("--sites", ("kv.*",)), "tiles": ("--roles", ("image.left", "image.right"))}
 )
@@ -278,20 +298,22 @@ class Interventions:
 
     Attributes:
         edits: Per stored stream the quantities that can be rewritten; None for all that its streams have.
-        unread: Streams whose end nothing that acts reads: an edit of the last residual or the final norm there
+        unread: Streams whose end nothing that acts reads. An edit of the last residual or the final norm there
             leaves the actions bit for bit, which makes it a control.
         prompt_kv: Whether it keeps keys and values of the prompt that the acting stream reads, see
             `Model.prompt_kv`.
-        first_affected_token: The first output that an edit of backbone or `kv` reaches through `kv`: 0, or 1 where
-            the prompt's own pass already chooses the first token.
+        first_affected_token: The first output that an edit of backbone or `kv` reaches through `kv`. It is 0, or 1
+            where the prompt's own pass already chooses the first token.
         attention: Whether it records the acting stream's attention to every token of the prompt.
         tiles: Whether it says which of the picture's tokens come of which patches, see `Model.patch_order`.
         gradients: Whether `Policy.differentiable` gives its actions with a graph.
         readout: `first-chunk` where the first chunk shows where the hand will go; `per-step` where an inference
             gives one action in discrete bins. Conditions are then evaluated at every call of an unedited episode,
             not executed.
-        instead: For what is not supported, why and what to do. Raises UsageError for advice on a kind of
-            intervention that does not exist.
+        instead: The reason and the advice for each kind of intervention that is not supported.
+
+    Raises:
+        UsageError: For advice on a kind of intervention that does not exist.
     """
 
     edits: Mapping[str, tuple[str, ...]] | None = None
@@ -328,7 +350,11 @@ class Interventions:
         return values_of
 
     def check(self, kind: InterventionKind, family: str) -> None:
-        """Raises UnsupportedInterventionError if `family`, whose declaration this is, does not support `kind`."""
+        """Check that `family`, whose declaration this is, supports `kind`.
+
+        Raises:
+            UnsupportedInterventionError: If it does not.
+        """
         if not self.supports(kind):
             why = {**_UNDECLARED, **self.instead}[kind]
             option, values = asked_as(kind)
@@ -338,7 +364,7 @@ class Interventions:
             )
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values, for listings and certificates."""
+        """Return plain values, for listings and certificates."""
         return {
             "kinds": [kind for kind in get_args(InterventionKind) if self.supports(kind)],
             "edits": None
@@ -352,4 +378,4 @@ class Interventions:
 
 
 ALL_EDITS = Interventions()
-"""Default of a family: image swaps, and edits at every site."""
+"""The default of a family: image swaps, and edits at every site."""

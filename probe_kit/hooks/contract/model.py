@@ -25,10 +25,10 @@ class Unembedding:
     """The modules that turn the last residual of a decoder into logits.
 
     Attributes:
-        streams: Whose last residual it reads; the positions that choose tokens come last.
-        norm: Modules, called one after the other.
-        head: As `norm`.
-        softcap: The logits l become softcap · tanh(l / softcap), as in Gemma 2.
+        streams: The streams whose last residual it reads; the positions that choose tokens come last.
+        norm: The module that is called first, on the residual.
+        head: The module that is called on what `norm` gives.
+        softcap: The logits l become softcap · tanh(l / softcap), as in Gemma 2; None leaves them as they are.
     """
 
     streams: tuple[str, ...]
@@ -38,13 +38,19 @@ class Unembedding:
 
     @classmethod
     def of_decoder(cls, streams: tuple[str, ...], language_model: Any, norm: nn.Module) -> "Unembedding":
-        """Return the `lm_head` of transformers' causal language model, with the soft cap of its configuration."""
+        """Return the `lm_head` of transformers' causal language model, with the soft cap of its configuration.
+
+        Args:
+            streams: The streams whose last residual is read; the positions that choose tokens come last.
+            language_model: The causal language model, with `lm_head` and `config`.
+            norm: The norm in front of the head.
+        """
         config = language_model.config
         cap = getattr(getattr(config, "text_config", config), "final_logit_softcapping", None)
         return cls(streams, norm, language_model.lm_head, None if cap is None else float(cap))
 
     def logits(self, residual: Tensor) -> Tensor:
-        """(…, V) in the model's dtype, of a residual (…, D) of any layer."""
+        """Return the logits (…, V), in the model's dtype, of a residual (…, D) of any layer."""
         with torch.inference_mode():
             return self.capped(self.head(self.norm(residual)))
 
@@ -58,15 +64,19 @@ class Rows:
     """One of several equal blocks of a batch: under guidance a module runs 2B rows, and only half are the stream.
 
     Attributes:
-        index: Which block, counted from 0.
-        blocks: How many.
+        index: Number of the block, counted from 0.
+        blocks: Count of the blocks.
     """
 
     index: int = 0
     blocks: int = 1
 
     def of(self, activation: Tensor) -> Tensor:
-        """The block as a view: (B, …) of (B * blocks, …). Raises CaptureError if the rows do not divide."""
+        """The block as a view: (B, …) of (B * blocks, …).
+
+        Raises:
+            CaptureError: If the rows do not divide.
+        """
         if self.blocks == 1:
             return activation
         rows, remainder = divmod(activation.shape[0], self.blocks)
@@ -85,18 +95,19 @@ EVERY = slice(None)
 class Tap:
     """An input or output of `module`, called `fires` times per inference, at which a site is read and written.
 
-    The residual stream is read at inputs, not outputs: some families drive their layers piecewise or add in place,
+    The residual stream is read at inputs, not outputs. Some families drive their layers piecewise or add in place,
     and then a layer's output is never seen or seen too late. The first submodule of a block is always called with
     the residual stream itself, so writing into that tensor writes the stream.
 
     Attributes:
         tokens: The positions of that (B, T, D) tensor which belong to the site, where one call serves two streams.
         rows: The block of the batch which belongs to the site, where one call serves several.
-        first: Calls of `module` in an inference that come before those of this stream and are passed over.
+        first: Number of calls of `module` in an inference that come before those of this stream and are passed
+            over.
         argument: Name of the keyword that carries the tensor, where the module is not called with it in first
             place.
-        view: Brings what passes to (B, T, D) where it has another form; it must share memory, so that an edit of
-            the result edits what passes.
+        view: Brings what passes to (B, T, D) where it has another form. The result must share memory, so that an
+            edit of it edits what passes.
         more: Whether an inference may call `module` further times, which belong to no site: where the model itself
             decides how many tokens it puts out.
     """
@@ -137,7 +148,7 @@ class HeadsTap(Tap):
         by_token.copy_(new.reshape(by_token.shape))
 
     def _by_token(self, passing: Tensor) -> Tensor:
-        """(B, T, H, E), a view."""
+        """A view (B, T, H, E) of the site's own part."""
         return self.rows.of(passing).transpose(1, 2)[:, self.tokens]
 
 
@@ -145,11 +156,11 @@ class Model(ABC):
     """A network whose activations can be captured: what capture, edits, verification and the store need.
 
     Attributes:
-        streams: Stored by an extraction.
-        further_streams: Captured by naming their sites only, such as vision towers.
+        streams: The streams that an extraction stores, by name.
+        further_streams: The streams that are captured by naming their sites only, such as vision towers.
         prompt_kv: The keys and values of the prompt that the acting part reads, block by block, as a stream of the
-            quantities `KV`; captured and edited by naming their sites, such as `kv.02.values`; None where a family
-            has none. Its tokens are the backbone's.
+            quantities `KV`. They are captured and edited by naming their sites, such as `kv.02.values`. The tokens
+            are the backbone's. None where a family has none.
         role_names: Per stream, every role its tokens can play.
         absent_inputs: Inputs that it never reads by design: `instruction`, `state`, `picture` or `picture.CAMERA`.
     """
@@ -169,11 +180,15 @@ class Model(ABC):
 
     @abstractmethod
     def roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
-        """Per stored stream, the roles of every token position of every row, from the model's own packing."""
+        """Return per stored stream the roles of every position of every row, from the model's own packing."""
 
     @abstractmethod
     def tap(self, site: Site) -> Tap:
-        """Return the tap at which `site` is read and written. Raises UnknownSiteError."""
+        """Return the tap at which `site` is read and written.
+
+        Raises:
+            UnknownSiteError: For a site that the model does not have.
+        """
 
     @property
     def unembedding(self) -> Unembedding | None:
@@ -181,7 +196,7 @@ class Model(ABC):
         return None
 
     def token_ids(self, instructions: Sequence[str]) -> list[tuple[int, ...]] | None:
-        """Per instruction, the ids that reach the network as its prompt; None if the model cannot say."""
+        """Return per instruction the ids that reach the network as its prompt; None if the model cannot say."""
         del instructions
         return None
 
@@ -191,12 +206,16 @@ class Model(ABC):
         Its commit then stands in the card.
 
         Raises:
-            CheckpointError: For what is not here.
+            CheckpointError: For a file that is not here.
         """
         return
 
     def sites(self, quantity: str = "residual") -> list[Site]:
-        """All sites of one quantity in the stored streams that have it, stream by stream."""
+        """All sites of one quantity in the stored streams that have it, stream by stream.
+
+        Raises:
+            UnknownSiteError: If no stream has the quantity.
+        """
         having = [stream for stream in self.streams.values() if quantity in stream.captured]
         if not having:
             raise UnknownSiteError(f"no stream of {self.card.family} has a quantity {quantity!r}")
@@ -215,10 +234,14 @@ class Model(ABC):
         return roles
 
     def patch_order(self) -> NDArray[np.int64]:
-        """(V,) which of the picture's tokens, counted from 0, every token of the `vision` stream ends in.
+        """Return which of the picture's tokens, counted from 0, every token of the `vision` stream ends in.
 
-        −1 for those that end in none, such as class tokens. Of one camera's picture, the same for each. Raises
-        UnknownSiteError for a model that does not say.
+        Returns:
+            (V,) of one camera's picture, the same for each camera; −1 for tokens that end in none, such as class
+            tokens.
+
+        Raises:
+            UnknownSiteError: For a model that does not say.
         """
         raise UnknownSiteError(
             f"{self.card.family} does not say which picture token comes of which patch; ask for all of `image`"
@@ -231,7 +254,11 @@ class Model(ABC):
         return first_of("backbone", self.streams.values()) or stream
 
     def stream_of(self, site: Site) -> Stream:
-        """The stream `site` lies in. Raises UnknownSiteError, naming what there is."""
+        """The stream `site` lies in.
+
+        Raises:
+            UnknownSiteError: If there is none; the message names the streams that there are.
+        """
         stream = self.streams.get(site.stream) or self.every_stream().get(site.stream)
         if stream is None or not stream.holds(site):
             available = "; ".join(
@@ -245,6 +272,10 @@ class Model(ABC):
 
     def check(self, observations: Sequence[Observation], seeds: Sequence[int] | None = None) -> None:
         """Refuse what the card rules out; adapters call it first.
+
+        Args:
+            observations: All rows of one call.
+            seeds: One per observation; None for a call without noise.
 
         Raises:
             ObservationError: For a batch over `card.batch`, an observation without what `card.needs` names, and
@@ -272,10 +303,10 @@ class Policy(Model):
     Deterministic for given seeds. Capturing changes no action, bit for bit.
 
     Attributes:
-        interventions: What of the interventions it supports; a family says the same before it is loaded.
+        interventions: The interventions that it supports; a family says the same before it is loaded.
         draws_noise: Whether noise of the seed enters every inference, as in a flow; None if undeclared.
-        flagged: (B,) rows of the last `act` in which the network put out something that is no action; what the row
-            then does is the family's. None for a family that cannot tell.
+        flagged: (B,) rows of the last `act` in which the network put out something that is no action. What the row
+            then does is the family's choice. None for a family that cannot tell.
     """
 
     interventions: ClassVar[Interventions] = ALL_EDITS
@@ -283,7 +314,10 @@ class Policy(Model):
     flagged: NDArray[np.bool_] | None = None
 
     def embodiment_mismatch(self) -> str | None:
-        """Why its actions cannot move this arm; None if they can. Its activations can be captured nevertheless."""
+        """Return why its actions cannot move this arm; None if they can.
+
+        Its activations can be captured nevertheless.
+        """
         return None
 
     def configured_mismatch(self) -> str | None:
@@ -291,26 +325,27 @@ class Policy(Model):
         return None
 
     def zero_filled_inputs(self) -> tuple[str, ...]:
-        """Inputs that `infer_without_acting` replaces by zeros, because the checkpoint expects others there."""
+        """Return inputs that `infer_without_acting` replaces by zeros: the checkpoint expects others there."""
         return ()
 
     def infer_without_acting(
         self, observations: Sequence[Observation], seeds: Sequence[int]
     ) -> NDArray[np.float32]:
-        """One inference as `act` makes it, whatever its output means: (B, chunk, any width) float32.
+        """Run one inference as `act` makes it, whatever its output means: (B, chunk, any width) float32.
 
-        For a policy with an `embodiment_mismatch`, which `act` refuses.
+        It serves a policy with an `embodiment_mismatch`, which `act` refuses.
         """
         return self.act(observations, seeds)
 
     def record_attention(self, note: Callable[[int, int, Tensor], None]) -> AbstractContextManager[None]:
-        """A context in which `note` receives the attention of the acting stream; see `hooks.attention`.
-
-        Raises UnsupportedInterventionError.
+        """A context in which `note` receives the attention of the acting stream; see `hooks.capture_attention`.
 
         Args:
             note: Called with a block of the backbone, an iteration, and weights (B, H, S, T): of S acting
                 positions on the backbone's T tokens. No number of the inference may change.
+
+        Raises:
+            UnsupportedInterventionError: For a family that does not declare attention.
         """
         del note
         self.interventions.check("attention", self.card.family)
@@ -321,11 +356,12 @@ class Policy(Model):
     def differentiable(self, observations: Sequence[Observation], seeds: Sequence[int]) -> Tensor:
         """The actions of `act` with a graph behind them: (B, chunk, 7) in metres and radians, as float32.
 
-        For `hooks.gradients_at`. Weights need no gradient, no module is compiled, attention is eager, and numbers
-        equal those of `act` to 1e-5 in float32. A number without a slope, such as a gripper that is open or
-        closed, has gradient zero.
+        It serves `hooks.gradients_at`. Weights need no gradient, no module is compiled, attention is eager, and
+        numbers equal those of `act` to 1e-5 in float32. A number without a slope, such as a gripper that is open
+        or closed, has gradient zero.
 
-        Raises UnsupportedInterventionError.
+        Raises:
+            UnsupportedInterventionError: For a family that does not declare gradients.
         """
         del observations, seeds
         self.interventions.check("gradients", self.card.family)
@@ -351,7 +387,7 @@ class Policy(Model):
         return self
 
     def laid_out(self, states: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(n, D) states of the scene's arm (n, 8), in the order and count that this checkpoint was given them."""
+        """Return states (n, 8) of the scene's arm as (n, D), in the order and count that a checkpoint reads."""
         return states
 
     @property
@@ -360,7 +396,7 @@ class Policy(Model):
         return None
 
     def unusual_states(self, states: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """(n, D) which numbers of recorded states (n, D) lie far outside the checkpoint's own statistics.
+        """Return (n, D) which numbers of recorded states (n, D) lie far outside the checkpoint's own statistics.
 
         Raises:
             CheckpointError: For a checkpoint without statistics.
@@ -369,9 +405,10 @@ class Policy(Model):
 
     @property
     def unguarded_state(self) -> str | None:
-        """Why the states of a source are compared with no statistics; None where `unusual_states` compares them.
+        """The reason why the states of a source are compared with no statistics; None where they are compared.
 
-        A family that reads a state has statistics of it, or says here why not; the card's notes repeat it.
+        `unusual_states` compares them. A family that reads a state has statistics of it, or says here why not; the
+        card's notes repeat it.
         """
         if self.state_numbers is None:
             return "no state is read"
@@ -379,7 +416,7 @@ class Policy(Model):
         return None if compares else "the family has no statistics of states"
 
     def unusual_actions(self, actions: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """(n, D) which numbers of recorded actions (n, D) lie far outside the checkpoint's own statistics."""
+        """Return (n, D) which numbers of recorded actions (n, D) lie far outside the checkpoint's statistics."""
         return np.zeros(actions.shape, bool)
 
     @property
@@ -388,22 +425,28 @@ class Policy(Model):
         return False
 
     def predict(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
-        """One chunk of actions per recorded observation, in the checkpoint's own units and width.
+        """Return one chunk of actions per recorded observation, in the checkpoint's own units and width.
+
+        States are taken as recorded. Nothing is claimed about whether the actions fit an arm.
 
         Returns:
-            (B, chunk, D) float32. It makes no claim that the actions fit an arm; states are taken as recorded.
+            (B, chunk, D) float32.
         """
         return self.act(observations, seeds)
 
     @abstractmethod
     def act(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
-        """One chunk of actions per observation.
+        """Return one chunk of actions per observation.
 
-        Raises InstructionError or ObservationError for what the policy cannot take in whole.
+        All randomness of a row comes from its seed.
 
         Returns:
             (B, chunk, 7) float32: xyz delta in metres and roll-pitch-yaw delta in radians in the robot base frame,
-            gripper 1 = open and 0 = closed, at 5 Hz. All randomness of a row comes from its seed.
+            gripper 1 = open and 0 = closed. The rate is 5 Hz.
+
+        Raises:
+            InstructionError: For an instruction that the policy cannot take in whole.
+            ObservationError: For an observation that the policy cannot take in whole.
         """
 
 
@@ -413,9 +456,9 @@ class Prompt:
 
     Attributes:
         text: The whole question as a person would ask it; the family puts its frame around it.
-        options: How the admissible answers begin, such as letters; the logits of their first tokens are compared.
-            They stand directly behind the frame, so an option in front begins with `AnswerModel.lead`.
-        begun: How the answer has begun already, put behind the frame; it begins with `AnswerModel.lead` too.
+        options: The beginnings of the admissible answers, such as letters; the logits of their first tokens are
+            compared. They stand directly behind the frame, so an option in front begins with `AnswerModel.lead`.
+        begun: The beginning of the answer, put behind the frame; it begins with `AnswerModel.lead` too.
         pictured: Whether the picture is shown; False asks in words alone.
     """
 
@@ -433,7 +476,7 @@ class Reading:
     Attributes:
         option_logits: (B, options) float32, one column per option of the questions, in their order.
         option_mass: (B,) float32 share of the next token's probability that lies on the options together.
-        state: From which `AnswerModel.speak` continues; opaque to all other code.
+        state: The state from which `AnswerModel.speak` continues; opaque to all other code.
         option_ids: (B, options) int64 tokens of the options; None if the model does not say them.
     """
 
@@ -444,7 +487,12 @@ class Reading:
 
     @classmethod
     def of(cls, logits: NDArray[np.float32], options: Sequence[Sequence[int]], state: Any = None) -> "Reading":
-        """Return the reading of the logits (B, V) behind every prompt. options: per row, the ids of its options.
+        """Return the reading of the logits behind every prompt.
+
+        Args:
+            logits: (B, V) of the last position of every row.
+            options: Per row, the ids of its options, as many in every row.
+            state: The state from which `AnswerModel.speak` continues; None for a model that needs none.
 
         Raises:
             UsageError: For options of a question that have the same id, or another number than their neighbours.
@@ -466,14 +514,16 @@ class Reading:
 
 
 NEAR_TIE: Mapping[str, float] = MappingProxyType({"float32": 1e-4, "bfloat16": 0.1})
-"""Per dtype, margins below which another batch or machine may turn a choice round.
+"""The margins per dtype below which another batch or machine may turn a choice round.
 
 Measured on small models, batches against single rows: logits move by 1e-5 in float32, margins by 0.03 in bfloat16.
 """
 
 
 class AnswerModel(Model):
-    """A model that answers questions in text. Being asked is one inference, as `capture` counts it.
+    """A model that answers questions in text.
+
+    A call of `read` is one inference, as `capture` counts it.
 
     Attributes:
         whole_prompt: Whether the backbone's stream has the last position of the prompt, where the answer begins.
@@ -494,16 +544,18 @@ class AnswerModel(Model):
 
     @abstractmethod
     def read(self, questions: Sequence[Prompt]) -> Reading:
-        """One prefill of all questions, which must have equally many options: every tap fires as promised.
+        """Read all questions, which must have equally many options, in one prefill: every tap fires as promised.
 
-        Questions with and without a picture do not go together in one call.
+        Questions with and without a picture are not mixed in one call.
 
-        Raises InstructionError or ObservationError for what the model cannot take in whole, UsageError for an
-        option that changes the prompt's own tokens, or begins like another one.
+        Raises:
+            InstructionError: For a question that the model cannot take in whole.
+            ObservationError: For an observation that the model cannot take in whole.
+            UsageError: For an option that changes the prompt's own tokens, or begins like another one.
         """
 
     def near_ties(self, reading: Reading) -> NDArray[np.bool_]:
-        """(B,) whether the two likeliest options are so close that rounding may decide; see `NEAR_TIE`."""
+        """Return (B,) whether the two likeliest options are so close that rounding may decide; see `NEAR_TIE`."""
         best = np.sort(reading.option_logits, axis=1)[:, -2:]
         # An unknown dtype counts as the coarser one: too many ties are said rather than too few.
         limit = NEAR_TIE.get(self.card.dtype, NEAR_TIE["bfloat16"])
@@ -511,14 +563,18 @@ class AnswerModel(Model):
 
     @staticmethod
     def shows_pictures(questions: Sequence[Prompt]) -> bool:
-        """Whether the questions are asked about their pictures. Raises UsageError if only some are."""
+        """Whether the questions are asked about their pictures.
+
+        Raises:
+            UsageError: If only some are.
+        """
         pictured = {question.pictured for question in questions}
         if len(pictured) > 1:
             raise UsageError("some of these questions come with a picture and some without; ask them in two calls")
         return pictured != {False}
 
     def asked_roles(self, questions: Sequence[Prompt]) -> dict[str, list[Roles]]:
-        """Like `roles`, of the sequences that `read` makes of these questions.
+        """The roles of the sequences that `read` makes of these questions, in the form of `roles`.
 
         A family whose prompt depends on more than a question's text, or that also acts, says so itself.
         """
@@ -526,4 +582,7 @@ class AnswerModel(Model):
 
     @abstractmethod
     def speak(self, reading: Reading, tokens: int) -> list[str]:
-        """Per row at most `tokens` greedy tokens of text, outside of any capture. No answer is an answer: ""."""
+        """Return per row at most `tokens` greedy tokens of text, outside of any capture.
+
+        The text is "" where the model ends the answer at once.
+        """

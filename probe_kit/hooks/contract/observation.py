@@ -16,8 +16,8 @@ class Observation:
 
     Attributes:
         image: (H, W, 3) uint8, the third-person camera.
-        state: (8,) float32: TCP x, y, z in metres in the robot base frame, roll, pitch, yaw in radians relative to
-            the gripper pointing down, 0, gripper openness in [0, 1].
+        state: (8,) float32: TCP x, y, z in metres in the robot base frame; roll, pitch, yaw in radians relative to
+            the gripper pointing down; 0; gripper openness in [0, 1].
         intrinsics: (3, 3) float32 pinhole matrix in pixels of `image`, x to the right and y down; None if unknown.
         cameras: Further pictures (H, W, 3) uint8 by the name of their camera.
     """
@@ -29,7 +29,7 @@ class Observation:
     cameras: Mapping[str, NDArray[np.uint8]] = field(default_factory=lambda: MappingProxyType({}))
 
     def __reduce__(self) -> tuple[type["Observation"], tuple[object, ...]]:
-        """Between processes the cameras travel as a plain dict; a read-only view cannot."""
+        """Pickle the cameras as a plain dict; a read-only view cannot travel between processes."""
         return Observation, (self.image, self.state, self.instruction, self.intrinsics, dict(self.cameras))
 
     def lacks(self, needs: frozenset[str]) -> tuple[str, ...]:
@@ -41,28 +41,36 @@ class Observation:
 
 
 def checked_picture(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """`image`, if it is (H, W, 3) uint8; else raises ObservationError."""
+    """Return `image`, if it is (H, W, 3) uint8.
+
+    Raises:
+        ObservationError: If it has another dtype or shape.
+    """
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
         raise ObservationError(f"image is {image.dtype} {image.shape}; expected uint8 (H, W, 3)")
     return image
 
 
 ARM_NUMBERS = 8
-"""Of `Observation.state`."""
+"""The count of numbers of `Observation.state`."""
 OPENNESS = ("measured", "release")
 CLOSED, OPENED = 0.015, 0.037
-"""Finger joints of the WidowX in metres."""
+"""The finger joints of the WidowX in metres, closed and open."""
 _EMPTY, _GRIPPER = 6, 7
-"""Places in `Observation.state`: a zero that stands for nothing, and the openness."""
+"""The places in `Observation.state` of a zero that stands for nothing, and of the openness."""
 
 
 def laid_out(state: NDArray[np.float32], numbers: int, openness: str = "measured") -> NDArray[np.float32]:
-    """(..., numbers) float32 of (..., 8): `Observation.state`, without its empty place where 7 numbers are read.
+    """Return `Observation.state` (..., 8) as (..., numbers) float32, without its empty place where 7 are read.
+
+    For any other count, and for a state of another size, the numbers stay as they are; the code that reads them
+    refuses.
 
     Args:
-        openness: `measured` is 0 closed to 1 open. `release` is what Act2Answer's evaluation calls so: 1 minus the
-            finger joint in metres, 0.985 closed and 0.963 open, so that both look alike. For any other count, and
-            for a state of another size, the numbers stay as they are; who reads them refuses.
+        state: (..., 8), see `Observation.state`.
+        numbers: The count of numbers that the policy reads, 7 or 8.
+        openness: `measured` is 0 closed to 1 open. `release` is the same number in Act2Answer's evaluation: 1
+            minus the finger joint in metres, 0.985 closed and 0.963 open, so that both look alike.
     """
     rows = np.array(state, np.float32)
     if rows.shape[-1] != ARM_NUMBERS:

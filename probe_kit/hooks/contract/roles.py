@@ -61,7 +61,7 @@ class Roles:
         return self.spans[-1].stop if self.spans else 0
 
     def mask(self, role: str) -> NDArray[np.bool_]:
-        """(T,) bool: positions of one role, or of all `<role>.<…>`."""
+        """Return (T,) bool: the positions of one role, or of all `<role>.<…>`."""
         mask = np.zeros(len(self), dtype=bool)
         for span in self.spans:
             if plays(span.role, role):
@@ -70,19 +70,22 @@ class Roles:
 
     @property
     def valid(self) -> NDArray[np.bool_]:
-        """(T,) bool: every position but padding."""
+        """The mask (T,) bool of every position but padding."""
         return ~self.mask(PADDING)
 
 
 def pool(tokens: Tensor, roles: Roles, views: Sequence[str]) -> Tensor:
-    """Pooled views of one sequence, reduced in float32 on the device of `tokens`.
+    """Return pooled views of one sequence, reduced in float32 on the device of `tokens`.
+
+    Padding enters no view.
 
     Args:
         tokens: (..., T, D), any float dtype.
-        views: As in `view_names`.
+        roles: The roles of the T positions.
+        views: Names as in `view_names`.
 
     Returns:
-        (..., V, D) float32. Padding enters no view.
+        (..., V, D) float32, the V views in the order of `views`.
 
     Raises:
         EmptyRoleError: For a view without a token.
@@ -101,8 +104,8 @@ def prepare_pool(roles: Iterable[Roles], views: Sequence[str], device: torch.dev
     """Bring to `device` what `pool` needs for these roles, which otherwise happens while the model runs.
 
     Raises:
-        EmptyRoleError: As `pool` does.
-        UnknownSiteError: As `pool` does.
+        EmptyRoleError: For a view without a token, as in `pool`.
+        UnknownSiteError: For an unknown view, as in `pool`.
     """
     indexed_device = torch.device(device)
     if indexed_device.type == "cuda" and indexed_device.index is None:
@@ -114,7 +117,7 @@ def prepare_pool(roles: Iterable[Roles], views: Sequence[str], device: torch.dev
 # The weights depend on the packing alone, and a run has few packings.
 @lru_cache(maxsize=1024)
 def _matrix(roles: Roles, views: tuple[str, ...], device: torch.device) -> Tensor:
-    """(V, T) float32 weights; pooling runs at every firing of every site, with few different roles."""
+    """Return (V, T) float32 weights; pooling runs at every firing of every site, with few different roles."""
     weights = np.stack([_weights(roles, view) for view in views]).astype(np.float32)
     return torch.from_numpy(weights).to(device)
 

@@ -10,7 +10,7 @@ from probe_kit.errors import UnknownSiteError, UsageError
 Part = Literal["backbone", "action", "vision", "bridge"]
 PARTS: tuple[Part, ...] = get_args(Part)
 QUANTITIES = ("residual", "attention", "mlp", "final_norm")
-"""What the streams of today's families have; a family may declare others."""
+"""The quantities that the streams of today's families have; a family may declare others."""
 KV = ("keys", "values")
 """Quantities of the stream `kv`, per block and token: all heads side by side, as attention reads them.
 
@@ -18,7 +18,7 @@ Keys are those after rotation.
 """
 KV_STREAM = "kv"
 HEADS = "heads"
-"""What every attention head of a block read, heads side by side: the input of the block's output projection.
+"""The values that every attention head of a block read, side by side: the input of the block's output projection.
 
 (B, T, heads times size of a head), of streams that declare `Stream.heads`. No run stores it.
 """
@@ -44,13 +44,13 @@ class Site:
 
     Attributes:
         stream: A stream of the model, such as `backbone` (VLM) or `expert` (action part); see `Stream.part`.
-        layer: `residual` is the stream *entering* block `layer`; 0 is the embeddings, the last one enters the
+        layer: The block, counted from 0; for `residual` the block that the stream enters.
+        quantity: `residual` is the stream *entering* block `layer`; 0 is the embeddings, the last one enters the
             final norm. `attention` and `mlp` are what block `layer` adds to it, as it is added: behind a norm,
             gate or scale, where the family has one. `final_norm` is its normed end. `heads` is what the block's
             attention heads read, see `HEADS`. A family may declare further quantities.
-        quantity: As `layer`.
-        iteration: Flow-matching step, counted from 0 (pure noise); for action tokens, the token; the camera, for
-            `vision` with several of them; None where the stream runs once.
+        iteration: Flow-matching step, counted from 0 (pure noise); for action tokens, the token; for `vision` with
+            several cameras, the camera. None where the stream runs once.
     """
 
     stream: str
@@ -64,7 +64,11 @@ class Site:
 
     @classmethod
     def parse(cls, name: str) -> "Site":
-        """The site called `name`. Raises UnknownSiteError if the name has another form."""
+        """The site called `name`.
+
+        Raises:
+            UnknownSiteError: If the name has another form.
+        """
         match = _PATTERN.fullmatch(name)
         if match is None:
             raise UnknownSiteError(
@@ -85,15 +89,18 @@ class Stream:
         layers: Number of residual sites, one more than the number of blocks.
         width: Features per token.
         iterations: Flow-matching steps or action tokens per inference, or None where the stream runs once.
-        part: Of the model it belongs to: `backbone` (VLM), `action` (where the action is made: an expert, or the
-            positions that choose action tokens), `vision`, or `bridge` between them.
-        label: What people read; default the name in plain words.
-        quantities: What can be captured of it; `residual` always.
+        part: The part of the model it belongs to: `backbone` (VLM), `action`, `vision`, or `bridge` between them.
+            The action is made in `action`: an expert, or the positions that choose action tokens. None takes the
+            part that the name tells.
+        label: The name that people read; "" takes the name in plain words.
+        quantities: The quantities that can be captured of it; `residual` always.
         probed: Whether peaks, retention and default probes use it; False for the unconditional half of guidance.
         sums: Whether residual + attention + mlp make the next residual; False where something else enters between
             blocks, such as DeepStack's pictures.
         heads: Attention heads of every block, where the family taps the quantity `heads`; 0 where it does not.
-            Raises UsageError for an unknown part, or none where the name does not tell it.
+
+    Raises:
+        UsageError: For an unknown part, or none where the name does not tell it.
     """
 
     name: str
@@ -155,7 +162,7 @@ class Stream:
 
 
 def kv_stream(blocks: int, width: int) -> Stream:
-    """The stream `kv` of a backbone of so many blocks; width: heads times size of a head."""
+    """The stream `kv` of a backbone of so many blocks; `width` is heads times size of a head."""
     return Stream(
         KV_STREAM, blocks + 1, width, part="bridge", label="keys and values of the prompt", quantities=KV
     )
@@ -172,7 +179,7 @@ def label_of(stream: str) -> str:
 
 
 def first_of(part: Part, streams: Iterable[Stream]) -> str | None:
-    """Name of the first probed stream of `part`, the one peaks and retention are about; None if there is none."""
+    """The first probed stream of `part` by name, the one peaks and retention are about; None if there is none."""
     return next((stream.name for stream in streams if stream.part == part and stream.probed), None)
 
 

@@ -1,4 +1,4 @@
-"""`probe-kit new-adapter`: a package with an adapter that passes the contract tests from the start.
+"""Write a package with an adapter that passes the contract tests from the start, for `probe-kit new-adapter`.
 
 The template's network is small, with random weights. While an author fills in their own, the tests stay green step
 by step, instead of meeting all of the contract at once.
@@ -25,7 +25,7 @@ _PACKAGE = "package"
 
 
 def write_adapter(name: str, folder: Path | str | None = None) -> list[Path]:
-    """Write the package of the family `name` into `folder`, by default one of its name; returns its files.
+    """Write the package of the family `name` into `folder`, by default one of its name, and return its files.
 
     Raises:
         UsageError: For a name that no family can have or that one has, for that of an installed module, and for a

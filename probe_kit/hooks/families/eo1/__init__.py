@@ -15,7 +15,10 @@ INTERVENTIONS = Interventions(
         "tiles": f"{MERGED}Exchange all of `image`",
     },
 )
-"""One decoder reads the prompt, then the noisy actions at every step, which read its keys and values."""
+"""The interventions of one decoder that reads the prompt, then the noisy actions at every step.
+
+The actions read the keys and values of the prompt.
+"""
 
 FAMILIES = (
     lerobot_family(

@@ -42,7 +42,7 @@ from probe_kit.models.qwen import qwen2_5_vl_config
 
 
 def build_eo1(config: EO1Config, device: str = "cpu") -> EO1Policy:
-    """An `EO1Policy` in eval mode with uninitialised weights; `config.dtype` is that of the Qwen2.5-VL."""
+    """Build an `EO1Policy` in eval mode with uninitialised weights; `config.dtype` is that of the Qwen2.5-VL."""
     config.device = building_device(device)
     config.pretrained_path = config.pretrained_path or Path()  # else lerobot downloads the weights of Qwen2.5-VL
     policy = cast(EO1Policy, build_empty(lambda: EO1Policy(config), torch.float32, config.device))
@@ -61,7 +61,7 @@ def build_eo1(config: EO1Config, device: str = "cpu") -> EO1Policy:
 
 
 def full_size_eo1() -> EO1Policy:
-    """EO-1 on Qwen2.5-VL-3B, on the meta device."""
+    """Build EO-1 on Qwen2.5-VL-3B, on the meta device."""
     config = EO1Config(
         device="cpu",
         dtype="float32",
@@ -72,7 +72,11 @@ def full_size_eo1() -> EO1Policy:
 
 
 def chat_step(folder: Path, fields: Mapping[str, Any]) -> EO1QwenProcessorStep:
-    """lerobot's step that reads a chat. folder: of the processor's files.
+    """Build lerobot's step that reads a chat.
+
+    Args:
+        folder: The folder of the processor's files.
+        fields: The fields of the saved step.
 
     Raises:
         CheckpointError: For files without a chat template.
@@ -113,14 +117,18 @@ class Eo1(PackedPolicy):
 
     @classmethod
     def current_values(cls, values: dict[str, Any], path: Path) -> dict[str, Any]:
-        """Raise CheckpointError for a file without the sizes of its vision-language model."""
+        """Return the fields as they are.
+
+        Raises:
+            CheckpointError: For a file without the sizes of its vision-language model.
+        """
         if values.get("vlm_config") is None:
             raise CheckpointError(f"{path} has no vlm_config, the sizes of its Qwen2.5-VL. Save it with lerobot")
         return values
 
     @classmethod
     def parse_config(cls, folder: Path, evaluation: Any) -> Any:
-        """lerobot's configuration, with what the processor files say: lerobot packs as they do."""
+        """Return lerobot's configuration, with what the processor files say: lerobot packs as they do."""
         config = super().parse_config(folder, evaluation)
         saved = step_fields(folder)
         template = saved.get(TEMPLATE, {})
@@ -136,30 +144,34 @@ class Eo1(PackedPolicy):
 
     @classmethod
     def build(cls, config: Any, folder: Path) -> Any:
-        """lerobot's policy of the size that the configuration has."""
+        """Build lerobot's policy of the size that the configuration has."""
         del folder
         if config.dtype == "auto":
             config.dtype = str(config.vlm_backbone_config.dtype or "float32").removeprefix("torch.")
         return build_eo1(config)
 
     def parts(self) -> dict[str, Path]:
-        """The processor's folder."""
+        """Return the processor's folder."""
         return {"vlm": self.config.processor_folder}
 
     @cached_property
     def packing(self) -> EO1QwenProcessorStep:
-        """lerobot's step that reads a chat."""
+        """The step of lerobot that reads a chat."""
         return chat_step(self.config.processor_folder, self.config.packing)
 
     @cached_property
     def tokenizer(self) -> Any:
-        """The vision-language model's, with the tokens of states and actions."""
+        """The tokenizer of the vision-language model, with the tokens of states and actions."""
         return self.packing._processor.tokenizer
 
     def pack(
         self, observations: Sequence[Observation], state: NDArray[np.float32]
     ) -> tuple[dict[str, Tensor], list[Tokens]]:
-        """See the base; also for a text that holds one of the chat's own marks, or no word."""
+        """Return inputs and prompts as the base does.
+
+        Raises:
+            InstructionError: Also for a text that holds one of the chat's own marks, or no word.
+        """
         tasks = [observation.instruction for observation in observations]
         for task in tasks:
             marks = [mark for mark in self.tokenizer.get_added_vocab() if mark in task]
@@ -178,7 +190,7 @@ class Eo1(PackedPolicy):
         return {**inputs, STATE: torch.from_numpy(state)}, self._labelled(inputs)
 
     def _labelled(self, packed: Mapping[str, Tensor]) -> list[Tokens]:
-        """Ids and roles of every row, up to the actions."""
+        """Return ids and roles of every row, up to the actions."""
         begin, end, picture = self.tokenizer.convert_tokens_to_ids(["<|state_end|>", "<|vla|>", "<|image_pad|>"])
         state, action = int(packed["state_token_id"]), int(packed["action_token_id"])
         rows = []
@@ -205,5 +217,5 @@ class Eo1(PackedPolicy):
         return {"backbone": token_stack(*shared, None), "expert": token_stack(*shared, steps, first=1)}
 
     def watched(self) -> dict[str, nn.Module]:
-        """The velocity."""
+        """Return the module of the velocity."""
         return {"velocity": self.network.model.action_out_proj}

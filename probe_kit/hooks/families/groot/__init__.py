@@ -5,7 +5,7 @@ from probe_kit.hooks.contract.sites import QUANTITIES, Stream
 from probe_kit.hooks.families.shared.kinds import MERGED, lerobot_family
 
 RESIZES = ("nvidia", "lerobot")
-"""Code that brings pictures to their size in two ways."""
+"""The code that brings pictures to their size, in two ways."""
 BRIDGE = ("residual", "attention", "mlp")
 INTERVENTIONS = Interventions(
     edits={"backbone": QUANTITIES, "bridge": BRIDGE, "expert": QUANTITIES},
@@ -18,7 +18,7 @@ INTERVENTIONS = Interventions(
         "tiles": f"{MERGED}Exchange all of `image`",
     },
 )
-"""The expert reads the whole backbone through the bridge, also its last residual."""
+"""The interventions of an expert that reads the whole backbone through the bridge, also its last residual."""
 
 FAMILIES = (
     lerobot_family(

@@ -41,7 +41,7 @@ _HEAD = f"{_MODEL}backbone.model.lm_head.weight"
 
 
 _DIFFUSERS = {"attention": "attn1", "heads": "attn1.to_out.0", "mlp": "ff"}
-"""What a block of diffusers adds: its one attention, to the prompt or itself, and its MLP."""
+"""The paths of what a block of diffusers adds: its one attention, to the prompt or itself, and its MLP."""
 
 
 def _lerobots_names(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -50,7 +50,10 @@ def _lerobots_names(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 class Groot(PackedPolicy):
-    """A loaded GR00T N1.7. One observation per call: its bridge reads padding, which changes the actions."""
+    """A loaded GR00T N1.7.
+
+    It takes one observation per call: its bridge reads padding, which changes the actions.
+    """
 
     family = "groot"
     config_type = "groot"
@@ -77,7 +80,7 @@ class Groot(PackedPolicy):
         weights_seed: int = 0,
         **options: Any,
     ) -> Self:
-        """See `LerobotPolicy.load`. dtype: bfloat16 for lerobot's autocast around float32 weights."""
+        """Load as `LerobotPolicy.load` does; dtype bfloat16 is lerobot's autocast around float32 weights."""
         policy = super().load(checkpoint, device, dtype, random_weights, weights_seed, **options)
         execute = min(int(policy.network._action_queue_steps), policy.chunk)
         policy.card = replace(policy.card, chunk=policy.chunk, execute=execute, batch=1)
@@ -85,7 +88,11 @@ class Groot(PackedPolicy):
 
     @classmethod
     def parse_config(cls, folder: Path, evaluation: Any) -> Any:
-        """lerobot's configuration, also for NVIDIA's layout. Raises UsageError for an option that has no use."""
+        """Return lerobot's configuration, also for NVIDIA's layout.
+
+        Raises:
+            UsageError: For an option that has no use.
+        """
         if is_nvidias(folder):
             config = nvidias_config(folder, evaluation.embodiment)
         elif evaluation.embodiment is not None:
@@ -101,7 +108,11 @@ class Groot(PackedPolicy):
 
     @classmethod
     def build(cls, config: Any, folder: Path) -> Any:
-        """lerobot's policy of the size that the base model's configuration has. Raises CheckpointError."""
+        """Build lerobot's policy of the size that the base model's configuration has.
+
+        Raises:
+            CheckpointError: For another kind of backbone.
+        """
         if (dtype := getattr(config, "dtype", None)) is not None:
             config.use_bf16 = dtype == "bfloat16"
             config.model_params_fp32 = config.model_params_fp32 or dtype == "float32"
@@ -111,11 +122,11 @@ class Groot(PackedPolicy):
         return build_groot(config, network_config(config.places.network, config, config.places.model_name))
 
     def parts(self) -> dict[str, Path]:
-        """The base model and the vision-language model."""
+        """Return the folders of the base model and of the vision-language model."""
         return {"base": self.config.places.base, "vlm": self.config.places.vlm}
 
     def further_settings(self) -> dict[str, str]:
-        """The embodiment whose statistics and weights are read, and how pictures are resized."""
+        """Return the embodiment whose statistics and weights are read, and how pictures are resized."""
         encode = self._steps.encode
         return {
             "embodiment": str(self.config.embodiment_tag),
@@ -128,7 +139,11 @@ class Groot(PackedPolicy):
         return read_steps(self.folder, self.config, self.config.resize, self.config.letterbox)
 
     def own_units(self, feature: str, kind: str) -> Normaliser:
-        """The units in the processors. Raises CheckpointError."""
+        """Return the units in the processors.
+
+        Raises:
+            CheckpointError: For statistics that are missing, or do not fit.
+        """
         del feature
         steps = self._steps
         if kind == "STATE":
@@ -137,7 +152,7 @@ class Groot(PackedPolicy):
 
     @property
     def predicts_relative(self) -> bool:
-        """Also by NVIDIA's statistics."""
+        """Whether the base says so, or NVIDIA's statistics."""
         return super().predicts_relative or bool(getattr(self._steps.decode, "use_relative_action", False))
 
     def _notes(self) -> tuple[str, ...]:
@@ -152,7 +167,7 @@ class Groot(PackedPolicy):
 
     @cached_property
     def chunk(self) -> int:
-        """Actions of an inference that have a meaning for this embodiment."""
+        """The number of actions of an inference that have a meaning for this embodiment."""
         widest = torch.empty(1, self._head.action_horizon, 1)
         length = int(self.network._resolve_prediction_horizon(widest))
         steps = (getattr(self._steps.decode, "modality_config", None) or {}).get("action", {}).get("delta_indices")
@@ -167,23 +182,23 @@ class Groot(PackedPolicy):
         return int(self.config.output_features["action"].shape[0])
 
     def denoise(self, batch: Mapping[str, Tensor], noise: Tensor) -> Tensor:
-        """The steps and numbers that this embodiment has."""
+        """Return the steps and numbers that this embodiment has."""
         return flow_actions(self.network, batch, noise)[:, : self.chunk, : self._action_numbers]
 
     @property
     def noise_shape(self) -> tuple[int, int]:
-        """The network's whole horizon, and its widest action."""
+        """The shape of one row's noise: the network's whole horizon, and its widest action."""
         return self._head.action_horizon, self._head.action_dim
 
     # -- the prompt --------------------------------------------------------------------------------------
 
     @cached_property
     def packing(self) -> Packing:
-        """lerobot's packing."""
+        """The packing of lerobot."""
         return Packing(self._steps, self.config.places.vlm)
 
     def suffix_labels(self) -> list[str]:
-        """The state, then the network's whole horizon."""
+        """Return the labels of the state, then of the network's whole horizon."""
         return ["state", *["action"] * int(self._head.action_horizon)]
 
     # -- capture -----------------------------------------------------------------------------------------
@@ -225,11 +240,11 @@ class Groot(PackedPolicy):
     # -- verification ------------------------------------------------------------------------------------
 
     def watched(self) -> dict[str, nn.Module]:
-        """The velocity."""
+        """Return the module of the velocity."""
         return {"velocity": self._head.action_decoder}
 
     def further_outputs(self, run: RecordedRun) -> dict[str, Produce]:
-        """The end of the backbone, and velocities without the state's position."""
+        """Return the end of the backbone, and velocities without the state's position."""
         end, horizon = self.streams["backbone"].sites()[-1], run.recorded["in_noise"].shape[1]
         return {
             "backbone_end": lambda: numpy_of(run.activations[end]),

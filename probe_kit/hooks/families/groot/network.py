@@ -1,6 +1,6 @@
-"""lerobot's own `GrootPolicy` at the size a checkpoint has, its flow, and NVIDIA's own layout of its files.
+"""The `GrootPolicy` of lerobot at the size a checkpoint has, its flow, and NVIDIA's own layout of its files.
 
-lerobot's constructor downloads and loads weights and allows remote code; here the network is built empty, of
+The constructor of lerobot downloads and loads weights and allows remote code; here the network is built empty, of
 transformers' own classes. Its flow draws noise for a whole batch at once; `flow_actions` calls the same modules
 with noise that is given.
 
@@ -37,13 +37,15 @@ from probe_kit.hooks.families.shared.kinds import IMAGES, STATE, Evaluation
 from probe_kit.models.building import build_empty, building_device, replaced
 
 VLM = GROOT_N1_7_BACKBONE_MODEL
-"""Whose configuration lerobot holds itself; any other is read from its folder."""
+"""The model whose configuration lerobot holds itself; any other is read from its folder."""
 
 
 def network_config(values: Mapping[str, Any], config: GrootConfig, vlm: str) -> GR00TN17Config:
-    """The network's configuration: the content of its `config.json`, and what lerobot's `config` sets over it.
+    """Return the network's configuration: the content of its `config.json`, and what `config` sets over it.
 
     Args:
+        values: The content of the network's `config.json`.
+        config: The configuration of lerobot.
         vlm: `VLM`, or the folder of the vision-language model's configuration.
 
     Raises:
@@ -61,7 +63,7 @@ def network_config(values: Mapping[str, Any], config: GrootConfig, vlm: str) -> 
 
 
 def build_groot(config: GrootConfig, network: GR00TN17Config, device: str = "cpu") -> GrootPolicy:
-    """A `GrootPolicy` in eval mode with uninitialised weights; parameters in float32 where `config` says so."""
+    """Build a `GrootPolicy` in eval mode with uninitialised weights; in float32 where `config` says so."""
     device = building_device(device)
     config.device = device
     dtype = torch.float32 if config.model_params_fp32 else torch.bfloat16
@@ -84,17 +86,19 @@ def build_groot(config: GrootConfig, network: GR00TN17Config, device: str = "cpu
 
 
 def full_size_groot() -> GrootPolicy:
-    """The size that lerobot's configuration of GR00T N1.7 has by default, on the meta device."""
+    """Build the size that lerobot's configuration of GR00T N1.7 has by default, on the meta device."""
     picture = PolicyFeature(FeatureType.VISUAL, (3, 256, 256))
     config = GrootConfig(device="cpu", input_features={"observation.images.image": picture})
     return build_groot(config, network_config({}, config, VLM), device="meta")
 
 
 def flow_actions(policy: Any, inputs: Mapping[str, Tensor], noise: Tensor) -> Tensor:
-    """(B, H, D) normalised actions from noise of that shape: lerobot's flow, one inference.
+    """Return normalised actions (B, H, D) from noise of that shape: lerobot's flow, one inference.
 
     Args:
-        inputs: What lerobot's processors pack. H, D: the network's own horizon and widest action.
+        policy: The policy of lerobot.
+        inputs: The tensors that lerobot's processors pack.
+        noise: (B, H, D), of the network's own horizon H and widest action D.
     """
     model, head = policy._groot_model, policy._groot_model.action_head
     placed = {name: _placed(tensor, model) for name, tensor in inputs.items()}
@@ -146,9 +150,12 @@ class GrootChoice(Evaluation):
 
 @dataclass(frozen=True)
 class Places:
-    """The folders of a checkpoint's parts. network: content of the network's `config.json`. base, vlm: folders.
+    """The folders of a checkpoint's parts.
 
     Attributes:
+        network: Content of the network's `config.json`.
+        base: Folder of the base model.
+        vlm: Folder of the vision-language model.
         model_name: The vision-language model as the network's configuration is to name it.
     """
 
@@ -159,10 +166,15 @@ class Places:
 
     @classmethod
     def of(cls, folder: Path, base: str, vlm: str | None) -> "Places":
-        """base: as the policy's configuration names it, a folder in the checkpoint or a hub id. vlm: another one.
+        """Find the parts of a checkpoint.
+
+        Args:
+            folder: The folder of the checkpoint.
+            base: The base model as the policy's configuration names it, a folder in the checkpoint or a hub id.
+            vlm: Another vision-language model, a folder or hub id; None for the one that the base model names.
 
         Raises:
-            CheckpointError: For what is not there.
+            CheckpointError: For a part that is not there.
         """
         base_folder = inside_or_hub(folder, base)
         content = read_json_object(base_folder / CONFIG_FILE, CheckpointError, _AGAIN)
@@ -177,10 +189,11 @@ def is_nvidias(folder: Path) -> bool:
 
 
 def nvidias_config(folder: Path, embodiment: str | None) -> GrootConfig:
-    """lerobot's configuration for a checkpoint in NVIDIA's layout.
+    """Return lerobot's configuration for a checkpoint in NVIDIA's layout.
 
     Args:
-        embodiment: Its tag; None where the files have one only.
+        folder: The folder of the checkpoint.
+        embodiment: The tag of the embodiment; None where the files have one only.
 
     Raises:
         CheckpointError: For missing files.

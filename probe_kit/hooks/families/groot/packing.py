@@ -84,11 +84,13 @@ _ACTION = dict.fromkeys(("rep", "type", "format", "state_key"), _ANY)
 
 @dataclass(frozen=True)
 class StateFields:
-    """The state of one embodiment. excluded: the network reads zeros. angles: groups read as sine and cosine.
+    """The state of one embodiment.
 
     Attributes:
-        deviations: Groups of the state and of the action that are mapped by mean and deviation.
-        action_deviations: As `deviations`.
+        excluded: Whether the network reads zeros.
+        angles: Groups that are read as sine and cosine.
+        deviations: Groups of the state that are mapped by mean and deviation.
+        action_deviations: Groups of the action that are mapped by mean and deviation.
     """
 
     excluded: bool
@@ -98,7 +100,11 @@ class StateFields:
 
 
 def processor_settings(folder: Path) -> dict[str, Any]:
-    """The settings in `processor_config.json`. Raises CheckpointError for one that may change numbers unseen."""
+    """Return the settings in `processor_config.json`.
+
+    Raises:
+        CheckpointError: For a setting that may change numbers unseen.
+    """
     path = folder / PROCESSOR_FILE
     content = read_json_object(path, CheckpointError, "Download the checkpoint again")
     check_values(content, _TOP, str(path))
@@ -114,7 +120,7 @@ def processor_settings(folder: Path) -> dict[str, Any]:
 
 
 def read_state_fields(folder: Path, settings: Mapping[str, Any], tag: str) -> StateFields:
-    """The settings of the processor file for the state of embodiment `tag`.
+    """Return the settings of the processor file for the state of embodiment `tag`.
 
     Raises:
         CheckpointError: For several frames of the state, and for a field that may change numbers unseen.
@@ -158,7 +164,11 @@ def check_widths(folder: Path, settings: Mapping[str, Any], network: Mapping[str
 
 
 def _groups(path: Path, modality: Mapping[str, Any], field: str) -> tuple[str, ...]:
-    """The groups that a field lists. Raises CheckpointError for one that the modality does not have."""
+    """Return the groups that a field lists.
+
+    Raises:
+        CheckpointError: For a group that the modality does not have.
+    """
     listed = modality.get(field) or []
     keys = modality.get("modality_keys", [])
     if not isinstance(listed, list) or (strange := [key for key in listed if key not in keys]):
@@ -185,12 +195,12 @@ def _check_number(path: Path, name: str, value: Any, kind: Any, most: int) -> No
 NVIDIAS_VERSION = "gr00t_n1d7 of Isaac-GR00T, commit 1852a8c of 2026"
 """The newest code of NVIDIA that was read."""
 _EDGE, _FRACTION = 256, 0.95
-"""What NVIDIA's processor takes for fields that a file lacks."""
+"""The values that NVIDIA's processor takes for fields that a file lacks."""
 
 
 @dataclass
 class NvidiasPictures(GrootN17VLMEncodeStep):  # type: ignore[misc]
-    """lerobot's step with NVIDIA's resizing in place of its own.
+    """The step of lerobot with NVIDIA's resizing in place of its own.
 
     NVIDIA squashes to the target size, bilinearly, and cuts pixels out; lerobot is bicubic and cuts a fraction.
     With `use_albumentations` both bring the shortest edge to a length by area; without a length, NVIDIA squashes.
@@ -207,7 +217,7 @@ class NvidiasPictures(GrootN17VLMEncodeStep):  # type: ignore[misc]
             )
 
     def _build_sample_images(self, video: Any, batch_size: int, target_device: Any) -> list[list[Tensor]]:
-        """(3, H, W) uint8 per frame and camera. video: (B, T, V, H, W, 3) uint8."""
+        """Return (3, H, W) uint8 per frame and camera of a `video` (B, T, V, H, W, 3) uint8."""
         del target_device
         pictures = np.asarray(video)
         return [
@@ -216,7 +226,7 @@ class NvidiasPictures(GrootN17VLMEncodeStep):  # type: ignore[misc]
         ]
 
     def resized(self, picture: NDArray[np.uint8]) -> Tensor:
-        """(3, H, W) uint8 of (H, W, 3)."""
+        """Resize a picture (H, W, 3) uint8 to (3, H, W) uint8."""
         square = _letterboxed(picture) if self.letter_box_transform else picture
         if self.use_albumentations:
             return torch.from_numpy(np.ascontiguousarray(self._by_area(square))).permute(2, 0, 1)
@@ -227,7 +237,7 @@ class NvidiasPictures(GrootN17VLMEncodeStep):  # type: ignore[misc]
         return resized
 
     def _by_area(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Resized, cut, and resized again."""
+        """Resize, cut, and resize again."""
         target, crop = self.image_target_size or [1, 1], self.image_crop_size or [1, 1]
         fraction = crop[0] / target[0] if self.crop_fraction is None else self.crop_fraction
         first = self._one_size(picture)
@@ -236,7 +246,7 @@ class NvidiasPictures(GrootN17VLMEncodeStep):  # type: ignore[misc]
         return self._one_size(first[top : top + height, column : column + width])
 
     def _one_size(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The shortest edge at its length, or squashed where there is none."""
+        """Return a picture with the shortest edge at its length, or squashed where there is none."""
         if self.shortest_image_edge is None:
             height, width = self.image_target_size or [1, 1]
         else:
@@ -259,10 +269,12 @@ class NvidiasPictures(GrootN17VLMEncodeStep):  # type: ignore[misc]
 
 
 def nvidias_pictures(step: GrootN17VLMEncodeStep, settings: Mapping[str, Any] | None) -> NvidiasPictures:
-    """The step with NVIDIA's resizing.
+    """Return the step with NVIDIA's resizing.
 
     Args:
-        settings: Of its processor file, whose missing fields have NVIDIA's values; None in lerobot's layout.
+        step: The step of lerobot.
+        settings: The settings of its processor file, whose missing fields have NVIDIA's values; None in lerobot's
+            layout.
     """
     values = {field.name: getattr(step, field.name) for field in fields(GrootN17VLMEncodeStep) if field.init}
     if settings is not None:
@@ -279,7 +291,7 @@ def lerobots_rule(step: GrootN17VLMEncodeStep) -> str:
 
 
 def _letterboxed(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """(side, side, 3) of (H, W, 3), black bars on both ends."""
+    """Pad a picture (H, W, 3) to (side, side, 3), with black bars on both ends."""
     height, width = picture.shape[:2]
     side = max(height, width)
     rows, columns = side - height, side - width
@@ -298,15 +310,19 @@ _STEPS: Mapping[str, type[Any]] = {
     "groot_action_unpack_unnormalize_v2": GrootActionUnpackUnnormalizeStep,
 }
 _HARMLESS = ("rename_observations_processor", "to_batch_processor", "device_processor")
-"""Steps that change no number: observations come here under the names of the policy."""
+"""The steps that change no number: observations come here under the names of the policy."""
 
 
 @dataclass(frozen=True)
 class Steps:
-    """lerobot's steps of one checkpoint: packing, pictures and words, actions. source: where they come from.
+    """The steps of lerobot for one checkpoint: packing, pictures and words, actions.
 
     Attributes:
-        fields: What NVIDIA's processor file says of the state; None in lerobot's layout.
+        source: The files they come from, for messages.
+        fields: The fields of NVIDIA's processor file for the state; None in lerobot's layout.
+
+    Raises:
+        CheckpointError: For an embodiment without a number.
     """
 
     pack: GrootN17PackInputsStep
@@ -324,11 +340,13 @@ class Steps:
 def read_steps(
     folder: Path, config: GrootConfig, resize: str | None = None, letterbox: bool | None = None
 ) -> Steps:
-    """The steps that lerobot makes of NVIDIA's files, or of the pipelines that it saved.
+    """Return the steps that lerobot makes of NVIDIA's files, or of the pipelines that it saved.
 
     Args:
+        folder: The folder of the checkpoint.
+        config: The configuration of lerobot.
         resize: `nvidia` or `lerobot`, whose code brings pictures to their size; None for the layout's own.
-            letterbox: whether pictures are made square with bars first; None for what the files say.
+        letterbox: Whether pictures are made square with bars first; None for what the files say.
 
     Raises:
         CheckpointError: For files that are missing, and for a step or field that is not known here.
@@ -358,7 +376,11 @@ def _lerobots_steps(folder: Path, config: GrootConfig) -> Steps:
 
 
 def _built(folder: Path, saved: SavedStep) -> Any:
-    """lerobot's object of a saved step; never by the name of a class, which could be any."""
+    """Build lerobot's object of a saved step; never by the name of a class, which could be any.
+
+    Raises:
+        CheckpointError: For an unknown step, for one that cannot be built, and for statistics that are missing.
+    """
     if saved.name not in _STEPS:
         raise CheckpointError(
             f"{folder} has the step {saved.name!r}, which changes numbers in a way probe_kit does not know. Known "
@@ -393,10 +415,10 @@ def _select_steps(steps: Sequence[Any], source: str) -> Steps:
 
 
 class Packing:
-    """lerobot's packing of pictures, words and state into the inputs of the network."""
+    """The packing of lerobot: pictures, words and state become the inputs of the network."""
 
     def __init__(self, steps: Steps, vlm: Path) -> None:
-        """vlm: folder of tokenizer and processor files."""
+        """Take the steps that pack; `vlm` is the folder of tokenizer and processor files."""
         # The state comes here in the network's own numbers, and pictures are made on the CPU, on every machine.
         self.pack = replace(steps.pack, normalize_min_max=False, training=False)
         self.encode = replace(steps.encode, training=False, device=None)
@@ -404,7 +426,11 @@ class Packing:
 
     @cached_property
     def processor(self) -> Any:
-        """transformers' processor of Qwen3-VL, as lerobot puts it together. Raises CheckpointError."""
+        """The processor of Qwen3-VL in transformers, as lerobot puts it together.
+
+        Raises:
+            CheckpointError: For missing files, and for a tokenizer without a chat template.
+        """
         folder = str(self.vlm)
         try:
             tokenizer = load_pretrained(AutoTokenizer, folder)
@@ -426,7 +452,7 @@ class Packing:
 
     @property
     def tokenizer(self) -> Any:
-        """The vision-language model's."""
+        """The tokenizer of the vision-language model."""
         return self.processor.tokenizer
 
     def order(self, cameras: Sequence[str]) -> list[str]:
@@ -435,7 +461,16 @@ class Packing:
         return [key.removeprefix(IMAGES) for key in keys]
 
     def row(self, pictures: Mapping[str, NDArray[np.uint8]], task: str, state: NDArray[np.float32]) -> PackedRow:
-        """One row. pictures: (H, W, 3) by camera. state: (D,). Raises InstructionError for one without words."""
+        """Pack one row.
+
+        Args:
+            pictures: (H, W, 3) by camera.
+            task: The instruction.
+            state: (D,) as the network reads it.
+
+        Raises:
+            InstructionError: For an instruction without words.
+        """
         processor = self.processor
         observation: dict[str, Any] = {
             f"{IMAGES}{camera}": torch.from_numpy(picture).permute(2, 0, 1)[None]
@@ -463,5 +498,5 @@ class Packing:
         )
 
     def batch(self, rows: Sequence[PackedRow]) -> dict[str, Tensor]:
-        """The one row: its bridge reads padding, so several make no batch."""
+        """Return the one row: its bridge reads padding, so several make no batch."""
         return rows[0].inputs if len(rows) == 1 else {}

@@ -39,7 +39,7 @@ class StateUnits(Normaliser):
         return len(self.low) + sum(end - begin for begin, end in self.angles)
 
     def normalise(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Physical units to the numbers the network reads; (..., D) to (..., numbers)."""
+        """Map physical units (..., D) to the numbers the network reads (..., numbers)."""
         if self.excluded:
             return np.zeros((*values.shape[:-1], self.numbers), np.float32)
         mapped, position = super().normalise(values), 0
@@ -51,7 +51,7 @@ class StateUnits(Normaliser):
         return np.asarray(np.concatenate([*parts, mapped[..., position:]], -1), np.float32)
 
     def unusual(self, values: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """(..., D): outside the bounds, or far from the mean; never of what is not read.
+        """Return (..., D): outside the bounds, or far from the mean; never of what is not read.
 
         An angle in radians comes back after a turn; one in degrees lies outside the bounds and beyond a turn.
         """
@@ -64,7 +64,13 @@ class StateUnits(Normaliser):
 def state_units(
     step: GrootN17PackInputsStep, numbers: int, source: str, fields: StateFields | None = None
 ) -> Normaliser:
-    """The units of lerobot's packing step, or of NVIDIA's processor where its `fields` are there.
+    """Return the units of lerobot's packing step, or of NVIDIA's processor where its `fields` are there.
+
+    Args:
+        step: The packing step of lerobot.
+        numbers: The count of numbers of the state.
+        source: The files the statistics come from, for messages.
+        fields: The fields of NVIDIA's processor file; None in lerobot's layout.
 
     Raises:
         CheckpointError: Where it would let the state pass unchanged.
@@ -83,7 +89,13 @@ def action_units(
     source: str,
     fields: StateFields | None = None,
 ) -> Normaliser:
-    """The units of lerobot's step that decodes actions. fields: of NVIDIA's processor file, if it is there.
+    """Return the units of lerobot's step that decodes actions.
+
+    Args:
+        step: The step of lerobot that decodes actions.
+        numbers: The count of numbers of an action.
+        source: The files the statistics come from, for messages.
+        fields: The fields of NVIDIA's processor file; None in lerobot's layout.
 
     Raises:
         CheckpointError: For statistics that are missing, and for actions relative to the state: they have no unit
@@ -102,7 +114,7 @@ def action_units(
 
 
 def _nvidias_state(step: GrootN17PackInputsStep, numbers: int, source: str, fields: StateFields) -> StateUnits:
-    """The groups of the state side by side, each mapped in its own way."""
+    """Return the groups of the state side by side, each mapped in its own way."""
     keys = (step.modality_config or {}).get("state", {}).get("modality_keys", [])
     statistics = (step.raw_stats or {}).get("state", {})
     names = ("q01", "q99") if step.use_percentiles else ("min", "max")
@@ -131,13 +143,17 @@ def _side_by_side(
     scored: Collection[str],
     subject: str,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], dict[str, tuple[int, int]]]:
-    """Two statistics of groups as vectors, which numbers are means and deviations, and where each group stands.
+    """Return two statistics of groups as vectors, which numbers are scored, and where each group stands.
 
     Args:
-        names: The statistics of groups that are not in `scored`.
+        keys: The names of the groups, in order.
+        statistics: The statistics of every group, by its name.
+        names: The two statistics of groups that are not in `scored`.
+        scored: The groups that are mapped by mean and deviation.
+        subject: The file and the part of it, for messages.
 
     Raises:
-        CheckpointError: For one that is missing.
+        CheckpointError: For a statistic that is missing.
     """
     parts: tuple[list[NDArray[np.float32]], ...] = ([], [])
     flags: list[bool] = []
@@ -164,10 +180,16 @@ def _mode(names: tuple[str, str], scored: NDArray[np.bool_]) -> str:
 def _grouped(
     step: GrootN17ActionDecodeStep, numbers: int, source: str, scored: Collection[str] = ()
 ) -> Normaliser:
-    """The groups of NVIDIA's statistics side by side, in the order of the configuration.
+    """Return the groups of NVIDIA's statistics side by side, in the order of the configuration.
 
     Args:
+        step: The step of lerobot that decodes actions.
+        numbers: The count of numbers of an action.
+        source: The files the statistics come from, for messages.
         scored: Groups that are mapped by mean and deviation.
+
+    Raises:
+        CheckpointError: For statistics that are missing, and for actions relative to the state.
     """
     action = (step.modality_config or {}).get("action", {})
     keys, kinds = action.get("modality_keys", []), action.get("action_configs", [])
@@ -194,7 +216,11 @@ def _grouped(
 def _bounds(
     statistics: Mapping[str, Any], numbers: int, feature: str, source: str
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Raises CheckpointError for statistics that are missing or of another length: lerobot fills them up."""
+    """The minima and maxima of a feature.
+
+    Raises:
+        CheckpointError: For statistics that are missing or of another length: lerobot fills them up.
+    """
     bounds = [np.asarray(statistics.get(name, []), np.float32).reshape(-1) for name in ("min", "max")]
     if any(len(bound) != numbers for bound in bounds):
         raise CheckpointError(

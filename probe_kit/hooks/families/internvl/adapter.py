@@ -18,7 +18,7 @@ TILES = ("auto", "1")
 
 
 class InternVL(VisionLanguageModel):
-    """A loaded InternVL. tiles: `auto` cuts pictures as released, `1` shows every one as one tile."""
+    """A loaded InternVL; its option `tiles` is `auto`, which cuts pictures as released, or `1`, one for each."""
 
     family: ClassVar[str] = "internvl"
     frame: ClassVar[Frame] = Frame(f"{USER}<img>", "</img>\n", USER, ASSISTANT)
@@ -33,7 +33,7 @@ class InternVL(VisionLanguageModel):
 
     @cached_property
     def vision(self) -> Stack:
-        """The vision tower; the last site is what leaves it. A row per tile."""
+        """The vision tower; the last site is what leaves it. There is a row per tile."""
         tower, width = self.network.model.vision_tower, int(self.network.config.vision_config.hidden_size)
         return Stack(tower.encoder.layer, tower.layernorm, width, None, "layernorm_before", stream_fields=TOWER)
 
@@ -47,12 +47,12 @@ class InternVL(VisionLanguageModel):
         return TiledPictures.from_folder(self.loaded.folder, self._side, self.tiles == "auto")
 
     def picture_ids(self, height: int, width: int) -> list[int]:
-        """Ids of a picture: per tile its patches after neighbours were joined."""
+        """Return the ids of a picture: per tile its patches after neighbours were joined."""
         config = self.network.config
         patches = self._side // int(config.vision_config.patch_size[0])
         joined = int(patches * float(config.downsample_ratio)) ** 2
         return [int(config.image_token_id)] * (joined * self.pictures.tiles(height, width))
 
     def picture_inputs(self, pictures: Pictures) -> dict[str, Tensor]:
-        """pixel_values (tiles of all pictures, 3, S, S)."""
+        """Return `pixel_values` (tiles of all pictures, 3, S, S)."""
         return {"pixel_values": self.pictures.pixels(pictures).to(self.loaded.device)}

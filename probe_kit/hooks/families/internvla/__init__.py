@@ -35,7 +35,10 @@ INTERVENTIONS = Interventions(
         "tiles": f"{MERGED}Exchange all of `image`",
     },
 )
-"""DINOv2's features reach the bridge past the backbone: patching backbone sites does not patch everything."""
+"""The interventions of a policy in which DINOv2's features reach the bridge past the backbone.
+
+Patching backbone sites does not patch everything.
+"""
 
 FAMILIES = (
     Family(
@@ -98,7 +101,10 @@ _GRIPPER, _OPEN = 6, 0.5
 
 
 class ActionUnits(ActionStatistics):
-    """The statistics of a run. Its head puts out numbers beyond [-1, 1], and a gripper between open and closed."""
+    """The statistics of a run.
+
+    Its head puts out numbers beyond [-1, 1], and a gripper between open and closed.
+    """
 
     lacking: ClassVar[str] = (
         "the checkpoint has no dataset_statistics.json: its actions have no physical unit. Take the file that the "
@@ -106,7 +112,10 @@ class ActionUnits(ActionStatistics):
     )
 
     def restore(self, values: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
-        """(…, D) in the data set's units: clipped to [-1, 1], the gripper open or closed, then stretched."""
+        """Return values (…, D) in the data set's units: clipped to [-1, 1], the gripper decided, then stretched.
+
+        The gripper is open or closed.
+        """
         clipped = np.clip(values.astype(np.float64), -1, 1)
         if clipped.shape[-1] > _GRIPPER:
             clipped[..., _GRIPPER] = clipped[..., _GRIPPER] >= _OPEN

@@ -2,7 +2,7 @@
 
 Backbone: the chat with one picture. Bridge: queries that read the backbone's last states and DINOv2's features.
 Expert: what the queries found, then the noisy actions, at every DDIM step. Under guidance the head runs every row
-twice; `expert` is the half that has the condition, `expert_unconditional` the one that has none, which only serves
+twice. `expert` is the half that has the condition, `expert_unconditional` the one that has none, which only serves
 to be subtracted.
 
 References of `verify`: B batch, V views, P prompt positions, L backbone layers, S DDIM steps, C conditions, A
@@ -49,13 +49,16 @@ from probe_kit.models.qwen import QwenInputs
 
 DEFAULT_CHECKPOINT = "InternRobotics/InternVLA-M1-Pretrain-RT-1-Bridge"
 STEPS, GUIDANCE = 10, 1.5
-"""As the released evaluation runs it."""
+"""The number of DDIM steps and the scale of guidance with which the released evaluation runs it."""
 _BLOCK = ("residual", "attention", "mlp")
 _UNCONDITIONAL = "expert_unconditional"
 
 
 class InternVLA(QwenVLA):
-    """A loaded InternVLA-M1. One observation per call: its queries read padding, which changes the actions."""
+    """A loaded InternVLA-M1.
+
+    It takes one observation per call: its queries read padding, which changes the actions.
+    """
 
     interventions = INTERVENTIONS
     draws_noise = True
@@ -131,20 +134,28 @@ class InternVLA(QwenVLA):
 
     @cached_property
     def units(self) -> ActionUnits:
-        """The statistics that give actions their units. Raises CheckpointError, UsageError."""
+        """The statistics that give actions their units.
+
+        Raises:
+            CheckpointError: If there are none, or bad ones.
+            UsageError: For a data set that is not there or has to be chosen.
+        """
         source = str(self.parts.run / STATISTICS_FILE)
         return ActionUnits.choose(self.parts.statistics(), self._unnorm_key, source)
 
     def text(self, instruction: str) -> str:
-        """Qwen's chat around the prompt the run was trained with."""
+        """Return Qwen's chat around the prompt the run was trained with."""
         return prompt(instruction, self.config.cot)
 
     def look(self, observation: Observation) -> NDArray[np.uint8]:
-        """The whole picture, squeezed to a square."""
+        """Return the whole picture, squeezed to a square."""
         return look(observation.image, self.config.picture)
 
     def patched_picture(self, observation: Observation) -> NDArray[np.uint8]:
-        """Qwen's utilities bring the picture to whole patches with PIL, before its processor sees it."""
+        """Return the picture at whole patches.
+
+        Qwen's utilities bring it there with PIL, before its processor sees it.
+        """
         picture = self.look(observation)
         rows, columns = self.pictures.grid(*picture.shape[:2])
         size = (columns * self.pictures.patch, rows * self.pictures.patch)
@@ -153,20 +164,20 @@ class InternVLA(QwenVLA):
         return np.array(Image.fromarray(picture).resize(size, Image.Resampling.BICUBIC))
 
     def views(self, observations: Sequence[Observation]) -> Tensor:
-        """(B, 3, H, W) float32 for DINOv2."""
+        """Return the pictures (B, 3, H, W) float32 for DINOv2."""
         rows = [dino_pixels(self.look(observation), self.config.dino.side) for observation in observations]
         return torch.stack(rows).to(self.device)
 
     # -- acting ------------------------------------------------------------------------------------------
 
     def act(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
-        """One chunk of actions per observation; see the contract."""
+        """Return one chunk of actions per observation; see the contract."""
         if (reason := self.embodiment_mismatch()) is not None:
             raise CheckpointError(reason)
         return open_or_closed(self.units.restore(self.infer_without_acting(observations, seeds)))
 
     def embodiment_mismatch(self) -> str | None:
-        """No statistics, or other actions than an end-effector delta."""
+        """Return a reason where there are no statistics, or for other actions than an end-effector delta."""
         units, head = self.units_or_reason(), self.config.head
         if isinstance(units, str):
             return units
@@ -180,7 +191,7 @@ class InternVLA(QwenVLA):
     def infer_without_acting(
         self, observations: Sequence[Observation], seeds: Sequence[int]
     ) -> NDArray[np.float32]:
-        """(B, A, action numbers) as the head puts them out, without units."""
+        """Return (B, A, action numbers) as the head puts them out, without units."""
         self.check(observations, seeds)
         head = self.config.head
         noise = seeded_noise(seeds, (head.length, head.action_dim), self.device)
@@ -190,7 +201,7 @@ class InternVLA(QwenVLA):
         return output
 
     def infer(self, inputs: QwenInputs, views: Tensor, noise: Tensor) -> Tensor:
-        """(B, A, action numbers) normalised actions; one inference, as `capture` counts it."""
+        """Return normalised actions (B, A, action numbers); one inference, as `capture` counts it."""
         self._grid = inputs.grid
         with torch.inference_mode():
             condition = self.network.read(inputs, views)
@@ -199,7 +210,7 @@ class InternVLA(QwenVLA):
     # -- capture -----------------------------------------------------------------------------------------
 
     def roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
-        """The chat; the queries; conditions and actions."""
+        """The roles of the chat, of the queries, and of conditions and actions."""
         queries, length = self.config.query.queries, self.config.head.length
         expert = [Roles.from_labels([*["condition"] * queries, *["action"] * length])] * len(observations)
         roles = {"backbone": self.backbone_roles(observations), "expert": expert}
@@ -209,7 +220,7 @@ class InternVLA(QwenVLA):
         return {name: roles[name] for name in self.streams}
 
     def tap(self, site: Site) -> Tap:
-        """The first norm of the block the site enters, the last norm, or what a block adds."""
+        """Return the first norm of the block the site enters, the last norm, or what a block adds."""
         stream = self.stream_of(site).name
         if stream == "backbone":
             return self.backbone_tap(site)
@@ -232,7 +243,10 @@ class InternVLA(QwenVLA):
 
 
 def internvla_units(checkpoint: str, *, unnorm_key: str | None = None, vlm: str | None = None, **_: Any) -> str:
-    """See `Family.units`; a checkpoint without statistics says so, since it can be captured."""
+    """Return the data set whose units the actions get, and what says so; see `Family.units`.
+
+    A checkpoint without statistics says so, since it can be captured.
+    """
     parts = find_parts(checkpoint, vlm, unread=True)
     if not (statistics := parts.statistics()):
         return f"none: {parts.run} has no {STATISTICS_FILE}"
@@ -256,12 +270,12 @@ def load_internvla(
 ) -> InternVLA:
     """Load InternVLA-M1 from a run's folder, one of its weight files, a converted folder, or a hub id.
 
-    Options: see the family.
+    The options are those of the family.
 
     Raises:
-        CheckpointError: For options that cannot be.
-        WeightsError: For options that cannot be.
-        UsageError: For options that cannot be.
+        CheckpointError: For a checkpoint that is not there or cannot be loaded.
+        WeightsError: For weights that are not exactly the network's.
+        UsageError: For an option that cannot be used.
     """
     name = checkpoint or DEFAULT_CHECKPOINT
     parts = find_parts(name, vlm, weights, unread=random_weights)
@@ -289,8 +303,8 @@ _INPUTS = ("cfg_scale", "unnorm_q01", "unnorm_q99", "unnorm_mask")
 def internvla_outputs(load: Callable[..., InternVLA], folder: Path, recorded: Arrays) -> Outputs:
     """Run the recorded inputs through the adapter.
 
-    Whole batches, padding included: that padding reaches the actions is part of the original. The backbone itself
-    is compared at valid positions.
+    Whole batches are run, padding included: that padding reaches the actions is part of the original. The backbone
+    itself is compared at valid positions.
     """
     steps = len(recorded["ddim_timestep_map"]) if "ddim_timestep_map" in recorded else 10
     guidance = float(recorded["cfg_scale"]) if "cfg_scale" in recorded else 1.5
@@ -346,7 +360,7 @@ def internvla_outputs(load: Callable[..., InternVLA], folder: Path, recorded: Ar
 
 
 def _pixels(policy: InternVLA, recorded: Arrays) -> Tensor:
-    """(B x V, 3, H, W): made of the recorded pictures, or else as recorded."""
+    """Return pictures (B x V, 3, H, W) for DINOv2: made of the recorded pictures, or else as recorded."""
     if "in_images_uint8" not in recorded:
         return torch.from_numpy(recorded["in_dino_pixels"])
     pictures = recorded["in_images_uint8"]

@@ -35,7 +35,7 @@ RELEASED_STEP = "steps_50000_pytorch_model.pt"
 _VLM_TYPE = "qwen2_5_vl"
 _VLM_PATTERNS = ("*.json", "*.txt", "*.jinja")
 _DEVELOPMENT = "qwen2_5_vl_config"
-"""Where development references keep the configuration of their small vision-language model."""
+"""The key under which development references keep the configuration of their small vision-language model."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,12 @@ class Parts:
     vlm: Path
 
     def read(self) -> Weights:
-        """The tensors. Raises WeightsError, and CheckpointError for an adapter beside a `.pt` file."""
+        """Read the tensors.
+
+        Raises:
+            WeightsError: For a file that is missing or damaged.
+            CheckpointError: For an adapter beside a `.pt` file.
+        """
         adapter = adapter_in(self.run)
         if adapter is None:
             return _read(self.weights)
@@ -67,7 +72,7 @@ class Parts:
         return read_weights(base) if base == self.run else with_adapter(_read(_weights(base, None, None)), adapter)
 
     def statistics(self) -> Mapping[str, Any]:
-        """Per data set, what un-normalises its actions; empty without the file."""
+        """Return per data set the statistics that un-normalise its actions; empty without the file."""
         return stored_statistics((self.run,), {}, str(self.run))[0]
 
 
@@ -76,16 +81,17 @@ def _read(path: Path) -> Weights:
 
 
 def find_parts(checkpoint: str, vlm: str | None, weights: str | None = None, unread: bool = False) -> Parts:
-    """The parts of a run's folder, its `checkpoints/`, one `.pt` file of it, a converted folder, or a hub id.
+    """Find the parts of a run's folder, its `checkpoints/`, one `.pt` file of it, a converted folder, or a hub id.
 
     Args:
-        vlm: Folder or hub id of the vision-language model's files; default what the run's configuration names.
-        weights: Name of a step's file; default the only one, or `RELEASED_STEP` among several. No other is
+        checkpoint: The folder, file or hub id.
+        vlm: Folder or hub id of the vision-language model's files; None takes what the run's configuration names.
+        weights: Name of a step's file; None takes the only one, or `RELEASED_STEP` among several. No other is
             downloaded.
-        unread: Nothing is looked for, since no weights will be read.
+        unread: Whether no weights will be read, so that none are looked for.
 
     Raises:
-        CheckpointError: Naming what is missing or ambiguous.
+        CheckpointError: For a part that is missing or ambiguous, which it names.
     """
     path = Path(checkpoint).expanduser()
     if path.is_file():
@@ -99,7 +105,13 @@ def find_parts(checkpoint: str, vlm: str | None, weights: str | None = None, unr
 
 
 def _weights(folder: Path, file_name: str | None, hub: str | None) -> Path:
-    """Safetensors beside the configuration, or a .pt file there or in `checkpoints/`; of `hub` if it is given."""
+    """Return safetensors beside the configuration, or a .pt file there or in `checkpoints/`.
+
+    Args:
+        folder: The folder of the checkpoint.
+        file_name: Name of a .pt file; None for the only one.
+        hub: The hub id from which a .pt file is downloaded; None for a folder here.
+    """
     if file_name is None and hub is None and adapter_in(folder) is not None and not any(folder.glob("**/*.pt")):
         return folder
     for candidate in (folder, folder / WEIGHTS_FOLDER):
@@ -114,7 +126,11 @@ def _weights(folder: Path, file_name: str | None, hub: str | None) -> Path:
 
 
 def _select_file(files: Sequence[str], name: str | None, location: str) -> str:
-    """The path of one .pt file among `files`, by its name. Raises CheckpointError for none and for several."""
+    """The path of one .pt file among `files`, by its name.
+
+    Raises:
+        CheckpointError: If there is none, and if there are several.
+    """
     by_name = {Path(file).name: file for file in files}
     listed = ", ".join(sorted(by_name))
     if not files:
@@ -136,7 +152,7 @@ def _select_file(files: Sequence[str], name: str | None, location: str) -> str:
 
 
 def _vlm(values: Mapping[str, Any], run: Path, vlm: str | None) -> tuple[Path, Mapping[str, Any]]:
-    """Folder and configuration of the vision-language model."""
+    """Return folder and configuration of the vision-language model."""
     if vlm is None and _DEVELOPMENT in values:
         return run, values[_DEVELOPMENT]
     folder = run if vlm is None and _is_vlm(run) else _vlm_folder(values, run, vlm)
@@ -149,7 +165,13 @@ def _vlm(values: Mapping[str, Any], run: Path, vlm: str | None) -> tuple[Path, M
 
 
 def _vlm_folder(values: Mapping[str, Any], run: Path, vlm: str | None) -> Path:
-    """`vlm`, or what config.yaml names: a folder, which may be relative to the run, or a model of the hub."""
+    """Return the folder of `vlm`, or of what config.yaml names.
+
+    Either is a folder, which may be relative to the run, or a model of the hub.
+
+    Raises:
+        CheckpointError: If neither names one.
+    """
     base = vlm or str(((values.get("framework") or {}).get("qwenvl") or {}).get("base_vlm", ""))
     if not base:
         raise CheckpointError(f"{run} names no vision-language model; pass its folder with -M vlm=DIR")
@@ -176,17 +198,20 @@ _RUN_FILES = (RUN_FILE, DIMS_FILE, STATISTICS_FILE)
 def convert(checkpoint: str, out: Path, vlm: str | None = None) -> str:
     """Write `out` with the same tensors as safetensors, the run's files, and those of the vision-language model.
 
+    Nothing of the pickle is executed.
+
     Args:
-        checkpoint: As `load_internvla` takes them. Nothing of the pickle is executed.
-        vlm: As `checkpoint`.
+        checkpoint: The checkpoint as `load_internvla` takes it.
+        out: The new folder.
+        vlm: Folder or hub id of the vision-language model's files; None takes what the run's configuration names.
 
     Returns:
         The sha256 over (name, dtype, shape, bytes) of all tensors, the same before and after.
 
     Raises:
         UsageError: If `out` exists.
-        CheckpointError: For what cannot be read.
-        WeightsError: For what cannot be read.
+        CheckpointError: For parts that are missing, and for a copy that differs.
+        WeightsError: For weights that cannot be read.
     """
     if out.exists():
         raise UsageError(f"{out} exists; name a folder that does not, so that nothing is overwritten")
@@ -218,7 +243,7 @@ def _write(parts: Parts, weights: Weights, folder: Path) -> None:
 
 
 def main(arguments: list[str]) -> int:
-    """RUN and OUT, and perhaps the vision-language model's folder; the exit code of the command line."""
+    """Convert RUN to OUT, perhaps with the vision-language model's folder, and return the exit code."""
     if len(arguments) not in (2, 3):
         print(__doc__, file=sys.stderr)
         return 2

@@ -68,14 +68,14 @@ from probe_kit.models.magma import (
 
 DEFAULT_CHECKPOINT = "microsoft/Magma-8B"
 SEPARATOR = "separator"
-"""Role of the vectors that end every row of a picture's map."""
+"""The role of the vectors that end every row of a picture's map."""
 STEPS, BINS = 7, 256
 PROMPTS = ("magma", "act2answer")
 _SHRINK = 256
 
 
 class Magma(TokenDecoder, Policy, SpeakingModel):
-    """A loaded Magma: acts, and answers questions in text."""
+    """A loaded Magma, which acts, and answers questions in text."""
 
     interventions = MAPS
     picture_roles = (IMAGE_ROLE, SEPARATOR)
@@ -93,7 +93,19 @@ class Magma(TokenDecoder, Policy, SpeakingModel):
         tokenizer: str | None = None,
         steps: int = STEPS,
     ) -> None:
-        """statistics: of the data set whose units the actions get, or why there are none: it answers without."""
+        """Make the adapter and its card.
+
+        Args:
+            loaded: The network, with what loading proved.
+            statistics: The statistics of the data set whose units the actions get, or why there are none: it
+                answers without.
+            layer_scale: The name that the file has for layer scales, `gamma` or `weight`.
+            shrink: Side to which pictures are shrunk first; 0 for whole pictures.
+            prompt: Order of the turns: `magma`, or `act2answer` for the user's first.
+            temperature: 0 for the likeliest token; above, tokens are drawn.
+            tokenizer: Folder of another tokenizer; None for the checkpoint's.
+            steps: Tokens per inference.
+        """
         super().__init__(loaded, steps)
         self._units, self.shrink, self.order, self.temperature = statistics, shrink, prompt, temperature
         self.top = top_of(CHECKPOINT, (loaded.folder,)) if temperature else TOP
@@ -141,12 +153,16 @@ class Magma(TokenDecoder, Policy, SpeakingModel):
 
     @cached_property
     def text(self) -> ChatText:
-        """The chat text. Raises CheckpointError naming the files that are missing."""
+        """The chat text.
+
+        Raises:
+            CheckpointError: For files that are missing, which it names.
+        """
         return ChatText.of(self._text_folder, self.config, self.order == "act2answer")
 
     @cached_property
     def action_tokens(self) -> ActionTokens:
-        """The ids that name values: the last ones before the added tokens."""
+        """The ids that name values, which are the last ones before the added tokens."""
         return ActionTokens(self.text.vocabulary, BINS)
 
     def prompt(self, instruction: str) -> TokenPrompt:
@@ -154,7 +170,11 @@ class Magma(TokenDecoder, Policy, SpeakingModel):
         return self.text.prompt(ACTION_QUESTION.format(instruction=instruction))
 
     def picture(self, image: NDArray[np.uint8]) -> Picture:
-        """Crops of a (H, W, 3) uint8 picture. Raises ObservationError."""
+        """Return the crops of a (H, W, 3) uint8 picture.
+
+        Raises:
+            ObservationError: For a picture of another dtype or shape.
+        """
         checked = checked_picture(image)
         return prepare_picture(shrink_picture(checked, self.shrink) if self.shrink else checked, self.pictures)
 
@@ -168,7 +188,16 @@ class Magma(TokenDecoder, Policy, SpeakingModel):
     def generate(
         self, prompts: Sequence[Sequence[int]], pictures: Sequence[Picture] | None, choose: Choose = greedy
     ) -> Decoded:
-        """Seven tokens behind every prompt; one inference, as `capture` counts it. Raises InstructionError."""
+        """Return seven tokens behind every prompt; one inference, as `capture` counts it.
+
+        Args:
+            prompts: The ids of every prompt, the picture as one placeholder.
+            pictures: One per prompt; None for prompts in words alone.
+            choose: Gives the ids of logits (B, V); greedy by default.
+
+        Raises:
+            InstructionError: For a prompt that is too long.
+        """
         for row, ids in enumerate(prompts):
             placeholder = 0 if pictures is None else 1
             span = self.network.span(ids, pictures[row].grid, self.pictures.base).length if pictures else 0
@@ -177,7 +206,7 @@ class Magma(TokenDecoder, Policy, SpeakingModel):
             return self.network.decode(prompts, pictures, self.steps, choose)
 
     def act(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
-        """One action per observation; a row that put out no action holds still, see `flagged` and the contract."""
+        """Return one action per observation; a row that put out no action holds still, see `flagged`."""
         if (reason := self.embodiment_mismatch()) is not None:
             raise CheckpointError(reason)
         ids = self._tokens(observations, seeds)
@@ -189,13 +218,17 @@ class Magma(TokenDecoder, Policy, SpeakingModel):
 
     @property
     def statistics(self) -> ActionStatistics:
-        """The statistics that give actions their units. Raises UsageError where none were chosen."""
+        """The statistics that give actions their units.
+
+        Raises:
+            UsageError: Where none were chosen.
+        """
         if isinstance(self._units, str):
             raise UsageError(self._units)
         return self._units
 
     def embodiment_mismatch(self) -> str | None:
-        """No chosen units, or other actions than an end-effector delta."""
+        """Return a reason where no units are chosen, or for other actions than an end-effector delta."""
         if isinstance(self._units, str):
             return self._units
         if len(self.statistics.low) == self.steps == STEPS:
@@ -208,11 +241,11 @@ class Magma(TokenDecoder, Policy, SpeakingModel):
     def infer_without_acting(
         self, observations: Sequence[Observation], seeds: Sequence[int]
     ) -> NDArray[np.float32]:
-        """(B, 1, tokens): the middle of the bin that each token names, without units."""
+        """Return (B, 1, tokens): the middle of the bin that each token names, without units."""
         return np.asarray(self.action_tokens.values(self._tokens(observations, seeds))[:, None], np.float32)
 
     def _tokens(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.int64]:
-        """(B, tokens) ids; one inference. Rows that put out something else than one action are flagged."""
+        """Return ids (B, tokens); one inference. Rows that put out something else than one action are flagged."""
         self.check(observations, seeds)
         choose = chooser(self.temperature, seeds, self.top)
         prompts = [self.prompt(observation.instruction).ids for observation in observations]
@@ -222,7 +255,7 @@ class Magma(TokenDecoder, Policy, SpeakingModel):
         return ids
 
     def _is_action(self, ids: NDArray[np.int64], decoded: Decoded, choose: Choose) -> NDArray[np.bool_]:
-        """(B,) which rows put out seven tokens that name bins, and then the end of the turn."""
+        """Return (B,) which rows put out seven tokens that name bins, and then the end of the turn."""
         names_bins = np.asarray(self.action_tokens.is_action(ids).all(axis=1))
         if not names_bins.any():
             return names_bins
@@ -230,7 +263,7 @@ class Magma(TokenDecoder, Policy, SpeakingModel):
         return np.asarray(names_bins & ends)
 
     def _behind(self, decoded: Decoded) -> Tensor:
-        """(B, V) logits behind the seven tokens, from modules without hooks."""
+        """Return the logits (B, V) behind the seven tokens, from modules without hooks."""
         with torch.inference_mode():
             return self.network.logits_behind(decoded, self.speaker)
 
@@ -247,7 +280,7 @@ class Magma(TokenDecoder, Policy, SpeakingModel):
         return [self.text.option(text, begun, option, question.pictured) for option in question.options]
 
     def prefill(self, questions: Sequence[Prompt]) -> Prefill:
-        """One inference: the prefill, whose logits compare the options, and six steps into the answer."""
+        """Run one inference: the prefill, whose logits compare the options, and six steps into the answer."""
         self.check([question.observation for question in questions])
         prompts = [self._question(question).ids for question in questions]
         pictured = self.shows_pictures(questions)
@@ -259,7 +292,7 @@ class Magma(TokenDecoder, Policy, SpeakingModel):
 
     @property
     def ends(self) -> frozenset[int]:
-        """Ids that end the turn."""
+        """The ids that end the turn."""
         return self.text.ends
 
     def words(self, ids: Sequence[int]) -> str:
@@ -269,13 +302,16 @@ class Magma(TokenDecoder, Policy, SpeakingModel):
     # -- capture -----------------------------------------------------------------------------------------
 
     def roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
-        """Frames are `special`, the question is `language`; the ends of a picture's rows stand apart from it."""
+        """The roles of frames, which are `special`, and of the question, which is `language`.
+
+        The ends of a picture's rows have a role of their own.
+        """
         return self.roles_of(
             [self._labels(self.prompt(observation.instruction), observation.image) for observation in observations]
         )
 
     def asked_roles(self, questions: Sequence[Prompt]) -> dict[str, list[Roles]]:
-        """Roles of questions other than what to do; how an answer has begun is `special`."""
+        """The roles of questions other than what to do; the beginning of an answer is `special`."""
         pictured = self.shows_pictures(questions)
         return self.roles_of(
             [
@@ -315,14 +351,14 @@ def _width(stage: Any) -> int:
 
 
 def _as_tokens(maps: Tensor) -> Tensor:
-    """(N, h · w, C) of (N, C, h, w), in the same memory."""
+    """Return maps (N, C, h, w) as tokens (N, h · w, C), in the same memory."""
     return maps.flatten(2).transpose(1, 2)
 
 
 def check_magma_words(
     checkpoint: str, instructions: Sequence[str], *, tokenizer: str | None = None, prompt: str = "magma", **_: Any
 ) -> None:
-    """See `Family.words`."""
+    """Raise InstructionError for an instruction that cannot be read; see `Family.words`."""
     folder = checkpoint_folder(checkpoint, SMALL_FILES)
     text_folder = folder if tokenizer is None else Path(tokenizer).expanduser()
     text = ChatText.of(text_folder, MagmaConfig.from_folder(folder), prompt == "act2answer")
@@ -331,7 +367,10 @@ def check_magma_words(
 
 
 def magma_units(checkpoint: str, *, unnorm_key: str | None = None, statistics: str | None = None, **_: Any) -> str:
-    """See `Family.units`; without a choice, why there are none: a Magma may be asked, and not act."""
+    """Return the data set whose units the actions get, and what says so; see `Family.units`.
+
+    Without a choice it is the reason why there are none: a Magma may be asked, and not act.
+    """
     by_data_set, source = magma_statistics(checkpoint_folder(checkpoint, SMALL_FILES), statistics)
     units = _units(by_data_set, source, unnorm_key)
     return f"none: {units}" if isinstance(units, str) else f"{units.key}, from {source}"
@@ -364,13 +403,25 @@ def load_magma(
 ) -> Magma:
     """Load Magma or one of its fine-tunes, from a folder or hub id.
 
-    Options: see the family.
+    Raises what `load_checkpoint` raises, too.
 
     Args:
+        checkpoint: Folder or hub id; None loads the released one.
+        device: Device in torch's spelling, such as `cuda:0`.
+        dtype: float32 or bfloat16; None takes what the checkpoint says.
+        random_weights: Whether the weights are drawn instead of read.
+        unnorm_key: Data set whose units the actions get; None for the only one.
+        statistics: File with action statistics; None for the checkpoint's, or else the package's.
+        shrink: Side to which pictures are shrunk first; 0 for whole pictures.
+        prompt: Order of the turns: `magma`, or `act2answer` for the user's first.
+        temperature: 0 for the likeliest token; above, tokens are drawn.
+        tokenizer: Folder of another tokenizer; None for the checkpoint's.
+        layer_scale: `gamma` refuses files that name layer scales otherwise; None accepts either name.
+        weights_seed: Seed of random weights.
         steps: Tokens per inference, for comparisons with other than seven; only seven are an action.
 
     Raises:
-        UsageError: And what `load_checkpoint` raises.
+        UsageError: For an option that cannot be used.
     """
     for name, value, choices in (
         ("prompt", prompt, PROMPTS),
@@ -421,7 +472,7 @@ def magma_outputs(load: Callable[..., Magma], folder: Path, recorded: Arrays) ->
 
 
 class _Reference:
-    """The recorded inputs, run through the adapter when something asks for what comes of them."""
+    """The recorded inputs, run through the adapter at the first request for a result of them."""
 
     def __init__(self, model: Magma, recorded: Arrays, client: Mapping[str, Any]) -> None:
         self.model, self.recorded, self.client = model, recorded, client
@@ -447,7 +498,7 @@ class _Reference:
 
     @property
     def _choose(self) -> Choose:
-        """The likeliest token that does not end the turn: the recording asked for a fixed number of them."""
+        """Chooses the likeliest token that does not end the turn: the recording asked for a fixed number."""
         end = self.client.get("special_ids", {}).get("eos", self.model.config.text.eos_token_id)
         ends = sorted(token_ids_of(end))
 
@@ -457,7 +508,7 @@ class _Reference:
         return choose
 
     def valid(self) -> dict[str, NDArray[np.bool_]]:
-        """The positions of the recorded batch that are no padding."""
+        """Return the positions of the recorded batch that are no padding."""
         if "batch_attention_mask" not in self.recorded or "batch_logits" not in self.recorded:
             return {}
         mask = np.zeros(self.recorded["batch_logits"].shape[:2], bool)
@@ -466,7 +517,7 @@ class _Reference:
         return dict.fromkeys(("batch_hidden_states", "batch_logits"), mask)
 
     def produced(self) -> dict[str, Produce]:
-        """Functions that make every output the adapter can make, whether recorded or not."""
+        """Return functions that make every output the adapter can make, whether recorded or not."""
         return {**self._pictures(), **self._streams(), **self._passes(), **self._actions()}
 
     def _pictures(self) -> dict[str, Produce]:
@@ -491,7 +542,10 @@ class _Reference:
         return np.array([(grid.rows, grid.columns) for grid in grids])
 
     def _map(self, stream: str, layer: int) -> NDArray[Any]:
-        """(N, C, h, w) of the tokens that a vision stream's tap gives; maps have the shape of what was shown."""
+        """Return maps (N, C, h, w) of the tokens that a vision stream's tap gives.
+
+        Maps have the shape of what was shown.
+        """
         layers = self.model.further_streams[stream].layers
         tokens = self.first[2][Site(stream, layer % layers)]
         height, width = self.model.network.trunk_input(self.first[0]).shape[-2:]
@@ -552,7 +606,7 @@ class _Reference:
         ]
 
     def _batch(self) -> tuple[NDArray[Any], NDArray[Any]]:
-        """The pass over the recorded batch, packed by the adapter, reordered to padding in front of every row."""
+        """Run the recorded batch, packed by the adapter, and reorder it to padding in front of every row."""
         states, logits = forward_outputs(self.model.network, self._batch_prompts, self._batch_pictures)
         for row, length in enumerate(self._batch_lengths):
             for values in (states[:, row], logits[None, row]):

@@ -40,10 +40,11 @@ from probe_kit.models.magma import (
 
 @dataclass(frozen=True)
 class ChatText(TokenizerFile):
-    """Magma's chat template: header tokens, image placeholder, question.
+    """The chat template of Magma: header tokens, image placeholder, question.
 
     Attributes:
-        user_first: The user's turn stands before the system's, as Act2Answer's release has it.
+        config: The configuration of the network.
+        user_first: Whether the user's turn stands before the system's, as Act2Answer's release has it.
     """
 
     config: MagmaConfig
@@ -51,7 +52,11 @@ class ChatText(TokenizerFile):
 
     @classmethod
     def of(cls, folder: Path, config: MagmaConfig, user_first: bool = False) -> "ChatText":
-        """Read the tokenizer in `folder`. Raises CheckpointError for missing files and another model's."""
+        """Read the tokenizer in `folder`.
+
+        Raises:
+            CheckpointError: For missing files and for a tokenizer of another model.
+        """
         TokenizerFile(folder).check_present()
         text = cls(folder, config, user_first)
         text.check()
@@ -75,7 +80,11 @@ class ChatText(TokenizerFile):
         return {"beginning": token} if token else {}
 
     def check(self) -> None:
-        """Refuse a tokenizer that belongs to another model. Raises CheckpointError."""
+        """Refuse a tokenizer that belongs to another model.
+
+        Raises:
+            CheckpointError: For such a tokenizer.
+        """
         counts = self.vocabulary, self.config.base_vocabulary
         if counts[1] not in (None, counts[0]):
             raise CheckpointError(
@@ -86,12 +95,12 @@ class ChatText(TokenizerFile):
 
     @property
     def vocabulary(self) -> int:
-        """Number of ids before the added tokens; the last of them name action bins."""
+        """The number of ids before the added tokens; the last of them name action bins."""
         return int(self.tokenizer.get_vocab_size(with_added_tokens=False))
 
     @cached_property
     def ends(self) -> frozenset[int]:
-        """Ids that end the assistant's turn."""
+        """The ids that end the assistant's turn."""
         stored = values_of(self.folder / GENERATION_FILE).get("eos_token_id")
         return token_ids_of(self.config.text.eos_token_id, stored, self.tokenizer.token_to_id("<|eot_id|>"))
 
@@ -99,7 +108,9 @@ class ChatText(TokenizerFile):
         """The whole prompt of a question about one picture, or in words alone.
 
         Args:
-            begun: How the answer has begun already.
+            question: The text of the question.
+            begun: The beginning of the answer, behind the header of the assistant's turn.
+            pictured: Whether the picture is shown; False asks in words alone.
 
         Raises:
             InstructionError: For a question that holds a token of the frames.
@@ -114,7 +125,11 @@ class ChatText(TokenizerFile):
         return TokenPrompt(frames + begun, tuple(encoding.ids), positions_of(encoding, start, stop))
 
     def _question_span(self, turn: str, frames: str) -> tuple[int, int]:
-        """The beginning and end of the user's words in `frames`."""
+        """The beginning and end of the user's words in `frames`.
+
+        Raises:
+            CheckpointError: For a template that changes the words.
+        """
         words = turn.strip()  # as templates do
         start = frames.find(words)
         if start < 0:
@@ -125,7 +140,11 @@ class ChatText(TokenizerFile):
         return start, start + len(words)
 
     def option(self, question: str, begun: str, option: str, pictured: bool = True) -> int:
-        """The first id of an option behind a prompt. Raises UsageError if it changes the prompt's own ids."""
+        """The first id of an option behind a prompt.
+
+        Raises:
+            UsageError: If it changes the prompt's own ids.
+        """
         before, behind = (self.prompt(question, text, pictured).ids for text in (begun, begun + option))
         return first_behind(before, behind, option)
 
@@ -150,11 +169,19 @@ def load_checkpoint(
 ) -> tuple[Loaded[MagmaNetwork], str]:
     """Load a folder or hub id; also return the name the file has for layer scales, `gamma` or `weight`.
 
-    Raises CheckpointError, WeightsError, UsageError for another dtype, MissingExtraError.
-
     Args:
-        dtype: float32 or bfloat16; default what the checkpoint says.
+        checkpoint: Folder or hub id.
+        device: Device in torch's spelling, such as `cuda:0`.
+        dtype: float32 or bfloat16; None takes what the checkpoint says.
+        random_weights: Whether the weights are drawn instead of read.
+        weights_seed: Seed of random weights.
         layer_scale: `gamma` refuses a file that names them otherwise; None and `weight` accept both names.
+
+    Raises:
+        CheckpointError: For a folder that is not there, and for files that are missing or bad.
+        WeightsError: For weights that are not exactly the network's, and for layer scales that were not trained.
+        UsageError: For another dtype.
+        MissingExtraError: Without a package that the network needs.
     """
     folder = checkpoint_folder(checkpoint)
     config = MagmaConfig.from_folder(folder)
@@ -193,10 +220,13 @@ def _draw(network: MagmaNetwork, seed: int) -> None:
 def _with_layer_scales(
     weights: Weights, layer_scale: str | None
 ) -> tuple[dict[str, Tensor], tuple[str, ...], str]:
-    """The tensors under the network's names, a note if some were stored as `.weight`, and the stored name.
+    """Return the tensors under the network's names, a note if some were stored as `.weight`, and the stored name.
 
     Loaders before transformers 5 rename every `gamma` to `weight`. The released file names them so; a file that
     such a loader saved later holds the initial constant, which is refused.
+
+    Raises:
+        WeightsError: For layer scales under a refused name, under both names, or as before training.
     """
     scales = {name: match for name in weights.tensors if (match := _BLOCK.fullmatch(name))}
     renamed = {name: match["block"] + ".gamma" for name, match in scales.items() if match["name"] == "weight"}
@@ -248,9 +278,12 @@ def magma_statistics(folder: Path, file: str | None) -> tuple[Mapping[str, Any],
 
 
 def magma_key(statistics: Mapping[str, Any], source: str, key: str | None) -> str:
-    """The data set whose units the actions get. Raises UsageError where it has to be chosen.
+    """The data set whose units the actions get.
 
     The packaged statistics are of one data set, with which a checkpoint without a file may have nothing to do.
+
+    Raises:
+        UsageError: Where it has to be chosen.
     """
     if key is None and source == PACKAGED:
         raise UsageError(

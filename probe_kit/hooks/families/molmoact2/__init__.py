@@ -13,7 +13,10 @@ LAYERWISE = replace(
     tiles=False,
     instead={"tiles": f"{MERGED}Its tower reads overlapping crops. Exchange all of `image`"},
 )
-"""Block n of the expert reads the keys and values of block n of the backbone, and nothing else of it."""
+"""The interventions of an expert whose block n reads the keys and values of block n of the backbone.
+
+It reads nothing else of the backbone.
+"""
 
 FAMILIES = (
     lerobot_family(

@@ -70,9 +70,9 @@ RELEASED: dict[str, Any] = {
     },
     "max_action_dim": 32, "max_action_horizon": 30,
 }  # fmt: skip
-"""What the released configurations say of sizes: Molmo2-ER on Qwen3-4B, an expert of 0.58 billion parameters."""
+"""The sizes of the released configurations: Molmo2-ER on Qwen3-4B, an expert of 0.58 billion parameters."""
 _PARTS = ("msa", "mca", "mlp")
-"""What a block of the expert adds: self-attention, attention to the prompt, MLP."""
+"""The parts that a block of the expert adds: self-attention, attention to the prompt, MLP."""
 
 
 def network_config(folder: Path | None = None) -> NetworkConfig:
@@ -89,7 +89,7 @@ def network_config(folder: Path | None = None) -> NetworkConfig:
 def build_molmoact2(
     config: MolmoAct2Config, network: NetworkConfig, folder: Path, device: str = "cpu"
 ) -> MolmoAct2Policy:
-    """lerobot's policy as `lerobots_policy` builds it, with modules that lerobot has not.
+    """Build lerobot's policy as `lerobots_policy` does, with modules that lerobot has not.
 
     Each block of the expert gets one per part that it adds: `attention_gate`, `cross_attention_gate`, `mlp_gate`.
     The prompt's keys and values pass through `prompt_kv`. Results stay lerobot's, bit for bit.
@@ -105,10 +105,13 @@ def build_molmoact2(
 def lerobots_policy(
     config: MolmoAct2Config, network: NetworkConfig, folder: Path, device: str = "cpu"
 ) -> MolmoAct2Policy:
-    """A `MolmoAct2Policy` in eval mode with uninitialised weights and CUDA graphs off.
+    """Build a `MolmoAct2Policy` in eval mode with uninitialised weights and CUDA graphs off.
 
     Args:
-        network: The configuration in the VLM's own folder `folder`.
+        config: The configuration of lerobot.
+        network: The configuration of the VLM.
+        folder: The VLM's own folder.
+        device: The device of the weights.
     """
     device = building_device(device)
     config.device, config.checkpoint_path = device, str(folder)
@@ -131,7 +134,7 @@ def lerobots_policy(
 
 
 def full_size_molmoact2() -> MolmoAct2Policy:
-    """The released size, on the meta device."""
+    """Build the released size, on the meta device."""
     picture = PolicyFeature(FeatureType.VISUAL, (3, 256, 256))
     config = MolmoAct2Config(device="cpu", input_features={"observation.images.image": picture})
     return build_molmoact2(config, network_config(), Path(), device="meta")
@@ -155,7 +158,7 @@ def _gated_forward(
     modulation: tuple[Tensor, ...] | None = None,
     rope_cache: tuple[Tensor, Tensor] | None = None,
 ) -> Tensor:
-    """(B, T, D): lerobot's block, each of its three parts gated as it is added."""
+    """Run lerobot's block, each of its three parts gated as it is added, and return (B, T, D)."""
     chunks = block.modulation(conditioning).chunk(9, dim=1) if modulation is None else modulation
     shift, scale, gate = (dict(zip(_PARTS, chunks[first::3], strict=True)) for first in range(3))
 
@@ -175,10 +178,12 @@ def _gated_forward(
 
 
 def flow_actions(policy: Any, inputs: Mapping[str, Tensor], noise: Tensor, padded: Tensor) -> Tensor:
-    """(B, H, 32) from noise of that shape: lerobot's flow, one inference.
+    """Return (B, H, 32) from noise of that shape: lerobot's flow, one inference.
 
     Args:
-        inputs: What lerobot's processor packs.
+        policy: The policy of lerobot.
+        inputs: The tensors that lerobot's processor packs.
+        noise: (B, H, 32).
         padded: (B, 32) True for numbers that no action has.
     """
     backbone, model_inputs = policy._backbone(), policy._model_inputs(inputs)
@@ -233,7 +238,7 @@ _PRECISION = "dtype"
 
 
 _GATES = {quantity: f"{quantity}_gate" for quantity in ("attention", "cross_attention", "mlp")}
-"""What a block of the expert adds is read behind its gates."""
+"""The gates behind which the parts that a block of the expert adds are read."""
 
 
 class MolmoAct2(PackedPolicy):
@@ -259,7 +264,11 @@ class MolmoAct2(PackedPolicy):
 
     @classmethod
     def current_values(cls, values: dict[str, Any], path: Path) -> dict[str, Any]:
-        """A newer lerobot calls the precision of the weights `dtype`. Raises CheckpointError for two of them."""
+        """Return the fields of `config.json`; a newer lerobot calls the precision of the weights `dtype`.
+
+        Raises:
+            CheckpointError: For two different precisions.
+        """
         renamed = {name: value for name, value in values.items() if name != _PRECISION}
         if (newer := values.get(_PRECISION)) is None:
             return renamed
@@ -272,9 +281,9 @@ class MolmoAct2(PackedPolicy):
 
     @classmethod
     def parse_config(cls, folder: Path, evaluation: Any) -> Any:
-        """lerobot's configuration, with what the processor files say: lerobot packs as they do.
+        """Return lerobot's configuration, with what the processor files say: lerobot packs as they do.
 
-        checkpoint_path: then the folder of the VLM's configuration and tokenizer.
+        Its `checkpoint_path` is then the folder of the VLM's configuration and tokenizer.
         """
         config = super().parse_config(folder, evaluation)
         read_steps(config, folder)
@@ -284,7 +293,11 @@ class MolmoAct2(PackedPolicy):
 
     @classmethod
     def build(cls, config: Any, folder: Path) -> Any:
-        """lerobot's policy of the size that the VLM's configuration has. Raises CheckpointError."""
+        """Build lerobot's policy of the size that the VLM's configuration has.
+
+        Raises:
+            CheckpointError: For LoRA adapters, for a policy of discrete actions only, and for missing statistics.
+        """
         if config.enable_lora_vlm:
             raise CheckpointError(f"{folder} holds LoRA adapters; merge them into its weights with lerobot first")
         if config.action_mode == "discrete":
@@ -303,11 +316,11 @@ class MolmoAct2(PackedPolicy):
             ) from error
 
     def parts(self) -> dict[str, Path]:
-        """The VLM's configuration and tokenizer."""
+        """Return the folder of the VLM's configuration and tokenizer."""
         return {"vlm": Path(self.config.checkpoint_path)}
 
     def own_units(self, feature: str, kind: str) -> FramedUnits | None:
-        """The units of lerobot's steps: numbers that a mask leaves unscaled, clamps, and frames of joints."""
+        """Return the units of lerobot's steps: numbers that a mask leaves unscaled, clamps, frames of joints."""
         units, config = super().own_units(feature, kind), self.config
         if units is None:
             return None
@@ -325,18 +338,25 @@ class MolmoAct2(PackedPolicy):
     # -- acting ------------------------------------------------------------------------------------------
 
     def denoise(self, batch: Mapping[str, Tensor], noise: Tensor) -> Tensor:
-        """See the base. Raises CaptureError for CUDA graphs."""
+        """Return the actions as the base does.
+
+        Raises:
+            CaptureError: If CUDA graphs are on.
+        """
         self._check_graphs()
         end = flow_actions(self.network, batch, noise, batch["action_dim_is_pad"])
         return end[..., : self._action_numbers]
 
     @property
     def noise_shape(self) -> tuple[int, int]:
-        """Actions of a chunk, and the widest action."""
+        """The shape of one row's noise: actions of a chunk, and the widest action."""
         return self.config.chunk_size, self.config.expected_max_action_dim
 
     def record_attention(self, note: Note) -> AbstractContextManager[None]:
-        """Computed once more: block n of the expert on the keys of block n of the backbone."""
+        """Record attention that is computed once more.
+
+        Block n of the expert attends to the keys of block n of the backbone.
+        """
         blocks = self.network._backbone().action_expert.blocks
         return recording_weights([block.cross_attn for block in blocks], note, _on_the_prompt)
 
@@ -355,7 +375,7 @@ class MolmoAct2(PackedPolicy):
 
     @cached_property
     def packing(self) -> Packing:
-        """lerobot's packing."""
+        """The packing of lerobot."""
         return Packing(self.config, self._action_numbers)
 
     # -- capture -----------------------------------------------------------------------------------------
@@ -380,23 +400,27 @@ class MolmoAct2(PackedPolicy):
         }
 
     def tap(self, site: Site) -> Tap:
-        """The first norm of the block the site enters, the final norm, or what a block adds behind its gate."""
+        """Return the first norm of the block the site enters, the final norm, or what a block adds, gated.
+
+        Raises:
+            CaptureError: If CUDA graphs are on.
+        """
         self._check_graphs()
         return super().tap(site)
 
     # -- verification ------------------------------------------------------------------------------------
 
     def watched(self) -> dict[str, nn.Module]:
-        """The velocity."""
+        """Return the module of the velocity."""
         return {"velocity": self.network._backbone().action_expert.final_layer}
 
     def further_outputs(self, run: RecordedRun) -> dict[str, Produce]:
-        """The backbone without its end, which only its final norm reads."""
+        """Return the backbone without its end, which only its final norm reads."""
         return {"backbone_resid": lambda: stacked(run.activations, self.streams["backbone"])[0, :-1]}
 
 
 def _on_the_prompt(attention: Any, inputs: tuple[Any, ...], keywords: dict[str, Any], _: Any) -> Tensor:
-    """(B, H, chunk, T): weights of the expert's actions on the prompt, whose kernel returns none."""
+    """Return the weights (B, H, chunk, T) of the expert's actions on the prompt, whose kernel returns none."""
     queries = attention.q_proj(inputs[0]).unflatten(-1, (attention.num_heads, -1)).transpose(1, 2)
     if attention.q_norm is not None:
         queries = attention.q_norm(queries)
@@ -405,5 +429,5 @@ def _on_the_prompt(attention: Any, inputs: tuple[Any, ...], keywords: dict[str, 
 
 
 def _of_width(marked: NDArray[np.bool_], numbers: int) -> NDArray[np.bool_]:
-    """(numbers,), or nothing marked where it is of another width, as in lerobot."""
+    """Return a mask (numbers,), or nothing marked where it is of another width, as in lerobot."""
     return marked if marked.shape == (numbers,) else np.zeros(numbers, bool)

@@ -26,27 +26,27 @@ class JointFrame:
 
     Attributes:
         signs: 1 or -1 per joint.
-        offsets: In the data set's units.
+        offsets: One per joint, in the data set's units.
     """
 
     signs: NDArray[np.float32]
     offsets: NDArray[np.float32]
 
     def entered(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(..., D) of the data set from (..., D) of the robot."""
+        """Return values (..., D) of the robot as the data set has them."""
         mapped, joints = np.array(values, np.float32), len(self.signs)
         mapped[..., :joints] = self.signs * mapped[..., :joints] + self.offsets
         return mapped
 
     def left(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(..., D) of the robot from (..., D) of the data set."""
+        """Return values (..., D) of the data set as the robot has them."""
         mapped, joints = np.array(values, np.float32), len(self.signs)
         mapped[..., :joints] = self.signs * (mapped[..., :joints] - self.offsets)
         return mapped
 
 
 SAME_FRAME = JointFrame(np.zeros(0, np.float32), np.zeros(0, np.float32))
-"""The robot has the data set's convention."""
+"""The frame of a robot with the data set's convention."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class FramedUnits(Normaliser):
     frame: JointFrame = SAME_FRAME
 
     def normalise(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Physical units to the numbers the network reads; (..., D).
+        """Map physical units (..., D) to the numbers the network reads.
 
         Raises:
             ObservationError: For a number that stays as it is and lies outside -1 to 1, as lerobot does.
@@ -72,17 +72,17 @@ class FramedUnits(Normaliser):
         return super().normalise(entered)
 
     def restore(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Network output to physical units; (..., D)."""
+        """Map network output (..., D) to physical units."""
         return self.frame.left(super().restore(values))
 
     def slopes(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(..., D) of `restore` at these outputs of the network; 0 where it clips."""
+        """Return the slopes of `restore` (..., D) at these outputs of the network; 0 where it clips."""
         slopes = super().slopes(values)
         slopes[..., : len(self.frame.signs)] *= self.frame.signs
         return slopes
 
     def unusual(self, values: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """(..., D) in the frame of the statistics."""
+        """Return (..., D) which values are unusual, in the frame of the statistics."""
         return super().unusual(self.frame.entered(values))
 
 
@@ -99,20 +99,21 @@ _PACKED = (
     "image_keys", "setup_type", "control_mode", "normalize_language", "add_setup_tokens", "add_control_tokens",
     "num_state_tokens", "max_sequence_length",
 )  # fmt: skip
-"""Fields of the configuration that the packing step has too."""
+"""The fields of the configuration that the packing step has too."""
 _SAME = {
     "checkpoint_path": "checkpoint_path",
     "chunk_size": "chunk_size",
     "max_action_dim": "expected_max_action_dim",
 }
-"""Fields of the packing step that are read from the configuration, under its name."""
+"""The fields of the packing step that are read from the configuration, under its name."""
 
 
 def read_steps(config: Any, folder: Path) -> None:
     """Put what the saved steps say into lerobot's configuration; without a packing step, it says so itself.
 
-    state_frame, action_frame: of the joints. clamps_state, clamps_action: whether numbers are moved to -1 to 1.
-    unclamped: (D,) True for numbers of the state that the clamp leaves out; None for those without statistics.
+    `state_frame` and `action_frame` are frames of the joints. `clamps_state` and `clamps_action` say whether
+    numbers are moved to -1 to 1. `unclamped` is (D,), True for numbers of the state that the clamp leaves out;
+    None for those without statistics.
 
     Raises:
         CheckpointError: For frames that are none, and for a packing step of another configuration.
@@ -144,7 +145,11 @@ def _frame(fields: Mapping[str, Any], folder: Path) -> JointFrame:
 
 
 def in_packed_order(config: Any, folder: Path) -> dict[str, Any]:
-    """The input features with the pictures that the packing reads, in its order. Raises CheckpointError."""
+    """Return the input features with the pictures that the packing reads, in its order.
+
+    Raises:
+        CheckpointError: For a picture that the configuration does not have.
+    """
     if not config.image_keys:
         return dict(config.input_features)
     if missing := [key for key in config.image_keys if key not in config.input_features]:
@@ -167,10 +172,10 @@ _PICTURES = ("pixel_values", "image_token_pooling", "image_grids", "image_num_cr
 
 
 class Packing:
-    """lerobot's packing of pictures, words and state into the inputs of the network."""
+    """The packing of lerobot: pictures, words and state become the inputs of the network."""
 
     def __init__(self, config: Any, actions: int) -> None:
-        """actions: numbers of an action. The rest is in lerobot's configuration."""
+        """Make the packing step of lerobot from its configuration; `actions` counts the numbers of an action."""
         self.step = MolmoAct2PackInputsProcessorStep(
             checkpoint_path=config.checkpoint_path,
             action_mode="continuous",
@@ -188,7 +193,16 @@ class Packing:
         self.tokenizer = self.step.processor.tokenizer
 
     def row(self, pictures: dict[str, NDArray[np.uint8]], task: str, state: NDArray[np.float32]) -> PackedRow:
-        """One row. pictures: (H, W, 3) by camera. Raises InstructionError for a prompt that does not fit."""
+        """Pack one row.
+
+        Args:
+            pictures: (H, W, 3) by camera.
+            task: The instruction.
+            state: (D,) as the network reads it.
+
+        Raises:
+            InstructionError: For a prompt that does not fit.
+        """
         self.step.image_keys = [f"observation.images.{camera}" for camera in pictures]
         observation: dict[str, Any] = {
             f"observation.images.{camera}": picture for camera, picture in pictures.items()
@@ -210,7 +224,10 @@ class Packing:
         return PackedRow(inputs, self._labels(inputs, list(pictures)))
 
     def _labels(self, inputs: dict[str, Tensor], cameras: Sequence[str]) -> list[str]:
-        """Each patch is its camera's; the instruction is `language`, the state's tokens are `state`."""
+        """Return the labels: a patch is its camera's; the instruction is `language`.
+
+        The state's tokens are `state`.
+        """
         pieces = self.tokenizer.convert_ids_to_tokens(inputs["input_ids"][0].tolist())
         labels = label_groups([piece.replace("\u0120", " ").replace("\u010a", "\n") for piece in pieces], _PROMPT)
         patches = iter(
@@ -225,7 +242,7 @@ class Packing:
         ]
 
     def batch(self, rows: Sequence[PackedRow]) -> dict[str, Tensor]:
-        """The rows as one batch; shorter ones are padded behind their end."""
+        """Return the rows as one batch; shorter ones are padded behind their end."""
         longest = max(len(row.labels) for row in rows)
         fill = {"input_ids": int(self.tokenizer.pad_token_id), "attention_mask": 0, "token_type_ids": 0}
         text = {

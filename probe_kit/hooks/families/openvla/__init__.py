@@ -10,7 +10,7 @@ BRIDGE = "bridge_orig"
 
 
 def _row(variant: str, checkpoint: str, unnorm_key: str, *alternatives: ProtocolRow) -> ProtocolRow:
-    """One of the three that the evaluation compares; they differ in checkpoint and units only."""
+    """Return one of the three rows that the evaluation compares; they differ in checkpoint and units only."""
     return ProtocolRow(
         checkpoint,
         execute=1,

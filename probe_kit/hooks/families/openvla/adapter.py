@@ -1,4 +1,4 @@
-"""The adapter for OpenVLA: prompt, actions as tokens, units of its training data.
+r"""The adapter for OpenVLA: prompt, actions as tokens, units of its training data.
 
 Sequence: beginning, 256 patches, "In: What action should the robot take to …?\nOut:" and one empty token. Seven
 greedy tokens follow, one per dimension; iteration k of the stream `action` is the position that chooses the k-th.
@@ -39,10 +39,11 @@ from probe_kit.models.prismatic import CROP_AREA, PrismaticConfig, PrismaticNetw
 
 @dataclass(frozen=True)
 class ActionTokens:
-    """The last `bins` text ids, from the highest down, name bins of [-1, 1].
+    """The last `bins` text ids, from the highest down, which name bins of [-1, 1].
 
     Attributes:
         vocabulary: Number of text ids, without the padding of the embedding.
+        bins: Number of these ids, and of the edges between which the bins lie.
     """
 
     vocabulary: int
@@ -50,16 +51,16 @@ class ActionTokens:
 
     @property
     def centres(self) -> NDArray[np.float64]:
-        """(bins - 1,): `bins` edges have one interval fewer between them."""
+        """The middles of the bins, (bins - 1,): `bins` edges have one interval fewer between them."""
         edges = np.linspace(-1, 1, self.bins)
         return np.asarray((edges[:-1] + edges[1:]) / 2)
 
     def values(self, ids: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Normalised values of ids of any shape; an id outside the range counts as the nearest bin."""
+        """Return normalised values of ids of any shape; an id outside the range counts as the nearest bin."""
         return np.asarray(self.centres[np.clip(self.vocabulary - 1 - ids, 0, self.bins - 2)])
 
     def is_action(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return, per id, True where it names a bin."""
+        """Return per id True where it names a bin."""
         return np.asarray((ids >= self.vocabulary - self.bins) & (ids < self.vocabulary))
 
 
@@ -94,7 +95,18 @@ class OpenVLA(PrismaticModel, Policy):
         resize: str = "pil",
         top: int | None = None,
     ) -> None:
-        """top: draw from so many of the likeliest ids that name actions; None from all."""
+        """Make the adapter and its card.
+
+        Args:
+            loaded: The network, with what loading proved.
+            statistics: The statistics of the data set whose units the actions get.
+            prompt: The template, with a place for the instruction.
+            crop: Whether the middle of the picture is shown.
+            tokenizer: Folder of another tokenizer; None for the checkpoint's.
+            temperature: 0 for the likeliest token; above, tokens are drawn.
+            resize: `pil`, or `tensor` as in Act2Answer's evaluation.
+            top: Draw from so many of the likeliest ids that name actions; None from all.
+        """
         super().__init__(loaded, steps=len(statistics.low), tokenizer=tokenizer)
         self.prompt_kv = kept_prompt(self.config.text)
         self.statistics, self.template, self.crop = statistics, prompt, crop
@@ -130,7 +142,7 @@ class OpenVLA(PrismaticModel, Policy):
     # -- acting ------------------------------------------------------------------------------------------
 
     def act(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
-        """One action per observation; seeds count only at a temperature. See the contract."""
+        """Return one action per observation; seeds count only at a temperature. See the contract."""
         if (reason := self.embodiment_mismatch()) is not None:
             raise CheckpointError(reason)
         ids = self._tokens(observations, seeds)
@@ -139,7 +151,7 @@ class OpenVLA(PrismaticModel, Policy):
         return open_or_closed(self.statistics.restore(self.action_tokens.values(ids)))[:, None]
 
     def embodiment_mismatch(self) -> str | None:
-        """Other actions than an end-effector delta."""
+        """Return a reason for other actions than an end-effector delta."""
         if self.steps == DIMENSIONS:
             return None
         return (
@@ -150,11 +162,11 @@ class OpenVLA(PrismaticModel, Policy):
     def infer_without_acting(
         self, observations: Sequence[Observation], seeds: Sequence[int]
     ) -> NDArray[np.float32]:
-        """(B, 1, tokens): the middle of the bin that each token names, without units."""
+        """Return (B, 1, tokens): the middle of the bin that each token names, without units."""
         return np.asarray(self.action_tokens.values(self._tokens(observations, seeds))[:, None], np.float32)
 
     def _tokens(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.int64]:
-        """(B, tokens) ids; one inference."""
+        """Return ids (B, tokens); one inference."""
         self.check(observations, seeds)
         rows = [self.prompt(observation.instruction) for observation in observations]
         pixels = self.pixel_values(self._look(observation.image) for observation in observations)
@@ -166,7 +178,11 @@ class OpenVLA(PrismaticModel, Policy):
         return ids
 
     def pixel_values(self, images: Iterable[NDArray[np.uint8]]) -> Tensor:
-        """(B, 3 per tower, S, S) float32, resized as asked. Raises ObservationError."""
+        """Return pictures (B, 3 per tower, S, S) float32, resized as asked.
+
+        Raises:
+            ObservationError: For a picture of another dtype or shape.
+        """
         if self.resize == "pil":
             return super().pixel_values(images)
         rows = [prepare_tensor(checked_picture(image), self.pictures) for image in images]
@@ -176,13 +192,17 @@ class OpenVLA(PrismaticModel, Policy):
         return centre_crop(image, self.config.towers[0].image_size) if self.crop else image
 
     def prompt(self, instruction: str) -> list[int]:
-        """Ids of the whole prompt, the empty token last. Raises CheckpointError for another tokenizer's ids."""
+        """Return the ids of the whole prompt, the empty token last.
+
+        Raises:
+            CheckpointError: For another tokenizer's ids.
+        """
         ids = self.tokenizer.encode(self.template.replace(SLOT, instruction.lower()))
         self._check_other_ids(ids)
         return self.with_empty_token(ids)
 
     def with_empty_token(self, ids: list[int]) -> list[int]:
-        """The model was trained with this token between prompt and action."""
+        """Return ids with the empty token at the end: the model was trained with it between prompt and action."""
         empty = self.config.empty_token
         return ids if ids[-1] == empty else [*ids, empty]
 
@@ -214,10 +234,11 @@ def load_openvla(
 ) -> OpenVLA:
     """Load OpenVLA, one of its fine-tunes, or a LoRA adapter that names its base, from a folder or hub id.
 
-    Options: see the family.
+    The options are those of the family. Raises what `load_checkpoint` raises, too.
 
     Raises:
-        UsageError: And what `load_checkpoint` raises.
+        CheckpointError: For a Prismatic model without actions, and for bad statistics.
+        UsageError: For an option that cannot be used, and for a data set that has to be chosen.
     """
     chooser(temperature, ())
     loaded = load_checkpoint(checkpoint or DEFAULT_CHECKPOINT, device, dtype, random_weights, bits, weights_seed)
@@ -232,7 +253,7 @@ def load_openvla(
 
 
 def openvla_units(checkpoint: str, *, unnorm_key: str | None = None, **_: Any) -> str:
-    """See `Family.units`."""
+    """Return the data set whose units the actions get, and what says so; see `Family.units`."""
     folders = checkpoint_folders(checkpoint, SMALL_FILES)
     by_data_set, source = prismatic_statistics(PrismaticConfig.from_folder(folders[-1]), folders)
     return f"{ActionStatistics.choose(by_data_set, unnorm_key, source).key}, from {source}"
@@ -246,7 +267,7 @@ def check_openvla_words(
     tokenizer: str | None = None,
     **_: Any,
 ) -> None:
-    """See `Family.words`."""
+    """Raise InstructionError for an instruction that is too long; see `Family.words`."""
     folders = checkpoint_folders(checkpoint, SMALL_FILES)
     config = PrismaticConfig.from_folder(folders[-1])
     text = find_tokenizer(folders, tokenizer, config.text.bos_token_id)
@@ -261,7 +282,10 @@ def check_openvla_words(
 
 
 def _template(prompt: str | None, config: PrismaticConfig) -> str:
-    """The first release (openvla-7b-v01) was made of Vicuna, and has Vicuna's prompt."""
+    """Return the template of a prompt.
+
+    The first release (openvla-7b-v01) was made of Vicuna, and has Vicuna's prompt.
+    """
     first = config.language_id.startswith("vicuna")
     return template_of(prompt or ("openvla-v01" if first else "openvla"), PROMPTS)
 

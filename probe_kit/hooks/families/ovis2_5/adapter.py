@@ -52,28 +52,32 @@ class Ovis25(ByPicture, VisionLanguageModel):
 
     @cached_property
     def vision(self) -> Stack:
-        """The vision tower; the last site is what the last block puts out. Patches word by word."""
+        """The vision tower; the last site is what the last block puts out. Patches are word by word."""
         blocks, view = self.network.visual_tokenizer.vit.vision_model.encoder.layers, {"view": self._by_picture}
         width = self.network.config.vision.width
         return Stack(blocks, blocks[-1], width, None, "layer_norm1", NOTHING, "output", view, TOWER)
 
     @cached_property
     def pictures(self) -> OvisPictures:
-        """The processor of pictures into patches. Raises CheckpointError naming the missing file."""
+        """The processor of pictures into patches.
+
+        Raises:
+            CheckpointError: For a missing file, which it names.
+        """
         return OvisPictures.from_folder(self.loaded.folder, self.network.config.vision)
 
     def picture_ids(self, height: int, width: int) -> list[int]:
-        """Ids at a picture's positions, as many as its size demands, between two marks."""
+        """Return the ids at a picture's positions, as many as its size demands, between two marks."""
         return [PICTURE_BEGINS, *[PICTURE] * self.pictures.tokens(height, width), PICTURE_ENDS]
 
     def picture_inputs(self, pictures: Pictures) -> dict[str, Tensor]:
-        """pixel_values (N, 3 x patch x patch) and image_grid_thw (B, 3)."""
+        """Return `pixel_values` (N, 3 x patch x patch) and `image_grid_thw` (B, 3)."""
         pixels, self._grid = self.pictures.patches(pictures)
         device = self.loaded.device
         return {"pixel_values": pixels.to(device), "image_grid_thw": self._grid.to(device)}
 
     def further_outputs(self, first: Prompt, produced: Mapping[str, Produce]) -> dict[str, Produce]:
-        """The visual words, and patches in the order of the authors' code."""
+        """Return the visual words, and patches in the order of the authors' code."""
 
         def vision() -> NDArray[Any]:
             return produced["vision_resid_row0"]()[:, _windows_first(self)]

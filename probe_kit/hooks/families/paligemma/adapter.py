@@ -41,22 +41,25 @@ class PaliGemma(VisionLanguageModel):
         return SquarePictures.from_folder(self.loaded.folder, int(self.network.config.vision_config.image_size))
 
     def picture_ids(self, height: int, width: int) -> list[int]:
-        """Ids at a picture's positions, as many for every size: a picture is shrunk to the tower's square."""
+        """Return the ids at a picture's positions, as many for every size.
+
+        A picture is shrunk to the tower's square.
+        """
         del height, width
         vision = self.network.config.vision_config
         return [int(self.network.config.image_token_id)] * (vision.image_size // vision.patch_size) ** 2
 
     def picture_inputs(self, pictures: Pictures) -> dict[str, Tensor]:
-        """pixel_values (B, 3, S, S)."""
+        """Return `pixel_values` (B, 3, S, S)."""
         return {"pixel_values": self.pictures.pixels(pictures).to(self.loaded.device)}
 
     def positions(self, packed: LeftPacked, picture_inputs: dict[str, Tensor]) -> Tensor:
-        """(B, T), counted from one."""
+        """Return positions (B, T), counted from one."""
         del picture_inputs
         return packed.positions(_FIRST_POSITION)
 
     def other_inputs(self, packed: LeftPacked) -> dict[str, Tensor]:
-        """token_type_ids: zero says that a position belongs to the prompt, which attends both ways."""
+        """Return `token_type_ids`: zero marks a position of the prompt, which attends both ways."""
         return {"token_type_ids": torch.zeros_like(packed.ids)}
 
 
@@ -67,7 +70,7 @@ def load_vlm_tiny(
     random_weights: bool = False,
     weights_seed: int = 0,
 ) -> PaliGemma:
-    """The embedded VLM: PaliGemma at 0.61 million parameters, trained on the prompts of `probe-kit ask`."""
+    """Load the embedded VLM: PaliGemma at 0.61 million parameters, trained on the prompts of `probe-kit ask`."""
     location = checkpoint or str(embedded_checkpoint("vlm-tiny"))
     vlm = PaliGemma.load(location, device, dtype, random_weights, weights_seed=weights_seed)
     vlm.card = replace(vlm.card, family="vlm-tiny", checkpoint=checkpoint or EMBEDDED)

@@ -19,7 +19,7 @@ _VLM_TINY = SourceWeights(
 
 
 def _embedded(name: str, summary: str, notes: str) -> Family:
-    """One of the embedded policies."""
+    """Return one of the embedded policies."""
     return Family(
         name,
         summary,

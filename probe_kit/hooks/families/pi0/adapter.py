@@ -46,9 +46,9 @@ _MARKS = ("resize_imgs_with_padding", "num_steps", "proj_width", "train_state_pr
 """Fields that only old files have."""
 _RENAMED = {"resize_imgs_with_padding": "image_resolution", "num_steps": "num_inference_steps"}
 _FIXED = {"adapt_to_pi_aloha": False, "use_delta_joint_actions_aloha": False}
-"""What lerobot 0.6 no longer does to states and actions; checkpoints that need it are refused."""
+"""The changes of states and actions that lerobot 0.6 no longer makes; checkpoints that need them are refused."""
 _WITHOUT_EFFECT = ("proj_width", "use_cache", "attention_implementation", "train_state_proj")
-"""Training, speed, and the expert's width, which the weights say themselves."""
+"""Fields of training, speed, and the expert's width, which the weights say themselves."""
 
 
 def is_old_layout(config: Mapping[str, Any]) -> bool:
@@ -57,7 +57,7 @@ def is_old_layout(config: Mapping[str, Any]) -> bool:
 
 
 def current_config(config: Mapping[str, Any], source: str) -> dict[str, Any]:
-    """The same settings under today's names. source: where the config lies, for messages.
+    """Return the same settings under today's names; `source` names the file of the config in messages.
 
     Raises:
         CheckpointError: For a setting that is no longer supported.
@@ -96,7 +96,7 @@ class Pi0(PaliGemmaPolicy, LerobotFlow):
 
     @classmethod
     def current_values(cls, values: dict[str, Any], path: Path) -> dict[str, Any]:
-        """Also of lerobot's older layout."""
+        """Return the fields of `config.json` under today's names, also of lerobot's older layout."""
         return current_config(values, str(path)) if is_old_layout(values) else values
 
     def further_settings(self) -> dict[str, str]:
@@ -113,7 +113,11 @@ class Pi0(PaliGemmaPolicy, LerobotFlow):
         return settings
 
     def units_of(self, feature: str, kind: str) -> Normaliser:
-        """The checkpoint's own; where it has none, those of its evaluation. Raises CheckpointError for both."""
+        """Return the checkpoint's own units; where it has none, those of its evaluation.
+
+        Raises:
+            CheckpointError: If there are both, or neither.
+        """
         requested = self.evaluation.statistics
         if (
             requested is not None
@@ -147,7 +151,10 @@ class Pi0(PaliGemmaPolicy, LerobotFlow):
 
     @cached_property
     def _statistics(self) -> StatisticsFile | None:
-        """The chosen statistics; for a checkpoint without own ones, its folder's or evaluation's. Else None."""
+        """The chosen statistics; for a checkpoint without own ones, its folder's or evaluation's.
+
+        None in every other case.
+        """
         source = self.evaluation.statistics
         if source is None and self._stored(STATE, "STATE") is None and self._stored("action", "ACTION") is None:
             source = statistics_in(self.folder) or EVALUATED_WITH.get(str(without_revision(self.checkpoint)))
@@ -164,7 +171,7 @@ class Pi0(PaliGemmaPolicy, LerobotFlow):
         return "padded-top-left" if is_old_layout(values) else "padded"
 
     def look(self, camera: str, images: Sequence[NDArray[np.uint8]]) -> Tensor:
-        """(B, 3, H, W) in [0, 1]; squashed and padded ones at the network's resolution."""
+        """Return pictures (B, 3, H, W) in [0, 1]; squashed and padded ones at the network's resolution."""
         if self.picture == "padded":
             return super().look(camera, images)
         if self.window(camera) != PictureWindow():
@@ -178,7 +185,7 @@ class Pi0(PaliGemmaPolicy, LerobotFlow):
         return padded_top_left(super().look(camera, images), (height, width))
 
     def laid_out(self, states: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Seven numbers where the evaluation's statistics are of seven."""
+        """Return seven numbers where the evaluation's statistics are of seven."""
         seven = self.evaluation.statistics is not None or self._statistics is not None
         return laid_out(states, self.state_numbers if seven else ARM_NUMBERS, self.evaluation.openness)
 
@@ -186,13 +193,13 @@ class Pi0(PaliGemmaPolicy, LerobotFlow):
 
     @classmethod
     def build(cls, config: Any, folder: Path) -> Any:
-        """lerobot's policy at the size `dims.json` gives, or at the released size."""
+        """Build lerobot's policy at the size `dims.json` gives, or at the released size."""
         sizes = sizes_file(folder)
         return cls.network_of(config, None if sizes is None else Pi0Size.from_file(sizes))
 
     @classmethod
     def network_of(cls, config: Any, size: Pi0Size | None) -> Any:
-        """lerobot's policy of this size; None for the released one."""
+        """Build lerobot's policy of this size; None for the released one."""
         return build_pi0(config, size)
 
     def _stacks(self) -> dict[str, Stack]:
@@ -207,15 +214,15 @@ class Pi0(PaliGemmaPolicy, LerobotFlow):
 
     @property
     def iterations(self) -> int:
-        """Flow-matching steps per inference."""
+        """The number of flow-matching steps per inference."""
         return int(self.config.num_inference_steps)
 
     def suffix_labels(self) -> list[str]:
-        """The state, then the chunk."""
+        """Return the labels of the state, then of the chunk."""
         return ["state", *["action"] * self.config.chunk_size]
 
     def record_attention(self, note: Note) -> AbstractContextManager[None]:
-        """lerobot's expert attends eagerly, and returns its weights."""
+        """Record the weights that lerobot's expert returns, which attends eagerly."""
         acting = [label == "action" for label in self.suffix_labels()]
 
         def note_acting(block: int, iteration: int, weights: Tensor) -> None:
@@ -235,10 +242,15 @@ def load_pi0_tiny(
     *,
     name: str = "pi0-tiny",
 ) -> Pi0:
-    """The embedded default: pi0 at 0.84 million parameters, trained to act on Color and Shape.
+    """Load the embedded default: pi0 at 0.84 million parameters, trained to act on Color and Shape.
 
     Args:
-        name: Of the embedded checkpoint.
+        checkpoint: Folder or hub id; None for the embedded one.
+        device: Device in torch's spelling, such as `cuda:0`.
+        dtype: float32 or bfloat16; None takes what the checkpoint's config says.
+        random_weights: Whether the weights are drawn instead of read.
+        weights_seed: Seed of random weights.
+        name: Name of the embedded checkpoint and of the family.
     """
     location = checkpoint or str(embedded_checkpoint(name))
     policy = Pi0.load(location, device, dtype, random_weights, weights_seed)
@@ -275,7 +287,7 @@ class Pi05(StatePrompt, Pi0):
 
     @classmethod
     def network_of(cls, config: Any, size: Pi0Size | None) -> Any:
-        """lerobot's policy of this size."""
+        """Build lerobot's policy of this size."""
         return build_pi05(config, size)
 
     def _stacks(self) -> dict[str, Stack]:

@@ -9,7 +9,7 @@ from probe_kit.hooks.families.shared.kinds import TOKENS, lerobot_family
 CAPTURED = 10
 """Action tokens whose positions are sites: "Action: ", and the lowest frequency of about seven dimensions."""
 FAST = replace(TOKENS, readout="first-chunk")
-"""One decoder puts out the tokens of a whole chunk."""
+"""The interventions of one decoder that puts out the tokens of a whole chunk."""
 
 FAMILIES = (
     lerobot_family(

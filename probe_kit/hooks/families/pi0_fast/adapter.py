@@ -63,12 +63,17 @@ from probe_kit.models.pi0 import EMBEDDING, LM_HEAD, PaliGemmaSize, build_resize
 
 FILES = ("tokenizer.json", "processor_config.json")
 _BROKEN = "\ufffd"
-"""What bytes become that make no character."""
+"""The character that stands for bytes that make no character."""
 
 
 @dataclass(frozen=True)
 class DecodedChunk:
-    """values: (H, D) float64, normalised. problems: why the tokens are no whole chunk; empty where they are."""
+    """The actions in the tokens of one row.
+
+    Attributes:
+        values: (H, D) float64, normalised.
+        problems: The reasons why the tokens are no whole chunk; empty where they are.
+    """
 
     values: NDArray[np.float64]
     problems: tuple[str, ...]
@@ -76,7 +81,13 @@ class DecodedChunk:
 
 @dataclass(frozen=True)
 class FastTokenizer:
-    """FAST's tokenizer. pieces: byte pairs. scale: coefficients per unit. least: the coefficient of chr(0)."""
+    """The tokenizer of FAST.
+
+    Attributes:
+        pieces: The tokenizer of byte pairs.
+        scale: Coefficients per unit.
+        least: The coefficient of chr(0).
+    """
 
     pieces: Any
     scale: float
@@ -84,7 +95,11 @@ class FastTokenizer:
 
     @classmethod
     def from_folder(cls, folder: Path) -> "FastTokenizer":
-        """Read `tokenizer.json` and `processor_config.json`. Raises CheckpointError."""
+        """Read `tokenizer.json` and `processor_config.json`.
+
+        Raises:
+            CheckpointError: For missing files, and for files that cannot be read.
+        """
         lacking = [name for name in FILES if not (folder / name).is_file()]
         if lacking:
             raise CheckpointError(
@@ -102,14 +117,14 @@ class FastTokenizer:
 
     @property
     def size(self) -> int:
-        """Number of its tokens."""
+        """The number of its tokens."""
         return int(self.pieces.get_vocab_size())
 
     def decode(self, ids: Sequence[int], horizon: int, dimensions: int) -> DecodedChunk:
-        """The chunk (horizon, dimensions) of its ids.
+        """The chunk (horizon, dimensions) of its ids, decoded as in lerobot's relaxed decoding.
 
-        Ids that it does not have and bytes that make no character are left out, missing coefficients are zero, and
-        surplus ones are cut, as in lerobot's relaxed decoding. Each is a problem: lerobot says so only in its log.
+        Ids that it does not have and bytes that make no character are left out. Missing coefficients are zero, and
+        surplus ones are cut. Each is a problem: lerobot says so only in its log.
         """
         problems = []
         fast_ids = [number for number in ids if 0 <= number < self.size]
@@ -150,7 +165,17 @@ class ActionText:
 
     @classmethod
     def of(cls, text: Any, fast: FastTokenizer, skipped: int, checked: bool) -> "ActionText":
-        """Read PaliGemma's tokenizer. skipped: ids at its end that stay free. Raises CheckpointError."""
+        """Read PaliGemma's tokenizer.
+
+        Args:
+            text: PaliGemma's tokenizer.
+            fast: FAST's tokenizer.
+            skipped: Count of ids at the end of `text` that stay free.
+            checked: Whether a row must begin with "Action: ".
+
+        Raises:
+            CheckpointError: If FAST's tokens do not fit into the ids.
+        """
         last = int(text.vocab_size) - 1 - skipped
         if last - fast.size < 0:
             raise CheckpointError(
@@ -161,11 +186,11 @@ class ActionText:
         return cls(fast, last, begin, int(text.convert_tokens_to_ids("|")), checked)
 
     def ids(self, fast: Sequence[int]) -> list[int]:
-        """The network's ids for FAST's tokens: "Action: ", the tokens, and the end."""
+        """Return the network's ids for FAST's tokens: "Action: ", the tokens, and the end."""
         return [*self.begin, *(self.last - number for number in fast), self.end]
 
     def decode(self, ids: Sequence[int], horizon: int, dimensions: int) -> DecodedChunk:
-        """The chunk in one row of ids. Also a problem: another beginning, and no end."""
+        """The chunk in one row of ids; another beginning and a missing end are problems too."""
         tokens, problems = list(ids), []
         if self.end in tokens:
             tokens = tokens[: tokens.index(self.end)]
@@ -179,7 +204,7 @@ class ActionText:
         return DecodedChunk(chunk.values, (*problems, *chunk.problems))
 
     def _without_begin(self, ids: Sequence[int]) -> list[int]:
-        """Every "Action: " is left out, as lerobot does it."""
+        """Leave out every "Action: ", as lerobot does it."""
         remaining, at, length = [], 0, len(self.begin)
         while at < len(ids):
             if tuple(ids[at : at + length]) == self.begin:
@@ -197,7 +222,7 @@ _NO_TOKENIZER = SimpleNamespace(from_pretrained=lambda *_, **__: None)
 
 
 def build_pi0_fast(config: PI0FastConfig, size: PaliGemmaSize | None = None, device: str = "cpu") -> PI0FastPolicy:
-    """A `PI0FastPolicy` without tokenizers; see `build_resized`."""
+    """Build a `PI0FastPolicy` without tokenizers; see `build_resized`."""
     with replaced(modeling_pi0_fast, {"AutoProcessor": _NO_TOKENIZER, "AutoTokenizer": _NO_TOKENIZER}):
         policy = build_resized(PI0FastPolicy, config, size, device)
     joint: Any = policy.model.paligemma_with_expert
@@ -206,7 +231,7 @@ def build_pi0_fast(config: PI0FastConfig, size: PaliGemmaSize | None = None, dev
 
 
 def full_size_pi0_fast() -> PI0FastPolicy:
-    """The released size, on the meta device."""
+    """Build the released size, on the meta device."""
     return build_pi0_fast(PI0FastConfig(device="cpu"), device="meta")
 
 
@@ -219,14 +244,19 @@ def decode_tokens(
     most: int,
     choose: Callable[[Tensor], Tensor],
 ) -> Tensor:
-    """(B, n) ids of `least` to `most` tokens: until every row has put out the end.
+    """Return ids (B, n) of `least` to `most` tokens: until every row has put out the end.
+
+    A row that has ended is decoded with the others, so that no row depends on another one. What it puts out behind
+    its end means nothing.
 
     Args:
         model: Lerobot's `PI0FastPytorch`.
-        pictures: (B, 3, H, W) in [-1, 1], and (B,) masks, of every camera. text: tokens and mask (B, T).
+        pictures: (B, 3, H, W) in [-1, 1], and (B,) masks, of every camera.
+        text: Tokens and mask of the prompts, (B, T).
         bounds: Ids that begin and end the actions.
-        choose: (B,) ids of logits (B, V). A row that has ended is decoded with the others, so that no row depends
-            on another one; what it puts out behind its end means nothing.
+        least: The smallest number of tokens.
+        most: The largest number of tokens.
+        choose: Gives (B,) ids of logits (B, V).
     """
     joint = model.paligemma_with_expert
     rows, device = len(text[0]), text[0].device
@@ -260,7 +290,7 @@ def decode_tokens(
 
 
 def _dtype(joint: Any, entering: Tensor) -> torch.dtype:
-    """lerobot computes in bfloat16 where the attention's weights are."""
+    """Return the dtype in which lerobot computes: bfloat16 where the attention's weights are."""
     stored: torch.dtype = joint.paligemma.model.language_model.layers[0].self_attn.q_proj.weight.dtype
     return torch.bfloat16 if stored == torch.bfloat16 else entering.dtype
 
@@ -280,7 +310,8 @@ class Decoding(Evaluation):
 class Pi0Fast(StatePrompt, PaliGemmaPolicy):
     """A loaded pi0-FAST.
 
-    problems: per row of the last inference, why its tokens are no whole chunk of actions; empty where they are.
+    `problems` holds per row of the last inference why its tokens are no whole chunk of actions; empty where they
+    are.
     """
 
     family = "pi0-fast"
@@ -304,7 +335,7 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
 
     @classmethod
     def build(cls, config: Any, folder: Path) -> Any:
-        """lerobot's policy at the size `dims.json` gives, or at the released size.
+        """Build lerobot's policy at the size `dims.json` gives, or at the released size.
 
         Raises:
             UsageError: For a number of captured tokens that an inference cannot put out, and for a temperature.
@@ -318,7 +349,7 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
 
     @property
     def temperature(self) -> float:
-        """0 for the likeliest token."""
+        """The temperature of the draw; 0 for the likeliest token."""
         requested = self.evaluation.temperature
         return float(self.config.temperature if requested is None else requested)
 
@@ -353,7 +384,7 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
         )
 
     def parts(self) -> dict[str, Path]:
-        """The FAST tokenizer."""
+        """Return the folder of the FAST tokenizer."""
         return {"fast": inside_or_hub(self.folder, self.config.action_tokenizer_name, FILES)}
 
     @cached_property
@@ -365,7 +396,7 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
     # -- acting ------------------------------------------------------------------------------------------
 
     def put_out(self, batch: dict[str, Tensor], seeds: Sequence[int]) -> NDArray[np.float32]:
-        """The chunks in the tokens; a row whose tokens are no whole chunk is flagged, with a warning."""
+        """Return the chunks in the tokens; a row whose tokens are no whole chunk is flagged, with a warning."""
         chunks = self.chunks(self.tokens(batch, seeds))
         self.problems = [chunk.problems for chunk in chunks]
         self.flagged = np.array([bool(row) for row in self.problems])
@@ -374,7 +405,7 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
         return np.stack([chunk.values for chunk in chunks]).astype(np.float32)
 
     def tokens(self, batch: dict[str, Tensor], seeds: Sequence[int]) -> Tensor:
-        """(B, n) ids that the network puts out for a batch in lerobot's keys; one inference."""
+        """Return ids (B, n) that the network puts out for a batch in lerobot's keys; one inference."""
         self.check_pictures(batch)
         bounds = int(self.tokenizer.bos_token_id), self.action_text.end
         least, most = self.evaluation.captured_tokens, int(self.config.max_decoding_steps)
@@ -384,7 +415,7 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
             return decode_tokens(self.network.model, pictures, text, bounds, least, most, choose)
 
     def chunks(self, ids: Tensor) -> list[DecodedChunk]:
-        """The normalised chunk in every row of (B, n) ids.
+        """Return the normalised chunk in every row of (B, n) ids.
 
         It has as many actions as the network was trained to put out. lerobot decodes as many as it executes, which
         is another transform where the two numbers differ.
@@ -393,7 +424,7 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
         return [self.action_text.decode(row, self.config.chunk_size, dimensions) for row in ids.tolist()]
 
     def record_attention(self, note: Note) -> AbstractContextManager[None]:
-        """Computed once more for the position that chooses a token."""
+        """Record attention that is computed once more for the position that chooses a token."""
         return of_decoder(self._decoder.layers, note)
 
     # -- capture -----------------------------------------------------------------------------------------
@@ -413,29 +444,29 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
         }
 
     def suffix_labels(self) -> list[str]:
-        """One position at every iteration."""
+        """Return the label of one position, which is the same at every iteration."""
         return ["action"]
 
     @property
     def unembedding(self) -> Unembedding:
-        """PaliGemma's final norm and head."""
+        """The final norm and head of PaliGemma."""
         head = self.network.model.paligemma_with_expert.paligemma.lm_head
         return Unembedding(("backbone", "action"), _FinalNorm(self._decoder.norm), head)
 
     # -- verification ------------------------------------------------------------------------------------
 
     def replay(self, batch: dict[str, Tensor], recorded: Arrays) -> dict[str, NDArray[Any]]:
-        """The chunks and their ids; nothing is drawn in a golden reference."""
+        """Return the chunks and their ids; nothing is drawn in a golden reference."""
         del recorded
         ids = self.tokens(batch, range(len(batch[TOKENS])))
         return {"actions": np.stack([chunk.values for chunk in self.chunks(ids)]), "tokens": numpy_of(ids)}
 
     def watched(self) -> dict[str, nn.Module]:
-        """The logits."""
+        """Return the module of the logits."""
         return {"logits": self.network.model.paligemma_with_expert.paligemma.lm_head}
 
     def further_outputs(self, run: RecordedRun) -> dict[str, Produce]:
-        """Prepared pictures, and the logits of the ids that are put out."""
+        """Return prepared pictures, and the logits of the ids that are put out."""
         batch = dict(run.batch)
         return {
             "prep_images": lambda: numpy_of(torch.stack(self.network._preprocess_images(batch)[0])),
@@ -445,20 +476,20 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
 
 
 class _FinalNorm(nn.Module):
-    """lerobot's norm without the gate that it returns beside what is normed."""
+    """The norm of lerobot without the gate that it returns beside what is normed."""
 
     def __init__(self, norm: nn.Module) -> None:
         super().__init__()
         self.norm = norm
 
     def forward(self, residual: Tensor) -> Tensor:
-        """(…, D)."""
+        """Return the normed residual (…, D)."""
         normed: Tensor = self.norm(residual)[0]
         return normed
 
 
 def _warn_of_problems() -> None:
-    """The same words at every step, so that a run says it once."""
+    """Warn in the same words at every step, so that a run says it once."""
     warnings.warn(
         "the model put out tokens that are no whole chunk of actions; `problems` of the policy says why. What is "
         "missing counts as zero before units are restored, and the step as flagged. Random weights do this; if "

@@ -1,7 +1,8 @@
 """The adapter for Prismatic vision-language models: packing, streams, taps, roles. OpenVLA builds on it.
 
-One stack serves two streams, distinguished by position: `backbone` is the prompt without its last token, the other
-one the positions whose logits choose the output: the prompt's last token, then every token fed back but the last.
+One stack serves two streams, distinguished by position: `backbone` is the prompt without its last token. The other
+one has the positions whose logits choose the output: the prompt's last token, then every token fed back but the
+last.
 """
 
 from abc import abstractmethod
@@ -51,13 +52,13 @@ _LLAMA_SYSTEM = (
 
 @dataclass(frozen=True)
 class TextFrame:
-    """Before and behind a question."""
+    """The text around a question: `before` it and `behind` it."""
 
     before: str
     behind: str
 
     def around(self, question: str) -> str:
-        """The whole text; the original strips white space from both ends of a question."""
+        """Return the whole text; the original strips white space from both ends of a question."""
         return f"{self.before}{question.strip()}{self.behind}"
 
     def question_span(self, question: str) -> tuple[int, int]:
@@ -88,13 +89,21 @@ def frame_of(language_id: str) -> TextFrame:
 
 
 def id_behind(tokenizer: "FileTokenizer", prompt: str, answer: str) -> int:
-    """The first id of `answer` behind `prompt`. Raises UsageError if it changes the prompt's own ids."""
+    """The first id of `answer` behind `prompt`.
+
+    Raises:
+        UsageError: If it changes the prompt's own ids.
+    """
     return first_behind(tokenizer.encode(prompt), tokenizer.encode(prompt + answer), answer)
 
 
 @dataclass(frozen=True)
 class FileTokenizer(TokenizerFile):
-    """A tokenizer that begins every text. beginning: the id of the model's configuration."""
+    """A tokenizer that begins every text.
+
+    Attributes:
+        beginning: The id of the model's configuration that begins a text; None where it has none.
+    """
 
     beginning: int | None
 
@@ -107,17 +116,17 @@ class FileTokenizer(TokenizerFile):
 
     @cached_property
     def special(self) -> frozenset[int]:
-        """Ids that the file declares special."""
+        """The ids that the file declares special, and the one that begins a text."""
         return super().special | {self._beginning or 0}
 
     def encode(self, text: str) -> list[int]:
-        """Ids, the beginning-of-sequence token first, also where the file does not add it."""
+        """Return ids, the beginning-of-sequence token first, also where the file does not add it."""
         ids: list[int] = self.encoding(text, special=True).ids
         begins = self._beginning is None or ids[:1] == [self._beginning]
         return ids if begins else [self._beginning, *ids]  # type: ignore[list-item]
 
     def inside(self, text: str, start: int, stop: int) -> list[bool]:
-        """Per id whether it holds any of these characters, by the offsets that the tokenizer gives."""
+        """Return per id whether it holds any of these characters, by the offsets that the tokenizer gives."""
         flags = positions_of(self.encoding(text, special=True), start, stop)
         return [False] * (len(self.encode(text)) - len(flags)) + list(flags)
 
@@ -129,8 +138,13 @@ class FileTokenizer(TokenizerFile):
 def find_tokenizer(folders: Sequence[Path], tokenizer: str | None, beginning: int | None) -> FileTokenizer:
     """The checkpoint's tokenizer, or the one in the folder `tokenizer`.
 
+    Args:
+        folders: The folders that may hold the checkpoint's, the first one before the others.
+        tokenizer: Folder of another tokenizer; None for the checkpoint's.
+        beginning: The id of the model's configuration that begins a text.
+
     Raises:
-        CheckpointError: Naming the missing files.
+        CheckpointError: For missing files, which it names.
     """
     places = list(folders) if tokenizer is None else [Path(tokenizer).expanduser()]
     for folder in places:
@@ -162,7 +176,14 @@ class PrismaticModel(TokenDecoder):
         tokenizer: str | None = None,
         text_folder: Path | None = None,
     ) -> None:
-        """text_folder: of a tokenizer that does not come with the checkpoint."""
+        """Make the streams and the card of a model.
+
+        Args:
+            loaded: The network, with what loading proved.
+            steps: Tokens per inference.
+            tokenizer: Folder of another tokenizer; None for the checkpoint's.
+            text_folder: Folder of a tokenizer that does not come with the checkpoint; None where it does.
+        """
         super().__init__(loaded, steps)
         self._chosen_tokenizer, self._text_folder = tokenizer, text_folder
         self.further_streams = {
@@ -172,7 +193,7 @@ class PrismaticModel(TokenDecoder):
         self.card = loaded.card(self.family, self._settings(), files=self._files(), tokenizer=tokenizer)
 
     def _files(self) -> dict[str, Path]:
-        """Every file besides the weights, with that of a tokenizer that comes from elsewhere."""
+        """Return every file besides the weights, with that of a tokenizer that comes from elsewhere."""
         files: dict[str, Path] = {}
         for number, folder in enumerate(self.loaded.folders):
             files |= side_files(folder, "" if number == len(self.loaded.folders) - 1 else "adapter/")
@@ -190,23 +211,34 @@ class PrismaticModel(TokenDecoder):
         return PictureSettings.of(self.config, self.loaded.folders[-1])
 
     def pixel_values(self, images: Iterable[NDArray[np.uint8]]) -> Tensor:
-        """(B, 3 per tower, S, S) float32 of (H, W, 3) uint8 pictures. Raises ObservationError."""
+        """Return (B, 3 per tower, S, S) float32 of (H, W, 3) uint8 pictures.
+
+        Raises:
+            ObservationError: For a picture of another dtype or shape.
+        """
         rows = [prepare_picture(checked_picture(image), self.pictures) for image in images]
         return torch.from_numpy(np.stack(rows)).to(self.loaded.device)
 
     @cached_property
     def tokenizer(self) -> FileTokenizer:
-        """The checkpoint's. Raises CheckpointError naming the files that are missing."""
+        """The tokenizer of the checkpoint, or the chosen one.
+
+        Raises:
+            CheckpointError: For files that are missing, which it names.
+        """
         folders = [*self.loaded.folders, *filter(None, [self._text_folder])]
         return find_tokenizer(folders, self._chosen_tokenizer, self.config.text.bos_token_id)
 
     @abstractmethod
     def prompt(self, instruction: str) -> list[int]:
-        """Ids of a whole prompt."""
+        """Return the ids of a whole prompt."""
 
     def pack(self, rows: Sequence[Sequence[int]]) -> Packed:
-        """Prompts of ids as a batch. Raises InstructionError for one that is too long, CheckpointError for ids
-        the model does not have.
+        """Return prompts of ids as a batch.
+
+        Raises:
+            InstructionError: For a prompt that is too long.
+            CheckpointError: For ids that the model does not have.
         """
         for row in rows:
             self.check_length(self.network.patches + len(row))
@@ -223,7 +255,7 @@ class PrismaticModel(TokenDecoder):
     def generate(
         self, pixel_values: Tensor | None, rows: Sequence[Sequence[int]], choose: Choose = greedy
     ) -> Decoded:
-        """`steps` tokens behind every prompt, greedy by default; one inference, as `capture` counts it."""
+        """Return `steps` tokens behind every prompt, greedy by default; one inference, as `capture` counts it."""
         packed = self.pack(rows)
         device = self.loaded.device
         with torch.inference_mode():
@@ -234,7 +266,7 @@ class PrismaticModel(TokenDecoder):
     # -- capture -----------------------------------------------------------------------------------------
 
     def roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
-        """Beginning of sequence, patches, text; padding behind it where another prompt is longer."""
+        """The roles of beginning of sequence, patches and text, with padding behind the shorter prompts."""
         rows = [self.prompt(observation.instruction) for observation in observations]
         backbone = []
         for row in rows:
@@ -248,12 +280,12 @@ class PrismaticModel(TokenDecoder):
         return [tuple(self.prompt(instruction)) for instruction in instructions]
 
     def patch_order(self) -> NDArray[np.int64]:
-        """A token per patch, row by row, behind the tower's class and register tokens."""
+        """Return a token per patch, row by row, behind the tower's class and register tokens."""
         prefix = int(self._towers["vision"].num_prefix_tokens)
         return np.concatenate([np.full(prefix, -1), np.arange(self.network.patches)])
 
     def vision_tap(self, site: Site) -> Tap:
-        """The input of a block; the last is what the projector reads, class and register tokens in front."""
+        """Return the input of a block; the last is what the projector reads, class and register tokens first."""
         return Tap(self._towers[site.stream].blocks[site.layer].norm1, 1)
 
     @property
@@ -262,7 +294,7 @@ class PrismaticModel(TokenDecoder):
 
 
 class Prismatic(PrismaticModel, SpeakingModel):
-    """A loaded Prismatic vision-language model: answers in text."""
+    """A loaded Prismatic vision-language model, which answers in text."""
 
     family: ClassVar[str] = "prismatic"
     output: ClassVar[str] = "answer"
@@ -281,11 +313,15 @@ class Prismatic(PrismaticModel, SpeakingModel):
         return frame_of(self.config.language_id)
 
     def prompt(self, instruction: str) -> list[int]:
-        """Ids of a question in the frame around it."""
+        """Return the ids of a question in the frame around it."""
         return self.tokenizer.encode(self.frame.around(instruction))
 
     def read(self, questions: Sequence[Prompt]) -> Reading:
-        """One prefill; see the contract. Raises UsageError if the model was loaded for more than one step."""
+        """Read all questions in one prefill; see the contract.
+
+        Raises:
+            UsageError: If the model was loaded for more than one step.
+        """
         if self.steps != 1:
             raise UsageError(
                 f"a question is one prefill; this model takes {self.steps} steps. Load it with steps=1"
@@ -297,7 +333,7 @@ class Prismatic(PrismaticModel, SpeakingModel):
         return [id_behind(self.tokenizer, self._framed(question), option) for option in question.options]
 
     def prefill(self, questions: Sequence[Prompt]) -> Prefill:
-        """One pass over all questions."""
+        """Read all questions in one pass."""
         self.check([question.observation for question in questions])
         pixels = None
         if self.shows_pictures(questions):
@@ -309,11 +345,14 @@ class Prismatic(PrismaticModel, SpeakingModel):
         return self.frame.around(question.text) + question.begun
 
     def roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
-        """Roles of the observations' instructions as questions."""
+        """The roles of the observations' instructions as questions."""
         return self.asked_roles([Prompt(observation, observation.instruction) for observation in observations])
 
     def asked_roles(self, questions: Sequence[Prompt]) -> dict[str, list[Roles]]:
-        """Everything around picture and question is `special`, how an answer has begun too."""
+        """Return the roles of questions: everything around picture and question is `special`.
+
+        The beginning of an answer is `special` too.
+        """
         patches = self.network.patches if self.shows_pictures(questions) else 0
         image = [IMAGE_ROLE] * patches
         rows = []
@@ -334,7 +373,7 @@ class Prismatic(PrismaticModel, SpeakingModel):
 
     @cached_property
     def ends(self) -> frozenset[int]:
-        """Ids that end an answer."""
+        """The ids that end an answer."""
         return token_ids_of(self.config.text.eos_token_id)
 
 
@@ -353,7 +392,7 @@ def load_prismatic(
 
     Its layout is that of `PrismaticForConditionalGeneration`, or of a training run as TRI-ML releases it, of which
     a hub id has the form `owner/repo/folder`. Towers and tokenizer of such a run are downloaded where they are.
-    Options: see the family. Raises what `load_checkpoint` raises.
+    The options are those of the family. Raises what `load_checkpoint` raises.
     """
     loaded = load_checkpoint(checkpoint or DEFAULT_CHECKPOINT, device, dtype, random_weights, bits, weights_seed)
     elsewhere, text_folder = loaded.network.config.tokenizer_id, None

@@ -31,7 +31,12 @@ from probe_kit.models.prismatic import PrismaticConfig, PrismaticNetwork, TowerC
 
 
 def check_quantisation(bits: int, device: str) -> None:
-    """Refuse before anything large is read. Raises UsageError or MissingExtraError."""
+    """Refuse a quantisation that cannot run, before anything large is read.
+
+    Raises:
+        UsageError: For another number of bits, and for a device that is no NVIDIA GPU.
+        MissingExtraError: Without bitsandbytes.
+    """
     if bits not in (8, 4):
         raise UsageError(f"bits is {bits}; expected 8 or 4")
     require("bitsandbytes", "quantized")
@@ -73,16 +78,22 @@ _PARTS = {"projector", "llm_backbone"}
 _TOWERS = "vision_backbone"
 _LAYERS = {"projector.0.": "projector.fc1.", "projector.2.": "projector.fc2.", "projector.4.": "projector.fc3."}
 _TAGS = {"vit_so400m_patch14_siglip_224": "webli", "vit_so400m_patch14_siglip_384": "webli"}
-"""Of ids that name none: timm's own default was SigLIP when these models were trained, and is SigLIP 2 since."""
+"""The tags of ids that name none.
+
+The default of timm itself was SigLIP when these models were trained, and is SigLIP 2 since.
+"""
 _FEATURIZERS = ("featurizer", "fused_featurizer")
 
 
 def read_release(file: Path, config: PrismaticConfig) -> Weights:
     """The tensors of a model of the release under the network's names.
 
+    Towers that the file does not hold are read from timm's files on the hub. Their positions are resampled to the
+    model's picture as timm does it.
+
     Args:
-        file: `latest-checkpoint.pt`, read with `weights_only=True`. Towers that it does not hold are read from
-            timm's files on the hub, and their positions resampled to the model's picture as timm does it.
+        file: `latest-checkpoint.pt`, read with `weights_only=True`.
+        config: The configuration of the model, which names its towers.
 
     Raises:
         WeightsError: For a file of another layout.
@@ -111,7 +122,11 @@ def read_release(file: Path, config: PrismaticConfig) -> Weights:
 
 
 def _renamed(part: Any, names: Mapping[str, str], file: Path) -> Iterator[tuple[str, Tensor]]:
-    """The tensors of a part with the beginnings of their names replaced. Raises WeightsError for another name."""
+    """The tensors of a part with the beginnings of their names replaced.
+
+    Raises:
+        WeightsError: For a tensor with another name.
+    """
     if not isinstance(part, dict):
         raise WeightsError(f"{file} holds a {type(part).__name__} in place of a state dict")
     for name, tensor in part.items():
@@ -124,7 +139,7 @@ def _renamed(part: Any, names: Mapping[str, str], file: Path) -> Iterator[tuple[
 
 
 def _tower_names(part: Any, config: PrismaticConfig, file: Path) -> dict[str, str]:
-    """The towers' names in the file of a fully fine-tuned model, and here."""
+    """Return the towers' names in the file of a fully fine-tuned model, with those here."""
     towers = dict.fromkeys(str(name).partition(".")[0] for name in part)
     if len(towers) != len(config.towers):
         raise WeightsError(
@@ -157,20 +172,20 @@ def _published(tower: TowerConfig) -> dict[str, Tensor]:
 
 
 def published_name(tower: TowerConfig) -> str:
-    """Hub id of timm's published weights of a tower."""
+    """Return the hub id of timm's published weights of a tower."""
     architecture, _, tag = tower.timm_id.partition(".")
     return f"timm/{architecture}.{tag or _TAGS[architecture]}"
 
 
 def _scale_name(name: str) -> str:
-    """timm calls a layer scale `gamma`, the network `scale_factor`."""
+    """Return the network's name of a tensor: a layer scale is `gamma` in timm and `scale_factor` in a network."""
     return name.removesuffix(".gamma") + ".scale_factor" if name.endswith(".gamma") else name
 
 
 # -- loading --------------------------------------------------------------------------------------------------
 
 FILES = (*PATTERNS, RUN_WEIGHTS)
-"""What is needed of a hub repository, or of the folder of one model of it."""
+"""The files that are needed of a hub repository, or of the folder of one model of it."""
 # Files of OpenVLA-OFT: its actions come from heads that its language model's checkpoint does not name.
 _OTHER_HEADS = ("action_head--*", "proprio_projector--*", "noisy_action_projector--*", "vision_backbone--*")
 
@@ -192,11 +207,19 @@ def load_checkpoint(
 ) -> Loaded[PrismaticNetwork]:
     """Load a folder or hub id, which may hold a LoRA adapter that names its base, or a training run's files.
 
-    Raises CheckpointError, WeightsError, UsageError for another dtype, MissingExtraError.
-
     Args:
-        dtype: float32 or bfloat16; default what the checkpoint says.
-        bits: Quantise the language model after the audit.
+        checkpoint: Folder or hub id.
+        device: Device in torch's spelling, such as `cuda:0`.
+        dtype: float32 or bfloat16; None takes what the checkpoint says.
+        random_weights: Whether the weights are drawn instead of read.
+        bits: Quantise the language model to 8 or 4 bits after the audit; None keeps it exact.
+        weights_seed: Seed of random weights.
+
+    Raises:
+        CheckpointError: For a folder that is not there, and for files that are missing or bad.
+        WeightsError: For weights that are not exactly the network's.
+        UsageError: For another dtype, and for a quantisation that cannot run.
+        MissingExtraError: Without a package that the weights need.
     """
     if bits is not None:
         check_quantisation(bits, device)

@@ -33,11 +33,15 @@ from probe_kit.hooks.outputs import (
 from probe_kit.models.prismatic import prepare_picture
 
 STREAMS = 3e-5
-"""Tolerance of activations, absolute."""
+"""The absolute tolerance of activations."""
 
 
 def asked_outputs(model: Prismatic, folder: Path, recorded: Arrays) -> Outputs:
-    """Ask the recorded questions. Raises UsageError where they do not lie beside the reference."""
+    """Ask the recorded questions.
+
+    Raises:
+        UsageError: Where they do not lie beside the reference.
+    """
     frame = model.frame
     questions = [
         Prompt(
@@ -51,20 +55,20 @@ def asked_outputs(model: Prismatic, folder: Path, recorded: Arrays) -> Outputs:
 
 
 class _Asked:
-    """The recorded questions, run through the adapter when something asks for what comes of them."""
+    """The recorded questions, run through the adapter at the first request for a result of them."""
 
     def __init__(self, model: Prismatic, questions: Sequence[Prompt], recorded: Arrays) -> None:
         self.model, self.questions, self.recorded = model, questions, recorded
 
     @cached_property
     def captured(self) -> list[tuple[ActivationCache, Prefill]]:
-        """Every row alone, with everything that is stored of it."""
+        """The activations and the prefill of every row alone, with everything that is stored of it."""
         runs = (watch(self.model, partial(self.model.prefill, [question])) for question in self.questions)
         return [(activations, prefill) for prefill, activations, _ in runs]
 
     @property
     def prompts(self) -> list[list[int]]:
-        """Ids of every row."""
+        """The ids of every row."""
         return [self.model.prompt(question.text) for question in self.questions]
 
     @cached_property
@@ -73,7 +77,7 @@ class _Asked:
         return self.model.pixel_values(question.observation.image for question in self.questions)
 
     def produced(self) -> dict[str, Produce]:
-        """Functions that make every output the adapter can make."""
+        """Return functions that make every output the adapter can make."""
         model, padding = self.model, int(self.model.config.text.pad_token_id or 0)
         lengths = [len(row) for row in self.prompts]
         bare = replace(self.questions[0], pictured=False)
@@ -104,7 +108,7 @@ class _Asked:
         return numpy_of(network.projector(network.vision_backbone(self.pixels)))
 
     def _streams(self, layers: Sequence[int], quantity: str) -> NDArray[Any]:
-        """(layers, B, P + T, D)."""
+        """Return the activations of both streams, (layers, B, P + T, D)."""
         rows = []
         for activations, _ in self.captured:
             parts = [
@@ -116,7 +120,7 @@ class _Asked:
 
     @staticmethod
     def _in_front(rows: Sequence[NDArray[Any]]) -> NDArray[Any]:
-        """(B, longest, …) with zeros in front of shorter rows."""
+        """Return rows as (B, longest, …) with zeros in front of shorter rows."""
         longest = max(map(len, rows))
         return np.stack([
             np.concatenate([np.zeros((longest - len(row), *row.shape[1:]), row.dtype), row]) for row in rows
@@ -134,7 +138,7 @@ INPUTS = (
     "image_uint8", "prompt_ids_without_empty", "attention_mask", "batch_input_ids", "batch_attention_mask",
     "batch_pixel_values",
 )  # fmt: skip
-"""What a reference records of what went in, beside the prompt's ids."""
+"""The names under which a reference records what went in, beside the prompt's ids."""
 
 
 def prismatic_outputs(load: Callable[..., Any], folder: Path, recorded: Arrays) -> Outputs:
@@ -148,7 +152,13 @@ def prismatic_outputs(load: Callable[..., Any], folder: Path, recorded: Arrays) 
 
 
 class Reference:
-    """The recorded inputs, run through the adapter. prompt: ids of its text tokens."""
+    """The recorded inputs, run through the adapter.
+
+    Args:
+        model: The adapter.
+        recorded: The arrays of the reference.
+        prompt: Ids of the text tokens of the prompt.
+    """
 
     def __init__(self, model: PrismaticModel, recorded: Arrays, prompt: list[int]) -> None:
         self.model, self.recorded, self.prompt = model, recorded, prompt
@@ -156,7 +166,12 @@ class Reference:
         self.decoded, self.activations, _ = watch(model, lambda: model.generate(self.pixels, [prompt]))
 
     def outputs(self, inputs: Collection[str], **family_outputs: Produce) -> Outputs:
-        """Everything that the adapter can make, whether recorded or not. inputs: recorded names that went in."""
+        """Return everything that the adapter can make, whether recorded or not.
+
+        Args:
+            inputs: Recorded names that went in.
+            **family_outputs: Functions that make further outputs, by name.
+        """
         valid: dict[str, NDArray[np.bool_]] = {}
         if "batch_attention_mask" in self.recorded:
             mask = self.recorded["batch_attention_mask"].astype(bool)
@@ -213,9 +228,9 @@ class Reference:
         return forward_outputs(self.model.network, row, torch.ones_like(row, dtype=torch.bool), pixels)
 
     def _batch(self) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Hidden states and logits of the recorded batch, packed as the adapter packs it.
+        """Return hidden states and logits of the recorded batch, packed as the adapter packs it.
 
-        Reordered to the recorded layout, where padding stands behind the last token.
+        They are reordered to the recorded layout, where padding stands behind the last token.
         """
         ids, mask = self.recorded["batch_input_ids"], self.recorded["batch_attention_mask"].astype(bool)
         packed = self.model.pack([row[valid].tolist() for row, valid in zip(ids, mask, strict=True)])

@@ -13,18 +13,21 @@ from probe_kit.models.bounds import check_bounds
 from probe_kit.models.checkpoint_files import chosen_name
 
 DIMENSIONS = 7
-"""Of an action: an end-effector's delta, and the gripper last."""
+"""The count of numbers of an action: an end-effector's delta, and the gripper last."""
 GRIPPER_OPEN = 0.5
-"""The data sets have 1 for an open gripper and 0 for a closed one."""
+"""The threshold of the gripper: the data sets have 1 for an open gripper and 0 for a closed one."""
 
 
 @dataclass(frozen=True)
 class ActionStatistics:
-    """Per dimension the 1 % and 99 % quantiles of a data set.
+    """The 1 % and 99 % quantiles of a data set, per dimension.
 
     Attributes:
-        mask: False for dimensions that stay as the model puts them out, such as a gripper that is 0 or 1 in the
-            data.
+        key: Name of the data set.
+        low: (D,), the 1 % quantiles, which stand for -1.
+        high: (D,), the 99 % quantiles, which stand for 1.
+        mask: (D,), False for dimensions that stay as the model puts them out, such as a gripper that is 0 or 1 in
+            the data.
     """
 
     lacking: ClassVar[str] = (
@@ -40,7 +43,12 @@ class ActionStatistics:
 
     @classmethod
     def choose(cls, statistics: Mapping[str, Any], key: str | None, source: str = "the checkpoint") -> Self:
-        """The statistics of data set `key`; without one, of the only data set. source: the file that holds them.
+        """Return the statistics of data set `key`; without one, of the only data set.
+
+        Args:
+            statistics: The statistics of every data set, by its name.
+            key: Name of the data set; None for the only one.
+            source: The file that holds them, for messages.
 
         Raises:
             UsageError: For a key that is not there or has to be chosen.
@@ -53,7 +61,11 @@ class ActionStatistics:
 
     @classmethod
     def of(cls, key: str, action: Mapping[str, Any]) -> Self:
-        """Read q01, q99 and, if there is one, mask. Raises CheckpointError if they do not fit each other."""
+        """Read q01, q99 and, if there is one, mask.
+
+        Raises:
+            CheckpointError: If they are missing or do not fit each other.
+        """
         if missing := [name for name in ("q01", "q99") if name not in action]:
             raise CheckpointError(f"the action statistics of {key} lack {' and '.join(missing)}")
         low, high = np.asarray(action["q01"], np.float64), np.asarray(action["q99"], np.float64)
@@ -70,12 +82,12 @@ class ActionStatistics:
         return sha256_json([self.low.tolist(), self.high.tolist(), self.mask.tolist()])
 
     def restore(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(…, D) normalised values in the data set's units."""
+        """Return normalised values (…, D) in the data set's units."""
         return np.where(self.mask, (values + 1) / 2 * (self.high - self.low) + self.low, values)
 
 
 def open_or_closed(actions: NDArray[Any]) -> NDArray[np.float32]:
-    """(…, D) float32 with the gripper, the last number, open (1) or closed (0)."""
+    """Return actions (…, D) as float32 with the gripper, the last number, open (1) or closed (0)."""
     decided = actions.copy()
     decided[..., -1] = decided[..., -1] > GRIPPER_OPEN
     return decided.astype(np.float32)

@@ -17,7 +17,10 @@ FLOW = Interventions(
     tiles=True,
     gradients=True,
 )
-"""An action expert reads the backbone's keys and values, at every flow-matching step, and nothing else of it."""
+"""The interventions of an action expert that reads the backbone's keys and values, and nothing else of it.
+
+It reads them at every flow-matching step.
+"""
 
 TOKENS = Interventions(
     edits={"backbone": QUANTITIES, "action": QUANTITIES},
@@ -28,26 +31,33 @@ TOKENS = Interventions(
     tiles=True,
     readout="per-step",
 )
-"""One decoder reads the prompt and puts out tokens; the prompt's own pass chooses the first of them."""
+"""The interventions of one decoder that reads the prompt and puts out tokens.
+
+The prompt's own pass chooses the first of them.
+"""
 
 MERGED = "it merges patches on their way to the backbone, and does not report which token they become. "
-"""Why a family does not say what tile a token is of."""
+"""The reason why a family does not say what tile a token is of."""
 MAPS = replace(
     TOKENS,
     tiles=False,
     instead={"tiles": f"{MERGED}Its tower makes maps of several crops. Exchange all of `image`"},
 )
-"""The same, where a picture becomes maps of several crops."""
+"""The interventions `TOKENS` without tiles, where a picture becomes maps of several crops."""
 
 _FAMILIES = "probe_kit.hooks.families"
 TOKENIZER_FOLDER = Option("tokenizer", str, "Folder of another tokenizer.json.", "the checkpoint's", is_path=True)
 
 
 def lerobot_family(name: str, description: str, checkpoint: str | None, adapter: str, **fields: Any) -> Family:
-    """A policy of lerobot's. adapter: `folder.adapter:Class`; the folder is named as lerobot names the policy.
+    """Return the family of a policy of lerobot.
 
     Args:
-        **fields: Others of `Family`.
+        name: Name of the family.
+        description: One line about the family.
+        checkpoint: Hub id of the default checkpoint; None for none.
+        adapter: `folder.adapter:Class`; the folder is named as lerobot names the policy.
+        **fields: Further fields of `Family`.
     """
     kind, path = adapter.partition(".")[0], f"{_FAMILIES}.{adapter}"
     shared = {
@@ -60,7 +70,15 @@ def lerobot_family(name: str, description: str, checkpoint: str | None, adapter:
 
 
 def answering_family(name: str, description: str, checkpoint: str | None, loader: str, **fields: Any) -> Family:
-    """A VLM that answers and does not act. loader: `folder.adapter:function`. fields: others of `Family`."""
+    """Return the family of a VLM that answers and does not act.
+
+    Args:
+        name: Name of the family.
+        description: One line about the family.
+        checkpoint: Hub id of the default checkpoint; None for none.
+        loader: `folder.adapter:function`, which loads the model.
+        **fields: Further fields of `Family`.
+    """
     shared = {
         "embodiment": "none: answers, does not act",
         "outputs": f"{_FAMILIES}.shared.vlm:vlm_outputs",
@@ -74,7 +92,7 @@ def answering_family(name: str, description: str, checkpoint: str | None, loader
 
 IMAGES, STATE, ACTION = "observation.images.", "observation.state", "action"
 _EMPTY_CAMERA = "empty_camera"
-"""Beginning of the names that lerobot gives to cameras that never get a picture."""
+"""The beginning of the names that lerobot gives to cameras that never get a picture."""
 
 
 def cameras_of(features: Iterable[str]) -> tuple[str, ...]:
@@ -113,9 +131,9 @@ class Evaluation:
     Attributes:
         statistics: A file, the name of a shipped one, `none` for numbers that are units already, or None for what
             the checkpoint says.
-        picture: How a picture comes to the network's resolution; None for what the layout of the checkpoint
-            implies.
-        openness: The state's last number, see `state_layout`.
+        picture: The way in which a picture comes to the network's resolution; None for what the layout of the
+            checkpoint implies.
+        openness: The meaning of the state's last number, see `laid_out`.
         unread: Settings of an old config.json that are left out, comma-separated.
     """
 

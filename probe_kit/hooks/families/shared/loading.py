@@ -27,12 +27,13 @@ class Loaded[Network: nn.Module]:
     """A network with its weights, what loading proved, and where it is from.
 
     Attributes:
-        dtype: Of the weights, as the card has it.
-        checkpoint: As requested.
-        folder: Of its other files. weights_seed: of random weights, else None.
-        notes: Of the card.
-        exact: As `notes`.
-        adapter: The folder of a LoRA adapter, whose files count before those of `folder`.
+        dtype: The dtype of the weights, as the card has it.
+        checkpoint: The folder or hub id as it was requested.
+        folder: The folder of the checkpoint's other files.
+        weights_seed: Seed of random weights; None for weights from a file.
+        notes: The first notes of the card.
+        exact: As `ModelCard.exact`.
+        adapter: The folder of a LoRA adapter, whose files count before those of `folder`; None for none.
     """
 
     network: Network
@@ -64,9 +65,13 @@ class Loaded[Network: nn.Module]:
         """The card of the model; its settings begin with the content of every file that is read.
 
         Args:
-            files: Besides the weights, by name; default those of the folder.
-            tokenizer: Of another folder, or a name.
-            **fields: Further ones of `ModelCard`.
+            family: Name of the family.
+            settings: Further settings, which follow those of the files.
+            files: The files besides the weights, by name; None takes those of the folder.
+            tokenizer: A folder whose files are read too, where it is another one, or a name; None for the
+                checkpoint's.
+            notes: Notes behind those of loading.
+            **fields: Further fields of `ModelCard`.
         """
         read = side_files(self.folder) if files is None else dict(files)
         if tokenizer is not None and (other := Path(tokenizer).expanduser()) != self.folder and other.is_dir():
@@ -112,10 +117,17 @@ def load_network[Network: nn.Module](
     A file may leave out parameters that are another one's double, such as tied output weights.
 
     Args:
-        dtype: float32 or bfloat16; default that of the tensors in the file, float32 for random weights.
+        build: Makes an empty network of a dtype on a device, which may be `meta`.
+        read: Reads the weights; not called for random ones.
+        checkpoint: The folder or hub id as it was requested.
+        folder: The folder of the checkpoint's files.
+        device: The device to which the network goes.
+        dtype: float32 or bfloat16; None takes that of the tensors in the file, float32 for random weights.
+        random_weights: Whether the weights are drawn instead of read.
+        weights_seed: Seed of random weights.
         name_in_module: The network's name of a tensor in the file.
-        tensors_of: The tensors under the network's names, where that is not all.
-        draw: Random weights of a seed.
+        tensors_of: Gives the tensors under the network's names, where other names are not all that differs.
+        draw: Draws random weights of a seed.
         finish: Called with the whole network, before it goes to the device.
 
     Raises:
@@ -144,7 +156,11 @@ def load_network[Network: nn.Module](
 
 
 def renamed_tensors(weights: Weights, name_in_module: Callable[[str], str]) -> dict[str, Tensor]:
-    """The tensors of a file under the network's names. Raises WeightsError for two of one name."""
+    """Return the tensors of a file under the network's names.
+
+    Raises:
+        WeightsError: For two tensors of one name.
+    """
     tensors = {name_in_module(name): value for name, value in weights.tensors.items()}
     if len(tensors) < len(weights.tensors):
         raise WeightsError(f"{weights.source}: two tensors have the same name here; nothing was run")
@@ -158,6 +174,12 @@ def assign_weights(
     name_in_module: Callable[[str], str],
 ) -> WeightsAudit:
     """Make `tensors` the parameters of a network on the meta device, and tie doubles again.
+
+    Args:
+        network: The network on the meta device.
+        weights: The files, which give the audit its hash.
+        tensors: The content of the files under the network's names.
+        name_in_module: The network's name of a tensor in the file.
 
     Raises:
         WeightsError: For a double with other numbers and for tensors without memory, and what `load_weights`
@@ -178,14 +200,14 @@ def assign_weights(
 
 
 def doubles(network: nn.Module) -> dict[str, str]:
-    """Parameters that are another one's double, with the name of that one."""
+    """Return the parameters that are another one's double, with the name of that one."""
     names = {id(parameter): name for name, parameter in network.named_parameters()}
     every = network.named_parameters(remove_duplicate=False)
     return {name: names[id(parameter)] for name, parameter in every if names[id(parameter)] != name}
 
 
 def as_dtype(tensors: Mapping[str, Tensor], dtype: torch.dtype) -> dict[str, Tensor]:
-    """The tensors, those of real numbers in `dtype`."""
+    """Return the tensors, those of real numbers in `dtype`."""
     return {name: value.to(dtype) if value.is_floating_point() else value for name, value in tensors.items()}
 
 
@@ -197,7 +219,7 @@ def _check_filled(network: nn.Module, source: str) -> None:
 
 
 def _stored_dtype(weights: Weights) -> str:
-    """bfloat16 if every floating tensor of the file is, else float32: nothing is rounded unasked."""
+    """Return `bfloat16` if every floating tensor of the file has it, else `float32`: no unasked rounding."""
     kinds = {tensor.dtype for tensor in weights.tensors.values() if tensor.is_floating_point()}
     return "bfloat16" if kinds == {torch.bfloat16} else "float32"
 
@@ -215,9 +237,9 @@ class Recipe:
     """The way from the files of a checkpoint to a family's network.
 
     Attributes:
-        config: Of the values of config.json.
-        build: An empty network of a configuration, dtype and device.
-        names: From tensors in files to those of the network.
+        config: Makes the configuration from the values of config.json.
+        build: Makes an empty network of a configuration, dtype and device.
+        names: The renames from tensors in files to those of the network.
     """
 
     config: Callable[[Mapping[str, Any]], Any]
@@ -266,7 +288,11 @@ def load_vlm(
 
 @contextmanager
 def _describing(file: Path) -> Iterator[None]:
-    """Whatever goes wrong inside is because of what a configuration says. Raises CheckpointError."""
+    """Run the body, whose errors are because of what a configuration says.
+
+    Raises:
+        CheckpointError: For an error in the body; it names the file.
+    """
     try:
         yield
     except (*_OF_VALUES, StrictDataclassError, OSError) as error:

@@ -29,41 +29,52 @@ def merger_norm(tower: Any) -> Any:
 
 
 class ByPicture:
-    """Vision towers that run over the patches of all pictures at once."""
+    """A vision tower that runs over the patches of all pictures at once."""
 
     _grid: Tensor | None = None
-    """(pictures, 3) patches of each picture under way along time, height and width."""
+    """The patches of each picture under way along time, height and width, (pictures, 3)."""
 
     def _by_picture(self, patches: Tensor) -> Tensor:
-        """(pictures, patches of one, D) of (patches, D); (1, patches, D) where pictures differ in size."""
+        """Return patches (patches, D) as (pictures, patches of one, D).
+
+        It is (1, patches, D) where pictures differ in size.
+        """
         grid = self._grid
         count = 1 if grid is None or bool((grid != grid[0]).any()) else len(grid)
         return patches.view(count, -1, patches.shape[-1])
 
 
 class QwenVision(ByPicture):
-    """The vision side of `vlm`, one of transformers' Qwen networks. folder: of preprocessor_config.json."""
+    """The vision side of `vlm`, one of transformers' Qwen networks.
+
+    Attributes:
+        folder: The folder of preprocessor_config.json.
+    """
 
     vlm: Any
     folder: Path
     fast_pictures: ClassVar[bool] = True
-    """Which of Qwen's two picture processors the model's authors ran."""
+    """Whether the model's authors ran the fast one of Qwen's two picture processors."""
 
     @property
     def tower(self) -> Any:
-        """Qwen's vision tower."""
+        """The vision tower of Qwen."""
         return self.vlm.model.visual
 
     @cached_property
     def vision(self) -> Stack:
-        """The tower; the last site is what its merger reads. Patches in the tower's own order."""
+        """The tower; the last site is what its merger reads. Patches are in the tower's own order."""
         width, view = int(self.vlm.config.vision_config.hidden_size), {"view": self._by_picture}
         norm = merger_norm(self.tower)
         return Stack(self.tower.blocks, norm, width, None, "norm1", tap_fields=view, stream_fields=TOWER)
 
     @cached_property
     def pictures(self) -> QwenPictures:
-        """The processor of pictures into patches. Raises CheckpointError naming the missing file."""
+        """The processor of pictures into patches.
+
+        Raises:
+            CheckpointError: For a missing file, which it names.
+        """
         vision = self.vlm.config.vision_config
         sizes = (int(vision.patch_size), int(vision.temporal_patch_size), int(vision.spatial_merge_size))
         return QwenPictures.from_folder(self.folder, *sizes, fast=self.fast_pictures)
@@ -76,7 +87,7 @@ USER, ASSISTANT = "<|im_start|>user\n", "<|im_end|>\n<|im_start|>assistant\n"
 
 
 def qwen_frame(system: str = "") -> Frame:
-    """Qwen's chat of one turn."""
+    """Return Qwen's chat of one turn, behind the `system` turn."""
     return Frame(f"{system}{USER}<|vision_start|>", "<|vision_end|>", f"{system}{USER}", ASSISTANT)
 
 
@@ -90,18 +101,18 @@ class QwenVLM(QwenVision, VisionLanguageModel):
         super().__init__(loaded, tokenizer, **settings)
 
     def picture_ids(self, height: int, width: int) -> list[int]:
-        """Ids at a picture's positions, as many as its size demands."""
+        """Return the ids at a picture's positions, as many as its size demands."""
         count = merged_tokens(self.pictures.grid(height, width), self.pictures.merge)
         return [int(self.network.config.image_token_id)] * count
 
     def picture_inputs(self, pictures: Pictures) -> dict[str, Tensor]:
-        """pixel_values (N, channels x time x patch x patch) and image_grid_thw (B, 3)."""
+        """Return `pixel_values` (N, channels x time x patch x patch) and `image_grid_thw` (B, 3)."""
         pixels, self._grid = self.pictures.patches(pictures)
         device = self.loaded.device
         return {"pixel_values": pixels.to(device), "image_grid_thw": self._grid.to(device)}
 
     def positions(self, packed: LeftPacked, picture_inputs: dict[str, Tensor]) -> Tensor:
-        """(3, B, T) over time, height and width, as the native class counts them; 0 at padding."""
+        """Return positions (3, B, T) over time, height and width, as the native class counts; 0 at padding."""
         counted, _ = self.network.model.get_rope_index(
             packed.ids,
             image_grid_thw=picture_inputs.get("image_grid_thw"),
@@ -112,7 +123,10 @@ class QwenVLM(QwenVision, VisionLanguageModel):
         return positions
 
     def other_inputs(self, packed: LeftPacked) -> dict[str, Tensor]:
-        """mm_token_type_ids: 1 at positions of pictures. Left out, Qwen2.5-VL silently counts them as text."""
+        """Return `mm_token_type_ids`, 1 at positions of pictures.
+
+        Left out, Qwen2.5-VL silently counts them as text.
+        """
         return {"mm_token_type_ids": (packed.ids == int(self.network.config.image_token_id)).long()}
 
 
@@ -128,7 +142,14 @@ class QwenVLA(QwenVision, Policy):
     """
 
     def __init__(self, vlm: Any, folder: Path, tokenizer: str | None, device: str) -> None:
-        """vlm: `Qwen…VLForConditionalGeneration`. folder: of tokenizer.json and preprocessor_config.json."""
+        """Make the adapter.
+
+        Args:
+            vlm: One of transformers' `Qwen…VLForConditionalGeneration`.
+            folder: The folder of tokenizer.json and preprocessor_config.json.
+            tokenizer: Another folder of tokenizer.json; None for `folder`.
+            device: The device of the network.
+        """
         self.vlm, self.folder, self.device = vlm, folder, device
         self._tokenizer_folder = folder if tokenizer is None else Path(tokenizer).expanduser()
 
@@ -152,7 +173,11 @@ class QwenVLA(QwenVision, Policy):
     @property
     @abstractmethod
     def units(self) -> Any:
-        """The statistics that give actions their units. Raises CheckpointError for none."""
+        """The statistics that give actions their units.
+
+        Raises:
+            CheckpointError: If there are none.
+        """
 
     @abstractmethod
     def text(self, instruction: str) -> str:
@@ -160,31 +185,38 @@ class QwenVLA(QwenVision, Policy):
 
     @abstractmethod
     def look(self, observation: Observation) -> Any:
-        """(H, W, 3) uint8 the processor gets."""
+        """Return the picture (H, W, 3) uint8 that the processor gets."""
 
     def units_or_reason(self) -> Any:
-        """The units, or why there are none: a checkpoint without them can be captured and cannot act."""
+        """Return the units, or why there are none: a checkpoint without them can be captured and cannot act."""
         try:
             return self.units
         except CheckpointError as error:
             return str(error)
 
     def patched_picture(self, observation: Observation) -> Any:
-        """(H, W, 3) uint8 that is cut into patches; another one where the authors resize once more before."""
+        """Return the picture (H, W, 3) uint8 that is cut into patches.
+
+        It is another one than that of `look` where the authors resize once more before.
+        """
         return self.look(observation)
 
     # -- inputs ------------------------------------------------------------------------------------------
 
     @cached_property
     def tokenizer(self) -> TokenizerFile:
-        """The checkpoint's. Raises CheckpointError for a missing file, and for one of another model."""
+        """The checkpoint's tokenizer.
+
+        Raises:
+            CheckpointError: For a missing file, and for one of another model.
+        """
         tokenizer = TokenizerFile(self._tokenizer_folder)
         tokenizer.check_present()
         tokenizer.check_vocabulary(int(self.vlm.config.text_config.vocab_size))
         return tokenizer
 
     def prompt(self, instruction: str) -> list[int]:
-        """Ids of the whole prompt, one for the picture."""
+        """Return the ids of the whole prompt, one for the picture."""
         ids: list[int] = self.tokenizer.encoding(self.text(instruction)).ids
         return ids
 
@@ -193,7 +225,7 @@ class QwenVLA(QwenVision, Policy):
         return [tuple(self.prompt(instruction)) for instruction in instructions]
 
     def rows(self, observations: Sequence[Observation]) -> list[list[int]]:
-        """Per observation the ids the backbone gets, the picture's as often as its size demands.
+        """Return per observation the ids the backbone gets, the picture's as often as its size demands.
 
         Raises:
             InstructionError: For a prompt that is too long.
@@ -210,7 +242,11 @@ class QwenVLA(QwenVision, Policy):
         return rows
 
     def inputs(self, observations: Sequence[Observation]) -> QwenInputs:
-        """The observations as the backbone reads them, on the model's device. Raises ObservationError."""
+        """The observations as the backbone reads them, on the model's device.
+
+        Raises:
+            ObservationError: For a picture of another dtype or shape.
+        """
         for observation in observations:
             checked_picture(observation.image)
         pixels, grid = self.pictures.patches([self.patched_picture(observation) for observation in observations])
@@ -227,7 +263,7 @@ class QwenVLA(QwenVision, Policy):
     # -- capture -----------------------------------------------------------------------------------------
 
     def backbone_roles(self, observations: Sequence[Observation]) -> list[Roles]:
-        """Chat marks, picture, text; padding behind it where another prompt is longer."""
+        """The roles of chat marks, picture and text, with padding behind where another prompt is longer."""
         rows, special = self.rows(observations), self.tokenizer.special
 
         def role(number: int) -> str:

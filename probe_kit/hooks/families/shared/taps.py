@@ -36,13 +36,15 @@ def decoder_tap(
     """Return the tap of a site: the first norm of the block it enters, the last norm, or a part of a block.
 
     Args:
-        norm: Behind the last block.
-        fires: Of `Tap`.
+        layers: The blocks of the decoder, in order.
+        norm: The norm behind the last block.
+        site: A site of the decoder's stream.
+        fires: Calls per inference, as in `Tap`.
         entry: Path of the block's first submodule, empty for the block itself.
         added: By quantity, the path of the submodule whose output a block adds, where it is neither `mlp` nor the
             output projection; of `heads`, whose input they are.
-        end: At which of its ends the last residual passes.
-        **fields: As `fires`.
+        end: The end of the norm at which the last residual passes.
+        **fields: Further fields of `Tap`.
     """
     if site.quantity == "final_norm":
         return Tap(norm, fires, "output", **fields)
@@ -71,11 +73,13 @@ class Stack:
     """One transformer stack inside a policy.
 
     Attributes:
-        entry: As `decoder_tap` has them.
-        added: As `entry`.
-        end: As `entry`.
-        tap_fields: Further ones of every tap, such as the positions that belong to the stream.
-        stream_fields: Of the `Stream`; heads are counted where they are not among them.
+        width: Features per token.
+        iterations: Passes per inference; None for a stack that runs once.
+        entry: Path of a block's first submodule, see `decoder_tap`.
+        added: Paths of submodules by quantity, see `decoder_tap`.
+        end: The end of the norm at which the last residual passes.
+        tap_fields: Further fields of every tap, such as the positions that belong to the stream.
+        stream_fields: Further fields of the `Stream`; heads are counted where they are not among them.
     """
 
     layers: Sequence[nn.Module]
@@ -103,13 +107,16 @@ class Stack:
 
 
 TOWER: Mapping[str, Any] = MappingProxyType({"part": "vision", "quantities": ("residual",), "heads": 0})
-"""Fields of the stream of a vision tower that is read between its blocks alone."""
+"""The fields of the stream of a vision tower that is read between its blocks alone."""
 
 
 def token_stack(layers: Any, norm: Any, width: int, iterations: int | None, **tap_fields: Any) -> Stack:
     """Return a decoder that runs over the prompt and then over what it puts out, in one of these two roles.
 
     Args:
+        layers: The blocks of the decoder, in order.
+        norm: The norm behind the last block.
+        width: Features per token.
         iterations: The captured passes, or None for the prompt; calls behind them belong to no site.
         **tap_fields: The `tokens` of its passes that belong to the stream, and `first`, the passes before those of
             the stream.
@@ -118,7 +125,7 @@ def token_stack(layers: Any, norm: Any, width: int, iterations: int | None, **ta
 
 
 def flow_stacks(backbone: Any, expert: Any, vision: Any, iterations: int) -> dict[str, Stack]:
-    """The three stacks of a flow policy; the vision tower's iterations are the cameras, see `LerobotFlow`."""
+    """The three stacks of a flow policy; the vision tower's iterations are the cameras, see `LerobotPolicy`."""
     return {
         "backbone": Stack(backbone.layers, backbone.norm, backbone.config.hidden_size, None),
         "expert": Stack(expert.layers, expert.norm, expert.config.hidden_size, iterations),
@@ -130,13 +137,16 @@ def flow_stacks(backbone: Any, expert: Any, vision: Any, iterations: int) -> dic
 
 ALL_TOKENS = slice(None)
 ALL_BUT_LAST = slice(None, -1)
-"""Models whose last prompt token belongs to the acting stream: its keys and values are not the backbone's."""
+"""The backbone's tokens in models whose last prompt token belongs to the acting stream.
+
+The keys and values of that token are not the backbone's.
+"""
 LAST = slice(-1, None)
-"""What that token is of the prompt; every token that is fed back is the last of its pass too."""
+"""The slice of that token in the prompt; every token that is fed back is the last of its pass too."""
 
 
 def kv_tap(kv: PromptKV, site: Site, tokens: slice = ALL_TOKENS) -> HeadsTap:
-    """Return the tap of the keys or values of one block. tokens: of the prompt, those of the backbone."""
+    """Return the tap of the keys or values of one block; `tokens` are the backbone's among those of the prompt."""
     passages: nn.ModuleList = getattr(kv, site.quantity)
     return HeadsTap(passages[site.layer], 1, tokens=tokens)
 
@@ -149,7 +159,7 @@ def kept_prompt(text: Any) -> Stream:
 
 
 def attach_prompt_kv(joint: Any, blocks: int) -> PromptKV:
-    """Keys and values of lerobot's `joint`, whose pass over the prompt leaves them there from now on.
+    """Return the keys and values of lerobot's `joint`, whose pass over the prompt leaves them there from now on.
 
     lerobot calls its `forward` by name, past all hooks, so the instance gets one that sends the cache through.
     """
@@ -173,13 +183,13 @@ def attach_prompt_kv(joint: Any, blocks: int) -> PromptKV:
 # -- attention ------------------------------------------------------------------------------------------------
 
 Note = Callable[[int, int, Tensor], None]
-"""Takes a block, an iteration, and weights (B, H, S, K)."""
+"""A function that takes a block, an iteration, and weights (B, H, S, K)."""
 
 
 Weights = Callable[[Any, tuple[Any, ...], dict[str, Any], Any], Tensor]
-"""Weights of one call: of the module, its inputs, its keywords and its output."""
+"""A function that gives the weights of one call, of the module, its inputs, its keywords and its output."""
 _OTHER_STEPS = ("q_norm", "attn_logit_softcapping")
-"""Attributes of attentions of transformers that do more than project, rotate and scale."""
+"""The attributes of attentions of transformers that do more than project, rotate and scale."""
 
 
 @contextmanager
@@ -201,7 +211,11 @@ def recording_weights(attentions: Sequence[nn.Module], note: Note, weights: Weig
 
 
 def returned(_: Any, __: tuple[Any, ...], ___: dict[str, Any], output: Any) -> Tensor:
-    """(B, H, S, K): what eager attention returns beside what it read. Raises CaptureError if it does not."""
+    """Return the weights (B, H, S, K) that eager attention returns beside what it read.
+
+    Raises:
+        CaptureError: If it returns none.
+    """
     if output[1] is None:
         raise CaptureError("an attention that should be eager gave no weights; load the model as it was released")
     weights: Tensor = output[1]
@@ -209,9 +223,10 @@ def returned(_: Any, __: tuple[Any, ...], ___: dict[str, Any], output: Any) -> T
 
 
 def recomputed(attention: Any, inputs: tuple[Any, ...], keywords: dict[str, Any], _: Any) -> Tensor:
-    """(B, H, 1, K) of the last position, of Llama's kind of attention, whose fast kernels return no weights.
+    """Return the weights (B, H, 1, K) of the last position of an attention of Llama's kind.
 
-    Computed once more from the module's inputs and the keys it left.
+    Its fast kernels return no weights, so they are computed once more from the module's inputs and the keys it
+    left.
 
     Raises:
         UnsupportedInterventionError: For an attention of another kind.
@@ -235,11 +250,17 @@ def recomputed(attention: Any, inputs: tuple[Any, ...], keywords: dict[str, Any]
 
 
 def shares(queries: Tensor, keys: Tensor, scale: float, keywords: dict[str, Any]) -> Tensor:
-    """(B, H, S, K) float32 softmax of queries (B, H, S, E) on keys (B, G, K, E), H a multiple of G.
+    """Return the softmax of queries on keys, float32.
 
     Args:
+        queries: (B, H, S, E).
+        keys: (B, G, K, E), H a multiple of G.
+        scale: Factor of the products of queries and keys.
         keywords: May hold `attention_mask` (B, 1, S or more, K or more): True where a key is seen, or what is
             added.
+
+    Returns:
+        (B, H, S, K).
     """
     keys = keys.repeat_interleave(queries.shape[1] // keys.shape[1], dim=1)
     logits = queries.float() @ keys.float().transpose(2, 3) * scale
@@ -263,7 +284,13 @@ def on_the_prompt(note: Note) -> Note:
 
 
 def of_decoder(layers: Sequence[Any], note: Note, eager: bool = False) -> AbstractContextManager[None]:
-    """A context over the attention of a decoder that puts out tokens."""
+    """Return a context over the attention of a decoder that puts out tokens.
+
+    Args:
+        layers: The blocks of the decoder, in order.
+        note: Receives the weights of every block and iteration on the prompt.
+        eager: Whether the attention returns its weights; else they are computed once more.
+    """
     return recording_weights(
         [layer.self_attn for layer in layers], on_the_prompt(note), returned if eager else recomputed
     )

@@ -1,6 +1,6 @@
 """The text side of a model: a checkpoint's `tokenizer.json`, and the text around a question or an instruction.
 
-The file is read by the `tokenizers` library itself: transformers 5 rebuilds Llama's tokenizer by rules of its own,
+The file is read by the `tokenizers` library itself. transformers 5 rebuilds Llama's tokenizer by rules of its own,
 while the released models were trained with what the file says.
 """
 
@@ -40,7 +40,7 @@ class TokenizerFile:
             )
 
     def check_vocabulary(self, vocabulary: int) -> None:
-        """Raise CheckpointError for ids that a model of so many does not have."""
+        """Raise CheckpointError for ids that a model with `vocabulary` of them does not have."""
         if (highest := max(self.tokenizer.get_vocab(with_added_tokens=True).values())) >= vocabulary:
             raise CheckpointError(
                 f"{self.file} has ids up to {highest}; this model has {vocabulary}. The tokenizer belongs to "
@@ -54,7 +54,11 @@ class TokenizerFile:
 
     @cached_property
     def settings(self) -> dict[str, Any]:
-        """The settings beside it; none without the file. Raises CheckpointError for one that is not JSON."""
+        """The settings beside it; none without the file.
+
+        Raises:
+            CheckpointError: For a file that is not JSON.
+        """
         return values_of(self.folder / SETTINGS_FILE)
 
     def token_of(self, kind: str) -> str | None:
@@ -64,12 +68,12 @@ class TokenizerFile:
 
     @cached_property
     def special(self) -> frozenset[int]:
-        """Ids that stand for no text, such as the ends of a chat's turns."""
+        """The ids that stand for no text, such as the ends of a chat's turns."""
         added = self.tokenizer.get_added_tokens_decoder()
         return frozenset(number for number, token in added.items() if token.special)
 
     def encoding(self, text: str, special: bool = False) -> Any:
-        """The library's encoding. special: with the tokens that the file puts around a text.
+        """Return the library's encoding of a text; `special` adds the tokens that the file puts around it.
 
         Raises:
             InstructionError: For a word that the tokenizer does not know.
@@ -99,7 +103,7 @@ class TokenizerFile:
 
 
 def positions_of(encoding: Any, start: int, stop: int) -> tuple[bool, ...]:
-    """True for ids, special ones left out, that hold characters from `start` up to `stop` of the text."""
+    """Return True for ids, special ones left out, that hold characters from `start` up to `stop` of the text."""
     return tuple(
         first < stop and last > start and not special
         for (first, last), special in zip(encoding.offsets, encoding.special_tokens_mask, strict=True)
@@ -107,7 +111,12 @@ def positions_of(encoding: Any, start: int, stop: int) -> tuple[bool, ...]:
 
 
 def first_behind(before: Sequence[int], extended: Sequence[int], option: str) -> int:
-    """The first id of an option. before, extended: the ids of a prompt without it and with it behind.
+    """Return the first id of an option.
+
+    Args:
+        before: The ids of a prompt without the option.
+        extended: The ids of the prompt with the option behind.
+        option: The text of the option, for messages.
 
     Raises:
         UsageError: For an option that changes the prompt's own ids: its logit would be that of another prompt.
@@ -128,7 +137,11 @@ def token_ids_of(*stored: Any) -> frozenset[int]:
 
 
 def values_of(file: Path) -> dict[str, Any]:
-    """A file's values; none without it. Raises CheckpointError for one that is not JSON."""
+    """The values of a JSON file; none without it.
+
+    Raises:
+        CheckpointError: For a file that is not JSON.
+    """
     if not file.is_file():
         return {}
     try:
@@ -145,10 +158,10 @@ class Frame:
     """The fixed strings around a question.
 
     Attributes:
-        before: In front of the picture's positions.
-        behind: Between them and the question.
-        bare: In front of a question that comes without a picture.
-        end: Behind the question; the answer begins there.
+        before: The text in front of the picture's positions.
+        behind: The text between them and the question.
+        bare: The text in front of a question that comes without a picture.
+        end: The text behind the question; the answer begins there.
     """
 
     before: str
@@ -165,9 +178,9 @@ class TokenPrompt:
     """A whole prompt.
 
     Attributes:
-        text: Behind the picture's positions.
-        ids: Of everything.
-        question: Which of the ids are the question.
+        text: The text behind the picture's positions.
+        ids: The ids of everything.
+        question: Per id, whether it is of the question.
         picture: First position of the picture and the one behind its last; equal where there is none, or where one
             placeholder stands for it.
     """
@@ -180,7 +193,12 @@ class TokenPrompt:
 
 @dataclass(frozen=True)
 class FramedText(TokenizerFile):
-    """A model's tokenizer and frame. vocabulary: ids the model has. ends: end tokens of an answer."""
+    """A model's tokenizer and frame.
+
+    Attributes:
+        vocabulary: Number of ids that the model has.
+        ends: End tokens of an answer.
+    """
 
     frame: Frame
     vocabulary: int
@@ -191,7 +209,9 @@ class FramedText(TokenizerFile):
         """Read the files in `folder`.
 
         Args:
-            config: Of the language model.
+            folder: The folder of the tokenizer.
+            frame: The strings around a question.
+            config: Configuration of the language model.
             generation: Folder that may hold generation_config.json.
 
         Raises:
@@ -223,9 +243,11 @@ class FramedText(TokenizerFile):
         """The prompt of a question.
 
         Args:
-            begun: How the answer has begun already.
-            picture: Ids at the positions of a picture, None without one; `marks` of them at either end are no
-                picture but say where it begins and ends.
+            question: The text of the question.
+            begun: The beginning of the answer, behind the frame.
+            picture: Ids at the positions of a picture, None without one.
+            marks: Count of the ids at either end of `picture` that are no picture but say where it begins and
+                ends.
 
         Raises:
             InstructionError: For text that holds a token of the frames or one the tokenizer does not know.
@@ -241,7 +263,11 @@ class FramedText(TokenizerFile):
         return TokenPrompt(text, (*before, *behind.ids), (*[False] * len(before), *is_question), picture_span)
 
     def option(self, prompt: TokenPrompt, option: str) -> int:
-        """The first id of `option` behind a prompt. Raises UsageError if it changes the prompt's own ids."""
+        """The first id of `option` behind a prompt.
+
+        Raises:
+            UsageError: If it changes the prompt's own ids.
+        """
         return first_behind(self.encoding(prompt.text).ids, self.encoding(prompt.text + option).ids, option)
 
     def decode(self, ids: Sequence[int]) -> str:
@@ -250,7 +276,11 @@ class FramedText(TokenizerFile):
 
 
 def _ends(folder: Path, config: Any) -> frozenset[int]:
-    """The end tokens in generation_config.json, or else in the configuration. Raises CheckpointError for none."""
+    """The end tokens in generation_config.json, or else in the configuration.
+
+    Raises:
+        CheckpointError: If neither names one.
+    """
     stored = values_of(folder / GENERATION_FILE).get("eos_token_id", getattr(config, "eos_token_id", None))
     numbers = stored if isinstance(stored, list) else [stored]
     if None in numbers or not numbers:
@@ -267,7 +297,11 @@ SLOT = "{instruction}"
 
 
 def template_of(name: str, prompts: Mapping[str, str]) -> str:
-    """A prompt by its name, or a template as it is. Raises UsageError for one without a place for words."""
+    """Return a prompt by its name, or a template as it is.
+
+    Raises:
+        UsageError: For a template without a place for words.
+    """
     template = prompts.get(name, name)
     if SLOT not in template:
         raise UsageError(f"prompt {name!r} is neither one of {', '.join(prompts)} nor a template with {SLOT}")

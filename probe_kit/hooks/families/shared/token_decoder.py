@@ -31,9 +31,11 @@ _NEUTRAL = {
 
 
 def chooser(temperature: float, seeds: Sequence[int], top: int | None = TOP, among: range | None = None) -> Choose:
-    """Greedy for temperature 0; else draws, each row by its own seed.
+    """Return a function that chooses tokens: greedy for temperature 0; else it draws, each row by its own seed.
 
     Args:
+        temperature: Divides the logits before the softmax; 0 takes the likeliest token.
+        seeds: One per row.
         top: Draw from so many of the likeliest only, and from those as likely as the last of them, as `generate`
             does; None from all.
         among: Draw from these ids only; None from all.
@@ -123,12 +125,18 @@ class TokenDecoder(Model):
 
     output: ClassVar[str] = "action"
     picture_roles: ClassVar[tuple[str, ...]] = (IMAGE_ROLE,)
-    """What the positions of a picture hold."""
+    """The roles of the positions of a picture."""
     added: ClassVar[Mapping[str, str]] = MappingProxyType({})
-    """See `decoder_tap`."""
+    """The paths of submodules by quantity, see `decoder_tap`."""
 
     def __init__(self, loaded: Loaded[Any], steps: int, captured: int | None = None) -> None:
-        """steps: tokens per inference. captured: those that `output` captures, all by default."""
+        """Make the streams of a model.
+
+        Args:
+            loaded: The network, with what loading proved.
+            steps: Tokens per inference.
+            captured: Count of the tokens that `output` captures; None for all.
+        """
         self.loaded, self.network, self.steps = loaded, loaded.network, steps
         self.config = config = loaded.network.config
         self.decoder: Any = self.network.language_model.model
@@ -149,7 +157,10 @@ class TokenDecoder(Model):
         raise NotImplementedError
 
     def tap(self, site: Site) -> Tap:
-        """The first norm of the block the site enters, the final norm, or what a block adds; see `vision_tap`."""
+        """Return the first norm of the block the site enters, the final norm, or what a block adds.
+
+        Sites of a vision tower have the tap that `vision_tap` gives.
+        """
         stream = self.stream_of(site)
         if stream is self.prompt_kv:
             return kv_tap(self.network.prompt_kv, site, ALL_BUT_LAST)
@@ -159,7 +170,7 @@ class TokenDecoder(Model):
         return decoder_tap(self.decoder.layers, self.final_norm, site, self.steps, added=self.added, tokens=tokens)
 
     def roles_of(self, rows: Sequence[Sequence[str]]) -> dict[str, list[Roles]]:
-        """The roles of a batch. rows: labels of the backbone's positions, padded behind to the longest."""
+        """The roles of a batch; `rows` are labels of the backbone's positions, padded behind to the longest."""
         return {"backbone": Roles.padded(rows), self.output: [Roles.from_labels([self.output])] * len(rows)}
 
     @property
@@ -174,7 +185,7 @@ class TokenDecoder(Model):
         return Unembedding.of_decoder(("backbone", self.output), self.network.language_model, self.final_norm)
 
     def record_attention(self, note: Note) -> AbstractContextManager[None]:
-        """Computed once more for the position that chooses a token."""
+        """Record attention that is computed once more for the position that chooses a token."""
         return of_decoder(self.decoder.layers, note)
 
     @property

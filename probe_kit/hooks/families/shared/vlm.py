@@ -1,7 +1,7 @@
 """Base adapter of vision-language models with text answers: packing, prefill, decoding, taps, roles, outputs.
 
-One stack has two streams, distinguished by position: `backbone` is the prompt without its last position,
-`answer` the last one, whose logits choose the first token of the answer. Padding stands in front of every row.
+One stack has two streams, distinguished by position: `backbone` is the prompt without its last position. `answer`
+is the last one, whose logits choose the first token of the answer. Padding stands in front of every row.
 
 B rows, T positions, L blocks, D width, V vocabulary. The questions of a golden reference stand in `dims.json`
 beside it, as whole prompts; the adapter is given what stands between their frames.
@@ -39,7 +39,7 @@ class Prefill:
     """The result of one pass over prompts.
 
     Attributes:
-        network: Called like transformers' own classes.
+        network: The network, called like transformers' own classes.
         mask: (B, T).
         last: (…, B, 1), positions of the last tokens.
         logits: (B, V), choosing the first tokens of the answers.
@@ -56,7 +56,14 @@ class Prefill:
     def of(
         cls, network: Any, packed: LeftPacked, counted: Tensor, picture_inputs: Mapping[str, Tensor]
     ) -> "Prefill":
-        """Read prompts once. counted: (…, B, T) positions. picture_inputs: further keywords, such as pictures."""
+        """Read prompts once.
+
+        Args:
+            network: The network, called like transformers' own classes.
+            packed: The prompts as one batch.
+            counted: (…, B, T) positions.
+            picture_inputs: Further keywords, such as pictures.
+        """
         output = network(
             input_ids=packed.ids,
             attention_mask=packed.mask,
@@ -70,13 +77,13 @@ class Prefill:
 
     @classmethod
     def of_decoded(cls, network: Any, decoded: Decoded) -> "Prefill":
-        """Return what came before the first of decoded tokens. network: the language model that continues."""
+        """Return the prefill of what came before the first of decoded tokens; `network` continues it."""
         decoded.cache.crop(decoded.mask.shape[1])
         last = positions(decoded.mask)[:, -1:]
         return cls(network, decoded.mask.long(), last, decoded.logits[:, 0], decoded.cache)
 
     def speak(self, tokens: int, ends: Collection[int]) -> Tensor:
-        """(B, at most `tokens`) greedy ids, up to where every row has put out one of `ends`.
+        """Return greedy ids (B, at most `tokens`), up to where every row has put out one of `ends`.
 
         The cache is left as it was, so that the same can be said again.
         """
@@ -119,7 +126,7 @@ class SpeakingModel(AnswerModel):
     @property
     @abstractmethod
     def ends(self) -> frozenset[int]:
-        """Ids that end an answer."""
+        """The ids that end an answer."""
 
     @abstractmethod
     def words(self, ids: Sequence[int]) -> str:
@@ -127,21 +134,29 @@ class SpeakingModel(AnswerModel):
 
     @abstractmethod
     def option_ids(self, question: Prompt) -> list[int]:
-        """The first id of every option. Raises UsageError for one that changes the prompt's own ids."""
+        """The first id of every option.
+
+        Raises:
+            UsageError: For an option that changes the prompt's own ids.
+        """
 
     @abstractmethod
     def prefill(self, questions: Sequence[Prompt]) -> Prefill:
-        """One pass over all questions."""
+        """Read all questions in one pass."""
 
     def read(self, questions: Sequence[Prompt]) -> Reading:
-        """One prefill; see the contract."""
+        """Read all questions in one prefill; see the contract."""
         self.shows_pictures(questions)
         options = [self.option_ids(question) for question in questions]
         prefill = self.prefill(questions)
         return Reading.of(prefill.logits.float().cpu().numpy(), options, prefill)
 
     def speak(self, reading: Reading, tokens: int) -> list[str]:
-        """Greedy text from the keys and values of the prompt on; see the contract. Raises UsageError."""
+        """Return greedy text from the keys and values of the prompt on; see the contract.
+
+        Raises:
+            UsageError: For a reading of another model.
+        """
         if not isinstance(reading.state, Prefill) or reading.state.network is not self.speaker:
             raise UsageError("this reading does not come from this model; pass what its read() returned")
         with torch.inference_mode():
@@ -156,11 +171,13 @@ Pictures = list[NDArray[np.uint8]]
 
 
 class VisionLanguageModel(SpeakingModel):
-    """A loaded vision-language model. Subclasses say how it is spoken to and how a picture becomes positions.
+    """A loaded vision-language model.
+
+    Subclasses say what frames a question and how a picture becomes positions.
 
     Attributes:
-        recipe: How its network is made of files.
-        stream_tolerance: Of activations in golden references, absolute.
+        recipe: The way from files to its network.
+        stream_tolerance: Absolute tolerance of activations in golden references.
     """
 
     family: ClassVar[str]
@@ -168,14 +185,20 @@ class VisionLanguageModel(SpeakingModel):
     stream_tolerance: ClassVar[float] = 3e-5
     frame: ClassVar[Frame]
     picture_token: ClassVar[str | None] = None
-    """What stands at the positions of a picture, if it is a token of the tokenizer."""
+    """The token at the positions of a picture, if it is one of the tokenizer."""
     marks: ClassVar[int] = 0
-    """Positions at either end of a picture's that only say where it begins and ends."""
+    """The number of positions at either end of a picture's that only say where it begins and ends."""
     sums: ClassVar[bool] = True
     """Whether a block's attention and MLP are all that is added to the stream."""
 
     def __init__(self, loaded: Loaded[Any], tokenizer: str | None = None, **settings: str) -> None:
-        """settings: what else the numbers depend on, for the card."""
+        """Make the streams and the card of a model.
+
+        Args:
+            loaded: The network, with what loading proved.
+            tokenizer: Folder of another tokenizer; None for the checkpoint's.
+            **settings: Everything else that the numbers depend on, for the card.
+        """
         self.loaded, self.network = loaded, loaded.network
         self._text_folder = loaded.folder if tokenizer is None else Path(tokenizer).expanduser()
         layers, width = len(self.language.layers) + 1, int(self.text_config.hidden_size)
@@ -204,7 +227,12 @@ class VisionLanguageModel(SpeakingModel):
         """Load a model of any size from a folder or hub id; see `load_vlm`.
 
         Args:
-            tokenizer: Folder of another one.
+            checkpoint: Folder or hub id.
+            device: Device in torch's spelling, such as `cuda:0`.
+            dtype: float32 or bfloat16; None takes that of the tensors in the file.
+            random_weights: Whether the weights are drawn instead of read.
+            tokenizer: Folder of another tokenizer; None for the checkpoint's.
+            weights_seed: Seed of random weights.
             **settings: Further options of the family, for its constructor.
         """
         loaded = load_vlm(cls.recipe, checkpoint, device, dtype, random_weights, weights_seed)
@@ -223,15 +251,15 @@ class VisionLanguageModel(SpeakingModel):
 
     @abstractmethod
     def picture_inputs(self, pictures: Pictures) -> dict[str, Tensor]:
-        """Keywords of the network for a batch of (H, W, 3) uint8 pictures, on the model's device."""
+        """Return keywords of the network for a batch of (H, W, 3) uint8 pictures, on the model's device."""
 
     def positions(self, packed: LeftPacked, picture_inputs: dict[str, Tensor]) -> Tensor:
-        """(…, B, T) int64 positions. picture_inputs: of `picture_inputs`; empty without pictures."""
+        """Return int64 positions (…, B, T); `picture_inputs` are those of the method, empty without pictures."""
         del picture_inputs
         return packed.positions()
 
     def other_inputs(self, packed: LeftPacked) -> dict[str, Tensor]:
-        """Further keywords of the network, with or without pictures."""
+        """Return further keywords of the network, with or without pictures."""
         del packed
         return {}
 
@@ -259,14 +287,23 @@ class VisionLanguageModel(SpeakingModel):
 
     @cached_property
     def text(self) -> FramedText:
-        """The text side of the prompt. Raises CheckpointError naming the files that are missing."""
+        """The text side of the prompt.
+
+        Raises:
+            CheckpointError: For missing files, which it names.
+        """
         text = FramedText.of(self._text_folder, self.frame, self.text_config, self.loaded.folder)
         if self.picture_token is not None:
             text.check_token(self.picture_token, int(self.network.config.image_token_id))
         return text
 
     def prompt(self, question: Prompt) -> TokenPrompt:
-        """The whole prompt of a question. Raises InstructionError or ObservationError for what does not fit in."""
+        """The whole prompt of a question.
+
+        Raises:
+            InstructionError: For text that does not fit in.
+            ObservationError: For a picture of another dtype or shape.
+        """
         ids = None
         if question.pictured:
             ids = self.picture_ids(*checked_picture(question.observation.image).shape[:2])
@@ -286,7 +323,7 @@ class VisionLanguageModel(SpeakingModel):
     # -- answering ---------------------------------------------------------------------------------------
 
     def prefill(self, questions: Sequence[Prompt]) -> Prefill:
-        """One pass over all questions."""
+        """Read all questions in one pass."""
         self.check([question.observation for question in questions])
         picture_inputs: dict[str, Tensor] = {}
         if self.shows_pictures(questions):
@@ -303,7 +340,7 @@ class VisionLanguageModel(SpeakingModel):
             )
 
     def packed(self, prompts: Sequence[TokenPrompt]) -> LeftPacked:
-        """Prompts as one batch on the model's device."""
+        """Return prompts as one batch on the model's device."""
         return LeftPacked.of([prompt.ids for prompt in prompts], self.text.padding, self.loaded.device)
 
     def option_ids(self, question: Prompt) -> list[int]:
@@ -318,7 +355,7 @@ class VisionLanguageModel(SpeakingModel):
 
     @property
     def ends(self) -> frozenset[int]:
-        """Ids that end an answer."""
+        """The ids that end an answer."""
         return self.text.ends
 
     def words(self, ids: Sequence[int]) -> str:
@@ -328,11 +365,14 @@ class VisionLanguageModel(SpeakingModel):
     # -- capture -----------------------------------------------------------------------------------------
 
     def roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
-        """Roles of the observations' instructions as questions."""
+        """The roles of the observations' instructions as questions."""
         return self.asked_roles([Prompt(observation, observation.instruction) for observation in observations])
 
     def asked_roles(self, questions: Sequence[Prompt]) -> dict[str, list[Roles]]:
-        """Everything around picture and question is `special`, how an answer has begun too."""
+        """Return the roles of questions: everything around picture and question is `special`.
+
+        The beginning of an answer is `special` too.
+        """
         self.shows_pictures(questions)
         rows = [_labels(self.prompt(question))[self._backbone_tokens] for question in questions]
         return {
@@ -341,7 +381,10 @@ class VisionLanguageModel(SpeakingModel):
         }
 
     def match_policies(self, matched: bool) -> None:
-        """Policies that read the keys and values of a prompt have all of it in their backbone."""
+        """Count the prompt's last position to the backbone where `matched`.
+
+        Policies that read the keys and values of a prompt have all of it in their backbone.
+        """
         self.whole_prompt = matched
 
     @property
@@ -349,7 +392,7 @@ class VisionLanguageModel(SpeakingModel):
         return ALL_TOKENS if self.whole_prompt else ALL_BUT_LAST
 
     def tap(self, site: Site) -> Tap:
-        """The first norm of the block the site enters, the final norm, or a block's output."""
+        """Return the first norm of the block the site enters, the final norm, or a block's output."""
         if self.stream_of(site).part == "vision":
             return self.vision.tap(site)
         tokens = self._backbone_tokens if site.stream == "backbone" else LAST
@@ -358,11 +401,11 @@ class VisionLanguageModel(SpeakingModel):
     # -- verification ------------------------------------------------------------------------------------
 
     def further_outputs(self, first: Prompt, produced: Mapping[str, Produce]) -> dict[str, Produce]:
-        """Quantities of a golden reference that only this family has, or has in another form.
+        """Return quantities of a golden reference that only this family has, or has in another form.
 
         Args:
             first: The first question.
-            produced: How the quantities of every family are made.
+            produced: The functions that make the quantities of every family.
         """
         del first, produced
         return {}
@@ -378,7 +421,7 @@ def _labels(prompt: TokenPrompt) -> list[str]:
 # -- verification ---------------------------------------------------------------------------------------------
 
 PIXELS, LOGITS = 1e-6, 2e-5
-"""Tolerances, absolute."""
+"""Absolute tolerances of pixels and of logits."""
 LETTERS = ("A", "B")
 DIMS_FILE = "dims.json"
 # How the templates that references were recorded with mark a picture's place.
@@ -415,7 +458,11 @@ def _tolerance(name: str, streams: float) -> float:
 
 
 def recorded_texts(folder: Path) -> list[str]:
-    """Return the whole prompts of a reference. Raises UsageError where they do not lie beside it."""
+    """Return the whole prompts of a reference.
+
+    Raises:
+        UsageError: Where they do not lie beside it.
+    """
     file = folder / DIMS_FILE
     if not file.is_file():
         raise UsageError(f"{file} is missing: it holds the questions that {folder} was recorded with")
@@ -423,7 +470,11 @@ def recorded_texts(folder: Path) -> list[str]:
 
 
 def questions_of(folder: Path, recorded: Arrays, model: VisionLanguageModel) -> list[Prompt]:
-    """Return the recorded questions with their pictures. Raises UsageError as `recorded_texts` does."""
+    """Return the recorded questions with their pictures.
+
+    Raises:
+        UsageError: Where the whole prompts do not lie beside the reference.
+    """
     letters = tuple(model.lead + letter for letter in LETTERS)
     pictures = [recorded[f"in_picture_{int(number)}"] for number in recorded["in_rows_picture"]]
     return [
@@ -440,7 +491,7 @@ def _between(text: str, model: VisionLanguageModel) -> str:
 
 
 class Reference:
-    """The recorded questions, run through the adapter when something asks for what comes of them."""
+    """The recorded questions, run through the adapter at the first request for a result of them."""
 
     def __init__(self, model: VisionLanguageModel, questions: Sequence[Prompt], recorded: Arrays) -> None:
         self.model, self.questions, self.recorded = model, questions, recorded
@@ -452,18 +503,18 @@ class Reference:
 
     @cached_property
     def batch(self) -> LeftPacked:
-        """All rows."""
+        """All rows as one batch."""
         return self.model.packed([self.model.prompt(question) for question in self.questions])
 
     @cached_property
     def captured(self) -> tuple[ActivationCache, Prefill]:
-        """One pass over all rows, with everything that is stored of it."""
+        """The activations and the result of one pass over all rows, with everything that is stored of it."""
         prefill, activations, _ = watch(self.model, lambda: self.model.prefill(self.questions))
         return activations, prefill
 
     @cached_property
     def alone(self) -> list[Prefill]:
-        """Every row by itself."""
+        """The prefill of every row by itself."""
         return [self.model.prefill([question]) for question in self.questions]
 
     @cached_property
@@ -472,7 +523,7 @@ class Reference:
         return replace(self.questions[0], pictured=False)
 
     def produced(self) -> dict[str, Produce]:
-        """Functions that make every output the adapter can make, whether recorded or not."""
+        """Return functions that make every output the adapter can make, whether recorded or not."""
         return {**self._inputs(), **self._pixels(), **self._streams(), **self._answers()}
 
     def _inputs(self) -> dict[str, Produce]:
@@ -521,7 +572,7 @@ class Reference:
         }
 
     def vision(self) -> NDArray[Any]:
-        """The input of every block of the tower for the first row's picture."""
+        """Return the input of every block of the tower for the first row's picture."""
         sites = self.model.further_streams["vision"].sites()[:-1]
         with capture(self.model, sites) as activations:
             self.model.prefill(self.questions[:1])
@@ -541,7 +592,7 @@ class Reference:
         }
 
     def _greedy(self) -> NDArray[np.int64]:
-        """Greedy ids behind every row, padded behind its end."""
+        """Return greedy ids behind every row, padded behind its end."""
         length = self.recorded["greedy_ids"].shape[1]
         with torch.inference_mode():
             answers = self.captured[1].speak(length, self.model.text.ends).numpy()
@@ -551,7 +602,14 @@ class Reference:
 def padded_answers(
     answers: Sequence[NDArray[np.int64]] | NDArray[np.int64], length: int, ends: Collection[int], padding: int
 ) -> NDArray[np.int64]:
-    """(B, length) ids, each row up to and with its end, padded behind it."""
+    """Return ids (B, length), each row up to and with its end, padded behind it.
+
+    Args:
+        answers: A row of ids per question.
+        length: The length of the padded rows.
+        ends: The ids that end an answer.
+        padding: The id that pads.
+    """
     padded = np.full((len(answers), length), padding)
     for row, ids in enumerate(answers):
         over = np.isin(ids, list(ends))

@@ -36,12 +36,14 @@ from probe_kit.models.pi0 import STATISTICS
 
 
 def build_smolvla(config: SmolVLAConfig, folder: Path, device: str = "cpu") -> SmolVLAPolicy:
-    """A `SmolVLAPolicy` in eval mode, float32, with uninitialised weights.
+    """Build a `SmolVLAPolicy` in eval mode, float32, with uninitialised weights.
+
+    Only the VLM's configuration and tokenizer are read: its weights are part of the policy's own file.
 
     Args:
-        folder: The checkpoint; `vlm_model_name` may be a path relative to it, or a hub id. Only the VLM's
-            configuration and tokenizer are read: its weights are part of the policy's own file.
-        device: `meta` serves to look at names and shapes.
+        config: The configuration of lerobot; its `vlm_model_name` may be a path relative to `folder`, or a hub id.
+        folder: The checkpoint.
+        device: The device of the weights; `meta` serves to look at names and shapes.
 
     Raises:
         CheckpointError: If the VLM's configuration cannot be found.
@@ -65,7 +67,7 @@ def build_smolvla(config: SmolVLAConfig, folder: Path, device: str = "cpu") -> S
 
 
 def _without_code() -> dict[str, Any]:
-    """The loaders that lerobot calls, so that they run no Python code of the VLM's files."""
+    """Return the loaders that lerobot calls, so that they run no Python code of the VLM's files."""
     loaders = {name: getattr(smolvlm_with_expert, name) for name in ("AutoConfig", "AutoProcessor")}
     return {
         name: SimpleNamespace(from_pretrained=partial(load_pretrained, loader)) for name, loader in loaders.items()
@@ -79,19 +81,19 @@ def locate_vlm(config: SmolVLAConfig, folder: Path) -> str:
 
 
 def current_smolvla_keys(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The same tensors without the statistics that old files kept among the weights."""
+    """Return the same tensors without the statistics that old files kept among the weights."""
     return {name: tensor for name, tensor in tensors.items() if not name.startswith(STATISTICS)}
 
 
 def full_size_smolvla() -> SmolVLAPolicy:
-    """The released size, on the meta device, without the hub: for names and shapes only."""
+    """Build the released size, on the meta device, without the hub: for names and shapes only."""
     with _released_vlm():
         return build_smolvla(SmolVLAConfig(device="cpu"), Path(), device="meta")
 
 
 @contextmanager
 def _released_vlm() -> Iterator[None]:
-    """While the network is built, lerobot asks us instead of the hub for SmolVLM2-500M's configuration."""
+    """Answer lerobot in place of the hub, while the network is built, with SmolVLM2-500M's configuration."""
     config = SmolVLMConfig(
         text_config={
             "model_type": "llama",
@@ -136,7 +138,11 @@ class SmolVLA(LerobotFlow):
 
     @classmethod
     def build(cls, config: Any, folder: Path) -> Any:
-        """lerobot's policy in float32, without a second download of the VLM's weights."""
+        """Build lerobot's policy in float32, without a second download of the VLM's weights.
+
+        Raises:
+            CheckpointError: For another dtype, and if the VLM's configuration cannot be found.
+        """
         if getattr(config, "dtype", "float32") != "float32":
             raise CheckpointError(
                 "SmolVLA runs in float32 here, because lerobot's mixed precision depends on how its VLM was "
@@ -157,7 +163,7 @@ class SmolVLA(LerobotFlow):
 
     @property
     def iterations(self) -> int:
-        """Flow-matching steps per inference."""
+        """The number of flow-matching steps per inference."""
         return int(self.config.num_steps)
 
     @cached_property
@@ -174,7 +180,7 @@ class SmolVLA(LerobotFlow):
         return load_pretrained(AutoTokenizer, _folder_of(vlm))
 
     def parts(self) -> dict[str, Path]:
-        """The VLM's configuration and tokenizer, where they lie in a folder here."""
+        """Return the folder of the VLM's configuration and tokenizer, where it is a folder here."""
         vlm = Path(self.config.vlm_model_name)
         return {"vlm": vlm} if vlm.is_dir() else {}
 
@@ -184,19 +190,19 @@ class SmolVLA(LerobotFlow):
         return min(len(self.config.image_features) - len(self.shown_cameras), int(self.config.empty_cameras))
 
     def prefix_labels(self, language: Sequence[str]) -> list[str]:
-        """Pictures, masked pictures, language and state, filled up to `prefix_length`."""
+        """Return the labels of pictures, masked pictures, language and state, filled up to `prefix_length`."""
         images = [label for camera in self.shown_cameras for label in self._camera_labels(f"image.{camera}")]
         labels = [*images, *self._camera_labels(PADDING) * self.masked_cameras, *language, "state"]
         return labels + [PADDING] * (self.config.prefix_length - len(labels))
 
     def _camera_labels(self, role: str) -> list[str]:
-        """One camera's positions; the special tokens around a masked picture are not masked."""
+        """Return one camera's positions; the special tokens around a masked picture are not masked."""
         labels = [role] * self.tokens_per_camera
         return ["special", "special", *labels, "special"] if self.config.add_image_special_tokens else labels
 
     @contextmanager
     def record_attention(self, note: Note) -> Iterator[None]:
-        """lerobot's attention is a method that tells no weights: computed once more from what it is given.
+        """Record attention that is computed once more: lerobot's attention is a method that returns no weights.
 
         Over the prompt it is called once per block, then in every iteration by each block that has an expert.
         """
@@ -226,7 +232,7 @@ class SmolVLA(LerobotFlow):
             del joint.eager_attention_forward
 
     def patch_order(self) -> NDArray[np.int64]:
-        """The connector's pixel shuffle makes one token of a square of patches."""
+        """Return the token of each patch: the connector's pixel shuffle makes one token of a square of patches."""
         vlm = self.network.model.vlm_with_expert.vlm.config
         side = vlm.vision_config.image_size // vlm.vision_config.patch_size
         rows, columns = np.divmod(np.arange(side**2), side)
@@ -234,7 +240,7 @@ class SmolVLA(LerobotFlow):
 
     @property
     def tokens_per_camera(self) -> int:
-        """Patches after the connector's pixel shuffle."""
+        """The number of patches after the connector's pixel shuffle."""
         vlm = self.network.model.vlm_with_expert.vlm.config
         patches = (vlm.vision_config.image_size // vlm.vision_config.patch_size) ** 2
         return int(patches // vlm.scale_factor**2)

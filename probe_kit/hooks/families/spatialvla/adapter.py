@@ -1,8 +1,8 @@
 """The adapter for SpatialVLA: packing, streams, taps, roles, cameras, actions.
 
-Sequence: the picture's patches, beginning of sequence, instruction, new line. One stack has two streams,
-by position: `backbone` is the prompt without the new line, `action` the positions whose logits choose an
-action token: the new line, then every token fed back but the last. Three tokens are a step, several steps a chunk.
+Sequence: the picture's patches, beginning of sequence, instruction, new line. One stack has two streams, by
+position: `backbone` is the prompt without the new line. `action` has the positions whose logits choose an action
+token: the new line, then every token fed back but the last. Three tokens are a step, several steps a chunk.
 """
 
 from collections.abc import Mapping, Sequence
@@ -55,13 +55,17 @@ PROCESSOR_FILE = "processor_config.json"
 
 @dataclass(frozen=True, kw_only=True)
 class LoadedSpatialVLA(Loaded[SpatialVLANetwork]):
-    """A loaded network. processor: the content of `processor_config.json`: bins, statistics, cameras."""
+    """A loaded network.
+
+    Attributes:
+        processor: The content of `processor_config.json`: bins, statistics, cameras.
+    """
 
     processor: Mapping[str, Any]
 
     @property
     def config(self) -> SpatialVLAConfig:
-        """The network's."""
+        """The configuration of the network."""
         return self.network.config
 
     @property
@@ -71,7 +75,11 @@ class LoadedSpatialVLA(Loaded[SpatialVLANetwork]):
 
     @property
     def chunk(self) -> int:
-        """Steps that one inference plans. Raises CheckpointError for none."""
+        """The number of steps that one inference plans.
+
+        Raises:
+            CheckpointError: If there are none.
+        """
         steps = int(self.processor.get("action_chunk_size", 1))
         if steps < 1:
             raise CheckpointError(f"{self.processor_file}: action_chunk_size is {steps}; expected at least 1")
@@ -84,11 +92,15 @@ def load_checkpoint(
     """Load a folder or hub id.
 
     Args:
-        dtype: float32 or bfloat16; default what the checkpoint says.
+        checkpoint: Folder or hub id.
+        device: Device in torch's spelling, such as `cuda:0`.
+        dtype: float32 or bfloat16; None takes what the checkpoint says.
+        random_weights: Whether the weights are drawn instead of read.
+        weights_seed: Seed of random weights.
 
     Raises:
-        CheckpointError: For another dtype.
-        WeightsError: For another dtype.
+        CheckpointError: For a folder that is not there, and for files that are missing or bad.
+        WeightsError: For weights that are not exactly the network's.
         UsageError: For another dtype.
     """
     folder = checkpoint_folder(checkpoint)
@@ -109,7 +121,11 @@ def load_checkpoint(
 
 
 def read_processor(folder: Path) -> dict[str, Any]:
-    """The content of `processor_config.json`. Raises CheckpointError if it is missing."""
+    """The content of `processor_config.json`.
+
+    Raises:
+        CheckpointError: If it is missing.
+    """
     file = folder / PROCESSOR_FILE
     if not file.is_file():
         raise CheckpointError(
@@ -121,7 +137,7 @@ def read_processor(folder: Path) -> dict[str, Any]:
 # -- prompts --------------------------------------------------------------------------------------------------
 
 PROMPTS = {"bare": SLOT, "question": f"What action should the robot take to {SLOT}?"}
-"""What training and the released evaluation say, and what the model's page shows."""
+"""The prompts of training and of the released evaluation (`bare`), and of the model's page (`question`)."""
 _END = "\n"
 
 
@@ -130,9 +146,9 @@ class Speech:
     """The way from an instruction to ids.
 
     Attributes:
-        template: With a place for the instruction.
-        lowercase: As in training; the released evaluation does not.
-        tokenizer_choice: None for the checkpoint's, or a folder.
+        template: The prompt with a place for the instruction.
+        lowercase: Whether the instruction is in lower case, as in training; in the released evaluation it is not.
+        tokenizer_choice: Folder of another tokenizer; None for the checkpoint's.
     """
 
     config: SpatialVLAConfig
@@ -150,7 +166,11 @@ class Speech:
 
     @cached_property
     def tokenizer(self) -> FileTokenizer:
-        """Raises CheckpointError naming files that are missing, or ids that are not this model's."""
+        """The tokenizer of the checkpoint, or the chosen one.
+
+        Raises:
+            CheckpointError: For files that are missing, which it names, and for ids that are not this model's.
+        """
         config = self.config
         tokenizer = find_tokenizer([self.folder], self.tokenizer_choice, config.beginning)
         for token, expected in (("<image>", config.image_token), ("<ACTION00000>", config.first_action)):
@@ -162,11 +182,11 @@ class Speech:
         return tokenizer
 
     def prompt(self, instruction: str) -> list[int]:
-        """Ids of the whole prompt: the picture's places, beginning of sequence, text, new line.
+        """Return the ids of the whole prompt: the picture's places, beginning of sequence, text, new line.
 
         Raises:
             InstructionError: For text that the tokenizer reads as a picture or an action, or that takes the new
-                line into itself: the model chooses its action there.
+                line into itself. The model chooses its action there.
         """
         text = self.template.replace(SLOT, instruction.lower() if self.lowercase else instruction)
         ids = self.tokenizer.encode(text + _END)
@@ -184,23 +204,23 @@ class Speech:
 # -- the adapter ----------------------------------------------------------------------------------------------
 
 DEFAULT_CHECKPOINT = "IPEC-COMMUNITY/spatialvla-4b-224-pt"
-"""The data set of the WidowX arm that Act2Answer imitates."""
+"""The checkpoint that is loaded where none is named."""
 SCENE = "scene"
-"""Asks for the camera of the observation."""
+"""The name that asks for the camera of the observation."""
 ENSEMBLE = 0.8
-"""With this exponent the client for SimplerEnv averages the plans of overlapping chunks."""
+"""The exponent with which the client for SimplerEnv averages the plans of overlapping chunks."""
 
 
 class SpatialVLA(TokenDecoder, Policy):
     """A loaded SpatialVLA.
 
-    steps: greedy tokens per inference. captured: how many of them the stream `action` captures.
+    `steps` is the number of greedy tokens per inference; `captured` of them are captured by the stream `action`.
     """
 
     family: ClassVar[str] = "spatialvla"
     interventions = TOKENS
     added = MappingProxyType({"attention": "post_attention_layernorm", "mlp": "post_feedforward_layernorm"})
-    """Gemma-2 norms what its attention and its MLP put out before adding it; SigLIP does not."""
+    """The norms of what the attention and the MLP of Gemma-2 put out, before it is added; SigLIP has none."""
     loaded: LoadedSpatialVLA
     network: SpatialVLANetwork
 
@@ -244,7 +264,7 @@ class SpatialVLA(TokenDecoder, Policy):
         )
 
     def _settings(self) -> dict[str, str]:
-        """Every choice."""
+        """Return every choice by its name."""
         return {
             "tokenizer": self.speech.tokenizer_choice or "the checkpoint's",
             "unnorm_key": self.statistics.key,
@@ -278,7 +298,11 @@ class SpatialVLA(TokenDecoder, Policy):
         return PictureSettings.of(self.config, self.loaded.folder)
 
     def pictures(self, observations: Sequence[Observation]) -> Tensor:
-        """(B, 3, S, S) float32 in [0, 1]. Raises ObservationError."""
+        """Return the pictures (B, 3, S, S) float32 in [0, 1].
+
+        Raises:
+            ObservationError: For a picture of another dtype or shape.
+        """
         rows = [
             prepare_picture(checked_picture(observation.image), self.picture_settings)
             for observation in observations
@@ -286,7 +310,11 @@ class SpatialVLA(TokenDecoder, Policy):
         return torch.from_numpy(np.stack(rows)).to(self.loaded.device)
 
     def cameras(self, observations: Sequence[Observation]) -> Tensor:
-        """(B, 3, 3) float32 intrinsics for the pictures as the model sees them. Raises ObservationError."""
+        """Return float32 intrinsics (B, 3, 3) for the pictures as the model sees them.
+
+        Raises:
+            ObservationError: For a matrix that is no camera's.
+        """
         rows = [self._camera(observation).at(self.config.side) for observation in observations]
         return torch.from_numpy(np.stack(rows)).to(self.loaded.device)
 
@@ -302,7 +330,7 @@ class SpatialVLA(TokenDecoder, Policy):
         return Intrinsics(matrix, width, height)
 
     def prompt(self, instruction: str) -> list[int]:
-        """Ids of a whole prompt, places for the picture first; see `Speech.prompt`."""
+        """Return the ids of a whole prompt, places for the picture first; see `Speech.prompt`."""
         return self.speech.prompt(instruction)
 
     def token_ids(self, instructions: Sequence[str]) -> list[tuple[int, ...]]:
@@ -310,20 +338,27 @@ class SpatialVLA(TokenDecoder, Policy):
         return [tuple(self.prompt(instruction)[self.config.patches :]) for instruction in instructions]
 
     def pack(self, rows: Sequence[Sequence[int]]) -> Packed:
-        """Prompts of ids as a batch. Raises InstructionError for one that is too long."""
+        """Return prompts of ids as a batch.
+
+        Raises:
+            InstructionError: For a prompt that is too long.
+        """
         self.check_length(max(map(len, rows)))
         return Packed.of(rows, self.config.padding)
 
     @property
     def positions(self) -> int:
-        """Also no more than Gemma-2's window: half of its layers attend to no more."""
+        """The most positions of a prompt and its output, and no more than Gemma-2's window.
+
+        Half of its layers attend to no more.
+        """
         window = self.config.text.sliding_window
         return min(super().positions, int(window)) if window else super().positions
 
     # -- acting ------------------------------------------------------------------------------------------
 
     def act(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
-        """A chunk per observation; decoding is greedy, so the seeds change nothing. See the contract.
+        """Return a chunk per observation; decoding is greedy, so the seeds change nothing. See the contract.
 
         A row is flagged if a token of its first step, the one that is executed, names no action.
         """
@@ -337,16 +372,19 @@ class SpatialVLA(TokenDecoder, Policy):
         return open_or_closed(self.actions(ids))
 
     def actions(self, ids: NDArray[np.int64]) -> NDArray[np.float64]:
-        """(…, 7) in the data set's units, the gripper as decoded, of ids (…, 3)."""
+        """Return the actions (…, 7) of ids (…, 3) in the data set's units, the gripper as decoded."""
         return self.statistics.restore(self.bins.values(ids))
 
     def generate(
         self, pictures: Tensor, cameras: Tensor, rows: Sequence[Sequence[int]], fed: Tensor | None = None
     ) -> Decoded:
-        """`steps` greedy tokens behind every prompt; one inference, as `capture` counts it.
+        """Return `steps` greedy tokens behind every prompt; one inference, as `capture` counts it.
 
         Args:
-            fed: (B, steps - 1) ids that are fed back instead of those chosen.
+            pictures: (B, 3, S, S) float32 in [0, 1].
+            cameras: (B, 3, 3) float32 intrinsics.
+            rows: The ids of every prompt.
+            fed: (B, steps - 1) ids that are fed back instead of those chosen; None feeds the chosen ones.
         """
         packed, device = self.pack(rows), self.loaded.device
         slots = [self.bins.slots[step % STEP_TOKENS] for step in range(self.steps)] if self.constrained else None
@@ -357,13 +395,13 @@ class SpatialVLA(TokenDecoder, Policy):
             )
 
     def record_attention(self, note: Note) -> AbstractContextManager[None]:
-        """Gemma-2's attention is eager, for its soft cap, and returns its weights."""
+        """Record the weights that Gemma-2's attention returns, which is eager for its soft cap."""
         return of_decoder(self.decoder.layers, note, eager=True)
 
     # -- capture -----------------------------------------------------------------------------------------
 
     def roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
-        """Patches, beginning of sequence, text; padding behind it where another prompt is longer."""
+        """The roles of patches, beginning of sequence and text, with padding behind the shorter prompts."""
         rows = [self.prompt(observation.instruction)[:-1] for observation in observations]
         return self.roles_of([self._labels(row) for row in rows])
 
@@ -373,11 +411,11 @@ class SpatialVLA(TokenDecoder, Policy):
         return picture + ["special" if number in special else "language" for number in row[len(picture) :]]
 
     def patch_order(self) -> NDArray[np.int64]:
-        """A token per patch, row by row; where a token lies in space is added to it behind the tower."""
+        """Return a token per patch, row by row; its place in space is added to it behind the tower."""
         return np.arange(self.config.patches)
 
     def vision_tap(self, site: Site) -> Tap:
-        """The first norm of a block, the norm behind the last, or what a block adds."""
+        """Return the first norm of a block, the norm behind the last, or what a block adds."""
         return decoder_tap(self.tower.encoder.layers, self.tower.post_layernorm, site, entry="layer_norm1")
 
 
@@ -399,7 +437,7 @@ def check_spatialvla_words(
     tokenizer: str | None = None,
     **_: Any,
 ) -> None:
-    """See `Family.words`."""
+    """Raise InstructionError for an instruction that cannot be read; see `Family.words`."""
     folder = checkpoint_folder(checkpoint, SMALL_FILES)
     speech = Speech.of(SpatialVLAConfig.from_folder(folder), folder, prompt, lowercase, tokenizer)
     for instruction in instructions:
@@ -424,10 +462,10 @@ def load_spatialvla(
 ) -> SpatialVLA:
     """Load SpatialVLA or one of its fine-tunes from a folder or hub id.
 
-    Options: see the family.
+    The options are those of the family. Raises what `load_checkpoint` raises, too.
 
     Raises:
-        UsageError: And what `load_checkpoint` raises.
+        UsageError: For an option that cannot be used, and for a data set that has to be chosen.
     """
     if iterations not in ("step", "chunk"):
         raise UsageError(f"iterations is {iterations!r}; expected step or chunk")
@@ -446,14 +484,14 @@ def load_spatialvla(
 
 
 def spatialvla_units(checkpoint: str, *, unnorm_key: str | None = None, **_: Any) -> str:
-    """See `Family.units`."""
+    """Return the data set whose units the actions get, and what says so; see `Family.units`."""
     folder = checkpoint_folder(checkpoint, SMALL_FILES)
     by_data_set, source = _statistics(folder, read_processor(folder))
     return f"{ActionStatistics.choose(by_data_set, unnorm_key, source).key}, from {source}"
 
 
 def choose_statistics(loaded: LoadedSpatialVLA, key: str | None) -> ActionStatistics:
-    """The statistics of data set `key`; without one, of the only data set there is.
+    """Return the statistics of data set `key`; without one, of the only data set there is.
 
     Raises:
         UsageError: For a key that is not there or has to be chosen.
@@ -470,7 +508,11 @@ def choose_statistics(loaded: LoadedSpatialVLA, key: str | None) -> ActionStatis
 
 
 def _statistics(folder: Path, processor: Mapping[str, Any]) -> tuple[Mapping[str, Any], str]:
-    """Per data set, what un-normalises its actions, and what holds it. Raises CheckpointError for none."""
+    """Return per data set the statistics that un-normalise its actions, and what holds them.
+
+    Raises:
+        CheckpointError: If there are none.
+    """
     file = str(folder / PROCESSOR_FILE)
     by_data_set, source = stored_statistics((folder,), processor.get("statistics") or {}, file)
     if not by_data_set:

@@ -68,14 +68,14 @@ class _Reference:
         self.pictures, self.cameras = self.policy.pictures(self.seen), self.policy.cameras(self.seen)
 
     def _policy(self, steps: int) -> SpatialVLA:
-        """The ordinary adapter, capturing every one of `steps` tokens."""
+        """Return the ordinary adapter, capturing every one of `steps` tokens."""
         loaded = self.loaded
         speech = Speech.of(loaded.config, loaded.folder, None, lowercase=True, tokenizer=None)
         camera = _camera(loaded, self.recorded)
         return SpatialVLA(loaded, speech, choose_statistics(loaded, None), camera, steps, steps, constrained=False)
 
     def produced(self) -> dict[str, Produce]:
-        """Functions that make every output the adapter can make, whether recorded or not."""
+        """Return functions that make every output the adapter can make, whether recorded or not."""
         return {**self._sight(), **self._language(), **self._tokens()}
 
     # -- picture, depth, space ---------------------------------------------------------------------------
@@ -113,14 +113,14 @@ class _Reference:
         return self._sight_of_pictures.depth
 
     def _thinned(self, full_map: Tensor, name: str) -> NDArray[Any]:
-        """Every n-th pixel of a large map, as it is recorded."""
+        """Return every n-th pixel of a large map, as it is recorded."""
         every = max(1, round(full_map.shape[-1] / self.recorded[name].shape[-1]))
         return _numpy(full_map[..., ::every, ::every])
 
     # -- language model ----------------------------------------------------------------------------------
 
     def _run(self, policy: SpatialVLA, fed: Tensor | None = None) -> tuple[dict[str, Produce], ActivationCache]:
-        """The quantities of the prompt, and of output tokens `fed` in the place of the policy's own."""
+        """Return the quantities of the prompt, and of output tokens `fed` in the place of the policy's own."""
         decoded, activations, _ = watch(
             policy, lambda: policy.generate(self.pictures, self.cameras, [self.prompt], fed)
         )
@@ -152,10 +152,10 @@ class _Reference:
 
     @torch.inference_mode()
     def _batch(self) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Hidden states and logits of the recorded batch, packed as the adapter packs it.
+        """Return hidden states and logits of the recorded batch, packed as the adapter packs it.
 
-        Put into the recorded layout, in which padding stands elsewhere. One head measures the depth of all rows,
-        as when it was recorded.
+        They are put into the recorded layout, in which padding stands elsewhere. One head measures the depth of
+        all rows, as when it was recorded.
         """
         recorded, network = self.recorded, self.policy.network
         mask = recorded["batch_attention_mask"].astype(bool)
@@ -194,7 +194,10 @@ class _Reference:
 
 
 def _camera(loaded: LoadedSpatialVLA, recorded: Arrays) -> str:
-    """Key of the recorded camera, whatever took the picture; `scene` if the checkpoint knows none like it."""
+    """Return the key of the recorded camera; `scene` if the checkpoint knows none like it.
+
+    The key does not depend on what took the picture.
+    """
     matrix = recorded.get("intrinsic_raw")
     for key, camera in known_cameras(loaded.processor, loaded.processor_file).items():
         if matrix is not None and np.array_equal(camera.matrix.astype(np.float32), matrix.astype(np.float32)):
@@ -203,5 +206,5 @@ def _camera(loaded: LoadedSpatialVLA, recorded: Arrays) -> str:
 
 
 def _numpy(tensor: Tensor | None) -> NDArray[Any]:
-    """NaN for what is not there, which equals nothing."""
+    """Return an array; NaN for what is not there, which equals nothing."""
     return np.full(1, np.nan) if tensor is None else numpy_of(tensor)

@@ -15,7 +15,10 @@ INTERVENTIONS = Interventions(
     attention=True,
     instead={"tiles": f"{MERGED}Exchange all of `image`"},
 )
-"""The expert reads keys and values of the backbone's last blocks; those of the blocks before are unread."""
+"""The interventions of an expert that reads keys and values of the backbone's last blocks.
+
+Those of the blocks before are unread.
+"""
 
 FAMILIES = (
     Family(

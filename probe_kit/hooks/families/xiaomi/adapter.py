@@ -2,7 +2,7 @@
 
 Backbone: the chat with one picture. Expert: a sink, the state, the action chunk; each layer reads the keys and
 values of one of the backbone's last layers. The expert's stream is normalised twice in every layer, so nothing in
-it only adds: `residual` is the stream entering a layer, normed by the layer before; `attention` and `mlp` are what
+it only adds. `residual` is the stream entering a layer, normed by the layer before. `attention` and `mlp` are what
 its halves add, gated; `middle` is the normed sum between them.
 
 References of `verify`: B batch, P prompt positions, L backbone layers, T expert positions, S Euler steps.
@@ -55,7 +55,7 @@ from probe_kit.models.xiaomi import (
 DEFAULT_CHECKPOINT = "XiaomiRobotics/Xiaomi-Robotics-0-SimplerEnv-WidowX"
 _PARTS = {"attention": "attn_gate", "heads": "attn.o_proj", "middle": "middle_layernorm", "mlp": "mlp_gate"}
 EXECUTE = 4
-"""Actions the released evaluation carries out before it looks again."""
+"""The number of actions that the released evaluation executes before it infers again."""
 
 
 class Xiaomi(QwenVLA):
@@ -119,12 +119,17 @@ class Xiaomi(QwenVLA):
     # -- the robot ---------------------------------------------------------------------------------------
 
     def units_or_reason(self) -> ActionUnits | str:
-        """The statistics, or why there are none; a robot that was named has to have them."""
+        """Return the statistics, or why there are none; a robot that was named has to have them."""
         return self.units if self._robot is not None else super().units_or_reason()
 
     @cached_property
     def units(self) -> ActionUnits:
-        """The statistics that give actions units and the chunk its length. Raises CheckpointError, UsageError."""
+        """The statistics that give actions units and the chunk its length.
+
+        Raises:
+            CheckpointError: If there are none.
+            UsageError: For a robot that is not there or has to be chosen.
+        """
         return read_units(self.folder, self._robot, self.config.action_dim)
 
     @cached_property
@@ -132,7 +137,7 @@ class Xiaomi(QwenVLA):
         """The robot as whose scene pictures are shown; the default one where no statistics name a robot.
 
         Raises:
-            UsageError: For one that Act2Answer's arm cannot stand in for.
+            UsageError: For a robot that Act2Answer's arm cannot stand in for.
         """
         units = self.units_or_reason()
         return robot_of(DEFAULT_ROBOT if isinstance(units, str) else units.robot)
@@ -147,25 +152,28 @@ class Xiaomi(QwenVLA):
 
     @property
     def unguarded_state(self) -> str | None:
-        """The release has statistics of actions alone."""
+        """The reason why states are not compared: the release has statistics of actions alone."""
         return f"the state is read as it is, and {STATISTICS_FILE} has statistics of actions alone"
 
     # -- acting ------------------------------------------------------------------------------------------
 
     def act(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
-        """One chunk of actions per observation; see the contract."""
+        """Return one chunk of actions per observation; see the contract."""
         units = self.units
         return open_or_closed(units.restore(self.infer_without_acting(observations, seeds))[..., :DIMENSIONS])
 
     def embodiment_mismatch(self) -> str | None:
-        """No statistics."""
+        """Return the reason why there are no statistics; None where there are some."""
         units = self.units_or_reason()
         return units if isinstance(units, str) else None
 
     def infer_without_acting(
         self, observations: Sequence[Observation], seeds: Sequence[int]
     ) -> NDArray[np.float32]:
-        """(B, chunk, action numbers) as the flow puts them out, without units; all where nothing says which."""
+        """Return (B, chunk, action numbers) as the flow puts them out, without units.
+
+        They are all numbers where nothing says which are used.
+        """
         self.check(observations, seeds)
         units = self.units_or_reason()
         numbers = self.config.action_dim
@@ -178,7 +186,11 @@ class Xiaomi(QwenVLA):
         return output
 
     def state(self, observations: Sequence[Observation]) -> Tensor:
-        """(B, 1, state numbers) float32: the robot's own layout, filled up with zeros. Raises ObservationError."""
+        """Return the state (B, 1, state numbers) float32: the robot's own layout, filled up with zeros.
+
+        Raises:
+            ObservationError: For a state of more numbers than the checkpoint reads.
+        """
         rows = torch.zeros(len(observations), self.config.state_length, self.config.state_dim)
         for row, observation in zip(rows, observations, strict=True):
             arm_state = laid_out(np.asarray(observation.state, np.float32), ARM_NUMBERS, self.openness)
@@ -191,7 +203,14 @@ class Xiaomi(QwenVLA):
         return rows.to(self.device)
 
     def infer(self, inputs: QwenInputs, state: Tensor, used: Tensor, noise: Tensor) -> Tensor:
-        """(B, A, action numbers) normalised actions; one inference, as `capture` counts it."""
+        """Return normalised actions (B, A, action numbers); one inference, as `capture` counts it.
+
+        Args:
+            inputs: The packed prompts.
+            state: (B, 1, state numbers) float32.
+            used: Mask of the numbers that an action has, in the shape of `noise`.
+            noise: (B, A, action numbers).
+        """
         self._grid = inputs.grid
         with torch.inference_mode():
             actions: Tensor = self.network(inputs, state, used, noise, self.steps)
@@ -200,13 +219,16 @@ class Xiaomi(QwenVLA):
     # -- capture -----------------------------------------------------------------------------------------
 
     def roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
-        """The chat; then sink, state, actions."""
+        """The roles of the chat; then those of sink, state and actions."""
         states = ["state"] * self.config.state_length
         expert = Roles.from_labels(["special", *states, *["action"] * self.card.chunk])
         return {"backbone": self.backbone_roles(observations), "expert": [expert] * len(observations)}
 
     def record_attention(self, note: Note) -> AbstractContextManager[None]:
-        """Computed once more from what a layer of the expert is given, under the block whose keys it reads."""
+        """Record attention that is computed once more from what a layer of the expert is given.
+
+        It is noted under the block whose keys the layer reads.
+        """
         layers: Any = self.network.dit.layers
         first, first_action = len(self.language.layers) - len(layers), 1 + self.config.state_length
 
@@ -218,7 +240,10 @@ class Xiaomi(QwenVLA):
         )
 
     def tap(self, site: Site) -> Tap:
-        """See the module's first lines; the backbone's sites are inputs: they hold what DeepStack added."""
+        """Return the tap of a site, with the quantities that the module's first lines describe.
+
+        The backbone's sites are inputs: they hold what DeepStack added.
+        """
         stream = self.stream_of(site)
         if stream is self.prompt_kv:
             return kv_tap(self.network.prompt_kv, site)
@@ -232,7 +257,10 @@ class Xiaomi(QwenVLA):
 
 
 def xiaomi_units(checkpoint: str, *, robot: str | None = None, **_: Any) -> str:
-    """See `Family.units`; a checkpoint without statistics says so, since it can be captured."""
+    """Return the robot whose units the actions get, and what says so; see `Family.units`.
+
+    A checkpoint without statistics says so, since it can be captured.
+    """
     folder = checkpoint_folder(checkpoint, SMALL_FILES)
     try:
         units = read_units(folder, robot, XiaomiConfig.from_folder(folder).action_dim)
@@ -255,12 +283,12 @@ def load_xiaomi(
 ) -> Xiaomi:
     """Load Xiaomi-Robotics-R0 from a folder or hub id.
 
-    Options: see the family.
+    The options are those of the family.
 
     Raises:
-        CheckpointError: For options that cannot be.
-        WeightsError: For options that cannot be.
-        UsageError: For options that cannot be.
+        CheckpointError: For a checkpoint that is not there or cannot be loaded.
+        WeightsError: For weights that are not exactly the network's.
+        UsageError: For an option that cannot be used.
     """
     if steps < 1:
         raise UsageError(f"{steps} Euler steps make no action; expected 1 or more")
@@ -328,13 +356,13 @@ def xiaomi_outputs(load: Callable[..., Xiaomi], folder: Path, recorded: Arrays) 
 
 
 def _outputs(calls: Mapping[str, list[Tensor]], kind: str, blocks: int) -> NDArray[Any]:
-    """(calls, blocks, …) of every block of a stack."""
+    """Return the outputs (calls, blocks, …) of every block of a stack."""
     rows = zip(*(calls[f"{kind}{number}"] for number in range(blocks)), strict=True)
     return numpy_of(torch.stack([torch.stack(row) for row in rows]))
 
 
 def _valid(policy: Xiaomi, mask: NDArray[np.bool_]) -> dict[str, NDArray[np.bool_]]:
-    """(B, P) for streams, (B, heads, P) for keys and values."""
+    """Return the masks of valid positions: (B, P) for streams, (B, heads, P) for keys and values."""
     heads = int(policy.vlm.config.text_config.num_key_value_heads)
     cached = np.repeat(mask[:, None], heads, axis=1)
     streams = ("backbone_layer_input", "backbone_layer_output", "backbone_final_norm")
@@ -342,7 +370,7 @@ def _valid(policy: Xiaomi, mask: NDArray[np.bool_]) -> dict[str, NDArray[np.bool
 
 
 def _restored(policy: Xiaomi, actions: NDArray[Any], recorded: Arrays) -> NDArray[Any]:
-    """Actions in units of the recorded statistics, where there are some; else of the checkpoint's."""
+    """Return actions in units of the recorded statistics, where there are some; else of the checkpoint's."""
     if not set(_NORMS) <= set(recorded):
         return policy.units.restore(actions)
     mean, deviation = (np.asarray(recorded[name], np.float64) for name in _NORMS)

@@ -5,7 +5,7 @@ from probe_kit.hooks.contract.sites import Stream
 from probe_kit.hooks.families.shared.kinds import MERGED, lerobot_family
 
 PICTURES = ("padded", "squashed")
-"""As lerobot, and as the authors."""
+"""The ways in which pictures come to the network's resolution: of lerobot, and of the authors."""
 BLOCK = ("residual", "attention", "mlp")
 INTERVENTIONS = Interventions(
     edits={"backbone": BLOCK, "expert": BLOCK},
@@ -18,7 +18,7 @@ INTERVENTIONS = Interventions(
         "tiles": f"{MERGED}Exchange all of `image`",
     },
 )
-"""All cameras but the first reach the expert past the backbone."""
+"""The interventions of a policy in which all cameras but the first reach the expert past the backbone."""
 
 FAMILIES = (
     lerobot_family(

@@ -1,7 +1,7 @@
 """The adapter for X-VLA.
 
 Backbone: Florence-2's encoder over the first camera's picture and the text. Expert: one sequence of the noisy
-actions, the end of the backbone, the further cameras and the robot's soft prompts, at every denoising step; all
+actions, the end of the backbone, the further cameras and the robot's soft prompts, at every denoising step. All
 attend to all. Florence-2 norms behind each addition, so nothing in the backbone's stream only adds.
 
 lerobot's `predict_action_chunk` ignores the noise it is given and draws its own for a whole batch at once.
@@ -56,7 +56,7 @@ from probe_kit.models.checkpoint_files import load_pretrained
 
 _LANGUAGE = "model.vlm.language_model."
 EMBEDDINGS = (f"{_LANGUAGE}shared.weight", f"{_LANGUAGE}encoder.embed_tokens.weight")
-"""One tensor under two names, of which a file may hold either."""
+"""The two names of one tensor, of which a file may hold either."""
 FLORENCE_LARGE: dict[str, Any] = {
     "vision_config": {
         "embed_dim": [256, 512, 1024, 2048],
@@ -73,11 +73,11 @@ FLORENCE_LARGE: dict[str, Any] = {
         "max_position_embeddings": 4096,
     },
 }
-"""Florence-2 large, the backbone that the paper names; the rest as transformers has it by default."""
+"""The sizes of Florence-2 large, the backbone that the paper names; the rest as transformers has it by default."""
 
 
 def build_xvla(config: XVLAConfig, device: str = "cpu") -> XVLAPolicy:
-    """A `XVLAPolicy` in eval mode with uninitialised weights, in the precision that `config` names."""
+    """Build a `XVLAPolicy` in eval mode with uninitialised weights, in the precision that `config` names."""
     device = building_device(device)
     config.device = device
     dtype = torch.bfloat16 if config.dtype == "bfloat16" else torch.float32
@@ -85,7 +85,7 @@ def build_xvla(config: XVLAConfig, device: str = "cpu") -> XVLAPolicy:
 
 
 def full_size_xvla() -> XVLAPolicy:
-    """Florence-2 large under lerobot's default transformer, on the meta device."""
+    """Build Florence-2 large under lerobot's default transformer, on the meta device."""
     config = XVLAConfig(
         device="cpu",
         florence_config=FLORENCE_LARGE,
@@ -99,7 +99,7 @@ def full_size_xvla() -> XVLAPolicy:
 
 
 def current_xvla_keys(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """A file's tensors under the names lerobot's network has.
+    """Return a file's tensors under the names lerobot's network has.
 
     Files of 2025 have Florence-2 in its authors' layout.
     """
@@ -108,11 +108,14 @@ def current_xvla_keys(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def denoised_actions(policy: Any, inputs: Mapping[str, Tensor], noise: Tensor) -> Tensor:
-    """(B, chunk, D) actions from noise (B, chunk, widest action): lerobot's denoising, one inference.
+    """Return actions (B, chunk, D) from noise: lerobot's denoising, one inference.
+
+    The network predicts actions, not a velocity: every step mixes them with the noise.
 
     Args:
-        inputs: In lerobot's keys. The network predicts actions, not a velocity: every step mixes them with the
-            noise.
+        policy: The policy of lerobot.
+        inputs: A batch in lerobot's keys.
+        noise: (B, chunk, widest action).
     """
     model, steps = policy.model, max(1, int(policy.config.num_denoising_steps))
     model_inputs = policy._build_model_inputs(dict(inputs))
@@ -139,15 +142,19 @@ STEPS = ("xvla_image_to_float", _MEAN, _DOMAIN)
 
 
 def read_steps(config: Any, folder: Path, domain: int | None) -> None:
-    """Put what the processor files say into lerobot's configuration; `domain` counts over theirs.
+    """Put what the processor files say into lerobot's configuration.
+
+    `imagenet` says whether pictures are normalised with ImageNet's mean and deviation. `tokenizer_name` is also
+    the folder in the checkpoint. lerobot takes robot 0 where nothing names one: here it is an error, and so is a
+    step that changes numbers in another way.
 
     Args:
-        domain: The robot's number. imagenet: whether pictures are normalised with ImageNet's mean and deviation.
-            tokenizer_name: also the folder in the checkpoint.
+        config: The configuration of lerobot, which is changed.
+        folder: The folder of the checkpoint.
+        domain: The robot's number, which counts over that of the files; None for theirs.
 
     Raises:
-        CheckpointError: . lerobot takes robot 0 where nothing names one: here it is an error, and so is a step
-            that changes numbers in another way.
+        CheckpointError: If nothing names a robot, and for a step that changes numbers in another way.
     """
     check_pipelines(folder)
     check_steps(folder, POSTPROCESSOR, (*NORMALISERS, *STEPS))
@@ -185,7 +192,7 @@ class XvlaChoice(Evaluation):
 
 _FLORENCE = {"attention": "self_attn.out_proj", "heads": "self_attn.out_proj", "mlp": "fc2"}
 _EXPERT = {"attention": "attn", "heads": "attn.proj", "mlp": "mlp"}
-"""By quantity, what a block adds or reads."""
+"""The paths of what a block adds or reads, by quantity."""
 
 
 class Xvla(DenoisingPolicy):
@@ -206,7 +213,7 @@ class Xvla(DenoisingPolicy):
 
     @classmethod
     def parse_config(cls, folder: Path, evaluation: Any) -> Any:
-        """lerobot's configuration, with what the processor files say."""
+        """Return lerobot's configuration, with what the processor files say."""
         config = super().parse_config(folder, evaluation)
         read_steps(config, folder, evaluation.domain)
         config.picture = evaluation.picture or ("padded" if config.resize_imgs_with_padding else None)
@@ -217,7 +224,12 @@ class Xvla(DenoisingPolicy):
 
     @classmethod
     def build(cls, config: Any, folder: Path) -> Any:
-        """lerobot's policy. Raises CheckpointError for a state that it would cut, UsageError for no such robot."""
+        """Build lerobot's policy.
+
+        Raises:
+            CheckpointError: For a state that it would cut.
+            UsageError: For a robot that it does not have.
+        """
         numbers = config.robot_state_feature.shape[0] if config.robot_state_feature else 0
         if config.use_proprio and numbers > config.max_state_dim:
             raise CheckpointError(
@@ -229,7 +241,7 @@ class Xvla(DenoisingPolicy):
         return build_xvla(config)
 
     def further_settings(self) -> dict[str, str]:
-        """The robot whose soft prompts are read, and how pictures come to their size."""
+        """Return the robot whose soft prompts are read, and how pictures come to their size."""
         return {"domain": str(self.config.domain), "picture": str(self.config.picture)}
 
     def _notes(self) -> tuple[str, ...]:
@@ -243,7 +255,7 @@ class Xvla(DenoisingPolicy):
         return (*super()._notes(), f"pictures {how}")
 
     def look(self, camera: str, images: Sequence[NDArray[np.uint8]]) -> Tensor:
-        """(B, 3, H, W) in [0, 1]: squashed where that is chosen; lerobot's network pads any other."""
+        """Return pictures (B, 3, H, W) in [0, 1]: squashed where that is chosen; lerobot pads any other."""
         if self.config.picture == "squashed":
             size = tuple(self.config.resize_imgs_with_padding)
             images = [
@@ -252,7 +264,7 @@ class Xvla(DenoisingPolicy):
         return super().look(camera, images)
 
     def parts(self) -> dict[str, Path]:
-        """The tokenizer, where it is another folder's."""
+        """Return the folder of the tokenizer, where it is another folder."""
         folder = self._tokenizer_folder
         return {} if folder == self.folder else {"tokenizer": folder}
 
@@ -270,7 +282,7 @@ class Xvla(DenoisingPolicy):
         return load_pretrained(AutoTokenizer, self._tokenizer_folder)
 
     def prompts(self, instructions: Sequence[str], state: NDArray[np.float32]) -> list[str]:
-        """The instructions as they are."""
+        """Return the instructions as they are."""
         del state
         return list(instructions)
 
@@ -279,7 +291,15 @@ class Xvla(DenoisingPolicy):
     def batch(
         self, observations: Sequence[Observation], state: NDArray[np.float32] | None = None
     ) -> dict[str, Tensor]:
-        """Return a batch as lerobot's processors leave it. state: (B, numbers) as the network reads them."""
+        """Return a batch as lerobot's processors leave it.
+
+        Args:
+            observations: The B rows of the batch.
+            state: (B, numbers) as the network reads them; None for that of the observations.
+
+        Raises:
+            ObservationError: For a picture of another size where the checkpoint resizes nothing.
+        """
         batch = super().batch(observations, state)
         mean, deviation = (torch.tensor(IMAGENET_STATS[name]).view(3, 1, 1) for name in ("mean", "std"))
         for camera in self.shown_cameras:
@@ -299,28 +319,28 @@ class Xvla(DenoisingPolicy):
 
     @property
     def unguarded_state(self) -> str | None:
-        """Also where its network reads none."""
+        """The reason also where its network reads no state."""
         return super().unguarded_state if self.config.use_proprio else "no state is read (use_proprio: false)"
 
     def denoise(self, batch: Mapping[str, Tensor], noise: Tensor) -> Tensor:
-        """See the base."""
+        """Return the actions as the base does."""
         return denoised_actions(self.network, batch, noise)
 
     @property
     def noise_shape(self) -> tuple[int, int]:
-        """Actions of a chunk, and the widest action."""
+        """The shape of one row's noise: actions of a chunk, and the widest action."""
         return self.config.chunk_size, self.network.model.dim_action
 
     # -- the sequences -----------------------------------------------------------------------------------
 
     @property
     def masked_cameras(self) -> int:
-        """Views without a picture, whose zeros the expert attends to: their role is `special`."""
+        """The number of views without a picture, whose zeros the expert attends to: their role is `special`."""
         return int(self.config.num_image_views) - len(self.shown_cameras)
 
     @cached_property
     def tokens_per_camera(self) -> int:
-        """The mean of a picture, then its patches."""
+        """The number of tokens of a picture: its mean, then its patches."""
         first = self.config.image_features[f"{IMAGES}{self.cameras[0]}"].shape[-2:]
         vision = self.network.model.vlm.config.vision_config
         sides: list[int] = []
@@ -333,16 +353,19 @@ class Xvla(DenoisingPolicy):
         return 1 + sides[0] * sides[1]
 
     def text_labels(self, ids: Sequence[int], valid: Sequence[bool]) -> list[str]:
-        """Padding is `special`: the network attends to it."""
+        """Return the labels of a text; padding is `special`, because the network attends to it."""
         labels = super().text_labels(ids, valid)
         return ["special" if label == PADDING else label for label in labels]
 
     def prefix_labels(self, language: Sequence[str]) -> list[str]:
-        """The first camera's picture, then the text."""
+        """Return the labels of the first camera's picture, then of the text."""
         return [*[f"image.{self.shown_cameras[0]}"] * self.tokens_per_camera, *language]
 
     def packed_roles(self, tokens: Tensor, mask: Tensor) -> dict[str, list[Roles]]:
-        """The backbone's tokens once more in the expert, between actions, further cameras and soft prompts."""
+        """Return the roles; the backbone's tokens are once more in the expert.
+
+        There they stand between actions, and further cameras and soft prompts.
+        """
         prompts = [
             self.prefix_labels(self.text_labels(row, valid))
             for row, valid in zip(tokens.tolist(), mask.tolist(), strict=True)
@@ -388,9 +411,9 @@ class Xvla(DenoisingPolicy):
     # -- verification ------------------------------------------------------------------------------------
 
     def watched(self) -> dict[str, nn.Module]:
-        """The chunk that every step predicts."""
+        """Return the module whose output is the chunk that every step predicts."""
         return {"predicted": self.network.model.transformer.action_decoder}
 
     def further_outputs(self, run: RecordedRun) -> dict[str, Produce]:
-        """The pictures as the network reads them."""
+        """Return the pictures as the network reads them."""
         return {"pixels": lambda: numpy_of(self.network._prepare_images(run.batch)[0])}

@@ -38,9 +38,10 @@ class DenoisingPolicy(LerobotPolicy):
 
     @abstractmethod
     def denoise(self, batch: Mapping[str, Tensor], noise: Tensor) -> Tensor:
-        """(B, chunk, D) normalised actions for a batch in lerobot's keys, with a graph where gradients are on.
+        """Return normalised actions (B, chunk, D) for a batch, with a graph where gradients are on.
 
         Args:
+            batch: Observations in lerobot's keys.
             noise: (B, *noise_shape) float32.
         """
 
@@ -50,12 +51,12 @@ class DenoisingPolicy(LerobotPolicy):
         return self.config.chunk_size, self.config.max_action_dim
 
     def infer(self, batch: Mapping[str, Tensor], noise: Tensor) -> Tensor:
-        """(B, chunk, D) normalised actions, as `denoise` makes them, without a graph."""
+        """Return normalised actions (B, chunk, D), as `denoise` makes them, without a graph."""
         with torch.inference_mode():
             return self.denoise(batch, noise)
 
     def put_out(self, batch: dict[str, Tensor], seeds: Sequence[int]) -> NDArray[np.float32]:
-        """The actions from the noise of the seeds."""
+        """Return the actions from the noise of the seeds."""
         chunk: NDArray[np.float32] = self.infer(batch, self.noise(seeds)).float().cpu().numpy()
         return chunk
 
@@ -67,7 +68,7 @@ class DenoisingPolicy(LerobotPolicy):
             return self.restored(self.denoise(self.batch(observations), self.noise(seeds)))
 
     def noise(self, seeds: Sequence[int]) -> Tensor:
-        """(B, *noise_shape) float32 noise, a row per seed, the same on every device."""
+        """Return float32 noise (B, *noise_shape), a row per seed, the same on every device."""
         return seeded_noise(seeds, self.noise_shape, self.config.device)
 
     def replay(self, batch: dict[str, Tensor], recorded: Arrays) -> dict[str, NDArray[Any]]:
@@ -90,21 +91,25 @@ class LerobotFlow(DenoisingPolicy):
     @property
     @abstractmethod
     def _joint(self) -> Any:
-        """lerobot's module of backbone and expert, whose first pass reads the prompt."""
+        """The module of backbone and expert in lerobot, whose first pass reads the prompt."""
 
     @property
     @abstractmethod
     def iterations(self) -> int:
-        """Flow-matching steps per inference."""
+        """The number of flow-matching steps per inference."""
 
     @property
     def _kv_width(self) -> int:
-        """Heads times size of a head of the backbone's keys."""
+        """The number of heads times size of a head of the backbone's keys."""
         projection: Any = self.stacks["backbone"].layers[0]
         return int(projection.self_attn.k_proj.out_features)
 
     def denoise(self, batch: Mapping[str, Tensor], noise: Tensor) -> Tensor:
-        """See the base. Raises ObservationError as `check_pictures` does."""
+        """Return the actions as the base does.
+
+        Raises:
+            ObservationError: For pictures that `check_pictures` refuses.
+        """
         self.check_pictures(batch)
         with _with_graph(self.network.model):
             chunk: Tensor = undecorated(self.network.predict_action_chunk)(batch, noise=noise)
@@ -113,7 +118,7 @@ class LerobotFlow(DenoisingPolicy):
     # -- verification ------------------------------------------------------------------------------------
 
     def watched(self) -> dict[str, nn.Module]:
-        """The velocity, and the connector of a backbone that has one."""
+        """Return the velocity, and the connector of a backbone that has one."""
         model = self.network.model
         connected = hasattr(model, "vlm_with_expert")
         connector = {"connector_out": model.vlm_with_expert.vlm.model.connector} if connected else {}
@@ -124,7 +129,10 @@ class LerobotFlow(DenoisingPolicy):
         return {"backbone": self.stacks["backbone"].layers[0]}
 
     def further_outputs(self, run: RecordedRun) -> dict[str, Produce]:
-        """Prepared inputs, and the path of the flow: Euler steps x ← x - v/S from the network's velocities."""
+        """Return prepared inputs, and the path of the flow.
+
+        The path is made by Euler steps x ← x - v/S from the network's velocities.
+        """
         steps, noise = self.iterations, torch.from_numpy(run.recorded["in_noise"])
         prepare = getattr(self.network, "_preprocess_images", None) or self.network.prepare_images
 
@@ -150,14 +158,14 @@ class LerobotFlow(DenoisingPolicy):
 
 
 def undecorated(method: Callable[..., Any]) -> Callable[..., Any]:
-    """A bound method without the decorator that turns gradients off; itself if it has none."""
+    """Return a bound method without the decorator that turns gradients off; itself if it has none."""
     inner = getattr(getattr(method, "__func__", method), "__wrapped__", None)
     return method if inner is None else partial(inner, getattr(method, "__self__", None))
 
 
 @contextmanager
 def _with_graph(model: Any) -> Iterator[None]:
-    """lerobot's sampling of a flow, without the decorator of its own."""
+    """Run the body with lerobot's sampling of a flow without the decorator of its own."""
     # An attribute of the instance hides the method of its class; `del` uncovers it again.
     model.sample_actions = undecorated(model.sample_actions)
     try:
@@ -173,7 +181,12 @@ Tokens = list[tuple[int, str]]
 
 
 class PackedRow(NamedTuple):
-    """One packed observation. inputs: what lerobot packs, with a batch axis of 1. labels: a role per position."""
+    """One packed observation.
+
+    Attributes:
+        inputs: The tensors that lerobot packs, with a batch axis of 1.
+        labels: A role per position.
+    """
 
     inputs: dict[str, Tensor]
     labels: list[str]
@@ -187,13 +200,14 @@ class PackedRow(NamedTuple):
 def chat_labels(
     ids: Sequence[int], pictures: Iterable[str], picture: int, words: tuple[int, int], state: int | None = None
 ) -> list[str]:
-    """The role of every position of a chat: `language` between two marks, else `special`.
+    """Return the role of every position of a chat: `language` between two marks, else `special`.
 
     Args:
+        ids: The ids of the whole chat.
         pictures: The roles of the pictures, each a run of patches, in their order.
-        picture: The ids of a patch and of the state.
+        picture: The id of a patch.
         words: The ids of the marks; the first counts where it stands last.
-        state: As `picture`.
+        state: The id of the state; None for a chat without one.
     """
     begin = len(ids) - ids[::-1].index(words[0])
     end, roles, role = ids.index(words[1], begin), iter(pictures), ""
@@ -211,19 +225,20 @@ class PackedPolicy(DenoisingPolicy):
 
     masked_cameras = 0
     word_roles: ClassVar[tuple[str, ...]] = ("language", "special")
-    """The tokens that stand for an instruction where two are compared."""
+    """The roles of the tokens that stand for an instruction where two are compared."""
 
     @cached_property
     @abstractmethod
     def packing(self) -> Any:
-        """lerobot's packing; it has the `tokenizer`, and `row` and `batch` for `pack`."""
+        """The packing of lerobot; it has the `tokenizer`, and `row` and `batch` for `pack`."""
 
     def pack(
         self, observations: Sequence[Observation], state: NDArray[np.float32]
     ) -> tuple[dict[str, Tensor], list[Tokens]]:
-        """The observations as the network reads them, and of each its prompt without the actions.
+        """Return the observations as the network reads them, and of each its prompt without the actions.
 
         Args:
+            observations: The B rows of the batch.
             state: (B, numbers) as the network reads them.
 
         Raises:
@@ -241,18 +256,27 @@ class PackedPolicy(DenoisingPolicy):
         return self.packing.tokenizer
 
     def pictures_of(self, observation: Observation) -> dict[str, NDArray[np.uint8]]:
-        """The pictures (H, W, 3) of the shown cameras. Raises ObservationError."""
+        """The pictures (H, W, 3) of the shown cameras.
+
+        Raises:
+            ObservationError: For a picture of another dtype or shape.
+        """
         return {camera: self.picture_of(camera, observation) for camera in self.shown_cameras}
 
     def batch(
         self, observations: Sequence[Observation], state: NDArray[np.float32] | None = None
     ) -> dict[str, Tensor]:
-        """Return a batch in lerobot's keys. state: (B, numbers) as the network reads them."""
+        """Return a batch in lerobot's keys.
+
+        Args:
+            observations: The B rows of the batch.
+            state: (B, numbers) as the network reads them; None for that of the observations.
+        """
         inputs, _ = self.pack(observations, self.state(observations) if state is None else state)
         return {name: tensor.to(self.config.device) for name, tensor in inputs.items()}
 
     def roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
-        """Roles from the packing itself; streams besides the acting one have the backbone's tokens."""
+        """The roles from the packing itself; streams besides the acting one have the backbone's tokens."""
         state = self.read_state(observations)
         _, rows = self.pack(observations, self._no_state(len(observations)) if state is None else state)
         prompts = Roles.padded([[label for _, label in row] for row in rows])
@@ -282,11 +306,14 @@ class PackedPolicy(DenoisingPolicy):
 _TOKENIZER = "google/paligemma-3b-pt-224"
 _TOKENIZER_FILES = ("tokenizer*", "special_tokens_map.json", "added_tokens.json", "config.json")
 LEAST_BYTES = 1_000_000_000
-"""Of weights in the released sizes, which have 3 billion parameters or more."""
+"""The smallest size of the weights of a released size, which has 3 billion parameters or more."""
 
 
 def _check_small_weights(folder: Path) -> None:
-    """A small network that lost its `dims.json` would be built at full size, for minutes, before it is refused."""
+    """Raise CheckpointError for a small network that lost its `dims.json`.
+
+    It would be built at full size, for minutes, before it is refused.
+    """
     size = sum(file.stat().st_size for file in folder.glob("*.safetensors"))
     if 0 < size < LEAST_BYTES:
         raise CheckpointError(
@@ -315,7 +342,7 @@ class PaliGemmaPolicy(LerobotPolicy):
 
     @cached_property
     def tokenizer(self) -> Any:
-        """PaliGemma's, from the checkpoint folder or the hub."""
+        """The tokenizer of PaliGemma, from the checkpoint folder or the hub."""
         if (folder := self._tokenizer_folder()) is not None:
             return load_pretrained(AutoTokenizer, folder)
         repository = tokenizer_name(self.folder) or _TOKENIZER
@@ -335,7 +362,7 @@ class PaliGemmaPolicy(LerobotPolicy):
         return next((folder for folder in places if (folder / "tokenizer.json").is_file()), None)
 
     def side_files(self) -> dict[str, Path]:
-        """Also the sizes, where they lie beside the folder."""
+        """Return the files of the base, and the sizes where they lie beside the folder."""
         files, sizes = super().side_files(), self.folder.parent / "dims.json"
         return {**({"dims.json": sizes} if sizes.is_file() else {}), **files}
 
@@ -346,21 +373,21 @@ class PaliGemmaPolicy(LerobotPolicy):
 
     @property
     def masked_cameras(self) -> int:
-        """All that are not shown."""
+        """The number of cameras that are not shown."""
         return len(self.config.image_features) - len(self.shown_cameras)
 
     def prefix_labels(self, language: Sequence[str]) -> list[str]:
-        """Cameras without a picture are masked and lie behind the shown ones."""
+        """Return the labels of a row; cameras without a picture are masked and lie behind the shown ones."""
         images = [f"image.{camera}" for camera in self.shown_cameras for _ in range(self.tokens_per_camera)]
         return [*images, *[PADDING] * self.tokens_per_camera * self.masked_cameras, *language]
 
     def patch_order(self) -> NDArray[np.int64]:
-        """A token per patch, row by row."""
+        """Return a token per patch, row by row."""
         return np.arange(self.tokens_per_camera)
 
     @property
     def tokens_per_camera(self) -> int:
-        """Patches of one picture."""
+        """The number of patches of one picture."""
         vision = self.network.model.paligemma_with_expert.paligemma.model.vision_tower.vision_model
         return int(vision.embeddings.num_patches)
 
@@ -368,7 +395,7 @@ class PaliGemmaPolicy(LerobotPolicy):
 # -- prompts that hold the state ------------------------------------------------------------------------------
 
 BINS = np.linspace(-1, 1, 256 + 1)[:-1]
-"""Lower edges of the 256 bins of a normalised state, as lerobot's processor step of pi0.5 makes them."""
+"""The lower edges of the 256 bins of a normalised state, as lerobot's processor step of pi0.5 makes them."""
 _PROMPT = re.compile(
     r"Task: ?(?P<language>.*), ?State: ?(?P<state>[-\d ]*);\s*(?:Action:\s*)?\Z", re.DOTALL | re.IGNORECASE
 )
@@ -377,12 +404,12 @@ _LEFT_OUT = (PADDING, "state")
 
 
 def digits(state: NDArray[np.float32]) -> list[str]:
-    """(B, numbers) normalised to the numbers of their bins: 0 to 255, and -1 below the range."""
+    """Return normalised numbers (B, numbers) as the numbers of their bins: 0 to 255, and -1 below the range."""
     return [" ".join(map(str, row)) for row in np.digitize(state, BINS) - 1]
 
 
 def label_groups(pieces: Sequence[str], pattern: re.Pattern[str]) -> list[str]:
-    """A label per piece of a text: the named group of `pattern` that it has characters in, else `special`."""
+    """Return a label per piece of a text: the named group of `pattern` with characters in it, else `special`."""
     ends = np.cumsum([len(piece) for piece in pieces])
     labels = ["special"] * len(pieces)
     if (match := pattern.search("".join(pieces))) is None:
@@ -400,7 +427,7 @@ class StatePrompt(LerobotPolicy):
 
     other_roles: ClassVar[tuple[str, ...]] = ("language", "state", "special")
     prompt_end: ClassVar[str] = ""
-    """What follows the state."""
+    """The text behind the state."""
 
     def prompts(self, instructions: Sequence[str], state: NDArray[np.float32]) -> list[str]:
         """Return prompts as lerobot's processor steps of these policies word them."""
@@ -411,7 +438,7 @@ class StatePrompt(LerobotPolicy):
         ]
 
     def text_labels(self, ids: Sequence[int], valid: Sequence[bool]) -> list[str]:
-        """The instruction is `language`, the digits are `state`, and the words around them are `special`."""
+        """Return labels: `language` for the instruction, `state` for the digits, `special` for words around."""
         special = frozenset(self.tokenizer.all_special_ids)
         pieces = [
             "" if number in special or not is_text else piece.replace("\u2581", " ")

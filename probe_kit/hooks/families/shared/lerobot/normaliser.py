@@ -25,11 +25,11 @@ from probe_kit.models.bounds import check_bounds, check_deviations
 from probe_kit.models.pi0 import STATISTICS
 
 _EPS = 1e-8
-"""In denominators, where the checkpoint says no other: LeRobot's default."""
+"""The number in denominators, where the checkpoint says no other: LeRobot's default."""
 USUAL_DEVIATIONS = 5.0
-"""From the mean; values further away are unusual."""
+"""The number of deviations from the mean; values further away are unusual."""
 _ROUNDING = 1e-3
-"""Share of the range by which a value may lie outside of its bounds."""
+"""The share of the range by which a value may lie outside of its bounds."""
 _STEPS = (*NORMALISERS, *MASKED)
 # The two statistics each mode needs, as (offset-like, scale-like).
 _NEEDED = {
@@ -49,15 +49,17 @@ class Normaliser:
 
     Attributes:
         mode: MEAN_STD, MIN_MAX, QUANTILES, QUANTILE10, IDENTITY, or several in words.
-        low: (D,) float32, what stands for -1 and 1; mean and deviation of numbers that are `scored`.
-        high: As `low`.
-        eps: In place of a range or beside a deviation.
-        source: The file they come from.
+        low: (D,) float32, the values that stand for -1; the mean of numbers that are `scored`.
+        high: (D,) float32, the values that stand for 1; the deviation of numbers that are `scored`.
+        eps: A small number in place of a range or beside a deviation.
+        source: The file that the statistics come from.
         scored: (D,) which numbers are mapped by mean and deviation; None for what `mode` says.
-        plain: Those that stay as they are.
-        clamped: Those of the network that are moved to -1 to 1.
-        sign: The action that becomes −1 or 1, as LIBERO's gripper; None where there is none. Raises
-            CheckpointError for statistics that are not finite, or whose scale is not positive.
+        plain: Mask of the numbers that stay as they are.
+        clamped: Mask of the network's numbers that are moved to -1 to 1.
+        sign: Index of the action that becomes −1 or 1, as LIBERO's gripper; None where there is none.
+
+    Raises:
+        CheckpointError: For statistics that are not finite, or whose scale is not positive.
     """
 
     mode: str
@@ -91,7 +93,7 @@ class Normaliser:
         return np.asarray(np.where(self.high == self.low, self.eps, self.high - self.low), np.float32)
 
     def normalise(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Physical units to the numbers the network reads; (..., D). Without range and eps, 0."""
+        """Map physical units (..., D) to the numbers the network reads; 0 without range and eps."""
         mapped = values
         if self.mode != "IDENTITY":
             span, deviation = self._span, self.high + self.eps
@@ -102,14 +104,14 @@ class Normaliser:
         return np.asarray(np.where(self.clamped, mapped.clip(-1, 1), mapped), np.float32)
 
     def restore(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Network output to physical units; (..., D)."""
+        """Map network output (..., D) to physical units."""
         restored = self._line(np.where(self.clamped, values.clip(-1, 1), values))
         if self.sign is not None:
             restored[..., self.sign] = -np.sign(2 * restored[..., self.sign] - 1)
         return restored
 
     def _line(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(..., D): `restore` without what clamps or jumps."""
+        """Return `restore` of values (..., D) without what clamps or jumps."""
         if self.mode == "IDENTITY":
             return np.asarray(values, np.float32)
         bounded = (values + 1) / 2 * self._span + self.low
@@ -118,9 +120,9 @@ class Normaliser:
         return np.asarray(np.where(self.plain, values, np.where(self._scored, scores, bounded)), np.float32)
 
     def slopes(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(..., D) by how much `restore` changes per unit of these outputs; 0 where it clamps or jumps.
+        """Return (..., D) by how much `restore` changes per unit of these outputs; 0 where it clamps or jumps.
 
-        By two points, so that the slope is that of `restore` in every mode.
+        The slope is taken from two points, so that it is that of `restore` in every mode.
         """
         low, high = (self._line(np.full_like(values, value)) for value in (0, 1))
         slopes = np.asarray(np.where(self.clamped & (np.abs(values) > 1), 0, high - low), np.float32)
@@ -129,9 +131,9 @@ class Normaliser:
         return slopes
 
     def unusual(self, values: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """(..., D) which physical values are more than five deviations from the mean, or outside the bounds.
+        """Return (..., D) which physical values are over five deviations from the mean, or outside the bounds.
 
-        Also where `normalise` clamps; never of numbers without statistics.
+        They include values that `normalise` clamps, and never numbers without statistics.
         """
         if self.mode == "IDENTITY":
             return np.zeros(values.shape, bool)
@@ -142,9 +144,10 @@ class Normaliser:
 
 
 def read_normaliser(folder: Path, pipeline: str, feature: str, kind: str) -> Normaliser:
-    """The map of one feature from `<pipeline>.json` and the safetensors file it names.
+    """Read the map of one feature from `<pipeline>.json` and the safetensors file it names.
 
     Args:
+        folder: The folder of the checkpoint.
         pipeline: `policy_preprocessor` or `policy_postprocessor`.
         feature: `observation.state` or `action`.
         kind: The feature's type in lerobot's norm_map, `STATE` or `ACTION`.
@@ -205,11 +208,14 @@ def read_buffers(folder: Path) -> dict[str, NDArray[np.float32]]:
 def from_buffers(
     buffers: Mapping[str, NDArray[np.float32]], modes: Mapping[str, object], feature: str, kind: str, source: str
 ) -> Normaliser | None:
-    """The map of one feature from old buffers; None where the configuration normalises nothing.
+    """Return the map of one feature from old buffers; None where the configuration normalises nothing.
 
     Args:
+        buffers: The statistics among the weights, see `read_buffers`.
         modes: `normalization_mapping` of the configuration.
-        source: Whose weights they are, for messages.
+        feature: `observation.state` or `action`.
+        kind: The feature's type in `modes`, `STATE` or `ACTION`.
+        source: The checkpoint whose weights they are, for messages.
 
     Raises:
         CheckpointError: If a buffer is missing, or was never filled.
@@ -239,29 +245,32 @@ SHIPPED = ("bridge",)
 """Statistics that come with the package, by name."""
 NO_STATISTICS = "none"
 FILES = ("dataset_statistics.json", "bridge_statistics.json", "statistics.json")
-"""Under these names a checkpoint's folder may hold them."""
+"""The names under which a checkpoint's folder may hold statistics."""
 _OPEN = 0.5
-"""Of the network's own number for the gripper, which ends in 1 for open and 0 for closed."""
+"""The threshold of the network's own number for the gripper, which ends in 1 for open and 0 for closed."""
 
 
 @dataclass(frozen=True)
 class Bounds(Normaliser):
-    """p01 to -1 and p99 to 1. A state is clipped there; an action keeps its last number, open above a half."""
+    """A map of p01 to -1 and p99 to 1.
+
+    A state is clipped there; an action keeps its last number, open above a half.
+    """
 
     def normalise(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Physical units to the numbers the network reads; (..., D)."""
+        """Map physical units (..., D) to the numbers the network reads, clipped to -1 to 1."""
         scaled = 2 * (values - self.low) / (self.high - self.low + _EPS) - 1
         return np.asarray(scaled.clip(-1, 1), np.float32)
 
     def restore(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Network output to physical units, and the gripper to 1 open or 0 closed; (..., D)."""
+        """Map network output (..., D) to physical units, and the gripper to 1 open or 0 closed."""
         metres = super().restore(values)
         # From the number of the network itself, which the statistics do not scale.
         metres[..., -1] = values[..., -1] > _OPEN
         return metres
 
     def slopes(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(..., D) of `restore`; 0 of the gripper, which is open or closed."""
+        """Return the slopes of `restore` (..., D); 0 of the gripper, which is open or closed."""
         slopes = super().slopes(values)
         slopes[..., -1] = 0
         return slopes
@@ -269,7 +278,12 @@ class Bounds(Normaliser):
 
 @dataclass(frozen=True)
 class StatisticsFile:
-    """A statistics file. sha256: of its bytes, for the identity of what was made with it."""
+    """A statistics file.
+
+    Attributes:
+        sha256: Hash of its bytes, for the identity of what was made with it.
+        content: The parsed JSON object.
+    """
 
     name: str
     sha256: str
@@ -277,7 +291,11 @@ class StatisticsFile:
 
     @classmethod
     def read(cls, name: str) -> "StatisticsFile":
-        """Read a file, or one of `SHIPPED`. Raises CheckpointError if `name` is neither or the file is no JSON."""
+        """Read a file, or one of `SHIPPED`.
+
+        Raises:
+            CheckpointError: If `name` is neither or the file is no JSON.
+        """
         if name in SHIPPED:
             return cls._of(f"{name} statistics shipped with probe_kit", _shipped(name))
         path = Path(name).expanduser()
@@ -298,7 +316,11 @@ class StatisticsFile:
         return cls(name, hashlib.sha256(content).hexdigest(), values)
 
     def bounds(self, part: Literal["action", "proprio"], numbers: int) -> Bounds:
-        """p01 and p99 of actions or states. Raises CheckpointError unless they are `numbers` finite ones each."""
+        """The map by p01 and p99 of actions or states.
+
+        Raises:
+            CheckpointError: Unless they are `numbers` finite ones each.
+        """
         group = self.content.get(part)
         rows = [np.asarray(group.get(name, []), np.float64) if isinstance(group, dict) else None
                 for name in ("p01", "p99")]  # fmt: skip

@@ -26,7 +26,7 @@ from probe_kit.hooks.outputs import (
 )
 
 _MASKED = ("backbone_resid", "backbone_final_norm", "prefix_embs")
-"""Compared at valid positions only: padding holds plausible numbers that mean nothing."""
+"""The quantities that are compared at valid positions only: padding holds plausible numbers that mean nothing."""
 
 
 def lerobot_outputs(load: Callable[..., LerobotPolicy], folder: Path, recorded: Arrays) -> Outputs:

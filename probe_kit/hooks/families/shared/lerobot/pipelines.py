@@ -13,7 +13,7 @@ from probe_kit.errors import CheckpointError
 from probe_kit.hooks.checkpoints.checkpoint import shard_name
 
 Inert = Mapping[str, tuple[Any, ...] | None]
-"""Fields of a newer lerobot by name, with the values under which inference is as without them; None for any."""
+"""The fields of a newer lerobot by name, with the values under which inference is as without; None for any."""
 _DELTAS = "observation_delta_indices"
 
 
@@ -25,12 +25,14 @@ def known_values(
     source: Path,
     waived: bool = False,
 ) -> dict[str, Any]:
-    """`values` without the fields that do nothing here.
+    """Return `values` without the fields that do nothing here.
 
     Args:
+        values: The content of the file.
         read_fields: Fields that the installed lerobot reads.
-        inert: Of a newer one.
-        unread: Those that the caller says change nothing.
+        inert: Fields of a newer one, with the values under which they do nothing.
+        unread: Fields that the caller says change nothing.
+        source: The file, for messages.
         waived: Whether users can say so, with -M unread.
 
     Raises:
@@ -89,17 +91,17 @@ _HARMLESS = (
     "rename_observations_processor", "to_batch_processor", "to_batch_processor_action",
     "to_batch_processor_observation", "to_batch_processor_complementary_data", "device_processor",
 )  # fmt: skip
-"""Steps that change no number: observations come here under the names of the policy."""
+"""The steps that change no number: observations come here under the names of the policy."""
 RELATIVE = ("relative_actions_processor", "absolute_actions_processor")
 NORMALISERS = ("normalizer_processor", "unnormalizer_processor")
 TOKENIZER, CROP = "tokenizer_processor", "image_crop_resize_processor"
 MASKED = ("molmoact2_masked_normalizer", "molmoact2_masked_unnormalizer")
 _ANY = None
-"""Values that are all honoured, or that change no number here."""
+"""The mark of values that are all honoured, or that change no number here."""
 _NORMALISED = dict.fromkeys(("eps", "features", "norm_map", "normalize_observation_keys"), _ANY)
 _FRAME = dict.fromkeys(("joint_signs", "joint_offsets"), _ANY)
 _TASK = ("task",)
-"""Where lerobot puts the instruction."""
+"""The values of `task_key` that are honoured: lerobot puts the instruction there."""
 _FIELDS: Mapping[str, Mapping[str, tuple[Any, ...] | None]] = {
     "rename_observations_processor": {"rename_map": _ANY},
     "device_processor": {"device": _ANY, "float_dtype": (None, "float32")},
@@ -145,7 +147,13 @@ _AGAIN = "Download the checkpoint again"
 
 @dataclass(frozen=True)
 class SavedStep:
-    """One step. name: in lerobot's registry, or a class. config: its fields. state: the file of its tensors."""
+    """One step of a saved pipeline.
+
+    Attributes:
+        name: The name in lerobot's registry, or a class.
+        config: The fields of the step.
+        state: The file of its tensors; None for a step without tensors.
+    """
 
     name: str
     config: Mapping[str, Any]
@@ -153,7 +161,11 @@ class SavedStep:
 
 
 def saved_steps(folder: Path, pipeline: str) -> tuple[SavedStep, ...]:
-    """The steps in `<pipeline>.json`, in order; none where the file is missing. Raises CheckpointError."""
+    """The steps in `<pipeline>.json`, in order; none where the file is missing.
+
+    Raises:
+        CheckpointError: For a file that lists no steps, or a step with other entries than lerobot's.
+    """
     path = folder / f"{pipeline}.json"
     if not path.is_file():
         return ()
@@ -191,6 +203,8 @@ def check_steps(folder: Path, pipeline: str, family_steps: Collection[str]) -> N
     """Raise CheckpointError for a step or a field whose effect is unknown here, and for normalised pictures.
 
     Args:
+        folder: The folder of the checkpoint.
+        pipeline: `policy_preprocessor` or `policy_postprocessor`.
         family_steps: Names of steps besides the harmless ones.
     """
     steps = saved_steps(folder, pipeline)
@@ -218,8 +232,9 @@ def check_values(values: Mapping[str, Any], honoured: Mapping[str, tuple[Any, ..
     """Raise CheckpointError for a field whose effect is unknown here, and for a value that is not honoured.
 
     Args:
+        values: The fields, by name.
         honoured: Fields with the values that are honoured; None for any.
-        subject: The file and the part of it.
+        subject: The file and the part of it, for messages.
     """
     for name, value in values.items():
         if name not in honoured:
@@ -236,7 +251,14 @@ def check_values(values: Mapping[str, Any], honoured: Mapping[str, tuple[Any, ..
 
 
 def check_same(folder: Path, step: str, saved: Mapping[str, Any], configured: Mapping[str, Any]) -> None:
-    """Raise CheckpointError for what a step was saved with, None for nothing, and `config.json` says otherwise."""
+    """Raise CheckpointError for a value that a step was saved with where `config.json` says otherwise.
+
+    Args:
+        folder: The folder of the checkpoint.
+        step: Name of the step, for messages.
+        saved: The fields of the step; None stands for no value.
+        configured: The fields as `config.json` has them.
+    """
     wrong = [
         f"{name}: {saved[name]!r} (config.json: {value!r})"
         for name, value in configured.items()
@@ -261,7 +283,7 @@ def tokenizer_folder(folder: Path) -> Path | None:
 
 
 def _normalised_pictures(folder: Path, step: SavedStep) -> list[str]:
-    """Features whose pictures lerobot would change: it does so where it has statistics of them."""
+    """Return features whose pictures lerobot would change: it does so where it has statistics of them."""
     if (step.config.get("norm_map") or {}).get("VISUAL", "IDENTITY") == "IDENTITY" or step.state is None:
         return []
     pictures = [
@@ -282,7 +304,7 @@ def adds_state(folder: Path) -> bool:
 
 
 def text_length(folder: Path) -> int | None:
-    """Positions that the text is padded to; None where no step says."""
+    """Return the number of positions that the text is padded to; None where no step says it."""
     length = step_fields(folder).get(TOKENIZER, {}).get("max_length")
     return None if length is None else int(length)
 

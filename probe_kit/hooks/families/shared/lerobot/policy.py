@@ -1,6 +1,6 @@
 """Base adapter of lerobot's policies: loading, batches, units, prompts, roles.
 
-Never lerobot's own `from_pretrained`: it returns partly or fully random models without an error.
+The `from_pretrained` of lerobot is never used: it returns partly or fully random models without an error.
 """
 
 from abc import abstractmethod
@@ -58,14 +58,14 @@ from probe_kit.models.building import WithoutFilling, initialise
 from probe_kit.models.decoding import PromptKV
 
 MOST_TOKENS = 1 << 16
-"""Of a prompt: far beyond any policy, and no memory without end."""
+"""The most tokens of a prompt: far beyond any policy, and no memory without end."""
 TOKENS, MASK = "observation.language.tokens", "observation.language.attention_mask"
 UNCOMPARED = ("IDENTITY", "EXCLUDED")
-"""Modes of units without statistics: the state is read as it is, or not at all."""
+"""The modes of units without statistics: the state is read as it is, or not at all."""
 _DIMENSIONS = 7
-"""Of the arm's actions."""
+"""The count of numbers of the arm's actions."""
 TEXT_FILES = (*SMALL_FILES, "policy_*.safetensors")
-"""All that packing and tokenising read: of the weights only those of lerobot's processors."""
+"""The files that packing and tokenising read: of the weights only those of lerobot's processors."""
 _VISION = "vision"
 """The stream of a vision tower."""
 
@@ -73,8 +73,7 @@ _VISION = "vision"
 class LerobotPolicy(Policy):
     """A lerobot policy behind the Policy contract; subclasses say how it packs its sequence and puts out actions.
 
-    cameras: those that a picture can be given for. shown_cameras: those that get one, in the configuration's
-    order.
+    `cameras` are those that a picture can be given for; `shown_cameras` get one, in the configuration's order.
     """
 
     family: ClassVar[str]
@@ -85,27 +84,33 @@ class LerobotPolicy(Policy):
     unread: ClassVar[tuple[str, ...]] = ()
     """Parameters that inference never reads and a file may lack."""
     tied: ClassVar[Mapping[str, str]] = MappingProxyType({})
-    """By the name of a tensor that a file may lack, the one tied to it, which is read in its place."""
+    """The tied tensor that is read in its place, by the name of a tensor that a file may lack."""
     current_names: ClassVar[Callable[[Mapping[str, Tensor]], dict[str, Tensor]]] = dict
-    """From a file's tensors to those under the names that the network has."""
+    """Maps a file's tensors to those under the names that the network has."""
     newer_fields: ClassVar[Inert] = {}
-    """Fields of its configuration in a newer lerobot than the installed one."""
+    """The fields of its configuration in a newer lerobot than the installed one."""
     takes_unread: ClassVar[bool] = False
     """Whether users can say with -M unread which fields change nothing."""
     known_steps: ClassVar[tuple[str, ...] | None] = (CROP,)
     """Steps of lerobot's processors that only this family has; None where it reads the pipelines itself."""
     other_roles: ClassVar[tuple[str, ...]] = ("language", "state", "special")
-    """What positions of the backbone hold besides pictures and padding."""
+    """The roles of positions of the backbone besides pictures and padding."""
     passages: PromptKV
-    """Where keys and values of the prompt pass, in families that have `prompt_kv`."""
+    """The modules through which keys and values of the prompt pass, in families that have `prompt_kv`."""
     prompt_tokens: ClassVar[slice] = ALL_TOKENS
-    """Of the prompt's keys and values, those of the backbone."""
+    """The backbone's tokens among those of the prompt's keys and values."""
     acting_stream: ClassVar[str]
     suffix_roles: ClassVar[tuple[str, ...]] = ("action",)
-    """What positions of the acting stream hold."""
+    """The roles of positions of the acting stream."""
 
     def __init__(self, network: Any, folder: Path, checkpoint: str) -> None:
-        """checkpoint: the name by which `folder` was requested."""
+        """Make the adapter.
+
+        Args:
+            network: The policy of lerobot, with its configuration.
+            folder: The folder of the checkpoint.
+            checkpoint: The name by which `folder` was requested.
+        """
         self.network, self.folder, self.checkpoint = network, folder, checkpoint
         self.config, self.evaluation = network.config, network.config.evaluation
         self.stacks = self._stacks()
@@ -114,7 +119,7 @@ class LerobotPolicy(Policy):
         self._show(self.cameras[:1])
 
     def with_cameras(self, cameras: Sequence[str]) -> Self:
-        """The same policy, given pictures of several cameras; all but the first from `Observation.cameras`.
+        """Return the same policy, given pictures of several cameras; all but the first from `Observation.cameras`.
 
         Raises:
             ObservationError: Unless they are the first ones of the configuration, in its order: lerobot moves
@@ -150,7 +155,7 @@ class LerobotPolicy(Policy):
     @classmethod
     @abstractmethod
     def build(cls, config: Any, folder: Path) -> Any:
-        """The network with uninitialised weights."""
+        """Build the network with uninitialised weights."""
 
     @classmethod
     def current_keys(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -173,7 +178,7 @@ class LerobotPolicy(Policy):
     @property
     @abstractmethod
     def masked_cameras(self) -> int:
-        """Cameras without a picture that still occupy positions, masked, after the shown ones."""
+        """The number of cameras without a picture that still occupy positions, masked, after the shown ones."""
 
     def prefix_labels(self, language: Sequence[str]) -> list[str]:
         """The role of every backbone position of one row, from those of its language positions."""
@@ -190,7 +195,10 @@ class LerobotPolicy(Policy):
 
     @abstractmethod
     def put_out(self, batch: dict[str, Tensor], seeds: Sequence[int]) -> NDArray[np.float32]:
-        """(B, chunk, action numbers) as the network puts them out, of a batch in lerobot's keys; one inference."""
+        """Return (B, chunk, action numbers) as the network puts them out for a batch in lerobot's keys.
+
+        It is one inference.
+        """
 
     # -- loading -----------------------------------------------------------------------------------------
 
@@ -207,9 +215,12 @@ class LerobotPolicy(Policy):
         """Load a lerobot checkpoint from a folder or hub id.
 
         Args:
-            dtype: float32 or bfloat16; default what the checkpoint's config says.
+            checkpoint: Folder or hub id.
+            device: Device in torch's spelling, such as `cuda:0`.
+            dtype: float32 or bfloat16; None takes what the checkpoint's config says.
             random_weights: Same architecture, tokenizer and statistics, but random weights of `weights_seed`.
-            **options: What its files do not say, the fields of `choice`.
+            weights_seed: Seed of random weights.
+            **options: Choices that its files do not make, the fields of `choice`.
 
         Raises:
             CheckpointError: For missing files.
@@ -275,10 +286,11 @@ class LerobotPolicy(Policy):
 
     @classmethod
     def parse_config(cls, folder: Path, evaluation: Any) -> Any:
-        """lerobot's configuration object of the folder's `config.json`, also of one that a newer lerobot wrote.
+        """Return lerobot's configuration object of the folder's `config.json`, also of a newer lerobot's.
 
         Args:
-            evaluation: Of `choice`.
+            folder: The folder of the checkpoint.
+            evaluation: The options of the loader, an instance of `choice`.
 
         Raises:
             CheckpointError: For a policy of another kind, and for a field that may change inference.
@@ -300,23 +312,26 @@ class LerobotPolicy(Policy):
 
     @classmethod
     def current_values(cls, values: dict[str, Any], path: Path) -> dict[str, Any]:
-        """The fields of `config.json` under the names that the installed lerobot has. Raises CheckpointError."""
+        """Return the fields of `config.json` under the names that the installed lerobot has.
+
+        A family that renames some raises CheckpointError for values that it cannot translate.
+        """
         del path
         return values
 
     def further_settings(self) -> dict[str, str]:
-        """Settings that numbers depend on besides weights and side files; empty where a checkpoint holds all."""
+        """Return settings that numbers depend on besides weights and side files; empty where files hold all."""
         return {}
 
     def side_files(self) -> dict[str, Path]:
-        """Every file besides the weights that loading and acting read: configuration, units, window, text."""
+        """Return every file besides the weights that loading and acting read: config, units, window, text."""
         files = side_files(self.folder)
         for prefix, folder in self.parts().items():
             files |= side_files(folder, f"{prefix}/")
         return files
 
     def parts(self) -> dict[str, Path]:
-        """Further folders that it reads, such as that of a vision-language model's tokenizer, by a name."""
+        """Return further folders that it reads, such as that of a vision-language model's tokenizer, by a name."""
         return {}
 
     def _notes(self) -> tuple[str, ...]:
@@ -337,18 +352,18 @@ class LerobotPolicy(Policy):
     # -- acting ------------------------------------------------------------------------------------------
 
     def act(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
-        """One chunk of actions per observation; see the contract."""
+        """Return one chunk of actions per observation; see the contract."""
         self.check_acting(observations, seeds)
         return self.action_units.restore(self.put_out(self.batch(observations), seeds))
 
     def check_acting(self, observations: Sequence[Observation], seeds: Sequence[int]) -> None:
-        """Also raise CheckpointError for a checkpoint whose actions the arm cannot execute."""
+        """Check observations, and raise CheckpointError for a checkpoint whose actions the arm cannot execute."""
         self.check(observations, seeds)
         if (reason := self._action_misfit()) is not None:
             raise CheckpointError(reason)
 
     def restored(self, output: Tensor) -> Tensor:
-        """(..., D) float32 actions, bit for bit those of `act`, with the graph of the network's output."""
+        """Return float32 actions (..., D), bit for bit those of `act`, with the graph of the network's output."""
         # The numbers of numpy's `restore`, on which a term of value zero hangs that carries the gradient.
         values = output.float()
         plain = values.detach().cpu().numpy()
@@ -361,7 +376,7 @@ class LerobotPolicy(Policy):
     def infer_without_acting(
         self, observations: Sequence[Observation], seeds: Sequence[int]
     ) -> NDArray[np.float32]:
-        """(B, chunk, action numbers) as the network puts them out, without units."""
+        """Return (B, chunk, action numbers) as the network puts them out, without units."""
         self.check(observations, seeds)
         zeros = (
             np.zeros((len(observations), self.state_numbers), np.float32) if self.zero_filled_inputs() else None
@@ -369,7 +384,7 @@ class LerobotPolicy(Policy):
         return self.put_out(self.batch(observations, zeros), seeds)
 
     def predict(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
-        """One chunk per recorded observation, by the checkpoint's own statistics; see the contract."""
+        """Return one chunk per recorded observation, by the checkpoint's own statistics; see the contract."""
         self.check(observations, seeds)
         states = np.stack([np.asarray(observation.state, np.float32) for observation in observations])
         if states.shape[1] != self.state_numbers:
@@ -392,12 +407,12 @@ class LerobotPolicy(Policy):
         return tuple(map(str, names)) if names and len(names) == count else None
 
     def unusual_states(self, states: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """(n, D): more than five deviations from the mean, or outside the bounds of the statistics."""
+        """Return (n, D): more than five deviations from the mean, or outside the bounds of the statistics."""
         return self.state_units.unusual(states)
 
     @property
     def unguarded_state(self) -> str | None:
-        """Also for a checkpoint that reads the state as it is, or without its units."""
+        """The reason also for a checkpoint that reads the state as it is, or without its units."""
         try:
             units = self.state_units
         except CheckpointError as error:
@@ -407,7 +422,7 @@ class LerobotPolicy(Policy):
         return None
 
     def unusual_actions(self, actions: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """(n, D): more than five deviations from the mean, or outside the bounds of the statistics."""
+        """Return (n, D): more than five deviations from the mean, or outside the bounds of the statistics."""
         return self.action_units.unusual(actions)
 
     @cached_property
@@ -416,15 +431,15 @@ class LerobotPolicy(Policy):
         return bool(getattr(self.config, "use_relative_actions", False)) or adds_state(self.folder)
 
     def embodiment_mismatch(self) -> str | None:
-        """Other actions than an end-effector delta, another state, or no units for either."""
+        """Return a reason for other actions than an end-effector delta, another state, or no units for either."""
         return self._action_misfit() or self._state_misfit()
 
     def zero_filled_inputs(self) -> tuple[str, ...]:
-        """The state, where it has other numbers than the arm's, or no units."""
+        """Return the state, where it has other numbers than the arm's, or no units."""
         return ("state",) if self._state_misfit() else ()
 
     def configured_mismatch(self) -> str | None:
-        """Other actions than an end-effector delta."""
+        """Return a reason for other actions than an end-effector delta."""
         dimensions = self.config.output_features["action"].shape[0]
         if dimensions != _DIMENSIONS:
             return f"{self.checkpoint} acts in {dimensions} dimensions; the arm needs a 7-DoF end-effector delta"
@@ -462,9 +477,10 @@ class LerobotPolicy(Policy):
     def batch(
         self, observations: Sequence[Observation], state: NDArray[np.float32] | None = None
     ) -> dict[str, Tensor]:
-        """The observations in lerobot's keys; the environment's picture goes to the first camera.
+        """Return the observations in lerobot's keys; the environment's picture goes to the first camera.
 
         Args:
+            observations: The B rows of the batch.
             state: (B, numbers) as the network reads them; None for that of the observations.
         """
         device = self.config.device
@@ -478,7 +494,11 @@ class LerobotPolicy(Policy):
         }
 
     def state(self, observations: Sequence[Observation]) -> NDArray[np.float32]:
-        """(B, numbers) as the network reads them. Raises ObservationError for another count of numbers."""
+        """Return the states (B, numbers) as the network reads them.
+
+        Raises:
+            ObservationError: For another count of numbers.
+        """
         rows = self.laid_out(np.stack([np.asarray(o.state, np.float32) for o in observations]))
         if rows.shape[1] != self.state_numbers:
             raise ObservationError(
@@ -487,30 +507,38 @@ class LerobotPolicy(Policy):
         return self.state_units.normalise(rows)
 
     def _pictures(self, camera: str, observations: Sequence[Observation]) -> Tensor:
-        """(B, 3, H, W) in [0, 1]: each picture as this checkpoint looks at it."""
+        """Return the pictures of a camera (B, 3, H, W) in [0, 1], each as this checkpoint looks at it."""
         return self.look(camera, [self.picture_of(camera, observation) for observation in observations])
 
     def picture_of(self, camera: str, observation: Observation) -> NDArray[np.uint8]:
-        """(H, W, 3); the first camera is shown the environment's picture. Raises ObservationError."""
+        """The picture (H, W, 3) of a camera; the first camera is shown the environment's picture.
+
+        Raises:
+            ObservationError: For a picture of another dtype or shape.
+        """
         return checked_picture(observation.image if camera == self.cameras[0] else observation.cameras[camera])
 
     def look(self, camera: str, images: Sequence[NDArray[np.uint8]]) -> Tensor:
-        """(B, 3, H, W) in [0, 1]: the part of each picture (H, W, 3) that this checkpoint looks at."""
+        """Return the part of each picture (H, W, 3) that this checkpoint looks at, (B, 3, H, W) in [0, 1]."""
         rows = torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2)
         return self.window(camera)(rows.to(self.config.device).float() / 255)
 
     def prompts(self, instructions: Sequence[str], state: NDArray[np.float32]) -> list[str]:
-        """The text that is read, per instruction. state: (B, numbers) as the network reads them."""
+        """The text that is read, per instruction; `state` is (B, numbers) as the network reads them."""
         del state
         return [text if text.endswith("\n") else f"{text}\n" for text in instructions]
 
     def tokenise(
         self, instructions: Sequence[str], state: NDArray[np.float32] | None = None
     ) -> tuple[Tensor, Tensor]:
-        """(B, tokenizer_max_length) ids and mask; never truncates and never drops a word.
+        """Return ids and mask (B, tokenizer_max_length); never truncates and never drops a word.
 
         Args:
+            instructions: One per row.
             state: (B, numbers) as the network reads them, for prompts that hold it; None for zeros.
+
+        Raises:
+            InstructionError: For a prompt that is too long, and for a word that the tokenizer does not know.
         """
         if state is None:
             state = np.zeros((len(instructions), self.state_numbers), np.float32)
@@ -540,7 +568,7 @@ class LerobotPolicy(Policy):
 
     @classmethod
     def _text_reader(cls, checkpoint: str, options: Mapping[str, Any]) -> Self:
-        """Return a policy without a network, which still packs and tokenises. options: of its loader."""
+        """Return a policy without a network, which packs and tokenises; `options` are those of its loader."""
         text = cls.__new__(cls)
         text.folder, text.evaluation = checkpoint_folder(checkpoint, TEXT_FILES), cls.choice(**options)
         text.config = cls._read_config(text.folder, text.evaluation)
@@ -560,16 +588,28 @@ class LerobotPolicy(Policy):
 
     @cached_property
     def state_units(self) -> Normaliser:
-        """Metres and radians to what the network reads. Raises CheckpointError if nothing says."""
+        """The map from metres and radians to what the network reads.
+
+        Raises:
+            CheckpointError: If nothing says it.
+        """
         return self.units_of(STATE, "STATE")
 
     @cached_property
     def action_units(self) -> Normaliser:
-        """The units that turn the network's output into metres and radians. Raises CheckpointError."""
+        """The units that turn the network's output into metres and radians.
+
+        Raises:
+            CheckpointError: If nothing says them.
+        """
         return self.units_of("action", "ACTION")
 
     def units_of(self, feature: str, kind: str) -> Normaliser:
-        """The units of one feature, STATE or ACTION."""
+        """Return the units of one feature, STATE or ACTION.
+
+        Raises:
+            CheckpointError: If nothing says them.
+        """
         if (units := self.own_units(feature, kind)) is not None:
             return units
         raise CheckpointError(
@@ -578,7 +618,11 @@ class LerobotPolicy(Policy):
         )
 
     def own_units(self, feature: str, kind: str) -> Normaliser | None:
-        """The units in the checkpoint's processor files or old buffers; None if it normalises nothing."""
+        """Return the units in the checkpoint's processor files or old buffers; None if it normalises nothing.
+
+        Raises:
+            CheckpointError: For statistics that are missing, or of another count of numbers.
+        """
         pipeline = PREPROCESSOR if kind == "STATE" else POSTPROCESSOR
         self._check_steps(self.folder, pipeline)  # behind the policy only actions depend on them
         if (self.folder / f"{pipeline}.json").is_file():
@@ -600,13 +644,13 @@ class LerobotPolicy(Policy):
     # -- capture -----------------------------------------------------------------------------------------
 
     def roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
-        """Prefix and suffix as the family packs them."""
+        """The roles of prefix and suffix as the family packs them."""
         return self.packed_roles(
             *self.tokenise([o.instruction for o in observations], self.read_state(observations))
         )
 
     def read_state(self, observations: Sequence[Observation]) -> NDArray[np.float32] | None:
-        """(B, numbers) as the network reads them; None where it is given zeros in place of the arm's state.
+        """Return (B, numbers) as the network reads them; None where it is given zeros in place of the arm's state.
 
         A recorded state of the checkpoint's own width is read, whatever the arm has.
         """
@@ -633,7 +677,7 @@ class LerobotPolicy(Policy):
         return [label if is_text else PADDING for label, is_text in zip(labels, valid, strict=True)]
 
     def read_late_files(self) -> None:
-        """The tokenizer."""
+        """Read the tokenizer."""
         self.tokenizer  # noqa: B018 - read once, and kept
 
     def token_ids(self, instructions: Sequence[str]) -> list[tuple[int, ...]]:
@@ -653,30 +697,34 @@ class LerobotPolicy(Policy):
     def replay(self, batch: dict[str, Tensor], recorded: Arrays) -> dict[str, NDArray[Any]]:
         """Return what the network puts out with the randomness of a golden reference.
 
-        `actions` (B, chunk, action numbers), and what else only this inference has.
+        These are `actions` (B, chunk, action numbers), and quantities that only this inference has.
         """
 
     def watched(self) -> dict[str, nn.Module]:
-        """Modules whose outputs a golden reference holds, by the name of the quantity."""
+        """Return modules whose outputs a golden reference holds, by the name of the quantity."""
         return {}
 
     def watched_inputs(self) -> dict[str, nn.Module]:
-        """Modules whose inputs `further_outputs` reads, by any name."""
+        """Return modules whose inputs `further_outputs` reads, by any name."""
         return {}
 
     def recorded_padding(self, recorded: Arrays) -> NDArray[np.bool_]:
-        """(B, T): the validity of every backbone position for recorded ids, by the adapter's own roles."""
+        """Return (B, T): the validity of every backbone position for recorded ids, by the adapter's own roles."""
         tokens, mask = (torch.from_numpy(recorded[name]) for name in ("in_lang_tokens", "in_lang_mask"))
         return np.stack([row.valid for row in self.packed_roles(tokens, mask.bool())["backbone"]])
 
     def further_outputs(self, run: RecordedRun) -> dict[str, Produce]:
-        """Quantities of a golden reference that only this family has, or has in another form."""
+        """Return quantities of a golden reference that only this family has, or has in another form."""
         del run
         return {}
 
 
 def checked_steps(steps: int, folder: Path) -> int:
-    """The number of flow steps. Raises CheckpointError for none, with which the action would be the noise."""
+    """Return the number of flow steps.
+
+    Raises:
+        CheckpointError: If there are none: the action would then be the noise.
+    """
     if steps < 1:
         raise CheckpointError(f"{folder} makes {steps} flow steps: its action would be noise. Expected 1 or more")
     return steps

@@ -21,9 +21,9 @@ class PictureWindow:
     """Crop, then resize (bilinear, antialiased) as lerobot's `ImageCropResizeProcessorStep` does.
 
     Attributes:
-        crop: Top, left, height, width in pixels of the camera, or None.
-        size: (height, width) after, or None.
-        camera: (height, width) of the pictures that `crop` was chosen on; others are brought to it first, with
+        crop: Top, left, height, width in pixels of the camera; None for the whole picture.
+        size: (height, width) after; None leaves the size.
+        camera: (height, width) of the pictures that `crop` was chosen on. Others are brought to it first, with
             their proportions kept by padding, as pi0 brings pictures to its own resolution. None for any.
     """
 
@@ -32,7 +32,11 @@ class PictureWindow:
     camera: tuple[int, int] | None = None
 
     def __call__(self, pictures: Tensor) -> Tensor:
-        """(B, 3, H, W) in [0, 1] to what the policy looks at. Raises ObservationError if the crop lies outside."""
+        """Return the region of pictures (B, 3, H, W) in [0, 1] that the policy looks at.
+
+        Raises:
+            ObservationError: If the crop lies outside.
+        """
         if self.crop is not None:
             if self.camera is not None and self.camera != tuple(pictures.shape[-2:]):
                 pictures = resize_with_pad_torch(pictures, *self.camera)
@@ -49,9 +53,11 @@ class PictureWindow:
 
 
 def read_window(folder: Path, camera: str, size: tuple[int, int] | None = None) -> PictureWindow:
-    """The window of one camera (`observation.images.<name>`); the whole picture if the checkpoint names none.
+    """The window of one camera; the whole picture if the checkpoint names none.
 
     Args:
+        folder: The folder of the checkpoint.
+        camera: Name of the feature, `observation.images.<name>`.
         size: (height, width) of that camera, as the checkpoint's configuration declares it.
 
     Raises:
@@ -68,14 +74,17 @@ def read_window(folder: Path, camera: str, size: tuple[int, int] | None = None) 
 
 
 def squashed(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
-    """(H, W, 3) uint8 at `size` (height, width), proportions given up, with the filter of INT-ACT's client."""
+    """Resize (H, W, 3) uint8 to `size` (height, width), proportions given up.
+
+    The filter is that of INT-ACT's client.
+    """
     height, width = size
     resized: NDArray[np.uint8] = np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_LANCZOS4))
     return resized
 
 
 def padded_top_left(pictures: Tensor, size: tuple[int, int]) -> Tensor:
-    """(B, 3, H, W) in [0, 1] at `size`, proportions kept, black on the left and top: lerobot until 0.3."""
+    """Resize (B, 3, H, W) in [0, 1] to `size`, proportions kept, black on the left and top: lerobot until 0.3."""
     height, width = size
     return torch.as_tensor(resize_with_pad(pictures, width, height, pad_value=0)).clamp(0.0, 1.0)
 
