@@ -198,7 +198,9 @@ def instruction_for(object_phrase: str, article: str) -> str:
 
 
 def side_words(text: str) -> tuple[str, ...]:
-    """Return the words that name a side or a place in a row: they would collide with the answers left and right.
+    """Return the words that name a side or a place in a row: they would collide with the answers.
+
+    The answers are left and right.
     """
     return tuple(word for word in re.findall(r"[a-z]+", text.lower()) if word in _SIDE_WORDS)
 

@@ -238,7 +238,7 @@ def suite_from_csv(
     category: str = DEFAULT_CATEGORY,
     terms: Terms,
 ) -> Suite:
-    """Make a suite in `folder` that asks the questions in the rows of `table`; the answer lies left and right in turn.
+    """Make a suite in `folder` of the questions in the rows of `table`; the answer lies left and right in turn.
 
     Columns `instruction`, `correct` and `wrong` are needed. Optional columns are `group`, `category` (otherwise
     the argument `category`), `object` (otherwise the words after "on the" in the instruction) and `other_object`.

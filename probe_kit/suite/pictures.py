@@ -70,8 +70,7 @@ def encode_png(image: Image.Image) -> bytes:
 
 
 def picture_size(encoded: bytes) -> tuple[int, int] | None:
-    """Return width and height in pixels as the file's header states them; None if it is no picture of `FORMATS`.
-    """
+    """Return width and height in pixels from the file's header; None if it is no picture of `FORMATS`."""
     try:
         with _opened(encoded) as image:
             return image.size
@@ -248,8 +247,7 @@ def letterboxed(image: Image.Image) -> Image.Image:
 
 
 def difference_hash(image: Image.Image) -> int:
-    """Return 64 bits that say where brightness falls from left to right; nearly equal for nearly equal pictures.
-    """
+    """Return 64 bits that say where brightness falls from left to right; similar for similar pictures."""
     small = image.convert("L").resize((9, 8), Image.Resampling.LANCZOS).tobytes()
     bits = 0
     for row in range(8):

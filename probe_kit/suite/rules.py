@@ -148,7 +148,9 @@ def _check_wordings(wordings: object, where: str) -> Iterator[Finding]:
 
 
 def _check_text(name: str, text: str, where: str) -> Iterator[Finding]:
-    """Check E02: no text is endless, contains terminal control characters, or looks like another with other bytes.
+    """Check E02: no text is endless, contains terminal control characters, or looks like other bytes.
+
+    A text in decomposed characters looks like the same text in Unicode's form NFC.
     """
     longest = LONGEST_NAME if name in _NAMES else LONGEST_FIELD
     if len(text.encode(errors="replace")) > longest:

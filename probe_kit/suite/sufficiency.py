@@ -82,8 +82,7 @@ class Smallest:
         return f"{self.category}: {counted(self.items, 'item')} in {counted(self.groups, 'independent group')}"
 
     def items_for(self, groups: int) -> int | None:
-        """Return the fewest items that `--items` can select with so many groups; None if the whole suite lacks them.
-        """
+        """Return the fewest items that `--items` can select with so many groups; None if the suite lacks them."""
         items = [item for item in self.suite.items if item.category == self.category]
         for number in range(1, len(items) + 1):
             apart = {member.pair_id for member in items[:number]} & {member.pair_id for member in items[number:]}

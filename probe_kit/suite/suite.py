@@ -106,7 +106,7 @@ class Suite:
 
     @property
     def seed_text(self) -> str:
-        """The text `name@version#first12` of the questions, with which the suite's intervals and p values are seeded.
+        """The text `name@version#first12` of the questions; it seeds the suite's intervals and p values.
 
         Two suites of one name and version that differ in pairs alone give the same draws.
         """

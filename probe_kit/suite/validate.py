@@ -269,7 +269,9 @@ def run_baselines(
 
 
 def save_baselines(suite: Suite, baselines: Sequence[Baseline]) -> Path:
-    """Write `baselines.json` to the suite's folder, with the balance of sides and roles; no part of the suite's hash.
+    """Write `baselines.json` to the suite's folder, with the balance of sides and roles.
+
+    The file is no part of the suite's hash.
     """
     path = suite.folder / FILE_NAME
     roles: dict[str, dict[str, dict[str, int]]] = {}

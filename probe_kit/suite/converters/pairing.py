@@ -84,8 +84,7 @@ def pair_candidates(
 
 
 def _native(candidate: Candidate, negated: bool) -> Proposal:
-    """Make the proposal of a candidate with both pictures; if `negated`, it asks for the opposite, if there is one.
-    """
+    """Make the proposal of a candidate with both pictures; `negated` asks for the opposite, if there is one."""
     assert candidate.distractor is not None
     wording = candidate.wording
     phrase, opposite = (wording.phrase, wording.opposite) if wording else (candidate.question, None)
@@ -144,8 +143,7 @@ def _may_meet(first: Candidate, second: Candidate) -> bool:
 def _disjoint_couples(
     candidates: Sequence[Candidate], rng: np.random.Generator
 ) -> list[tuple[Candidate, Candidate]]:
-    """Pair candidates inside one family; every picture is in at most one pair, with the next free one that fits.
-    """
+    """Pair candidates inside one family; every picture is in at most one pair, with the next free fitting one."""
     waiting: dict[str, list[Candidate]] = {}
     used: set[str] = set()
     couples = []
@@ -198,8 +196,7 @@ def emit(
 
 
 def _with_sides(bundles: Sequence[Bundle], rng: np.random.Generator) -> Iterator[tuple[Proposal, Side]]:
-    """Yield each proposal with the side of its target; phrases alternate, and their remainders balance each other.
-    """
+    """Yield each proposal with the side of its target; phrases alternate, and their remainders balance."""
     lean: Counter[str] = Counter()
     side_of_first: dict[str, Side] = {}
     for bundle in sorted(bundles, key=lambda bundle: bundle[0].instruction):

@@ -197,8 +197,7 @@ def _distant_dots(pen: Pen, level: float, color: RGB) -> None:
 
 
 def _window(pen: Pen, level: float, color: RGB) -> None:
-    """Draw a veil of `color` in front of a checkerboard; the more transparent, the more of the board is visible.
-    """
+    """Draw a veil of `color` in front of a checkerboard; the more transparent, the more of the board shows."""
     for row in range(4):
         for column in range(4):
             behind = _WHITE if (row + column) % 2 else _DARK
@@ -255,8 +254,7 @@ _BY_NAME = {name: gradable for gradable in GRADABLES for name in (gradable.more,
 
 @dataclass(frozen=True)
 class Sample(Tile):
-    """Everything that the picture is drawn from: a gradable, by its word for more, with this much of its property.
-    """
+    """Everything that the picture is drawn from: a gradable, by its word for more, with this much of it."""
 
     more: str
     level: float

@@ -89,8 +89,7 @@ _LEAST_LIGHTNESS = 110
 
 
 def hued_background(ink: RGB, rng: np.random.Generator, contrast: float = INK_CONTRAST) -> RGB:
-    """Draw a background of any hue, from pale to vivid, at least `contrast` levels lighter or darker than `ink`.
-    """
+    """Draw a background of any hue, pale to vivid, at least `contrast` levels lighter or darker than `ink`."""
     while True:
         shade = colorsys.hsv_to_rgb(rng.uniform(), rng.uniform(0, 0.9), rng.uniform(0.5, 1))
         red, green, blue = (round(255 * channel) for channel in shade)

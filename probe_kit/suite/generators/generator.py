@@ -84,7 +84,9 @@ def each_on_hues[C: Concept, T: Tile](
 
 
 def none_alike[C: Concept](families: Sequence[set[str]]) -> Callable[[C, C], bool]:
-    """Return a rule that allows two concepts unless their names are together in one of `families` of look-alikes.
+    """Return a rule that allows two concepts unless their names are together in one of `families`.
+
+    A family contains names of look-alikes.
     """
     return lambda first, second: not any({first.name, second.name} <= family for family in families)
 
