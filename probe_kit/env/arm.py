@@ -289,7 +289,9 @@ class Arm:
         return np.array([state[0] for state in self._client.getJointStates(self.body, self.model.joints)])
 
     def tool_state(self) -> Array:
-        """Return the measured x, y, z, roll, pitch, yaw (6,) of the tool; the angles are relative to pointing down.
+        """Return the measured x, y, z, roll, pitch, yaw (6,) of the tool.
+
+        The angles are relative to pointing down.
         """
         pose = self.chain.pose(self.joints())
         return np.concatenate([pose.position, to_rpy(pose.rotation @ np.array(self.model.down).T)])
@@ -409,13 +411,10 @@ def check_action(action: ArrayLike) -> Array:
 
 
 class DeltaController:
-    """A controller that keeps the commanded tool pose `target` and joints `q`, and moves both by one action at a time.
+    """A controller that keeps the commanded tool pose `target` and joints `q`, and moves both action by action.
 
     Args:
-        arm: Arm in the simulation.
-        limits: Limits of actions, workspace and inverse kinematics.
-        q: (n,) commanded joints at the start, in radians.
-        euler: Convention of the rotation of an action, see `SceneSpec`.
+        euler: How the rotation of an action is read, see `SceneSpec`.
     """
 
     def __init__(self, arm: Arm, limits: LimitSpec, q: Array, euler: Euler = "zyx") -> None:

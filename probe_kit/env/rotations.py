@@ -140,7 +140,7 @@ class SerialChain:
         return np.asarray(step * min(1.0, MAX_JOINT_STEP / max(np.abs(step).max(), 1e-12)))
 
     def pose_and_jacobian(self, q: Array) -> tuple[Pose, Array]:
-        """Return the pose of the tool at joint angles q (n,), and its Jacobian (6, n), by the product of exponentials.
+        """Return the tool's pose at joint angles q (n,), and its Jacobian (6, n), by the product of exponentials.
 
         The Jacobian is linear over angular velocity, both in the world frame.
         """

@@ -105,8 +105,7 @@ class Trajectory:
 
     @property
     def frames(self) -> Values:
-        """The frames (T + 1, len(CHANNELS)) float32 as stored: state, then the action before it, NaN in the first.
-        """
+        """The frames (T + 1, len(CHANNELS)) float32 as stored: state, then the action before, NaN in the first."""
         frames = np.full((len(self), len(CHANNELS)), np.nan, np.float32)
         start = 0
         for name, of_name in (STATE | ACTIONS).items():
@@ -228,7 +227,9 @@ class Outcome:
 
     @property
     def never_moved(self) -> bool:
-        """Whether the cube is out of bounds because it stayed at its start: a failed grasp rather than a wrong answer.
+        """Whether the cube is out of bounds because it stayed at its start.
+
+        That is a failed grasp rather than a wrong answer.
         """
         return self.zone == "oob" and not self.cube_moved
 
@@ -414,8 +415,7 @@ class ReleasedOnTile(OutcomeRule):
     name = "released-on-tile"
 
     def inside(self, trajectory: Trajectory, side: Side) -> Flags:
-        """Return (T + 1,) whether the cube is on the square of the tile as it lies, touches it, is released, and rests.
-        """
+        """Return (T + 1,) whether the cube is on the tile as it lies, touches it, is released, and rests."""
         tile, position = trajectory.tile(side), 0 if side == "left" else 1
         away = _turned_back(trajectory.cube[:, :2] - tile[:, :2], tile[:, 3:])
         over = (np.abs(away) <= self.half).all(axis=1)

@@ -69,8 +69,7 @@ class ScriptedExpert:
         self._actions = self._follow(plan)
 
     def act(self) -> NDArray[np.float32]:
-        """Return the next action (7,) float32; once the cube is placed, the tool stays still with an open gripper.
-        """
+        """Return the next action (7,) float32; once the cube is placed, the tool stays with an open gripper."""
         if self._actions is None:
             raise EpisodeOverError("the expert has no plan; call its `reset` after that of the environment.")
         return next(self._actions).astype(np.float32)
@@ -152,7 +151,9 @@ class ScriptedExpert:
 
 
 class Idle:
-    """A policy that never moves the tool and leaves the gripper as at the start: shut around a held cube, else open.
+    """A policy that never moves the tool and leaves the gripper as at the start.
+
+    The gripper is shut around a cube in the hand, else open.
 
     Args:
         env: An Act2AnswerEnv, wrapped or not.

@@ -136,8 +136,7 @@ class Camera:
         return np.asarray(centre + self.spec.focal_length * np.stack([x, -y], -1) / z[..., None])
 
     def rays(self) -> Array:
-        """Return the viewing direction (H, W, 3) in the world through the middle of every pixel, not normalised.
-        """
+        """Return the viewing direction (H, W, 3) in the world through the middle of every pixel, unnormalised."""
         v, u = np.mgrid[: self.spec.height, : self.spec.width] + 0.5
         across = (u - self.spec.width / 2) / self.spec.focal_length
         down = (v - self.spec.height / 2) / self.spec.focal_length
@@ -154,8 +153,7 @@ class Camera:
         return Camera(replace(spec, width=round(spec.width * height / spec.height), height=height))
 
     def widened(self) -> "Camera":
-        """Return the same view at the same scale, twice as wide and high: with its surroundings just off screen.
-        """
+        """Return the same view at the same scale, twice as wide and high: with what lies just outside of it."""
         spec = self.spec
         fov = 2 * float(np.degrees(np.arctan(2 * np.tan(np.radians(spec.fov) / 2))))
         return Camera(replace(spec, width=2 * spec.width, height=2 * spec.height, fov=fov))

@@ -277,7 +277,9 @@ class SceneSpec:
 
     @property
     def intrinsics(self) -> NDArray[np.float32]:
-        """The pinhole matrix (3, 3) of the policy's picture, in its pixels: x right, y down, (0, 0) the upper left corner.
+        """The pinhole matrix (3, 3) of the policy's picture, in its pixels.
+
+        x points right, y down, and (0, 0) is the upper left corner.
         """
         (height, width), camera = self.picture_shape, self.camera
         across, down = width / camera.width, height / camera.height

@@ -1,4 +1,4 @@
-"""`probe-kit suite`: build, convert, check and show suites."""
+"""The command `probe-kit suite`: build, convert, check and show suites."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
