@@ -64,7 +64,7 @@ _LEGEND = (
 
 
 def _estimated(cell: Cell, by_row: Mapping[tuple[int, int], float]) -> Condition:
-    """Return a condition without an inference: the clean action, and the displacement that an estimate gives a cell.
+    """Return a condition without an inference: the clean action, and the displacement estimated for a cell.
 
     Args:
         cell: Cell whose patch is estimated.
@@ -175,8 +175,7 @@ class AttributionPatching(Intervention):
         return rows, shares
 
     def _select(self, cells: Sequence[Cell], shares: Sequence[NDArray[np.float64]]) -> tuple[set[Cell], set[Cell]]:
-        """Return the cells with the largest estimates of any category, by kind, and those drawn from the others.
-        """
+        """Return the cells with the largest estimates of any category, by kind, and those drawn from the rest."""
         top: set[Cell] = set()
         drawn: set[Cell] = set()
         kinds = [kind_of_place(cell.site_group.name) for cell in cells]

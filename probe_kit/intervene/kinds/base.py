@@ -211,8 +211,7 @@ class Intervention(Choice, ABC):
 
     @staticmethod
     def finding(rows: Sequence[Any], context: Measurement) -> str:
-        """Return a verdict, a colon and the finding, in few words without brackets; `rows` are without controls.
-        """
+        """Return a verdict, a colon and the finding, in few words without brackets; `rows` have no controls."""
         del rows, context
         return ""
 

@@ -67,8 +67,7 @@ _LEGEND = (
 
 
 def identity_patch(sites: Sequence[Site]) -> Condition:
-    """Return the inference as the run made it, with every site that any condition changes written back unchanged.
-    """
+    """Return the inference as the run made it, with every site that a condition changes written back as it is."""
 
     def play(context: ConditionContext) -> ConditionResult:
         policy = context.session.policy
@@ -168,7 +167,7 @@ class ClosedLoop(AlongDirection):
 
         Raises:
             UnknownSiteError: For a place that does not exist.
-            NoProbesError: For a direction of probes in a run without them.
+            NoDirectionError: For a named place without a direction.
         """
         cells = [
             Cell(site_group, role)

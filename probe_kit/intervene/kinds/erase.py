@@ -178,8 +178,7 @@ class ConceptErasure(Intervention):
 
     @staticmethod
     def table(rows: "Sequence[ErasureEffect]", context: Measurement) -> "Table":
-        """Return one line per category and place; controls are columns of the edits that are compared with them.
-        """
+        """Return one line per category and place; controls are columns of the edits compared with them."""
         edits = [row for row in rows if row.finding not in ("control", "identity patch")]
         return effect_table(
             f"What is lost without it? {context.subject}, erase",

@@ -225,7 +225,7 @@ class Reach(NamedTuple):
 
     @classmethod
     def of(cls, clean: NDArray[np.float64], tiles_apart: float = TILES_APART) -> "Reach":
-        """Return the reach of (E,) clean displacements in metres, left positive, over all categories of an intervention.
+        """Return the reach of (E,) clean displacements in metres, left positive, over all categories.
 
         The reach is a difference of medians: a few categories in which the policy moves weakly do not shorten it.
         """

@@ -362,8 +362,7 @@ def _by_category(selections: Sequence[_Selection]) -> dict[str, list[PatchEffect
 
 
 def _depth(subject: tuple[str, ...]) -> tuple[object, ...]:
-    """Return a sort key: the backbone, the acting stream, then `kv`; shallow before deep, all tokens before roles.
-    """
+    """Return a sort key: backbone, acting stream, then `kv`; shallow before deep, all tokens before roles."""
     site, role, *values = subject
     name = PlaceName.parse(site)
     part = {BACKBONE: 0, KV_STREAM: 2}.get(name.stream, 1)
@@ -371,7 +370,7 @@ def _depth(subject: tuple[str, ...]) -> tuple[object, ...]:
 
 
 def best_patch_targets(run: RunReader, categories: Sequence[str]) -> tuple[str, ...]:
-    """Return `PLACE|ROLE`, of each category the last place of the backbone that was located, in its narrowest role.
+    """Return `PLACE|ROLE`, of each category the last place of the backbone located, in its narrowest role.
 
     The last place lies behind all other places through which the answer passes. Where none of the backbone was
     located, it is the last of the acting stream or of `kv`. Of its roles it has the one with the largest effect,
@@ -557,7 +556,7 @@ class Interchange(PatchKind):
 
         Raises:
             UnknownSiteError: For a place that does not exist.
-            NoProbesError: For a direction of probes in a run without them.
+            NoDirectionError: For a named place without a direction.
         """
         cells = cells_at(session, resolve_all(self.sites, session.policy).values(), self.roles)
         source_sites = sites_of_cells(cells)
