@@ -81,8 +81,8 @@ class Trial:
     The scene knows arm, cube and tiles; the trial knows the question, and by Act2Answer's rules when it is over.
     It is not called an episode, which is the planned question with its layout (`suite.items.Episode`).
 
-    `executed` is the last action (7,) as executed: after the limits, no motion where the arm could not follow, and
-    the gripper that was really commanded. It is None before the first action.
+    `executed` is the last action (7,) as executed, after the limits: no motion where the arm could not follow, and
+    the real command of the gripper. It is None before the first action.
     """
 
     def __init__(self, scene: Scene, question: Question) -> None:
@@ -170,12 +170,13 @@ LARGEST_SHIFT, LARGEST_TURN = 1.0, float(np.pi)
 class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[misc]
     """The environment: answer a question by putting the cube on one of two pictures.
 
-    Observation: `pixels.image` (H, W, 3) uint8, and `agent_pos` (8,) float32. The latter is x, y, z of the tool in
-    metres, roll, pitch, yaw relative to pointing down in radians, a zero that Bridge policies expect, and the
-    opening of the gripper (1 open, 0 closed).
+    Observation: `pixels.image` (H, W, 3) uint8, and `agent_pos` (8,) float32. The latter starts with x, y, z of
+    the tool in metres, and roll, pitch, yaw relative to pointing down in radians. Then come a zero that Bridge
+    policies expect, and the opening of the gripper (1 open, 0 closed).
 
     Action (7,): xyz delta in metres and roll-pitch-yaw delta in radians along the fixed world axes, added to the
-    last commanded pose, and the gripper. Above 0.5 opens it, any other value closes it. One action takes 0.2 s.
+    last commanded pose, and the gripper. A gripper value above 0.5 opens it, any other closes it. One action takes
+    0.2 s.
 
     Reward: 1.0 with the last action if the cube lies in the correct zone, otherwise 0.0.
 

@@ -1,6 +1,6 @@
 """The arm: its URDF, the arm in the simulation, and the conversion of actions to joint angles.
 
-The WidowX-250S is generated from a table and the meshes of the `rtb-data` package: PyBullet reads URDF but not
+The WidowX-250S is generated from a table and the meshes of the `rtb-data` package. PyBullet reads URDF but not
 xacro, which is all that package has. Lengths are in metres, angles in radians, masses in kilograms. The gripper's
 bar and propeller belong to one rigid link here, and inertia is left to PyBullet.
 
@@ -414,7 +414,10 @@ class DeltaController:
     """A controller that keeps the commanded tool pose `target` and joints `q`, and moves both action by action.
 
     Args:
-        euler: How the rotation of an action is read, see `SceneSpec`.
+        arm: Arm in the simulation.
+        limits: Limits of actions, workspace and inverse kinematics.
+        q: (n,) commanded joints at the start, in radians.
+        euler: Convention of the rotation of an action, see `SceneSpec`.
     """
 
     def __init__(self, arm: Arm, limits: LimitSpec, q: Array, euler: Euler = "zyx") -> None:

@@ -580,7 +580,8 @@ class Behaviour:
         hand_starts_over: Picture that the hand is over before the first action.
         hand_starts_nearer: Picture that the hand is nearer to before the first action.
         first_choice: Picture whose box the hand was brought into first. The box in which it began counts from when
-            the hand is nearer to that picture by more than `SceneSpec.moved`, or was away and came back.
+            the hand is nearer to that picture by more than `SceneSpec.moved`. It also counts if the hand was away
+            and came back.
         dwell_correct: Steps over the correct picture's box, counted likewise.
         dwell_wrong: Steps over the wrong picture's box, counted likewise.
         dwell_start: Steps over a box that are left out of the other two counts.

@@ -276,7 +276,7 @@ class TextureCache:
 PLANK_WIDTH = 0.14
 """Width of a plank, in metres."""
 TABLE_END = 0.92
-"""x at which the table meets a wall, in metres."""
+"""Position along x, in metres, at which the table meets a wall."""
 DARK_WOOD = np.array([118.0, 78.0, 46.0])
 LIGHT_WOOD = np.array([190.0, 146.0, 98.0])
 WALL = np.array([196.0, 198.0, 194.0])

@@ -1,7 +1,7 @@
 """All parameters of the scene in one frozen record, which is stored with every run.
 
-Frame: the world frame is the base frame of the WidowX of BridgeV2. +x points away from the robot, +y to its left,
-+z up, and the table top is z = 0.
+Frame: the world frame is the base frame of the WidowX of BridgeV2. The axis +x points away from the robot, +y to
+its left, +z up, and the table top is z = 0.
 
 Units: metres, radians, seconds, kilograms, newtons.
 """
@@ -68,7 +68,7 @@ class CameraSpec:
 class LightSpec:
     """One lamp without shadows, and the share of light of each way of reflection.
 
-    A white tile on the table reflects 0.77 of full scale, so that the brightest ablation of the paper (30 % more)
+    A white tile on the table reflects 0.77 of full scale. So the brightest ablation of the paper (30 % more)
     reaches white without clipping.
 
     Attributes:
@@ -101,7 +101,7 @@ class PhysicsSpec:
 class LimitSpec:
     """The limits of the controller; anything beyond is clipped and counted.
 
-    None means no such limit.
+    For the first four fields, None means no such limit.
 
     Attributes:
         translation: Largest change of the position per action and axis, in metres.
@@ -177,8 +177,8 @@ class SceneSpec:
         light_level: Factor of all light; a photo behind the scene gets darker and brighter with it.
 
     Raises:
-        SceneError: If the zones overlap, if the untouched cube would already lie in one, if the home pose is
-            outside the limits, or if a value makes no sense.
+        SceneError: If the zones overlap, or the untouched cube would already lie in one. Also if the home pose is
+            outside the limits, or a value makes no sense.
     """
 
     name: str = "bridge"
@@ -311,8 +311,8 @@ class SceneSpec:
             files: By field, the file that the values name by its hash.
 
         Raises:
-            SceneError: If a file is not given or has other content, for a file that the scene was made without, or
-                for a field of another version.
+            SceneError: If a file is not given or has other content, or the scene was made without it. Also for a
+                field of another version.
         """
         parts = {"camera": CameraSpec, "light": LightSpec, "physics": PhysicsSpec, "limits": LimitSpec}
         unknown = sorted(set(values) - set(cls.__dataclass_fields__))
@@ -447,14 +447,15 @@ PRESETS: Mapping[str, dict[str, Any]] = MappingProxyType(
 )
 """Changes of each named scene to the default one.
 
-bridge: places of VL-Think, camera of SimplerEnv, and a home pose 25 mm higher than theirs, so that the gripper
-hides nothing of either picture in the first frame, the one that probes read.
+bridge: places of VL-Think, camera of SimplerEnv, and a home pose 25 mm higher than theirs. So the gripper hides
+nothing
+of either picture in the first frame, the one that probes read.
 
 vl-think: their home pose as well; the gripper then hides 4 % of the left picture.
 
 act2answer: the protocol that was released with the paper, as far as it is available here. The cube is in the hand
 already, tiles are larger and can be pushed, and nothing limits an action.
 
-frontal: the same camera, but everything lies symmetric about its vertical plane and is turned towards it, so that
-both pictures have the same size and shape on screen.
+frontal: the same camera, but everything lies symmetric about its vertical plane and is turned towards it. So both
+pictures have the same size and shape on screen.
 """

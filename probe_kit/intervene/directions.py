@@ -4,7 +4,7 @@ A probe's weights are the direction in which the answer is best *read*: they are
 variation. The answer *lies* along the difference of the two class means, and that is the direction to write along.
 
 Pooled directions are of a mean over tokens, from the run's columns. An answer that lies in *which* tokens are
-marked leaves no mean behind: marks on the left tile for one answer and on the right tile for the other cancel. The
+marked leaves no mean behind. Marks on the left tile for one answer and on the right tile for the other cancel. The
 differences of class means at every position do not cancel. They lie along few directions, which are the same for
 every token. These are found in the tokens themselves.
 """
@@ -55,8 +55,8 @@ class Directions:
 
     Attributes:
         bases: By name and episode, (K, D) float32, orthonormal.
-        halves: By episode, (K,) or (T, K) half the differences of the class means along the requested directions,
-            of a mean over tokens or of the role's T positions.
+        halves: By episode, (K,) or (T, K) half the differences of the class means along the requested directions.
+            They are of a mean over tokens, or of the role's T positions.
         control_names: Names of the random directions that serve as controls.
         vectors: By name, (D,) the step of a file's direction, in place of a half difference; None for directions
             that are not from a file.
@@ -82,7 +82,7 @@ class Directions:
             strength: Number of half differences; negative away from `left`.
 
         Returns:
-            (D,) or (T, D) float32. The t-th row of (T, D) belongs to the role's t-th token; a mark on either tile
+            (D,) or (T, D) float32. The t-th row of (T, D) belongs to the role's t-th token. A mark on either tile
             has its own sign at the positions of each.
         """
         if self.vectors is not None:
@@ -138,8 +138,8 @@ def fit_directions_in_cells(
 
     Raises:
         NoDirectionError: For a named place without a direction.
-        UsageError: Where there are too few episodes to learn from.
         UnknownSiteError: For a place of several sites or one that is not stored.
+        UsageError: If there are too few episodes to fit on.
     """
     if vector is not None:
         return {cell: _of_file(session, cell, vector, controls, seed) for cell in cells}
@@ -218,8 +218,6 @@ class PassedOver:
     def left[T](self, fitted: Mapping[Cell, T]) -> dict[Cell, T]:
         """Return the fits without the cells that a category passed over.
 
-        Raises the last NoDirectionError if no cell is left.
-
         Raises:
             NoDirectionError: If no cell is left; it is the last one recorded.
         """
@@ -252,7 +250,7 @@ def fit_pooled_directions(
         run: Run with the stored streams.
         site: Site of a residual stream.
         role: Role of the tokens.
-        direction: `mean-difference` or `probe`.
+        direction: Name of the direction, `mean-difference` or `probe`.
         controls: Number of random directions that serve as controls.
         seed: Seed of controls and folds.
         categories: Categories to fit; None for all of the run.

@@ -75,10 +75,10 @@ def finding_of_cell(alone: SwapShare | None, needed: SwapShare | None, every: Sw
     """Return a cell's finding.
 
     Args:
-        alone: Share of the swap with this cell alone patched.
-        needed: Share of the swap that all cells lose without it.
-        every: Share of the swap with all cells patched.
-        p: p-value of the cell alone.
+        alone: Share of the swap with this cell alone patched; None where the swap is not significant.
+        needed: Share of the swap that all cells lose without it; None likewise.
+        every: Share of the swap with all cells patched; None likewise.
+        p: The p-value of the cell alone.
     """
     if alone is None or needed is None or every is None:
         return "n/a"
@@ -102,9 +102,9 @@ class CellReading(NamedTuple):
     """One of several cells that are read in parallel.
 
     Attributes:
-        alone: Share with this cell alone patched.
-        needed: Share that all cells lose without it.
-        p: p-value that it moves the output alone.
+        alone: Share with this cell alone patched; None where the source is not significant.
+        needed: Share that all cells lose without it; None likewise.
+        p: The p-value that it moves the output alone.
         p_fwe: Family-wise p-value of the same, against all cells.
         finding: Finding in words, see `finding_of_cell`.
     """

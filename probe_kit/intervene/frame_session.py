@@ -234,7 +234,7 @@ class FrameSession(ReplaySession):
 
     @cached_property
     def _tabled(self) -> list[tuple[Frame, Frame]]:
-        """Frames and donors of the user's own table, which `open_session` has checked."""
+        """The frames and donors of the user's own table, which `open_session` has checked."""
         by_name = self.frames.by_name
         return [(by_name[row[:2]], by_name[row[2:]]) for row in self.table]
 

@@ -22,9 +22,9 @@ class ListedIntervention:
     """One stored intervention.
 
     Attributes:
-        state: `used` by verdicts, tables and figures, or of a kind that none of them reads. `other` if other
-            results contain all of it, of more episodes or newly. `other episodes` if the run has different ones by
-            now.
+        state: Use of the result. It is `used` by verdicts, tables and figures, or of a kind that none of them
+            reads. It is `other` if other results contain all of it, of more episodes or newly. It is `other
+            episodes` if the run has different ones by now.
         created: ISO time (UTC).
         items: Number of items of each category; None for all.
         wording: Name of the wording; empty for the items' own words.

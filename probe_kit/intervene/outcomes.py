@@ -126,7 +126,8 @@ class ConditionOutcomes:
             episodes were played.
         size: (K, E) size of the change, in spreads of clean actions; None where whole episodes were played.
         seed_text: Text of the run by which random draws are made.
-        chunks: (K, E, N) all numbers of the actions of first inferences.
+        chunks: (K, E, N) all numbers of the actions of first inferences; None where whole episodes were played,
+            and in stored outcomes.
         mass: (N, B, I, H, R) attention of N inferences; None where it was not recorded.
         inferences: (N, 2) rows of these inferences in the run's episodes, and their calls; None likewise.
         patches: (N, B, P) attention on single patches; None where it is not known.

@@ -41,9 +41,9 @@ class Pair:
         episode: Id of the episode.
         category: Category of the episode.
         side: Side of the correct picture; None without sides.
-        donor: In runs without sides, the other frame of which the source has one input.
+        donor: In runs without sides, the other frame of which the source has one input; None in the scene.
         donor_name: Name of that frame.
-        control: The clean input after a meaningless change of the varied input.
+        control: The clean input after a meaningless change of the varied input; None in the scene.
         tiles: (H, W) mask of each tile in the clean picture, by side.
         stored: (n, D) actions of the clean inference in the run; None where it has none.
         step: Number of the inference in the episode, or of the recorded frame.

@@ -164,10 +164,12 @@ class SiteGroup:
 def resolve_sites(pattern: str, policy: "Model") -> list[SiteGroup]:
     """Return the places that a pattern names.
 
-    `backbone.*` is every layer, each a place; `backbone.02` is one. `expert.03@0-4` is a layer over iterations 0
-    to 4, changed at each of them; `expert.03` is over all. `kv.02` is what block 2 passes to the acting stream,
-    keys and values together. A quantity may follow the layer: `kv.02.values`, `backbone.02.mlp`,
-    `backbone.02.heads` for all heads of a block, `backbone.02.heads.3` for one, `backbone.*.heads.*` for each.
+    The pattern `backbone.*` is every layer, each a place, and `backbone.02` is one. The pattern `expert.03@0-4` is
+    a layer over iterations 0 to 4, changed at each of them, and `expert.03` is over all. The pattern `kv.02` is
+    what block 2 passes to the acting stream, keys and values together.
+
+    A quantity may follow the layer: `kv.02.values`, `backbone.02.mlp`, `backbone.02.heads` for all heads of a
+    block, `backbone.02.heads.3` for one, `backbone.*.heads.*` for each.
 
     Raises:
         UnsupportedInterventionError: For `kv` of a family that has none.

@@ -158,7 +158,7 @@ class InterventionResult(Measurement):
 
         Args:
             details: Whether to split the table where it is wide, and to state below it the reasons of each
-                verdict; else columns are left out by name.
+                verdict. Else columns are left out by name.
         """
         table = self._kind.table(self.effects, self)
         if not details:
@@ -186,8 +186,6 @@ class InterventionResult(Measurement):
         """The verdicts by category, from this result and what else is stored at the first access.
 
         Empty without sides.
-
-        Raises RunDamagedError.
 
         Raises:
             RunDamagedError: If a stored intervention was changed.

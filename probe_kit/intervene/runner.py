@@ -52,9 +52,9 @@ def run_intervention(
         intervention: Kind with its settings; None for `ImageSwap()`.
         source: Places of the policy and the pictures; None for the embedded suite and the model's own checkpoint.
         load: Function that loads the policy; None to load it by its name.
-        progress: Function that is called after every replayed item.
+        progress: Function that is called after every replayed item; None for a progress bar in a notebook.
         on_fit_progress: Function that is called after every item inferred before that, where directions or erasers
-            are fitted.
+            are fitted; None likewise.
         on_note: Function that is called before the replay with a sentence about edits that cannot change anything;
             `notes` has it too.
 

@@ -1,8 +1,8 @@
 """The tokens of a role in one inference, tiles of the picture among them, and the places that a token sees.
 
 Tiles are roles of a pair's picture. Halves of the picture are not tiles, because the camera looks from aside. The
-renderer gives the pixels of a tile. The policy itself shows which patches see it, by its own crop and resize: the
-embeddings that change when just those pixels change, before any patch attends to another.
+renderer gives the pixels of a tile. The policy itself shows which patches see it, by its own crop and resize. They
+are those whose embeddings change when just those pixels change, before any patch attends to another.
 """
 
 from functools import cached_property
@@ -73,8 +73,8 @@ def token_mask(model: "Model", model_input: Given, stream: str, role: str) -> ND
 class PairTokens:
     """The tokens of a pair's clean inference by role, tiles among the roles.
 
-    All patches of a pair share one of these, so that the model determines only once the role of every token, and
-    the patches that see each tile.
+    All patches of a pair share one of these. So the model determines only once the role of every token, and the
+    patches that see each tile.
     """
 
     def __init__(self, model: "Model", pair: Pair) -> None:

@@ -117,14 +117,14 @@ class UseVerdict:
 
     @property
     def explanation(self) -> str:
-        """Reason, place and tie."""
+        """The reason, place and tie."""
         first, *second = self.by_readout
         reasons = [first.reason, *(f"over the whole episode: {verdict.reason}" for verdict in second)]
         return "; ".join(filter(None, (*reasons, self.where, self.tie)))
 
     @property
     def sentence(self) -> str:
-        """Behaviour by every stored readout, place and tie; with the reason where it is not used."""
+        """The behaviour by every stored readout, place and tie; with the reason where it is not used."""
         first, *second = self.by_readout
         if second and first.own_verdict == second[0].own_verdict:
             both = " and ".join(_READOUTS[verdict.readout] for verdict in (first, *second))
@@ -205,7 +205,7 @@ class _Numbers(NamedTuple):
     """The numbers of an effect toward the correct picture, or of its mirror.
 
     Attributes:
-        p: p-value of the direction.
+        p: The p-value of the direction.
         follow: Net follow rate.
         follow_ends: Ends of its interval.
         share: Displacement as a share of the reach.
@@ -456,7 +456,7 @@ def classify_all(
 
     Args:
         effects: Effects of the image swap, by category.
-        encoded: Whether the answer can be read in the backbone, by category.
+        encoded: Whether the answer can be read in the backbone, by category; None without probes.
         places: Findings inside the network, by category.
         ties: Tie in words, by category.
         other_readouts: The behaviour by the other readout, by category.

@@ -134,10 +134,10 @@ def unseen(
 def reach(each: NDArray[np.floating], tail: float | Matrix = SIGNIFICANCE / 2) -> Matrix:
     """The share of groups, (…, S), that may differ without having been observed, with chance `tail` per side.
 
-    Where at most one group differs from most, it is the share of which nothing is observed with chance 2 · tail:
-    at 0.025 about 3 / G. (One group that differs says that such groups exist, and not what others are like.) Where
-    more differ, the next one may as well be like any of them: with k that differ, only one in k is like nothing
-    observed.
+    Where at most one group differs from most, it is the share of which nothing is observed with chance 2 · tail.
+    At 0.025 that is about 3 / G. One group that differs says that such groups exist, and not what others are like.
+    Where more differ, the next one may as well be like any of them. With k that differ, only one in k is like
+    nothing observed.
 
     Args:
         each: (G, S) means of the groups.
@@ -239,9 +239,9 @@ def explained_interval(
     """Return an approximate 95 % interval of R², with whole groups as the unit; up to 1.
 
     R² is 1 − q with q = A / B, where A is the sum of squared errors and B that of the deviations. The variance of
-    q is that of the ratio of two sums over groups (Cochran, “Sampling techniques”, 1977, section 6.13): v = Σ (a −
-    q b)² · G / (G − 1) / B². The limits are 1 − q exp(± t √v / q), symmetric in log q. For a single group they are
-    minus infinity and 1.
+    q is that of the ratio of two sums over groups: v = Σ (a − q b)² · G / (G − 1) / B² (Cochran, “Sampling
+    techniques”, 1977, section 6.13). The limits are 1 − q exp(± t √v / q), symmetric in log q. For a single group
+    they are minus infinity and 1.
 
     Args:
         scores: (n,) scores whose mean is R²; see `explained_scores`.

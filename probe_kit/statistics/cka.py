@@ -21,10 +21,10 @@ def unbiased_cka(first: Matrix, second: Matrix) -> float:
     """Return the linear CKA of features (E, D) and (E, D') of the same episodes.
 
     It is 1 for features that are equal up to rotation and scaling. It is 0 on average where they are independent,
-    whatever D.
+    whatever D. It is NaN where one set does not vary.
 
-    HSIC = (tr KL + 1ᵀK1 · 1ᵀL1 / ((E − 1)(E − 2)) − 2 · 1ᵀKL1 / (E − 2)) / (E (E − 3)), with K and L the products
-    of the features, whose diagonal is 0. CKA is NaN where one set does not vary.
+    HSIC = (tr KL + 1ᵀK1 · 1ᵀL1 / ((E − 1)(E − 2)) − 2 · 1ᵀKL1 / (E − 2)) / (E (E − 3)). K and L are the products
+    of the features, with 0 on the diagonal.
 
     Raises:
         UsageError: For fewer than FEWEST episodes, or different numbers of episodes.

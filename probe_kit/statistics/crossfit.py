@@ -2,8 +2,8 @@
 
 Missing episodes of one side favour no site, and chance is always one half. The choice of a site is repeated on
 resampled groups, and sites share it by how often they are best. The spread over the resamples says what the choice
-adds to the variance: Efron, “Estimation and accuracy after model selection”, Journal of the American Statistical
-Association 109 (2014).
+adds to the variance. See Efron, “Estimation and accuracy after model selection”, Journal of the American
+Statistical Association 109 (2014).
 """
 
 from collections.abc import Sequence
@@ -94,7 +94,7 @@ def remove_fold_priors(decisions: Matrix, labels: NDArray[np.bool_], fold_of: Ar
 
     Raises:
         UsageError: For a shape that does not fit, fewer than two folds, or NaN.
-        UnbalancedEpisodesError: Where a fold was trained on one side alone.
+        UnbalancedEpisodesError: If a fold was trained on one side alone.
     """
     folds = np.asarray(fold_of)
     if decisions.ndim != 2 or not decisions.shape[1] == labels.size == folds.size:
@@ -141,7 +141,7 @@ class StreamScores:
 
     Attributes:
         scores: The scores of each site in every group, held out by the outer folds.
-        guide: (S, F, G) qualities by which sites are chosen, the larger the better. It is the quality of a group's
+        guide: (S, F, G) qualities by which sites are chosen, the larger the better. They are of a group's
             predictions in the inner folds of an outer fold, and 0 for the groups that the outer fold tests.
         fold_of: (G,) outer fold that tests a group, a position along F.
     """
@@ -172,8 +172,8 @@ class StreamScores:
             iterations: (S,) iteration of each site; None for a stream that runs once.
 
         Raises:
-            UsageError: For another number of places than of sites, no site, qualities of other folds or groups, or
-                a quality other than 0 of a group in the fold that tests it.
+            UsageError: For other numbers of places, folds or groups, no site, or a quality other than 0 of a group
+                in the fold that tests it.
         """
         at, folds = np.asarray(layers), np.asarray(fold_of, np.intp)
         steps = np.zeros_like(at) if iterations is None else np.asarray(iterations)
@@ -312,9 +312,9 @@ def _are_best(quality: Matrix) -> NDArray[np.bool_]:
 def _influence_on_choice(times: Matrix, scores: Matrix) -> Matrix:
     """Return the covariance (G,) of how often a group is drawn, (G, R), with (R,) scores.
 
-    This is the infinitesimal jackknife. So few resamples give covariances even where there are none: their sum of
-    squares is G / R of the variance of the scores (Wager, Hastie and Efron, JMLR 15, 2014). The covariances are
-    shrunk by that.
+    This is the infinitesimal jackknife. So few resamples give covariances even where there are none. Their sum of
+    squares is then G / R of the variance of the scores (Wager, Hastie and Efron, JMLR 15, 2014). The covariances
+    are shrunk by that.
     """
     influence: Matrix = (times - 1) @ (scores - scores.mean()) / scores.size
     influence -= influence.mean()

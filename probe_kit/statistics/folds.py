@@ -23,8 +23,8 @@ Every fold needs a group of its own.
 SHARED_TRAINING = sqrt(1 + OUTER_FOLDS / (OUTER_FOLDS - 1))
 """Factor, 1.5, by which folds that share training groups widen the standard error of a held-out mean.
 
-Nadeau and Bengio, “Inference for the generalization error”, Machine Learning 52 (2003): with K folds the variance
-is 1/K + n_test/n_train in place of 1/K, which is 1 + K / (K − 1) times as much.
+With K folds, the variance is 1/K + n_test/n_train in place of 1/K, which is 1 + K / (K − 1) times as much. See
+Nadeau and Bengio, “Inference for the generalization error”, Machine Learning 52 (2003).
 """
 
 FoldUnit = Literal["groups", "concepts"]

@@ -75,8 +75,8 @@ def difference_interval(
 ) -> Interval:
     """Return the interval of `first` − `second`, at the level of the two intervals.
 
-    With a, b the values, l, u their limits and ρ the correlation: low = a − b − √((a − l_a)² + (u_b − b)² − 2 ρ (a
-    − l_a)(u_b − b)), high with the other limits. No limits where either has none.
+    a and b are the values, l and u their limits, and ρ is the correlation. Then low = a − b − √((a − l_a)² + (u_b
+    − b)² − 2 ρ (a − l_a)(u_b − b)), and high has the other limits. There are no limits where either has none.
 
     Args:
         first: Value of the first estimate.
@@ -305,8 +305,9 @@ def share_interval(
 ) -> tuple[Matrix, Matrix]:
     """Return Clopper and Pearson's limits for arrays of shares, with the effective number of episodes.
 
-    The method is that of Korn and Graubard (1998). With n = min(s (1 − s) / v, E) · (t(1 − tail, E − 1) / t(1 −
-    tail, df))², the limits are Beta⁻¹(tail; s n, n − s n + 1) and Beta⁻¹(1 − tail; s n + 1, n − s n).
+    The method is that of Korn and Graubard (1998). The effective number is n = min(s (1 − s) / v, E) · (t(1 −
+    tail, E − 1) / t(1 − tail, df))². The limits are Beta⁻¹(tail; s n, n − s n + 1) and Beta⁻¹(1 − tail; s n + 1, n
+    − s n).
 
     Where nothing varies, n is `n_groups`, whatever their sizes: G groups that are alike with chance p all agree
     with chance p^G. No share is better known than there. Without this rule, a share near 1 of unequal groups with

@@ -149,7 +149,7 @@ def paired_greater_p(values: NDArray[np.float64], items: ArrayLike, groups: Arra
 
 
 Right = NDArray[np.bool_]
-"""(N,) whether each item is right."""
+"""Whether each item is right, (N,)."""
 
 
 def mcnemar_p(first: Right, second: Right) -> float:
@@ -326,7 +326,7 @@ def max_t(
 def least_column_p(values: NDArray[np.float64], groups: ArrayLike, seed: int) -> float:
     """Return the one-sided chance that the first of K exchangeable columns lies so far below the others' mean.
 
-    The place of the first column is drawn anew, the same in all rows of a group: any column may be the first where
+    The place of the first column is drawn anew, the same in all rows of a group. Any column may be the first where
     none differs. With two columns it is a test by signs. The level is exact, because the observed places are one
     of the draws.
 

@@ -44,9 +44,9 @@ class Scores:
         """Return the means over categories that share no group.
 
         Their covariance is the sum of the covariances over n². The degrees of freedom are (Σ v)² / Σ (v² / df),
-        with v the sum of a category's variances (Satterthwaite, “An approximate distribution of estimates of
-        variance components”, Biometrics Bulletin 2, 1946). So a category that varies more than all others is not
-        known better because of them.
+        with v the sum of a category's variances. So a category that varies more than all others is not known
+        better because of them. See Satterthwaite, “An approximate distribution of estimates of variance
+        components”, Biometrics Bulletin 2 (1946).
 
         Raises:
             UsageError: Without categories.
@@ -123,8 +123,8 @@ def retention_difference(first: Scores, second: Scores, between: Matrix | None =
         first: Scores (expert, backbone) of a run, or their means over categories.
         second: Those of another run, or of another mean.
         between: (2, 2) covariance of the first's (expert, backbone) with the second's, where both are of the same
-            groups (`CrossFit.covariance_with`; for means, its sum over categories divided by n²). None for other
-            groups.
+            groups; see `CrossFit.covariance_with`. For means it is the sum over categories divided by n². None for
+            other groups.
     """
     a, b = retention(first), retention(second)
     correlation = 0.0 if between is None else _correlation(first, second, between)

@@ -194,7 +194,7 @@ def _net_limit_of_none(groups: int) -> float:
 def groups_for_absence(episodes: int) -> int:
     """Return the fewest groups of so many episodes with which a stream that knows nothing can be called absent.
 
-    That is at best: for a single site, right in half of the episodes, which differ as much within groups as
+    That is at best: for a single site that is right in half of the episodes. These differ as much within groups as
     between them. `probe-kit power` simulates how often it happens.
     """
     return _fewest(lambda groups: _limit_at_chance(groups, episodes) < ABSENT_BELOW, GROUPS_FOR_RETENTION)

@@ -1,9 +1,9 @@
 """Items and episodes: questions with two pictures, and rollouts of them in one layout; their words and groups.
 
-Of the wordings, `knowledge` is the item's own instruction; `named` says what the correct picture literally shows;
-`side` says where it is; `neutral` asks for any picture. A model that fails `knowledge` and passes `named` lacks
-the knowledge. One that fails `side` lacks the skill. The score of `neutral` is the share that needs no
-instruction.
+The wording `knowledge` is the item's own instruction, and `named` says what the correct picture literally shows.
+The wording `side` says where it is, and `neutral` asks for any picture. A model that fails `knowledge` and passes
+`named` lacks the knowledge. One that fails `side` lacks the skill. The score of `neutral` is the share that needs
+no instruction.
 
 Folds must not separate a group. Counterparts show the same pictures, with the other one as target.
 """
@@ -108,7 +108,7 @@ class Item:
 
     @property
     def content_sha256(self) -> str:
-        """Hex sha256 of `content`: items with equal hashes ask and show the same, and have the same twin."""
+        """The hex sha256 of `content`: items with equal hashes ask and show the same, and have the same twin."""
         return sha256_json(self.content)
 
     def file_name(self, side: Side) -> str:

@@ -2,8 +2,8 @@
 
 Leakage: can pictures alone, text alone or a fixed side identify the correct picture? Each baseline predicts the
 correct side of every episode (both layouts of every item), trained on other groups. Chance is one half. A category
-passes if no baseline is further above chance than the interval that a coin has over that many *items*: the two
-layouts of an item are not independent.
+passes if no baseline is further above chance than the interval of a coin over that many *items*. The two layouts
+of an item are not independent.
 """
 
 import json
@@ -71,8 +71,8 @@ def roles_balanced(suite: Suite) -> Iterator[Finding]:
 def role_counts(items: Sequence[Item]) -> dict[tuple[str, str], tuple[int, int]]:
     """Return by category and concept how often it is the target and how often the distractor.
 
-    The concept of the wrong picture is the one that its counterpart asks for, where there is one: a table of one's
-    own names the correct picture alone.
+    Where an item has a counterpart, the concept of its wrong picture is the one that the counterpart asks for. A
+    table of one's own names the correct picture alone.
     """
     twins = counterparts_of(items)
     targets = Counter((item.category, item.target_concept) for item in items)

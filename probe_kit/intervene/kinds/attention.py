@@ -327,8 +327,8 @@ class AttentionShares:
         categories: (N,) category of every episode.
         sides: (N,) side of the correct picture; empty in a run without sides.
         calls: (N,) inference of the episode, counted from 0.
-        mass: (N, B, I, H, R) float32 shares. NaN where a block is not read in an iteration, and for roles without
-            a token in an inference, such as a tile behind the arm.
+        mass: (N, B, I, H, R) float32 shares. They are NaN where a block is not read in an iteration, and for roles
+            without a token, such as a tile behind the arm.
     """
 
     roles: tuple[str, ...]

@@ -418,7 +418,7 @@ class ControlTest(NamedTuple):
         controls: Rows of its controls.
         beyond: (E,) values of the condition minus the mean of its controls.
         t: Statistic of the test.
-        p: p-value of the condition alone.
+        p: The p-value of the condition alone.
         p_fwe: Family-wise p-value, against the largest t of the category.
     """
 

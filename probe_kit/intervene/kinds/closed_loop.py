@@ -166,6 +166,7 @@ class ClosedLoop(AlongDirection):
         """Return the identity patch, the image swap and every target.
 
         Raises:
+            NoProbesError: For a direction of probes in a run without them.
             UnknownSiteError: For a place that does not exist.
             NoDirectionError: For a named place without a direction.
         """
@@ -264,15 +265,15 @@ class ClosedLoopEffect(EffectRow):
         wrong: Share of episodes that end on the wrong picture.
         in_zone: Share of episodes that end on either picture.
         wrong_in_zone: Share of wrong ones among those in a zone; None if none is.
-        net_left: The same as `net`, of episodes with the wrong picture on the left.
-        net_right: The same as `net`, of episodes with the wrong picture on the right.
-        control_net: Mean `net` of its controls that do not disrupt the task.
+        net_left: The same as `net`, of episodes with the wrong picture on the left; None if there are none.
+        net_right: The same as `net`, of episodes with the wrong picture on the right; None if there are none.
+        control_net: Mean `net` of its controls that do not disrupt the task; None without any.
         gained: Number of episodes that end wrong only with the edit.
         lost: Number of episodes that end wrong only without it.
         p_mcnemar: Exact two-sided p-value with the episodes of an item taken as independent, so that it is no
             verdict.
         t: Statistic of `net` beyond the controls'.
-        p: p-value of the same.
+        p: The p-value of the same.
         p_fwe: Family-wise p-value, against the largest t of the category.
         disrupted: Whether the cube is in a zone less than half as often.
     """

@@ -304,15 +304,16 @@ class ErasureEffect(EffectRow):
         share_left: Share that is left of how far actions go to the correct side. None if they do not go there,
             because a share of noise is noise.
         mean_displacement: Metres away from the correct side.
-        control_share_left: Mean `share_left` of the controls.
-        control_net: Mean `net` of the controls.
-        control_displacement: Mean `mean_displacement` of the controls.
+        control_share_left: Mean `share_left` of the controls; None without any.
+        control_net: Mean `net` of the controls; None without any.
+        control_displacement: Mean `mean_displacement` of the controls; None without any.
         p: Exact one-sided p-value that an item's action moves away from the correct picture farther than under the
-            controls, by items and by groups, the larger one.
+            controls. It is the larger one of by items and by groups; None for rows that are not tested.
         p_fwe: Family-wise p-value of the same, by sign flips of whole groups against the largest t of the
-            category.
-        probe_accuracy_before: Held-out accuracy of a fresh probe on the mean over tokens, without the edit.
-        probe_accuracy: The same accuracy behind the edit.
+            category; None likewise.
+        probe_accuracy_before: Held-out accuracy of a fresh probe on the mean over tokens, without the edit; None
+            if not stored.
+        probe_accuracy: The same accuracy behind the edit; None if not stored.
     """
 
     right_before: float

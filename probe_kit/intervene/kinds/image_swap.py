@@ -93,7 +93,7 @@ class InputEffect(Effect):
         full_size: Mean size of its change by all of the donor's inputs.
         share: Displacement toward the donor's action by this input, as a share of the exchange of all inputs. None
             where that changes nothing.
-        share_ci: The 95 % interval of `share`, by groups.
+        share_ci: The 95 % interval of `share`, by groups; None likewise.
         p: Exact one-sided p-value that the change is larger than the control's, by items and by groups, the larger
             one.
         finding: Verdict in a word: `decides`, `moves`, `no effect` within the bound, or `open`.
@@ -149,8 +149,8 @@ def _finding(share: SwapShare | None, p: float, ratio: float) -> Finding:
     """Return the verdict of an input.
 
     Args:
-        share: Share of the exchange of all inputs.
-        p: p-value that the change is larger than the control's.
+        share: Share of the exchange of all inputs; None where that changes nothing.
+        p: The p-value that the change is larger than the control's.
         ratio: Size of its change over that by all inputs.
     """
     if share is None:
@@ -257,8 +257,8 @@ class ImageSwapEffect(Effect):
             sides.
         reach_share_ci: Student's 95 % interval of `reach_share`, by groups.
         moved_share: Mean displacement in units of the reach, whichever way the action moves.
-        left_reached: Of the episodes with the correct picture on the left, the share that reaches it (beyond a
-            quarter of the reach from the middle), minus that share with swapped images.
+        left_reached: Share of the episodes with the correct picture on the left that reach it, minus that share
+            with swapped images. Reached is what lies beyond a quarter of the reach from the middle.
         right_reached: The same of the episodes with the correct picture on the right.
         readout: Readout of all displacements, `first-chunk` or `per-step`.
         key: Key of the stored intervention.

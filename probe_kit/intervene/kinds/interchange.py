@@ -75,17 +75,17 @@ class PatchEffect(EffectRow):
         coefficient: Coefficient of steering, as text; empty for other edits.
         effect: Share of what the whole image swap does to where the action goes, toward the target side. None if
             the swap does nothing, so that a share would be a ratio of noise.
-        effect_ci: The 95 % interval of `effect`, by groups.
+        effect_ci: The 95 % interval of `effect`, by groups; None likewise.
         net_left: The same as `net`, of episodes with the target side left.
         net_right: The same as `net`, of episodes with the target side right.
         mean_displacement: Metres toward the target side.
-        control_displacement: Metres toward the target side of its matched controls, on average.
+        control_displacement: Metres toward the target side of its matched controls, on average; None without any.
         t: Statistic of the displacement beyond the controls'.
-        p: p-value of the same.
-        p_fwe: Family-wise p-value, against the largest t of all edits of the category.
+        p: The p-value of the same; None for rows that are not tested.
+        p_fwe: Family-wise p-value, against the largest t of all edits of the category; None likewise.
         action_share: Displacement toward the source's action as a share of the whole image swap's; None where that
             changes nothing.
-        action_share_ci: The 95 % interval of `action_share`, by groups.
+        action_share_ci: The 95 % interval of `action_share`, by groups; None likewise.
     """
 
     coefficient: str
@@ -555,6 +555,7 @@ class Interchange(PatchKind):
         """Return clean, images swapped, and every place at every role.
 
         Raises:
+            NoProbesError: For a direction of probes in a run without them.
             UnknownSiteError: For a place that does not exist.
             NoDirectionError: For a named place without a direction.
         """

@@ -84,13 +84,14 @@ class SearchedSets(NamedTuple):
 class JointPlaces(Intervention):
     """Conditions with every cell alone, all but it, all of them, and the smallest set that carries the effect.
 
-    A cell is the tokens of a role at a place.
+    A cell is the tokens of a role at a place. The smallest set is searched in one half of each category's groups,
+    drawn with `seed`, and scored in the other.
 
     Attributes:
-        sites: Patterns of places that are read in parallel, the blocks of `kv`, one layer, or the heads of one
-            block; of several layers the first decides.
-        roles: Of the cells' tokens. The smallest set is searched in one half of each category's groups, drawn with
-            `seed`, and scored in the other.
+        sites: Patterns of places that are read in parallel: the blocks of `kv`, one layer, or the heads of one
+            block. Of several layers, the first would decide.
+        roles: Roles of the cells' tokens.
+        seed: Seed of the halves of the groups.
     """
 
     kind: ClassVar[str] = NAME
@@ -250,8 +251,8 @@ _COLUMNS: Mapping[str, Any] = {
 class JointEffect(Effect):
     """The effect of one set of cells in one category.
 
-    The smallest sets are scored on the groups in which they were not searched. Shares are None where the swap
-    itself is not significant.
+    The smallest sets are scored on the groups in which they were not searched. Shares and their intervals are None
+    where the swap itself is not significant.
 
     Attributes:
         part: Kind of the set: `cell`, `every-cell`, `minimal` or `second`.
@@ -261,7 +262,7 @@ class JointEffect(Effect):
         alone_ci: The 95 % interval of `alone`, by groups.
         needed: Share of the swap that all cells lose without them.
         needed_ci: The 95 % interval of `needed`, by groups.
-        p: p-value that the set alone moves the action toward the target side. For cells it is by sign flips of
+        p: The p-value that the set alone moves the action toward the target side. For cells it is by sign flips of
             whole groups, for the smallest sets it is exact.
         p_fwe: Family-wise p-value against all cells; None for sets of several.
         finding: Finding in words.

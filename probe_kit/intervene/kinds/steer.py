@@ -1,7 +1,7 @@
 """Steering: a direction added to the tokens of one role, with matched controls of the same norm.
 
 One vector for all tokens cannot move an answer that lies in *which* tokens are marked: it marks all of them alike.
-`mean-difference:K` has a vector for each position, which moves the mark from one tile to the other.
+A direction `mean-difference:K` has a vector for each position, which moves the mark from one tile to the other.
 
 Steering is a supplement to the interchange, not a replacement. The sum may lie off the network's distribution, a
 coefficient has no natural size, and at a large one every direction disrupts the task. So coefficients count half

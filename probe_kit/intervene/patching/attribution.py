@@ -1,6 +1,6 @@
 """A screen by gradients over pairs: estimates for all cells, and exact patches of the anchors that test them.
 
-One backward pass gives the estimates of all cells of a pair, as in attribution patching (Syed et al. 2023,
+One backward pass gives the estimates of all cells of a pair. This is attribution patching (Syed et al. 2023,
 https://arxiv.org/abs/2310.10348).
 """
 
@@ -54,7 +54,7 @@ FIRST = 3
 class AttributionEffect(Effect):
     """One cell in one category.
 
-    Shares are None where the swap itself is not significant.
+    Shares and their intervals are None where the swap itself is not significant.
 
     Attributes:
         sites: Name of the place.
@@ -65,7 +65,8 @@ class AttributionEffect(Effect):
         estimate_ci: The 95 % interval of `estimate`, by groups.
         exact: Share of the image swap with these tokens patched; None too where no exact patch was made.
         exact_ci: The 95 % interval of `exact`, by groups.
-        p_fwe: Family-wise p-value of the exact patch, one-sided, max-T over those of the category.
+        p_fwe: Family-wise p-value of the exact patch, one-sided, max-T over those of the category; None without an
+            exact patch.
         rank: Rank by estimate among the cells of its kind, 1 for the largest; None in a void screen.
         finding: Finding on the category's screen: `anchored`, `void`, or `n/a` where no anchor carries the effect.
         key: Key of the intervention.

@@ -243,7 +243,7 @@ def patched(
         tokens: Tokens of the pair's clean inference.
         cells: Cells that are patched together.
         source: Activations of the pair's source, at the sites of the cells.
-        along: (K, D) orthonormal rows, see `patch_cells`.
+        along: (K, D) orthonormal rows, see `patch_cells`; None to patch in full.
         complement: Whether to patch all but the component within `along`.
 
     Yields:

@@ -166,7 +166,7 @@ def sweep_cells(
         cells: Cells, or sets of cells that are patched together.
         metric: Function of an output and its input, such as `session.lateral_displacement`. It is measured in the
             inference that is patched.
-        along: (K, D) orthonormal rows, see `patch_cells`.
+        along: (K, D) orthonormal rows, see `patch_cells`; None to patch in full.
         complement: Whether to patch all but the component within `along`.
 
     Raises:
@@ -262,7 +262,7 @@ class MinimalCells:
         tried: Number of sets that were tried.
         share: Share in the other half of the groups, with its interval; None where the source is not significant
             there.
-        p: p-value that the set moves the metric toward the source there.
+        p: The p-value that the set moves the metric toward the source there.
         choosing: Groups of the search.
     """
 

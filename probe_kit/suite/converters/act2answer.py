@@ -67,9 +67,9 @@ def read_tile(path: Path, yaw: int = RELEASE_YAW) -> Tile:
         yaw: Degrees by which the scene turns the tile about z, one of `YAWS`.
 
     Raises:
-        SuiteError: If the file cannot be read, if nothing faces up, or if the upper face has no picture, more than
-            one, or one that is tinted, repeated or askew.
         MissingExtraError: Without trimesh.
+        SuiteError: If the file cannot be read, or nothing faces up. Also if the upper face has no picture, more
+            than one, or one that is tinted, repeated or askew.
     """
     trimesh = require("trimesh", "act2answer")
     if not path.is_file():
@@ -209,9 +209,9 @@ def read_pairs(root: Path) -> list[Pair]:
     """Read every question in the order of its index.
 
     Raises:
-        SuiteError: For an answer that is no side (the release takes it for left), for one tile on both sides (the
-            release has one body per name), or for indices that are not 0, 1, 2 … (the release asks for them one by
-            one).
+        SuiteError: For an answer that is no side (the release takes it for left), or for one tile on both sides
+            (the release has one body per name). Also for indices that are not 0, 1, 2 … (the release asks for them
+            one by one).
     """
     path = root / PAIRS
     records = read_annotations(path, SOURCE, REMEDY, list)

@@ -129,10 +129,10 @@ class ConvertOptions:
         paper_polarity: Whether to keep every comparison as the source asks it, so that pictures alone can give the
             answer.
         image_root: Folder of the pictures; None if they lie below the root.
-        llm_base: Address of an OpenAI-compatible service that proposes wordings where no rule matches. Its key is
-            read from the environment variable PROBE_KIT_LLM_KEY.
-        llm_model: Name of the model at this service.
-        llm_cache: Folder of the service's replies.
+        llm_base: Address of an OpenAI-compatible service that proposes wordings where no rule matches; None for no
+            service. Its key is read from the environment variable PROBE_KIT_LLM_KEY.
+        llm_model: Name of the model at this service; None without a service.
+        llm_cache: Folder of the service's replies; None without a service.
         trust_llm: Whether wordings of the model are emitted without a person's review.
     """
 

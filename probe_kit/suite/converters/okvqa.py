@@ -78,7 +78,7 @@ _OTHER_MATTER = re.compile(
 
 
 Boxes = Mapping[int, Mapping[str, float]]
-"""For each picture, the share of its area that the largest box of each COCO class covers."""
+"""The share of a picture's area that the largest box of each COCO class covers, by picture."""
 
 
 def read(root: Path, categories: Sequence[str], options: OkVqaOptions) -> Reading:

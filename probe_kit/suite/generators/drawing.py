@@ -8,9 +8,9 @@ Concepts recur in other pictures, so a probe can learn by itself which pixels an
 `random-features`). The concept should recur, and little else. So the background has any hue, and where size means
 nothing, drawings have different sizes anywhere on their tile.
 
-Icons are rendered once by `scripts/build_suite_art.py` and shipped with their licences. `suite/art/` contains two
-sheets of 128 px cells, `fluent.png` in colour and `material.png` as grey masks, and `index.json` with the icon
-names in the order of the cells. `suite/art/NOTICE.md` names their origin.
+Icons are rendered once by `scripts/build_suite_art.py` and shipped with their licences. The folder `suite/art/`
+contains two sheets of 128 px cells, `fluent.png` in colour and `material.png` as grey masks. The file `index.json`
+has the icon names in the order of the cells. The notice `suite/art/NOTICE.md` names their origin.
 """
 
 import colorsys
@@ -223,7 +223,7 @@ class Canvas:
         return Pen(self._image, placement)
 
     def picture(self) -> Image.Image:
-        """The finished tile, RGB, 256 by 256 pixels."""
+        """Return the finished tile, RGB, 256 by 256 pixels."""
         return self._image.resize((TILE_PIXELS, TILE_PIXELS), Image.Resampling.LANCZOS)
 
 

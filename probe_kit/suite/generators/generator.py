@@ -27,7 +27,7 @@ class Generator[C: Concept]:
     Attributes:
         pairs: Every two concepts that may lie side by side, each couple once.
         tiles: Function that draws the two tiles of a couple. All that does not show the concepts must be drawn for
-            both from the same distribution, because another function decides which of the two is asked for.
+            both from the same distribution. Another function decides which of the two is asked for.
         name_of: Function that returns the words for what a tile literally shows, which need no knowledge, for the
             wording `named`. They are empty where they say no more than the concept does. None if the category has
             no such words.
