@@ -42,7 +42,7 @@ _inside_option = partial(typer.Option, rich_help_panel="Inside the network")
 
 
 class Numbers(tuple[float, ...]):
-    """Comma-separated numbers."""
+    """A tuple of numbers that are given as comma-separated text."""
 
     __slots__ = ()
 

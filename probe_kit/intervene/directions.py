@@ -94,7 +94,7 @@ def check_direction(direction: str) -> None:
     """Refuse a name that is no direction to patch tokens within.
 
     Raises:
-        UsageError: For such a name.
+        UsageError: For an unknown direction.
     """
     if direction.startswith(f"{MEAN_DIFFERENCE}:"):
         Method.of(direction)

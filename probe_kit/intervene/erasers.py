@@ -261,7 +261,7 @@ def _check_more(method: Method, available: int) -> None:
     """Refuse a method with more directions than there are: its name states the number.
 
     Raises:
-        UsageError: For such a method.
+        UsageError: For more directions than the tokens have.
     """
     if method.rank > available:
         raise UsageError(

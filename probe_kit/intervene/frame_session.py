@@ -84,7 +84,7 @@ class Frames:
         """Refuse an input that the frames do not have, such as a mistyped camera.
 
         Raises:
-            UsageError: For such an input.
+            UsageError: For an input that the frames do not have.
         """
         inputs = (INSTRUCTION, PICTURE, *(f"{PICTURE}.{name}" for name in self.cameras), STATE)
         if vary not in inputs:
@@ -242,7 +242,7 @@ class FrameSession(ReplaySession):
         """Refuse an input that no frame of another group varies.
 
         Raises:
-            UsageError: For such an input.
+            UsageError: If no frame of another group varies the input.
         """
         if not any(self._donors(item) for item in self.items):
             raise UsageError(

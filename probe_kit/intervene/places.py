@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from probe_kit.hooks import Model, Policy, Stream
 
 TILE_ROLES = ("image.left", "image.right")
-"""Roles of the patches that see one of the two pictures; see `tiles`."""
+"""Roles of the patches that see one of the two pictures; see `tokens`."""
 TILES: Mapping[str, Side] = dict(zip(TILE_ROLES, ("left", "right"), strict=True))
 """Tile of each of these roles."""
 ALL = "all"

@@ -108,7 +108,7 @@ def check_roles(intervention: Intervention, policy: "Policy") -> None:
     The default roles are tried where none are named; then one of them that the policy has is enough.
 
     Raises:
-        UsageError: For such a role.
+        UsageError: For a role that no token has.
     """
     default_roles = next((field.default for field in fields(intervention) if field.name == "roles"), ())
     patterns_of: dict[tuple[str, ...], list[str]] = {}

@@ -133,7 +133,7 @@ def check_run_fits(run: Run) -> None:
     """Refuse a run whose policy did not act, or acted in a way that cannot be repeated here.
 
     Raises:
-        UsageError: For such a run.
+        UsageError: If effects of an intervention cannot be measured on the run.
     """
     settings = run.settings
     why = None

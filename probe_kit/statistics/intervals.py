@@ -101,7 +101,8 @@ def difference_interval(
 def mean_interval(values: Sequence[float], limits: Sequence[Interval]) -> Interval:
     """Return the interval of the mean of independent estimates, at the level of their intervals.
 
-    low = mean − √(Σ (value − its low)²) / n, high alike. No limits where one of them has none.
+    The lower limit is mean − √(Σ (value − its low)²) / n, and the upper one alike. There are no limits where an
+    estimate has none.
 
     Raises:
         UsageError: Without estimates.

@@ -38,7 +38,7 @@ def better_than_reference(
 
     Args:
         correct: (S, E) scores, such as whether a decision is right.
-        reference: (E,) what the control scores in each episode.
+        reference: (E,) score of the control in each episode.
         groups: (E,) group of items of every episode.
         seed: Seed of the signs.
         widening: Factor of the drawn differences; SHARED_PROBE for R², whose groups share a probe and so are not

@@ -348,7 +348,7 @@ def _check_contradictions(rows: Sequence[Row], table: Path) -> None:
     """Refuse a question that is asked twice, or with another answer.
 
     Raises:
-        UsageError: For such a question.
+        UsageError: For a question that comes twice, with the same answer or the opposite one.
     """
     lines: dict[tuple[str, Path, Path], int] = {}
     for row in rows:

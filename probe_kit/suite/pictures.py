@@ -157,7 +157,7 @@ def rgb_of(image: Image.Image, name: str, remedy: str) -> Image.Image:
 
     Raises:
         SuiteError: For a format outside `FORMATS`, a picture that is too large or has several frames, more than 8
-            bits per channel, and damaged bytes.
+            bits per channel, or damaged bytes.
     """
     if image.format not in (None, *FORMATS):
         raise SuiteError(f"{name} is {image.format}; expected one of {', '.join(FORMATS)}. {remedy}")

@@ -355,7 +355,7 @@ def swap_responses_by_episode(run: RunReader) -> dict[str, int]:
 def stored_image_swaps(run: RunReader, readout: str | None = None) -> dict[str, ImageSwapEffect]:
     """Return by category the effects of the image swaps that are stored for the episodes the run has now.
 
-    Of several image swaps it is the preferred one, see `outcomes`. Empty if there is none.
+    Of several image swaps it is the preferred one, see `stored`. Empty if there is none.
 
     Args:
         run: Run with the stored interventions.

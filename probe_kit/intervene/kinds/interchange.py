@@ -439,7 +439,7 @@ def check_roles_apart(roles: Sequence[str], kind: str) -> None:
     """Refuse roles that share tokens: sets of such cells would patch tokens twice.
 
     Raises:
-        UsageError: For such roles.
+        UsageError: If the role `all` is among others.
     """
     if ALL in roles:
         raise UsageError(f"--kind {kind} needs roles that share no token; leave all out")

@@ -38,8 +38,6 @@ Draw = Callable[[Pen, float, RGB], None]
 class Gradable:
     """A thing that is asked for by more or by less of one property.
 
-    is the level.
-
     Attributes:
         more: Phrase for the thing with more of the property.
         less: Phrase for the thing with less of it.
