@@ -2,6 +2,7 @@
 
 `gymnasium.make("probe_kit.env:probe_kit/Act2Answer-v0", spec=SceneSpec())`, which needs no import of ours, and
 `Act2AnswerEnv(SceneSpec())` are the same.
+
 Importing this module loads neither the simulator nor torch.
 """
 

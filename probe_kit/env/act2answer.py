@@ -26,8 +26,9 @@ class Question:
     """An instruction with the picture of each side in one layout.
 
     Attributes:
-        pictures: RGB images by the side they lie on *in this layout*.
-        side_correct: likewise.
+        name: Name of the episode, `<item_id>:o` or `<item_id>:s`.
+        pictures: RGB images by the side on which they lie *in this layout*.
+        side_correct: Side of the correct picture, in this layout too.
     """
 
     name: str
@@ -38,7 +39,7 @@ class Question:
 
     @classmethod
     def from_item(cls, item: Item, layout: Layout) -> Self:
-        """The question of an item. An item without hashes is taken as it is.
+        """Make the question of an item; an item without hashes is not checked.
 
         Raises:
             SuiteError: If a picture is missing or broken, or has other pixels than the item says.
@@ -53,7 +54,7 @@ class Question:
 
     @classmethod
     def built_in(cls, layout: Layout = "original") -> Self:
-        """Two plain pictures for trying the environment without a suite: blue is correct, orange is wrong."""
+        """Return a question with two plain pictures, without a suite: blue is correct, orange is wrong."""
         side: Side = "left" if _checked(layout) == "original" else "right"
         blue, orange = (Image.new("RGB", (64, 64), color) for color in ("royalblue", "darkorange"))
         pictures = {side: blue, other_side(side): orange}
@@ -69,9 +70,9 @@ def _checked(layout: Layout) -> Layout:
 # -- the trial ------------------------------------------------------------------------------------------------
 
 FALLEN_BELOW = -0.05
-"""Height of the cube, metres, at which it has left the table."""
+"""Height of the cube, in metres, at which it has left the table."""
 REST_STEPS = 5
-"""Actions it must lie still, once released, for an early stop."""
+"""Number of actions for which the cube must lie still, once released, for an early stop."""
 
 
 class Trial:
@@ -80,8 +81,8 @@ class Trial:
     The scene knows arm, cube and tiles; the trial knows the question, and by Act2Answer's rules when it is over.
     It is not called an episode, which is the planned question with its layout (`suite.items.Episode`).
 
-    executed: the last action (7,) as executed: after the limits, no motion where the arm could
-    not follow, and the gripper that was really commanded. None before the first.
+    `executed` is the last action (7,) as executed, after the limits: no motion where the arm could not follow, and
+    the real command of the gripper. It is None before the first action.
     """
 
     def __init__(self, scene: Scene, question: Question) -> None:
@@ -104,7 +105,7 @@ class Trial:
         return self.stopped_early or self.ending is not None
 
     def advance(self, action: Array) -> None:
-        """Carry out one checked action (7,)."""
+        """Execute one checked action (7,)."""
         move = self.controller.command(action)
         opening = 0.0 if self.steps < self.scene.spec.forced_closed else move.opening
         finite = self.scene.advance(move.q_from, move.q_to, opening)
@@ -116,7 +117,7 @@ class Trial:
         self.stopped_early = self.scene.spec.early_stop and self.ending is None and self._came_to_rest()
 
     def outcome(self) -> Outcome:
-        """The record of the episode as it stands."""
+        """Return the record of the episode at this moment."""
         scene, question = self.scene, self.question
         xy = self._cube_xy()
         to_correct = distance(xy, scene.tile_xy(question.side_correct))
@@ -146,7 +147,7 @@ class Trial:
         return "max_steps" if self.steps >= self.scene.spec.max_steps else None
 
     def _came_to_rest(self) -> bool:
-        """Whether the cube has been in the hand, was let go and has lain still since for long enough."""
+        """Whether the cube was in the hand, was released and has been still since for long enough."""
         grasped = self.scene.is_grasped()
         self._was_grasped |= grasped
         still = not grasped and self.scene.cube_state().speed < REST_SPEED
@@ -163,23 +164,27 @@ class Trial:
 Observation = dict[str, Any]
 Info = dict[str, Any]
 LARGEST_SHIFT, LARGEST_TURN = 1.0, float(np.pi)
-"""Bounds of the action space, metres and radians, where the scene limits no action."""
+"""Bounds of the action space, in metres and radians, where the scene limits no action."""
 
 
 class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[misc]
-    """Answer a question by putting the cube on one of two pictures.
+    """The environment: answer a question by putting the cube on one of two pictures.
 
-    Observation: `pixels.image` (H, W, 3) uint8, and `agent_pos` (8,) float32: x, y, z of the tool in metres,
-    roll, pitch, yaw relative to pointing down in radians, a zero that Bridge policies expect, and the opening
-    of the gripper (1 open, 0 closed).
-    Action (7,): xyz delta in metres and roll-pitch-yaw delta in radians along the fixed world axes, added to
-    the last commanded pose, and the gripper: above 0.5 opens it, the rest closes it. One action takes 0.2 s.
+    Observation: `pixels.image` (H, W, 3) uint8, and `agent_pos` (8,) float32. The latter starts with x, y, z of
+    the tool in metres, and roll, pitch, yaw relative to pointing down in radians. Then come a zero that Bridge
+    policies expect, and the opening of the gripper (1 open, 0 closed).
+
+    Action (7,): xyz delta in metres and roll-pitch-yaw delta in radians along the fixed world axes, added to the
+    last commanded pose, and the gripper. A gripper value above 0.5 opens it, any other closes it. One action takes
+    0.2 s.
+
     Reward: 1.0 with the last action if the cube lies in the correct zone, otherwise 0.0.
+
     Reset options: `item` (an Item; without it two plain pictures) and `layout` ("original" or "swapped").
 
-    The episode is truncated after `max_steps`, when the cube falls off the table or when the simulator
-    breaks; it terminates only with `SceneSpec.early_stop`. One process can hold many environments, but the
-    simulator holds Python's lock while it works: run in parallel with processes, not with threads.
+    The episode is truncated after `max_steps`, when the cube falls off the table or when the simulator breaks. It
+    terminates only with `SceneSpec.early_stop`. One process can hold many environments, but the simulator holds
+    Python's lock while it works: run in parallel with processes, not with threads.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 5}
@@ -211,11 +216,11 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
     # -- gymnasium ---------------------------------------------------------------------------------------
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, Info]:
-        """Start an episode; `info["tile_visibility"]` says how much of each picture the camera sees.
+        """Start an episode; `info["tile_visibility"]` is the share of each picture that the camera sees.
 
         Raises:
-            SuiteError: For a missing or broken picture.
-            SceneError: For an unknown option, in both cases before anything moved.
+            SuiteError: For a missing or broken picture, before anything moved.
+            SceneError: For an unknown option, before anything moved.
             EpisodeOverError: After `close`.
         """
         super().reset(seed=seed)
@@ -229,12 +234,12 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
         return observation, self._info() | {"tile_visibility": self.scene.tile_visibility(self._current_frame())}
 
     def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, Info]:
-        """`advance` and then `observe`."""
+        """Execute one action (7,) and observe: `advance` and then `observe`."""
         reward, terminated, truncated, info = self.advance(action)
         return self.observe(), reward, terminated, truncated, info
 
     def render(self) -> Picture:
-        """The picture (H, W, 3) uint8 of the scene now, as rendered."""
+        """Return the picture (H, W, 3) uint8 of the scene now, as rendered."""
         scene, frame = self.scene, self._current_frame()
         if self._picture is None:
             self._picture = scene.picture(frame)
@@ -242,10 +247,10 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
         return self._picture.copy()
 
     def render_small(self, height: int) -> Picture:
-        """The picture (height, w, 3) uint8 of the scene now: for films, and no model.
+        """Return a picture (height, w, 3) uint8 of the scene now, for films and not for models.
 
-        Shrunk from that of `render` where that was drawn since the last action. Else drawn at this height, which
-        takes an eighth of the time at a third of the height and gives less smooth edges.
+        It is shrunk from that of `render` where that was drawn since the last action. Else it is drawn at this
+        height. That takes an eighth of the time at a third of the height, and gives less smooth edges.
         """
         if self._frame is None:
             return self.scene.small_picture(height)
@@ -261,7 +266,7 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
     # -- cheap stepping ----------------------------------------------------------------------------------
 
     def advance(self, action: ArrayLike) -> tuple[float, bool, bool, Info]:
-        """Carry out one action without drawing a picture: reward, terminated, truncated, info.
+        """Execute one action (7,) without drawing a picture: reward, terminated, truncated, info.
 
         A policy that executes a chunk of actions blindly needs a picture only before the next chunk, and drawing
         is most of the work.
@@ -281,7 +286,7 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
         return float(info["is_success"]), trial.stopped_early, trial.ending is not None, info
 
     def observe(self) -> Observation:
-        """The observation now; draws the picture unless it was drawn since the last action."""
+        """Return the observation now; draw the picture unless it was drawn since the last action."""
         picture, size = self.render(), self.scene_spec.picture_size
         if size is not None:
             picture = np.array(Image.fromarray(picture).resize(size, Image.Resampling.LANCZOS))
@@ -290,9 +295,9 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
         return {"pixels": {"image": picture}, "agent_pos": agent_pos}
 
     def observe_exchanged(self) -> tuple[Observation, Picture]:
-        """The observation now if the two pictures lay in each other's place, and its picture as rendered.
+        """Return the observation with the two pictures in each other's place, and its picture as rendered.
 
-        What the other layout of the item shows in this very state; the episode is unchanged.
+        It shows the other layout of the item in this very state; the episode is unchanged.
         """
         before = self._current_frame(), self._picture
         try:
@@ -303,7 +308,11 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
             self._frame, self._picture = before
 
     def outcome(self) -> Outcome:
-        """The record of the episode so far. Raises EpisodeOverError before the first action."""
+        """Return the record of the episode so far.
+
+        Raises:
+            EpisodeOverError: Before the first action.
+        """
         if self.trial.steps == 0:
             raise EpisodeOverError("no action was executed yet, so there is no outcome; call `step` first.")
         return self.trial.outcome()
@@ -312,11 +321,18 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
 
     @property
     def scene(self) -> Scene:
-        """The simulated scene. Raises EpisodeOverError before the first `reset`."""
+        """The simulated scene.
+
+        Raises:
+            EpisodeOverError: Before the first `reset`, or after `close`.
+        """
         return self.trial.scene
 
     def tile_masks(self) -> dict[Side, NDArray[np.bool_]]:
-        """(H, W) where in `observe`'s picture each tile's own is seen; where it was shrunk, where any of it is."""
+        """Return masks (H, W) of where each tile's picture is seen in `observe`'s picture.
+
+        Where that picture was shrunk, a pixel counts if any of it shows the tile's picture.
+        """
         masks, size = self.scene.tile_masks(self._current_frame()), self.scene_spec.picture_size
         if size is None:
             return masks
@@ -325,7 +341,11 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
 
     @property
     def trial(self) -> Trial:
-        """The running or finished episode. Raises EpisodeOverError before `reset` and after `close`."""
+        """The running or finished episode.
+
+        Raises:
+            EpisodeOverError: Before `reset` or after `close`.
+        """
         if self._trial is None:
             raise EpisodeOverError("there is no episode; call `reset` first (and not after `close`).")
         return self._trial
@@ -344,7 +364,7 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
 
     @property
     def task(self) -> str:
-        """Name of the current episode, `<item_id>:o` or `<item_id>:s`."""
+        """The name of the current episode, `<item_id>:o` or `<item_id>:s`."""
         return self._question.name
 
     @property
@@ -413,7 +433,7 @@ def _question(options: dict[str, Any]) -> Question:
 
 
 class Recorder:
-    """Notes the state of an environment, now and after every action. Looking changes nothing in the simulator.
+    """A recorder of an environment's state, now and after every action; it changes nothing in the simulator.
 
     Args:
         env: An Act2AnswerEnv that was just reset, wrapped or not.
@@ -424,7 +444,7 @@ class Recorder:
         self._frames = [np.concatenate([_state(self._env.scene), np.full(LED_TO, np.nan)])]
 
     def note(self, commanded: ArrayLike) -> None:
-        """After an action (7,) was executed."""
+        """Record the state after an action (7,) was executed."""
         trial = self._env.trial
         assert trial.executed is not None
         command = np.asarray(commanded, np.float64)
@@ -436,7 +456,7 @@ class Recorder:
 
 
 def _state(scene: Scene) -> Array:
-    """The state part of a frame; see `scoring.STATE`."""
+    """Return the state part of a frame; see `scoring.STATE`."""
     cube, tiles = scene.cube_state(), [scene.tile_state(side) for side in SIDES]
     return np.array(
         [
@@ -455,6 +475,6 @@ def _state(scene: Scene) -> Array:
 
 
 def _finger_forces(scene: Scene) -> list[float]:
-    """Newtons with which each finger presses on the cube, summed over the points of contact."""
+    """Return the newtons with which each finger presses on the cube, summed over the points of contact."""
     contacts = scene.client.getContactPoints(bodyA=scene.arm.body, bodyB=scene.cube)
     return [sum(contact[9] for contact in contacts if contact[3] == finger) for finger in scene.arm.model.fingers]

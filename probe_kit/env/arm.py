@@ -1,11 +1,11 @@
 """The arm: its URDF, the arm in the simulation, and the conversion of actions to joint angles.
 
-The WidowX-250S is generated from a table and the meshes of the `rtb-data` package: PyBullet reads URDF but not
-xacro, which is all that package has. Lengths in metres, angles in radians, masses in kilograms. The gripper's
+The WidowX-250S is generated from a table and the meshes of the `rtb-data` package. PyBullet reads URDF but not
+xacro, which is all that package has. Lengths are in metres, angles in radians, masses in kilograms. The gripper's
 bar and propeller belong to one rigid link here, and inertia is left to PyBullet.
 
-Actions follow the Bridge convention of SimplerEnv. Deltas accumulate on the pose that was last *commanded*, not
-on the measured one, so that tracking errors do not add up. The rotation delta turns about the fixed axes of the
+Actions follow the Bridge convention of SimplerEnv. Deltas accumulate on the pose that was last *commanded*, not on
+the measured one, so that tracking errors do not add up. The rotation delta turns about the fixed axes of the
 world, through the tool.
 """
 
@@ -28,9 +28,9 @@ from probe_kit.scene_names import ArmName
 MESH_FOLDER = Path("xacro/trossen_descriptions/meshes/meshes_wx250s")
 GREY = "0.13 0.13 0.13 1"
 EFFORT = 100.0
-"""Largest torque of a joint in the description, N m."""
+"""Largest torque of a joint in the description, in N m."""
 FINGER_EFFORT = 10.0
-"""Largest force of a finger in the description, N."""
+"""Largest force of a finger in the description, in N."""
 ORIGIN: XYZ = (0.0, 0.0, 0.0)
 QUARTER: XYZ = (0.0, 0.0, pi / 2)
 
@@ -155,18 +155,20 @@ class ArmModel:
     """The constants of one arm: joints, links, fingers and limits.
 
     Attributes:
-        urdf: Finds the description file on this machine, or writes it into the folder it is given.
-        base: Where it stands in the world.
-        joints: Link indices in PyBullet's order.
-        fingers: As `joints`.
-        tool: As `joints`.
-        closed: Finger joint positions in metres; both fingers move alike.
-        opened: As `closed`.
+        urdf: Function that finds the description file on this machine, or writes it into the folder that it is
+            given.
+        base: Position of the base in the world, in metres.
+        joints: Link indices of the joints, in PyBullet's order.
+        fingers: Link indices of the two fingers.
+        tool: Link index of the tool.
+        closed: Finger joint position of the closed gripper in metres; both fingers move alike.
+        opened: Finger joint position of the open gripper in metres.
         down: Rotation (3, 3) of the tool link when the gripper points down and its fingers open along y.
-        posture: Joint angles the arm starts from when it looks for its home pose, and drifts back to.
-        clearance: Lowest tool height at which the finger tips stay off the table.
-        hand_drop: How far the middle of a held object hangs below the tool.
-        pads: Finger joint position at which the pads would meet.
+        posture: Joint angles in radians from which the search for the home pose starts, and to which a redundant
+            arm drifts.
+        clearance: Lowest tool height, in metres, at which the finger tips stay off the table.
+        hand_drop: Metres by which the middle of a held object hangs below the tool.
+        pads: Finger joint position, in metres, at which the pads would meet.
     """
 
     urdf: Callable[[Path], Path]
@@ -229,14 +231,16 @@ VELOCITY_GAIN = 1.0
 """Gains of PyBullet's position control, without unit: shares of an error that one simulation step corrects."""
 GEAR_FORCE = 50.0
 GEAR_ERP = 0.1
-"""Force, N, and share of an error corrected in a step, of the gear by which one finger mirrors the other."""
+"""Force, in N, and share of an error corrected in a step, of the gear by which one finger mirrors the other."""
 
 
 class Arm:
     """An arm loaded into a physics server.
 
     Joint angles are (n,) radians; an opening is 1 for an open and 0 for a closed gripper.
-    Raises SceneError if the description is missing or has other joints than the model.
+
+    Raises:
+        SceneError: If the description is missing, cannot be read, or has other joints than the model.
     """
 
     def __init__(self, client: BulletClient, model: ArmModel, physics: PhysicsSpec, urdf: Path) -> None:
@@ -249,14 +253,14 @@ class Arm:
         self.chain = self._measure_chain()
 
     def set_joints(self, q: Array, opening: float) -> None:
-        """Put the joints there at rest, without moving through the space between."""
+        """Set the joints to these angles at rest, without moving through the space between."""
         for joint, angle in zip(self.model.joints, q, strict=True):
             self._client.resetJointState(self.body, joint, angle)
         for finger in self.model.fingers:
             self._client.resetJointState(self.body, finger, self._finger_position(opening))
 
     def command_gripper(self, opening: float) -> None:
-        """Let the fingers close or open until another command comes."""
+        """Command the fingers to an opening, until another command comes."""
         for finger in self.model.fingers:
             self._client.setJointMotorControl2(
                 self.body,
@@ -281,23 +285,26 @@ class Arm:
         )
 
     def joints(self) -> Array:
-        """Measured joint angles (n,)."""
+        """Return the measured joint angles (n,)."""
         return np.array([state[0] for state in self._client.getJointStates(self.body, self.model.joints)])
 
     def tool_state(self) -> Array:
-        """Measured x, y, z, roll, pitch, yaw (6,) of the tool; the angles are relative to pointing down."""
+        """Return the measured x, y, z, roll, pitch, yaw (6,) of the tool.
+
+        The angles are relative to pointing down.
+        """
         pose = self.chain.pose(self.joints())
         return np.concatenate([pose.position, to_rpy(pose.rotation @ np.array(self.model.down).T)])
 
     def opening(self) -> float:
-        """Measured opening of the gripper, 0 closed to 1 open."""
+        """Return the measured opening of the gripper, 0 closed to 1 open."""
         states = self._client.getJointStates(self.body, self.model.fingers)
         middle = sum(state[0] for state in states) / 2
         span = self.model.opened - self.model.closed
         return float(np.clip((middle - self.model.closed) / span, 0.0, 1.0))
 
     def tool_down(self, position: XYZ, rpy: XYZ = (0.0, 0.0, 0.0)) -> Pose:
-        """The pose with the tool at `position` and the gripper pointing down, but for a turn `rpy`."""
+        """Return the pose with the tool at `position` and the gripper pointing down, except for a turn `rpy`."""
         return Pose(np.array(position), from_rpy(rpy) @ np.array(self.model.down))
 
     def _load(self, urdf: Path) -> int:
@@ -322,7 +329,7 @@ class Arm:
         return self.model.closed + opening * (self.model.opened - self.model.closed)
 
     def _couple_fingers(self) -> None:
-        """Gear the fingers to each other: alone they share the load unevenly and drop the cube 1 cm off."""
+        """Gear the fingers to each other: alone, they share the load unevenly and drop the cube 1 cm off."""
         client, (left, right) = self._client, self.model.fingers
         gear = client.createConstraint(
             self.body, left, self.body, right, client.JOINT_GEAR, (1, 0, 0), (0, 0, 0), (0, 0, 0)
@@ -333,7 +340,7 @@ class Arm:
             client.changeDynamics(self.body, finger, lateralFriction=self._physics.friction, frictionAnchor=1)
 
     def _measure_chain(self) -> SerialChain:
-        """Read the screws off the loaded robot at q = 0."""
+        """Read the screws of the loaded robot at q = 0."""
         client, model = self._client, self.model
         self.set_joints(np.zeros(len(model.joints)), 0.0)
         info = [client.getJointInfo(self.body, joint) for joint in model.joints]
@@ -360,16 +367,16 @@ OPEN_ABOVE = 0.5
 
 @dataclass(frozen=True)
 class Move:
-    """The motion that one action asks of the arm.
+    """The motion of the arm for one action.
 
     Attributes:
-        q_from: (n,) commanded joints before and after.
-        q_to: As `q_from`.
-        opening: 1 open, 0 closed.
-        clipped: A limit changed the action.
-        ik_error: Metres that remain to the wanted position.
-        shift: (3,) metres and radians by which the commanded pose really moved, in the words of the action.
-        turn: As `shift`.
+        q_from: (n,) commanded joints before the action, in radians.
+        q_to: (n,) commanded joints after the action, in radians.
+        opening: Commanded opening of the gripper, 1 open, 0 closed.
+        clipped: Whether a limit changed the action.
+        ik_error: Metres that remain to the requested position.
+        shift: (3,) metres by which the commanded pose really moved, in the convention of the action.
+        turn: (3,) radians by which the commanded pose really turned, in the convention of the action.
     """
 
     q_from: Array
@@ -382,7 +389,11 @@ class Move:
 
 
 def check_action(action: ArrayLike) -> Array:
-    """The action as float64 (7,). Raises ActionError if it has another shape or is not finite."""
+    """Return the action as float64 (7,).
+
+    Raises:
+        ActionError: If it is not numeric, has another shape or is not finite.
+    """
     try:
         values = np.asarray(action, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -400,10 +411,13 @@ def check_action(action: ArrayLike) -> Array:
 
 
 class DeltaController:
-    """Keeps the commanded tool pose `target` and joints `q`, and moves both by one action at a time.
+    """A controller that keeps the commanded tool pose `target` and joints `q`, and moves both action by action.
 
     Args:
-        euler: How the rotation of an action is read, see `SceneSpec`.
+        arm: Arm in the simulation.
+        limits: Limits of actions, workspace and inverse kinematics.
+        q: (n,) commanded joints at the start, in radians.
+        euler: Convention of the rotation of an action, see `SceneSpec`.
     """
 
     def __init__(self, arm: Arm, limits: LimitSpec, q: Array, euler: Euler = "zyx") -> None:

@@ -1,7 +1,7 @@
 """Rotations, and forward and inverse kinematics of a chain of revolute joints, in plain numpy.
 
-We do not use PyBullet's own inverse kinematics: it starts from the measured joints (so the answer depends
-on the tracking error), and with `currentPositions` it is wrong for a base that is not at the origin.
+PyBullet's own inverse kinematics is not used. It starts from the measured joints, so the answer depends on the
+tracking error. With `currentPositions`, it is wrong for a base that is not at the origin.
 """
 
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 
 
 def from_rpy(rpy: ArrayLike) -> Array:
-    """Rotation matrix (3, 3) of roll, pitch, yaw (3,)."""
+    """Return the rotation matrix (3, 3) of roll, pitch, yaw (3,)."""
     (sr, sp, sy), (cr, cp, cy) = np.sin(rpy), np.cos(rpy)
     return np.array(
         [
@@ -26,12 +26,12 @@ def from_rpy(rpy: ArrayLike) -> Array:
 
 
 def from_euler_xyz(angles: ArrayLike) -> Array:
-    """Rotation matrix (3, 3) of Euler angles "XYZ" (3,): R = Rx(first) Ry(second) Rz(third)."""
+    """Return the rotation matrix (3, 3) of Euler angles "XYZ" (3,): R = Rx(first) Ry(second) Rz(third)."""
     return from_rpy(np.negative(angles)).T
 
 
 def to_rpy(R: Array) -> Array:
-    """Roll, pitch, yaw (3,) of a rotation matrix (3, 3); at pitch = ±π/2 the roll is set to zero."""
+    """Return roll, pitch, yaw (3,) of a rotation matrix (3, 3); at pitch = ±π/2 the roll is set to zero."""
     level = np.hypot(R[0, 0], R[1, 0])
     pitch = np.arctan2(-R[2, 0], level)
     if level < 1e-6:
@@ -40,7 +40,7 @@ def to_rpy(R: Array) -> Array:
 
 
 def to_vector(R: Array) -> Array:
-    """Rotation vector (3,), axis times angle with angle in [0, π], of a rotation matrix (3, 3)."""
+    """Return the rotation vector (3,), axis times angle with angle in [0, π], of a rotation matrix (3, 3)."""
     twist = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
     sine, cosine = np.linalg.norm(twist), 0.5 * (np.trace(R) - 1.0)
     if sine > 1e-9:
@@ -54,7 +54,7 @@ def to_vector(R: Array) -> Array:
 
 
 def yaw_quaternion(yaw: float) -> tuple[float, float, float, float]:
-    """Quaternion (x, y, z, w) of a turn about +z."""
+    """Return the quaternion (x, y, z, w) of a turn about +z."""
     return (0.0, 0.0, float(np.sin(yaw / 2)), float(np.cos(yaw / 2)))
 
 
@@ -63,9 +63,9 @@ def yaw_quaternion(yaw: float) -> tuple[float, float, float, float]:
 DAMPING = 0.02
 """Largest damping factor; it shrinks with the residual, so that the last steps are Newton steps."""
 MAX_JOINT_STEP = 0.3
-"""Largest joint change of one iteration, radians."""
+"""Largest joint change of one iteration, in radians."""
 POSTURE_PULL = 0.05
-"""Share of the way back to the resting posture taken in the null space, for chains of more than 6 joints."""
+"""Share of the way back to the resting posture per step in the null space, for chains of more than 6 joints."""
 TOLERANCE = 1e-5
 """Residual (metres and radians together) at which the iteration stops."""
 
@@ -80,7 +80,7 @@ class Pose:
 
 @dataclass(frozen=True)
 class Solution:
-    """Joint angles (n,) in radians, and what remains to the target: metres and radians."""
+    """Joint angles (n,) in radians, and the errors that remain to the target: metres and radians."""
 
     q: Array
     error: float
@@ -92,11 +92,11 @@ class SerialChain:
     """A chain of n revolute joints, described by its screws at q = 0 in the world frame.
 
     Attributes:
-        axes: (n, 3) unit axis of each joint and a point on it.
-        points: As `axes`.
+        axes: (n, 3) unit axis of each joint.
+        points: (n, 3) a point on each axis, in metres.
         tip: Pose of the tool at q = 0.
-        lower: (n,) joint limits in radians.
-        upper: As `lower`.
+        lower: (n,) lower joint limits in radians.
+        upper: (n,) upper joint limits in radians.
     """
 
     axes: Array
@@ -106,16 +106,19 @@ class SerialChain:
     upper: Array
 
     def pose(self, q: Array) -> Pose:
-        """Pose of the tool at joint angles q (n,)."""
+        """Return the pose of the tool at joint angles q (n,)."""
         return self.pose_and_jacobian(q)[0]
 
     def solve(self, target: Pose, start: Array, posture: Array, iterations: int = 30) -> Solution:
-        """Joint angles that bring the tool to `target`, within the limits, by damped least squares.
+        """Return joint angles that bring the tool to `target`, within the limits, by damped least squares.
+
+        An unreachable target raises nothing: look at the errors of the solution.
 
         Args:
-            start: (n,) where to begin; pass the last commanded angles for 2 or 3 iterations.
-            posture: (n,) what a redundant chain drifts to while it keeps the tool in place. An unreachable target
-                raises nothing: look at the errors of the solution.
+            target: Pose of the tool.
+            start: (n,) joint angles of the start; with the last commanded angles, 2 or 3 iterations are enough.
+            posture: (n,) joint angles to which a redundant chain drifts while it keeps the tool in place.
+            iterations: Most iterations.
         """
         q = start
         for _ in range(iterations):
@@ -137,9 +140,9 @@ class SerialChain:
         return np.asarray(step * min(1.0, MAX_JOINT_STEP / max(np.abs(step).max(), 1e-12)))
 
     def pose_and_jacobian(self, q: Array) -> tuple[Pose, Array]:
-        """Pose of the tool at joint angles q (n,), and its Jacobian (6, n), by the product of exponentials.
+        """Return the tool's pose at joint angles q (n,), and its Jacobian (6, n), by the product of exponentials.
 
-        The Jacobian holds linear over angular velocity, both in the world frame.
+        The Jacobian is linear over angular velocity, both in the world frame.
         """
         cross, cross_squared = self._generators
         turns = np.eye(3) + np.sin(q)[:, None, None] * cross + (1 - np.cos(q))[:, None, None] * cross_squared
@@ -154,7 +157,7 @@ class SerialChain:
 
     @cached_property
     def _generators(self) -> tuple[Array, Array]:
-        """Cross-product matrices (n, 3, 3) of the axes, and their squares."""
+        """The cross-product matrices (n, 3, 3) of the axes, and their squares."""
         cross = np.cross(np.eye(3)[None], self.axes[:, None])
         return np.asarray(cross), np.asarray(cross @ cross)
 

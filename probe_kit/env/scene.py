@@ -38,29 +38,35 @@ FLOOR_SIZE = (8.0, 8.0, 0.02)
 FLOOR_CENTRE = (0.0, 0.0, -0.75)
 FLOOR_COLOR = (0.62, 0.64, 0.66, 1.0)
 TILE_COLOR = (0.85, 0.85, 0.83, 1.0)
-"""Sizes and centres (x, y, z) are metres in the frame of the robot's base; colours are RGBA."""
+"""Sizes and centres (x, y, z) are in metres in the frame of the robot's base; colours are RGBA."""
 LIMBO = (0.0, 0.0, 5.0)
-"""Where the cube waits in the saved state, so far up that it touches nothing."""
+"""Position of the cube in the saved state, so far up that it touches nothing."""
 TILE_LIMBO: Mapping[Side, XYZ] = MappingProxyType({"left": (0.0, 1.0, 5.0), "right": (0.0, -1.0, 5.0)})
-"""Likewise tiles that can be pushed."""
+"""Positions of tiles that can be pushed in the saved state."""
 GRAVITY = (0.0, 0.0, -9.81)
 HOME_POSITION_ERROR, HOME_ROTATION_ERROR = 0.001, 0.01
-"""How far `home_joints` may bring the tool from `home`, metres and radians."""
+"""Largest distance of the tool from `home` at `home_joints`, in metres and radians."""
 GRASP_GAP = 0.003
-"""Space between each finger and a cube that starts in the hand, before the fingers close, metres."""
+"""Space between each finger and a cube that starts in the hand, before the fingers close, in metres."""
 QUAD_LIFT = 0.0005
-"""How far the picture lies above its box, metres; enough for the depth buffer to tell them apart."""
+"""Height of the picture above its box, in metres; enough for the depth buffer to separate them."""
 _EMPTY_TABLES: dict[tuple[CameraSpec, LightSpec, float], Frame] = {}
-"""What scenes of this process saw before anything was on their table; the next like them need not draw it."""
+"""Frames of the empty tables of this process's scenes; an equal scene need not draw it again."""
 _TILE_PIXELS: dict[tuple[CameraSpec, float, float, float, tuple[XY, ...]], dict[Side, int]] = {}
-"""Likewise the pixels of their pictures."""
+"""Pixels of the tiles' pictures in these scenes."""
 _MOST_CACHED = 8
-"""Entries of each of the two caches."""
+"""Most entries of each of the two caches."""
 
 
 @dataclass(frozen=True)
 class BodyState:
-    """The state of cube or tile: position (3,) of the middle, quaternion (4,) x, y, z, w, linear speed in m/s."""
+    """The state of the cube or a tile.
+
+    Attributes:
+        position: (3,) middle of the body, in metres.
+        quaternion: (4,) x, y, z, w.
+        speed: Linear speed in m/s.
+    """
 
     position: Array
     quaternion: Array
@@ -93,7 +99,7 @@ class Scene:
         self._folder.cleanup()
 
     def reset(self, pictures: Mapping[Side, Image.Image], cube_position: XYZ, cube_yaw: float) -> None:
-        """Put everything back to its start, with these pictures on the tiles."""
+        """Return everything to its start, with these pictures on the tiles."""
         if not (self._healthy and self.textures.has_room(len(pictures))):
             self._reload()
         self.client.restoreState(self._saved)
@@ -133,7 +139,7 @@ class Scene:
         return self._healthy
 
     def put_cube_in_hand(self) -> None:
-        """Start with the cube held at the home pose: close around it without gravity, then switch that on."""
+        """Start with the cube held at the home pose: close around it without gravity, then switch gravity on."""
         client, model = self.client, self.arm.model
         x, y, z = self.spec.home
         around_cube = model.pads + self.spec.cube_side / 2 + GRASP_GAP
@@ -144,9 +150,9 @@ class Scene:
     def close_hand(self, actions: int) -> None:
         """Close the hand at the home pose for so many actions, without gravity during the first.
 
-        With gravity, a cube that waits in the air falls 12 mm before the fingers reach it. Called behind `reset`,
-        with nothing moved since. Closing around a cube in the same place is simulated once: the state that it led
-        to is restored, and is the same bit for bit.
+        With gravity, a cube that waits in the air falls 12 mm before the fingers reach it. The call must follow
+        `reset`, with nothing moved since. Closing around a cube in the same place is simulated once. Afterwards
+        the resulting state is restored, and is the same bit for bit.
         """
         cube = self.cube_state()
         start = (actions, self.arm.opening(), cube.position.tobytes(), cube.quaternion.tobytes())
@@ -179,7 +185,7 @@ class Scene:
         return (float(x), float(y))
 
     def finger_contacts(self) -> tuple[bool, bool]:
-        """Tell of the left and the right finger whether it touches the cube."""
+        """Return whether the left and whether the right finger touches the cube."""
         contacts = self.client.getContactPoints(bodyA=self.arm.body, bodyB=self.cube)
         touching = {contact[3] for contact in contacts}
         left, right = self.arm.model.fingers
@@ -198,7 +204,7 @@ class Scene:
         return any(self.touches_tile(side) for side in SIDES)
 
     def frame(self) -> Frame:
-        """Robot, cube and tiles as the camera sees them, without the table.
+        """Draw robot, cube and tiles as the camera sees them, without the table.
 
         PyBullet normalises the normals of a mesh in place whenever it draws them. The last bit of some alternates,
         and with it a colour by 1 of 255. So frame n of an episode always has the same parity of drawings before
@@ -214,7 +220,7 @@ class Scene:
         return self._draw()
 
     def small_picture(self, height: int) -> Picture:
-        """The finished picture (height, w, 3), drawn with fewer pixels, so that edges are less smooth."""
+        """Return the finished picture (height, w, 3), drawn with fewer pixels, so that edges are less smooth."""
         if self.spec.tile_mass > 0:
             self._lay_pictures()
         self._drawn += 1
@@ -225,15 +231,15 @@ class Scene:
         return self.camera.render(self.client, self.spec.light, self.spec.light_level)
 
     def picture(self, frame: Frame) -> Picture:
-        """The finished picture (H, W, 3) of a frame."""
+        """Return the finished picture (H, W, 3) of a frame."""
         return self.backdrop.under(frame)
 
     def tile_visibility(self, frame: Frame) -> dict[Side, float]:
-        """Share of each picture that is on screen and that neither robot nor cube hides in `frame`."""
+        """Return the share of each picture that is on screen and that neither robot nor cube hides in `frame`."""
         return {side: float((frame.bodies == self.quads[side]).sum() / self._tile_pixels[side]) for side in SIDES}
 
     def tile_masks(self, frame: Frame) -> dict[Side, NDArray[np.bool_]]:
-        """(H, W) where in the picture each tile's own picture is seen."""
+        """Return masks (H, W) of where each tile's picture is seen in the frame."""
         return {side: np.asarray(frame.bodies == self.quads[side]) for side in SIDES}
 
     def _build(self) -> None:
@@ -274,8 +280,8 @@ class Scene:
     def _reload(self) -> None:
         """Load everything into a new server.
 
-        restoreState does not heal a state that was once not finite, and resetSimulation keeps a copy of every
-        texture (0.2 MB): only the end of a server frees all of its memory.
+        restoreState does not repair a state that was once not finite, and resetSimulation keeps a copy of every
+        texture (0.2 MB). Only the end of a server frees all of its memory.
         """
         self.client.close()
         self.client = BulletClient()
@@ -309,7 +315,7 @@ class Scene:
         return q
 
     def _surroundings(self, empty: Frame) -> Picture:
-        """Colours behind robot, cube and tiles; a photo gets darker and brighter with the light of the scene."""
+        """Return the colours behind robot, cube and tiles; a photo is scaled with the light of the scene."""
         spec = self.spec
         if spec.rendering == "raw":
             return empty.rgb
@@ -353,7 +359,7 @@ class Scene:
             self.client.changeVisualShape(self.quads[side], -1, textureUniqueId=texture)
 
     def _lay_pictures(self) -> None:
-        """Let the pictures follow tiles that were pushed; they touch nothing, so that it changes no motion."""
+        """Move the pictures with tiles that were pushed; they touch nothing, so that this changes no motion."""
         lift = self.spec.tile_height / 2 + QUAD_LIFT
         for side in SIDES:
             state = self.tile_state(side)

@@ -1,17 +1,17 @@
 """Scoring of an episode by pure functions of its trajectory: outcome, events, outcome rules, behaviour.
 
-A frame is the state before the first action or after one; frame t follows action t. All that is said about an
-episode is computed from its frames, so that re-scoring needs no simulator.
+A frame is the state before the first action or after one; frame t follows action t. All statements about an
+episode are computed from its frames, so that re-scoring needs no simulator.
 
-The rule of the paper uses the final position of the cube in the plane alone. A success rate is made of a policy
-*and* of a rule, and rules disagree on the same episodes by a factor of ten. So a rule is a named object, every
+The rule of the paper uses the final position of the cube in the plane alone. A success rate depends on a policy
+*and* on a rule, and rules disagree on the same episodes by a factor of ten. So a rule is a named object, every
 episode can be judged by all of them, and every printed rate comes with its rule's name. All use the places of the
 tiles at the moment that is judged, which after a push is not where they began.
 
-The start biases some of the behaviour. In the released scene the hand starts over the right picture's box, so that
-every answer to the right is also the "first choice", and it is nearer to the right picture before it has moved.
-What the start gave is therefore left out (first choice, dwell, closer to, release) or named beside it (side of the
-start).
+The start biases some of the behaviour. In the released scene the hand starts over the right picture's box. So
+every answer to the right is also the "first choice", and the hand is nearer to the right picture before it has
+moved. The part that the start contributes is therefore left out (first choice, dwell, closer to, release) or named
+separately (side of the start).
 """
 
 from abc import ABC, abstractmethod
@@ -46,15 +46,15 @@ STATE: dict[str, tuple[str, ...]] = {
     "held": ("bool",),
     "touches": ("left", "right"),
 }
-"""What every frame holds, and the names of its parts."""
+"""Names of a frame's parts, and of the components of each."""
 MOTION: tuple[str, ...] = ("dx", "dy", "dz", "droll", "dpitch", "dyaw", "gripper")
 ACTIONS: dict[str, tuple[str, ...]] = {"commanded": MOTION, "executed": MOTION, "ik_error": ("m",)}
-"""What led to a frame; not a number in the first."""
+"""Parts that describe the action before a frame; not a number in the first frame."""
 CHANNELS: tuple[str, ...] = tuple(f"{name}.{part}" for name, parts in (STATE | ACTIONS).items() for part in parts)
 """Columns of a stored frame, in order."""
 _AXES = {MOTION: "motion", POSE: "pose"}
 LED_TO = sum(len(parts) for parts in ACTIONS.values())
-"""How many of them describe the action."""
+"""Number of columns that describe the action."""
 
 
 @dataclass(frozen=True)
@@ -63,18 +63,18 @@ class Trajectory:
 
     Attributes:
         tool: (T + 1, 6) measured x, y, z, roll, pitch, yaw, the angles relative to pointing down.
-        opening: (T + 1,) of the gripper, 1 open.
+        opening: (T + 1,) opening of the gripper, 1 open.
         cube: (T + 1, 7) middle of the body x, y, z and its quaternion x, y, z, w.
-        cube_speed: (T + 1,).
-        tile_left: As `cube`.
-        tile_right: As `cube`.
-        finger_force: (T + 1, 2) with which each finger presses on the cube. held: (T + 1,) bool, both fingers
-            touch the cube.
-        touches: (T + 1, 2) bool, the cube touches the left or right tile.
+        cube_speed: (T + 1,) speed of the cube in m/s.
+        tile_left: (T + 1, 7) pose of the tile that started left, in the form of `cube`.
+        tile_right: (T + 1, 7) pose of the tile that started right, in the form of `cube`.
+        finger_force: (T + 1, 2) force with which each finger presses on the cube.
+        held: (T + 1,) bool, whether both fingers touch the cube.
+        touches: (T + 1, 2) bool, whether the cube touches the left or right tile.
         commanded: (T, 7) actions as they came.
-        executed: (T, 7) what the commanded pose really advanced by, after limits, a gripper that is kept shut, and
-            poses out of reach (zero then).
-        ik_error: (T,) metres that remained.
+        executed: (T, 7) real advance of the commanded pose, after limits, a gripper that is kept shut, and poses
+            out of reach (zero then).
+        ik_error: (T,) metres that remained to the requested position.
     """
 
     tool: Values
@@ -105,7 +105,7 @@ class Trajectory:
 
     @property
     def frames(self) -> Values:
-        """(T + 1, len(CHANNELS)) float32 as stored: state, then the action that led to it, NaN in the first."""
+        """The frames (T + 1, len(CHANNELS)) float32 as stored: state, then the action before, NaN in the first."""
         frames = np.full((len(self), len(CHANNELS)), np.nan, np.float32)
         start = 0
         for name, of_name in (STATE | ACTIONS).items():
@@ -116,20 +116,20 @@ class Trajectory:
         return frames
 
     def __len__(self) -> int:
-        """Number of frames, T + 1."""
+        """Return the number of frames, T + 1."""
         return len(self.tool)
 
     @property
     def steps(self) -> int:
-        """Number of actions, T."""
+        """The number of actions, T."""
         return len(self.commanded)
 
     def tile(self, side: Side) -> Values:
-        """(T + 1, 7) pose of the tile on `side`."""
+        """Return the pose (T + 1, 7) of the tile on `side`."""
         return self.tile_left if side == "left" else self.tile_right
 
     def to_xarray(self) -> "xr.Dataset":
-        """The same with labelled axes: `frame` from 0, `step` from 1, and the parts by name."""
+        """Return the trajectory with labelled axes: `frame` from 0, `step` from 1, and the parts by name."""
         import xarray as xr
 
         arrays: dict[str, xr.DataArray] = {}
@@ -149,23 +149,23 @@ class Trajectory:
 Zone = Literal["correct", "wrong", "oob"]
 Ending = Literal["max_steps", "cube_fell", "non_finite"]
 SENSITIVITY_RADII = (0.055, 0.065, 0.081)
-"""Half a tile side, the rule of VL-Think, half a diagonal plus 3 mm: metres, for the default tile."""
+"""Half a tile side, the rule of VL-Think, half a diagonal plus 3 mm: in metres, for the default tile."""
 
 
 REST_SPEED = 0.002
-"""Speed of the cube in m/s below which it lies still."""
+"""Speed of the cube, in m/s, below which it lies still."""
 
 
 def distance(a: XY, b: XY) -> float:
-    """Distance in the plane, in the unit of the arguments."""
+    """Return the distance in the plane, in the unit of the arguments."""
     return float(np.hypot(a[0] - b[0], a[1] - b[1]))
 
 
 def zone(distance_correct: float, distance_wrong: float, radius: float) -> Zone:
     """Return the zone in which the cube ended, from its distances to both tile centres (all in one unit).
 
-    A cube on the edge of a zone is inside. Out of bounds if it is in neither; if a distance is not a number,
-    because the simulator broke, it is in neither.
+    A cube on the edge of a zone is inside. It is out of bounds if it is in neither zone. If a distance is not a
+    number, because the simulator broke, it is in neither.
 
     Raises:
         SceneError: If it would be in both.
@@ -181,19 +181,21 @@ def zone(distance_correct: float, distance_wrong: float, radius: float) -> Zone:
 
 @dataclass(frozen=True)
 class Outcome:
-    """The stored result of one finished or running episode. Metres, in the world frame.
+    """The stored result of one finished or running episode, in metres, in the world frame.
 
     Attributes:
-        zone: By the rule of the paper, with radius `epsilon`.
-        cube_xy: The middle of the cube.
-        cube_z: As `cube_xy`.
-        distance_correct: In the plane, to the tile centres.
-        distance_wrong: As `distance_correct`.
-        cube_moved: It is further than `SceneSpec.moved` from where it started.
-        on_tile: At the end it touches a tile, both fingers touch it; `Run.behaviour` says whether they ever did.
-        is_grasped: As `on_tile`.
-        clipped: How many actions the limits changed.
-        truncation_reason: Why the episode was cut, None if it is running or stopped early by itself.
+        zone: Zone of the cube by the rule of the paper, with radius `epsilon`.
+        cube_xy: Middle of the cube in the plane.
+        cube_z: Height of the cube's middle.
+        distance_correct: Distance of the cube to the correct tile's centre, in the plane.
+        distance_wrong: Distance of the cube to the wrong tile's centre, in the plane.
+        epsilon: Radius of the zones.
+        cube_moved: Whether the cube is further than `SceneSpec.moved` from its start.
+        on_tile: Whether the cube touches a tile at the end; `Run.behaviour` says whether it ever did.
+        is_grasped: Whether both fingers touch the cube at the end; `Run.behaviour` says whether they ever did.
+        steps: Number of executed actions.
+        clipped: Number of actions that the limits changed.
+        truncation_reason: Reason why the episode was cut; None if it is running or stopped early by itself.
     """
 
     zone: Zone
@@ -218,18 +220,21 @@ class Outcome:
 
     @property
     def side_placed(self) -> Literal["left", "right", "none"]:
-        """Side of the zone the cube is in."""
+        """The side of the zone that the cube is in; "none" if it is out of bounds."""
         if self.zone == "oob":
             return "none"
         return self.side_correct if self.is_success else other_side(self.side_correct)
 
     @property
     def never_moved(self) -> bool:
-        """Out of bounds because the cube stayed where it was: a failed grasp rather than a wrong answer."""
+        """Whether the cube is out of bounds because it stayed at its start.
+
+        That is a failed grasp rather than a wrong answer.
+        """
         return self.zone == "oob" and not self.cube_moved
 
     def to_json(self) -> dict[str, Any]:
-        """The record as plain JSON values; numbers that are not finite become None."""
+        """Return the record as plain JSON values; numbers that are not finite become None."""
         derived = {
             "is_success": self.is_success,
             "side_placed": self.side_placed,
@@ -241,7 +246,7 @@ class Outcome:
 def success_by_radius(
     outcomes: Iterable[Outcome], radii: Sequence[float] = SENSITIVITY_RADII
 ) -> dict[float, float]:
-    """Success rate for each zone radius in metres, from the stored distances: no episode runs again.
+    """Return the success rate for each zone radius in metres, from the stored distances: no episode runs again.
 
     Raises:
         ValueError: Without outcomes.
@@ -254,7 +259,7 @@ def success_by_radius(
 
 
 def success_at(distances: Iterable[tuple[float, float]], radius: float) -> float:
-    """Success rate at a zone radius, metres, from distances to the correct and the wrong tile, metres.
+    """Return the success rate at a zone radius from distances to the correct and the wrong tile, all in metres.
 
     Raises:
         SceneError: If the radius makes the zones overlap.
@@ -271,7 +276,7 @@ def _plain(value: Any) -> Any:
 # -- events ---------------------------------------------------------------------------------------------------
 
 MOVED = 0.005
-"""Metres the tool has to leave its first place by to have set off; less is the arm settling."""
+"""Metres from its first place by which the tool has set off; less is the arm settling."""
 LATERAL = 0.02
 """Metres towards either tile, of some 0.31 between them, by which the tool has committed to a side."""
 
@@ -285,10 +290,10 @@ class Events:
     Attributes:
         first_motion: The tool has left its place.
         grasp: The cube is held.
-        first_lateral_move: After the grasp, the tool has moved `LATERAL` along the line between the tiles from
-            where it grasped: before the grasp it goes where the cube is, whatever the question.
+        first_lateral_move: After the grasp, the tool has moved `LATERAL` along the line between the tiles from the
+            place of the grasp. Before the grasp it goes to the cube, whatever the question.
         release: The cube is not held any more, and not again. Frame t follows action t, so that the action with
-            that number brought it about.
+            that number caused it.
     """
 
     first_motion: int | None
@@ -334,7 +339,7 @@ def _first(happened: NDArray[np.bool_]) -> int | None:
 # -- outcome rules --------------------------------------------------------------------------------------------
 
 RELEASED_STEPS = 11
-"""Control steps at the end that the released evaluation averages over."""
+"""Control steps at the end over which the released evaluation averages."""
 
 Flags = NDArray[np.bool_]
 
@@ -346,7 +351,10 @@ class OutcomeRule(ABC):
 
     @abstractmethod
     def inside(self, trajectory: Trajectory, side: Side) -> Flags:
-        """(T + 1,) whether the cube counts as put on the picture on `side`, frame by frame. Not a number: no."""
+        """Return (T + 1,) whether the cube counts as put on the picture on `side`, frame by frame.
+
+        A position that is not a number does not count.
+        """
 
     @property
     @abstractmethod
@@ -356,13 +364,13 @@ class OutcomeRule(ABC):
 
 @dataclass(frozen=True)
 class Disc(OutcomeRule):
-    """The middle of the cube, seen from above, is within `radius` metres of the middle of the picture."""
+    """A rule: the middle of the cube, seen from above, is within `radius` metres of the picture's middle."""
 
     radius: float
     name = "disc"
 
     def inside(self, trajectory: Trajectory, side: Side) -> Flags:
-        """Height, grasp and motion do not count."""
+        """Return (T + 1,) whether the cube is within the disc; height, grasp and motion do not count."""
         away = trajectory.cube[:, :2] - trajectory.tile(side)[:, :2]
         return np.asarray(np.hypot(*away.T) <= self.radius)
 
@@ -374,11 +382,14 @@ class Disc(OutcomeRule):
 
 @dataclass(frozen=True)
 class Box(OutcomeRule):
-    """The middle of the cube is over a square of `half` metres to every side of the picture, `height` above it.
+    """A rule: the middle of the cube is over a square around the picture, and high enough.
 
-    The rule of the released evaluation. The square lies along x and y of the world, whatever way the tiles are
-    turned, and `height` counts from the middle of the tile. The cube may be held, lie on the bare table or have
-    been left where it started.
+    It is the rule of the released evaluation. The square lies along x and y of the world, whatever way the tiles
+    are turned. The cube may be held, lie on the bare table or have been left at its start.
+
+    Attributes:
+        half: Metres from the middle of the picture to each side of the square.
+        height: Metres from the middle of the tile up to the least height of the cube's middle.
     """
 
     half: float
@@ -386,7 +397,7 @@ class Box(OutcomeRule):
     name = "box"
 
     def inside(self, trajectory: Trajectory, side: Side) -> Flags:
-        """Held or lying, on the picture or beside it."""
+        """Return (T + 1,) whether the cube is over the square, held or lying, on the picture or next to it."""
         away = trajectory.cube[:, :3] - trajectory.tile(side)[:, :3]
         return np.asarray((np.abs(away[:, :2]) <= self.half).all(axis=1) & (away[:, 2] >= self.height))
 
@@ -398,13 +409,13 @@ class Box(OutcomeRule):
 
 @dataclass(frozen=True)
 class ReleasedOnTile(OutcomeRule):
-    """The cube was let go and lies still on the picture that can be seen: `half` metres to every side."""
+    """A rule: the cube was released and lies still on the visible picture, `half` metres to every side."""
 
     half: float
     name = "released-on-tile"
 
     def inside(self, trajectory: Trajectory, side: Side) -> Flags:
-        """Demand the square of the tile as it lies, touch, open fingers, and rest."""
+        """Return (T + 1,) whether the cube is on the tile as it lies, touches it, is released, and rests."""
         tile, position = trajectory.tile(side), 0 if side == "left" else 1
         away = _turned_back(trajectory.cube[:, :2] - tile[:, :2], tile[:, 3:])
         over = (np.abs(away) <= self.half).all(axis=1)
@@ -419,7 +430,10 @@ class ReleasedOnTile(OutcomeRule):
 
 
 def _turned_back(away: NDArray[np.float32], quaternion: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(F, 2) offsets in the plane, seen from a tile that is turned about the vertical; quaternions x, y, z, w."""
+    """Return offsets (F, 2) in the plane as seen from a tile that is turned about the vertical.
+
+    The tile's quaternions (F, 4) are x, y, z, w.
+    """
     x, y, z, w = quaternion.T
     yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     turned = np.stack([np.cos(yaw), np.sin(yaw), -np.sin(yaw), np.cos(yaw)], axis=1).reshape(-1, 2, 2)
@@ -431,12 +445,12 @@ class Judgement:
     """The verdict of a rule on one episode.
 
     Attributes:
-        outcome: At its end.
-        correct: Share of the judged steps, whole numbers where only the last one is judged.
-        wrong: As `correct`.
-        oob: As `correct`.
-        both: At its end the cube counts for both pictures, which is called correct.
-        idle: The outcome if nothing had moved since before the first action.
+        outcome: Zone at the end of the episode.
+        correct: Share of the judged steps in the correct zone; 0 or 1 where only the last step is judged.
+        wrong: Share of the judged steps in the wrong zone alone.
+        oob: Share of the judged steps in neither.
+        both: Whether the cube counts for both pictures at the end, which is called correct.
+        idle: Outcome if nothing had moved since before the first action.
     """
 
     outcome: Zone
@@ -456,12 +470,17 @@ def judge(
 ) -> Judgement:
     """Judge one episode by a rule.
 
+    An episode that ended before `max_steps` is taken to have stayed as it was until then.
+
     Args:
-        last_steps: How many control steps at the end count, each as much as the others. An episode that ended
-            before `max_steps` is taken to have stayed as it was until then.
+        trajectory: Trajectory of the episode.
+        rule: Rule that decides when the cube counts as put on a picture.
+        side_correct: Side of the correct picture in the episode's layout.
+        last_steps: Number of control steps at the end that count, each as much as the others.
+        max_steps: Actions of a full episode; None to judge the episode's own last steps.
 
     Raises:
-        UsageError: For fewer than one.
+        UsageError: For less than one step.
     """
     if last_steps < 1:
         raise UsageError(f"the last {last_steps} steps of an episode cannot be judged; expected at least 1")
@@ -496,11 +515,15 @@ RULES: Mapping[str, str] = MappingProxyType(
         ReleasedOnTile.name: "the cube was let go and lies still on the picture",
     }
 )
-"""Every rule by name, and what it asks for."""
+"""Every rule by name, with its condition in words."""
 
 
 def check_rule(name: str) -> str:
-    """`name`, if there is such a rule. Raises UsageError, naming the nearest and all."""
+    """Return `name`, if there is such a rule.
+
+    Raises:
+        UsageError: For another name; the message has the nearest rule and all of them.
+    """
     if name not in RULES:
         near = get_close_matches(name, RULES, n=1)
         hint = f"did you mean {near[0]}? " if near else ""
@@ -509,7 +532,11 @@ def check_rule(name: str) -> str:
 
 
 def rule_of(name: str, scene: Mapping[str, Any]) -> OutcomeRule:
-    """The rule of this name with the sizes of a scene, `SceneSpec.to_json()`. Raises UsageError."""
+    """Return the rule of this name with the sizes of a scene, `SceneSpec.to_json()`.
+
+    Raises:
+        UsageError: For an unknown name.
+    """
     return _MAKERS[check_rule(name)](scene)
 
 
@@ -533,7 +560,7 @@ _MAKERS: dict[str, Callable[[Mapping[str, Any]], OutcomeRule]] = {
 Choice = Literal["correct", "wrong", "none"]
 
 HAND_ABOVE = 0.02
-"""How far above the middle of a tile the tool must be to count as over it, metres (the released evaluation's)."""
+"""Metres above the middle of a tile from which on the tool counts as over it (the released evaluation's)."""
 
 
 TIE = 1e-3
@@ -542,28 +569,31 @@ TIE = 1e-3
 
 @dataclass(frozen=True)
 class Behaviour:
-    """One episode. Metres, shares from 0 to 1, control steps; None where there is nothing to say.
+    """The behaviour in one episode; metres, shares from 0 to 1, control steps, or None where it is not defined.
 
     Attributes:
-        grasped: Both fingers ever touched the cube, and let go of it after that.
-        released: As `grasped`.
-        released_at: Frame of the first release.
-        moved: The cube was ever further than `SceneSpec.moved` from its start, seen from above.
-        furthest: How far it was at most.
-        hand_starts_over: Which picture the hand is over, and nearer to, before the first action.
-        hand_starts_nearer: As `hand_starts_over`.
-        first_choice: The picture whose box the hand was brought into first. The box it began in counts from when
-            the hand is nearer to that picture by more than `SceneSpec.moved`, or was away and came back.
-        dwell_correct: Steps over either box, counted likewise.
-        dwell_wrong: As `dwell_correct`.
-        dwell_start: What is left out so.
-        min_distance_correct: Of the hand, seen from above, over the whole episode.
-        min_distance_wrong: As `min_distance_correct`.
-        closer_to: To which picture the hand came closer than it was at the start, by the larger gain.
-        release_near: The picture whose box the hand was over at the first release, counted likewise; None if it
+        grasped: Whether both fingers ever touched the cube.
+        released: Whether the hand released the cube after a grasp.
+        released_at: Frame of the first release; None without one.
+        moved: Whether the cube was ever further than `SceneSpec.moved` from its start, seen from above.
+        furthest: Largest distance of the cube from its start.
+        hand_starts_over: Picture that the hand is over before the first action.
+        hand_starts_nearer: Picture that the hand is nearer to before the first action.
+        first_choice: Picture whose box the hand was brought into first. The box in which it began counts from when
+            the hand is nearer to that picture by more than `SceneSpec.moved`. It also counts if the hand was away
+            and came back.
+        dwell_correct: Steps over the correct picture's box, counted likewise.
+        dwell_wrong: Steps over the wrong picture's box, counted likewise.
+        dwell_start: Steps over a box that are left out of the other two counts.
+        min_distance_correct: Least distance of the hand to the correct picture, seen from above, over the whole
+            episode.
+        min_distance_wrong: Least distance of the hand to the wrong picture, seen from above, over the whole
+            episode.
+        closer_to: Picture to which the hand came closer than it was at the start, by the larger gain.
+        release_near: Picture whose box the hand was over at the first release, counted likewise; None if it
             released nothing.
         correct_side_share: Share of steps with the hand on the correct side of the line between the pictures.
-        start_side_correct: Whether it began on that side.
+        start_side_correct: Whether the hand began on that side.
     """
 
     grasped: bool
@@ -586,7 +616,14 @@ class Behaviour:
 
 
 def behaviour_of(trajectory: Trajectory, side_correct: Side, box_half: float, moved: float) -> Behaviour:
-    """Describe the behaviour in one episode; box_half, moved: as in the scene, metres."""
+    """Describe the behaviour in one episode.
+
+    Args:
+        trajectory: Trajectory of the episode.
+        side_correct: Side of the correct picture in the episode's layout.
+        box_half: Half the side of the box of the rule `box`, in metres, see `SceneSpec.box_half`.
+        moved: Distance in metres from which on the cube or hand counts as moved, see `SceneSpec.moved`.
+    """
     sides: tuple[Side, Side] = (side_correct, other_side(side_correct))
     over = [_over(trajectory, side, box_half) for side in sides]
     distances = [np.hypot(*(trajectory.tool[:, :2] - trajectory.tile(side)[:, :2]).T) for side in sides]
@@ -627,13 +664,13 @@ def behaviour_of(trajectory: Trajectory, side_correct: Side, box_half: float, mo
 
 
 def _over(trajectory: Trajectory, side: Side, half: float) -> Flags:
-    """(T + 1,) whether the hand is over the box around a picture."""
+    """Return (T + 1,) whether the hand is over the box around a picture."""
     away = trajectory.tool[:, :3] - trajectory.tile(side)[:, :3]
     return np.asarray((np.abs(away[:, :2]) <= half).all(axis=1) & (away[:, 2] >= HAND_ABOVE))
 
 
 def _left_where_it_began(over: Flags, away: NDArray[np.float32], moved: float) -> Flags:
-    """(T + 1,) the frames of an uninterrupted stay from the start on in which the hand was not brought closer."""
+    """Return (T + 1,) whether the hand has stayed over a box from the start on without being brought closer."""
     return np.asarray(np.logical_and.accumulate(over) & (away[0] - away < moved))
 
 
@@ -642,7 +679,10 @@ def _choice(correct: bool, wrong: bool) -> Choice:
 
 
 def _offset_to_correct_side(trajectory: Trajectory, side_correct: Side) -> NDArray[np.float32]:
-    """(T + 1,) how far the hand is on the correct side of the line midway between where the pictures began."""
+    """Return (T + 1,) the metres of the hand beyond the line midway between the pictures' starts.
+
+    They are positive on the correct side.
+    """
     correct, wrong = trajectory.tile(side_correct)[0, :2], trajectory.tile(other_side(side_correct))[0, :2]
     middle, towards = (correct + wrong) / 2, (correct - wrong) / np.linalg.norm(correct - wrong)
     return np.asarray((trajectory.tool[:, :2] - middle) @ towards)

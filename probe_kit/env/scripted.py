@@ -1,4 +1,4 @@
-"""Scripted policies that need no model, and pictures as models elsewhere want them."""
+"""Scripted policies that need no model, and pictures in the formats of other tools."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,13 +16,13 @@ from probe_kit.errors import EpisodeOverError
 from probe_kit.suite.items import other_side
 
 MAX_SHIFT = 0.05
-"""Largest translation of one action, metres."""
+"""Largest translation of one action, in metres."""
 MAX_TURN = 0.35
-"""Largest rotation of one action, radians."""
+"""Largest rotation of one action, in radians."""
 TRAVEL_HEIGHT = 0.12
-"""Height of the tool above the table on the way, metres."""
+"""Height of the tool above the table on the way, in metres."""
 RELEASE_GAP = 0.003
-"""Space between the cube and what it is put on when the fingers open, metres."""
+"""Space between the cube and the surface below it when the fingers open, in metres."""
 OPEN, CLOSED = 1.0, 0.0
 STAY_SHUT = np.array([0, 0, 0, 0, 0, 0, CLOSED])
 
@@ -38,13 +38,16 @@ class Waypoint:
 
 
 class ScriptedExpert:
-    """Carries the cube to the correct tile (`mirrored`: to the wrong one), through the public actions alone.
+    """A policy that carries the cube to the correct tile, or with `mirrored` to the wrong one.
+
+    It uses the public actions alone. Call `reset` after each reset of the environment.
 
     Args:
-        env: An Act2AnswerEnv, wrapped or not. Call `reset` after each reset of the environment.
-        grasp_height: Of the tool, metres; None for the middle of the cube.
-        tolerance: Distance in metres at which a way-point counts as reached. Demonstrations whose executed actions
-            are noisy need a wider one, or the expert lingers.
+        env: An Act2AnswerEnv, wrapped or not.
+        mirrored: Whether the cube goes to the wrong tile.
+        grasp_height: Height of the tool in metres; None for the middle of the cube.
+        tolerance: Distance in metres at which a way-point counts as reached. Demonstrations with noise on the
+            executed actions need a wider one, or the expert lingers.
     """
 
     def __init__(
@@ -57,18 +60,22 @@ class ScriptedExpert:
         self._actions: Iterator[Array] | None = None
 
     def reset(self) -> None:
-        """Look at the table and plan. Raises EpisodeOverError if the environment was not reset."""
+        """Look at the table and plan.
+
+        Raises:
+            EpisodeOverError: If the environment was not reset.
+        """
         plan = self._carry() if self._env.scene_spec.start_grasped else [*self._grasp(), *self._carry()]
         self._actions = self._follow(plan)
 
     def act(self) -> NDArray[np.float32]:
-        """The next action (7,) float32; once the cube is placed it stays still with the gripper open."""
+        """Return the next action (7,) float32; once the cube is placed, the tool stays with an open gripper."""
         if self._actions is None:
             raise EpisodeOverError("the expert has no plan; call its `reset` after that of the environment.")
         return next(self._actions).astype(np.float32)
 
     def _grasp(self) -> list[Waypoint]:
-        """Over the cube, down, close, and up again."""
+        """Plan the grasp: over the cube, down, close, and up again."""
         x, y, _ = self._cube()
         yaw, height = self._cube_yaw(), self._grasp_height()
         above, at = np.array([x, y, TRAVEL_HEIGHT]), np.array([x, y, height])
@@ -80,7 +87,7 @@ class ScriptedExpert:
         ]
 
     def _carry(self) -> list[Waypoint]:
-        """Over the tile, down to just above it, open, and up again."""
+        """Plan the placement: over the tile, down to just above it, open, and up again."""
         spec, side = self._env.scene_spec, self._env.question.side_correct
         x, y = self._env.scene.tile_xy(other_side(side) if self._mirrored else side)
         height = spec.tile_height + self._grasp_height() + RELEASE_GAP
@@ -100,7 +107,7 @@ class ScriptedExpert:
         ]
 
     def _follow(self, plan: list[Waypoint]) -> Iterator[Array]:
-        """Actions along the way-points, then no motion for ever."""
+        """Yield actions along the way-points, then no motion forever."""
         for waypoint in plan:
             while not self._arrived(waypoint):
                 yield self._towards(waypoint)
@@ -121,7 +128,7 @@ class ScriptedExpert:
         return bool(np.linalg.norm(shift) < self._tolerance and abs(turn) < 1e-3)
 
     def _remaining(self, waypoint: Waypoint) -> tuple[Array, float]:
-        """Translation and turn about +z from the commanded pose to the way-point."""
+        """Return the translation and turn about +z from the commanded pose to the way-point."""
         target = self._env.trial.controller.target
         yaw = to_rpy(target.rotation @ np.array(self._env.scene.arm.model.down).T)[2]
         return waypoint.position - target.position, float(waypoint.yaw - yaw)
@@ -130,13 +137,13 @@ class ScriptedExpert:
         return self._env.scene.cube_state().position
 
     def _cube_yaw(self) -> float:
-        """The turn of the cube that is nearest to none; a cube looks the same after a quarter turn."""
+        """Return the turn of the cube that is nearest to none; a cube looks the same after a quarter turn."""
         x, y, z, w = self._env.scene.cube_state().quaternion
         yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
         return float((yaw + np.pi / 4) % (np.pi / 2) - np.pi / 4)
 
     def _grasp_height(self) -> float:
-        """Height of the tool when the cube lies on the table between the fingers."""
+        """Return the height of the tool when the cube lies on the table between the fingers."""
         if self._height is not None:
             return self._height
         model = self._env.scene.arm.model
@@ -144,7 +151,9 @@ class ScriptedExpert:
 
 
 class Idle:
-    """Never moves the tool, and leaves the gripper as it was at the start: shut around a cube in hand, else open.
+    """A policy that never moves the tool and leaves the gripper as at the start.
+
+    The gripper is shut around a cube in the hand, else open.
 
     Args:
         env: An Act2AnswerEnv, wrapped or not.
@@ -154,10 +163,10 @@ class Idle:
         self._env: Act2AnswerEnv = env.unwrapped
 
     def reset(self) -> None:
-        """There is nothing to plan."""
+        """Do nothing: there is nothing to plan."""
 
     def act(self) -> NDArray[np.float32]:
-        """The next action (7,) float32."""
+        """Return the next action (7,) float32."""
         return np.array([0, 0, 0, 0, 0, 0, not self._env.scene_spec.start_grasped], np.float32)
 
 
@@ -165,10 +174,10 @@ class Idle:
 
 
 def to_lerobot(observation: Mapping[str, Any]) -> dict[str, Any]:
-    """The observation as lerobot's policies name it, in numpy.
+    """Return the observation with the names of lerobot's policies, in numpy.
 
-    `observation.images.image`: (..., 3, H, W) float32 in [0, 1]. `observation.state`: (..., 8) float32. Leading
-    batch dimensions, as a vector environment adds them, stay.
+    `observation.images.image` is (..., 3, H, W) float32 in [0, 1]. `observation.state` is (..., 8) float32.
+    Leading batch dimensions, as a vector environment adds them, stay.
     """
     image = np.asarray(observation["pixels"]["image"])
     return {
@@ -178,13 +187,15 @@ def to_lerobot(observation: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def to_openpi(observation: Mapping[str, Any], prompt: str, size: int = 224) -> dict[str, Any]:
-    """One observation as an openpi policy server expects it.
+    """Return one observation as an openpi policy server expects it.
 
-    `observation/image`: (size, size, 3) uint8, the whole picture shrunk and padded with black to a square.
-    `observation/state`: (8,) float32.
+    `observation/image` is (size, size, 3) uint8, the whole picture shrunk and padded with black to a square.
+    `observation/state` is (8,) float32.
 
     Args:
+        observation: Observation of the environment, without batch dimensions.
         prompt: The instruction.
+        size: Side of the square picture in pixels.
     """
     return {
         "observation/image": _padded(Image.fromarray(observation["pixels"]["image"]), size),
@@ -205,7 +216,7 @@ def save_gif(path: Path, pictures: Sequence[Picture], fps: float = 5.0) -> None:
     """Write pictures (H, W, 3) uint8 as an endless GIF; collect them with `env.render()` after each action.
 
     Raises:
-        ValueError: If there are none.
+        ValueError: If there are no pictures.
     """
     if not pictures:
         raise ValueError(f"{path}: no pictures to write; call `env.render()` at least once.")

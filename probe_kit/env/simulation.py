@@ -1,11 +1,11 @@
 """PyBullet's side of the scene: clients, the camera, pictures on tiles, photographed backgrounds, films.
 
-Pixels covered by the table cost most of the rendering time and never change. So the empty table is drawn once
-(the *backdrop*), hidden from the renderer afterwards, and every frame is composed with it by depth. The result is
-the naive rendering bit for bit; under visual matching a photo takes the place of the backdrop's colours.
+Pixels covered by the table cost most of the rendering time and never change. So the empty table is drawn once (the
+*backdrop*), hidden from the renderer afterwards, and every frame is composed with it by depth. The result is the
+naive rendering bit for bit; under visual matching, a photo replaces the backdrop's colours.
 
 PyBullet stretches a texture on a box so that only a corner of it shows, and it loads broken files without an
-error. So a tile is a box with a quad of our own mesh on top, and every texture is a PNG we wrote ourselves.
+error. So a tile is a box with a quad of our own mesh on top, and every texture is a PNG that this module wrote.
 """
 
 import hashlib
@@ -38,7 +38,7 @@ _importing = Lock()  # the descriptor that is exchanged meanwhile is of the whol
 
 
 def import_pybullet() -> Any:
-    """The module pybullet, without the line on stderr that says when it was compiled.
+    """Return the module pybullet, without the line on stderr that says when it was compiled.
 
     Its C code writes that line to the file descriptor on every first import, past `sys.stderr`.
     """
@@ -51,7 +51,7 @@ def import_pybullet() -> Any:
 
 @contextmanager
 def _without_greeting() -> Iterator[None]:
-    """Hold back what is written to file descriptor 2, and pass it on without the greeting."""
+    """Hold back all output to file descriptor 2, and pass it on without the greeting."""
     if sys.stderr is not None:
         sys.stderr.flush()
     try:
@@ -123,43 +123,43 @@ class Camera:
 
     @property
     def axes(self) -> Array:
-        """Rows right, up, forward (3, 3): unit axes of the camera in the world."""
+        """The rows right, up, forward (3, 3): unit axes of the camera in the world."""
         forward = np.asarray(self.spec.forward) / np.linalg.norm(self.spec.forward)
         right = np.cross(forward, (0.0, 0.0, 1.0))
         right /= np.linalg.norm(right)
         return np.array([right, np.cross(right, forward), forward])
 
     def project(self, points: ArrayLike) -> Array:
-        """Pixel places (..., 2) as x, y of world points (..., 3) in front of the camera."""
+        """Return pixel places (..., 2) as x, y of world points (..., 3) in front of the camera."""
         x, y, z = np.moveaxis((np.asarray(points) - self.spec.eye) @ self.axes.T, -1, 0)
         centre = np.array([self.spec.width, self.spec.height]) / 2
         return np.asarray(centre + self.spec.focal_length * np.stack([x, -y], -1) / z[..., None])
 
     def rays(self) -> Array:
-        """Viewing direction (H, W, 3) in the world through the middle of every pixel, not normalised."""
+        """Return the viewing direction (H, W, 3) in the world through the middle of every pixel, unnormalised."""
         v, u = np.mgrid[: self.spec.height, : self.spec.width] + 0.5
         across = (u - self.spec.width / 2) / self.spec.focal_length
         down = (v - self.spec.height / 2) / self.spec.focal_length
         return np.asarray(np.stack([across, -down, np.ones_like(across)], -1) @ self.axes)
 
     def magnified(self, factor: int) -> "Camera":
-        """The same view with `factor` times the pixels in each direction."""
+        """Return the same view with `factor` times the pixels in each direction."""
         spec = self.spec
         return Camera(replace(spec, width=factor * spec.width, height=factor * spec.height))
 
     def at_height(self, height: int) -> "Camera":
-        """The same view with so many rows of pixels."""
+        """Return the same view with so many rows of pixels."""
         spec = self.spec
         return Camera(replace(spec, width=round(spec.width * height / spec.height), height=height))
 
     def widened(self) -> "Camera":
-        """The same view at the same scale, twice as wide and high: with what lies just outside of it."""
+        """Return the same view at the same scale, twice as wide and high: with what lies just outside of it."""
         spec = self.spec
         fov = 2 * float(np.degrees(np.arctan(2 * np.tan(np.radians(spec.fov) / 2))))
         return Camera(replace(spec, width=2 * spec.width, height=2 * spec.height, fov=fov))
 
     def view_matrix(self) -> list[float]:
-        """World to camera, column-major as OpenGL wants it."""
+        """Return the matrix from world to camera, column-major as in OpenGL."""
         right, up, forward = self.axes
         matrix = np.eye(4)
         matrix[:3, :3] = right, up, -forward
@@ -167,7 +167,7 @@ class Camera:
         return [float(x) for x in matrix.T.ravel()]
 
     def projection_matrix(self) -> list[float]:
-        """Camera to clip space, column-major as OpenGL wants it."""
+        """Return the matrix from camera to clip space, column-major as in OpenGL."""
         spec = self.spec
         f = 1 / np.tan(np.radians(spec.fov) / 2)
         depth = spec.far - spec.near
@@ -178,7 +178,7 @@ class Camera:
         return [float(x) for x in matrix.T.ravel()]
 
     def render(self, client: BulletClient, light: LightSpec, level: float) -> Frame:
-        """Draw what is visible in the server behind `client`, with all light scaled by `level`."""
+        """Draw everything visible in the server behind `client`, with all light scaled by `level`."""
         width, height = self.spec.width, self.spec.height
         _, _, rgba, depth, bodies = client.getCameraImage(
             width,
@@ -209,14 +209,14 @@ class Backdrop:
     depth: NDArray[np.float32]
 
     def at_size(self, spec: CameraSpec) -> "Backdrop":
-        """The same with the pixels of `spec`: mean colours, and the depth of the nearest pixel."""
+        """Return the backdrop with the pixels of `spec`: mean colours, and the depth of the nearest pixel."""
         size = (spec.width, spec.height)
         rgb = Image.fromarray(self.rgb).resize(size, Image.Resampling.BOX)
         depth = Image.fromarray(self.depth).resize(size, Image.Resampling.NEAREST)
         return Backdrop(np.asarray(rgb), np.asarray(depth))
 
     def under(self, frame: Frame) -> Picture:
-        """The picture (H, W, 3) of `frame` composed with the backdrop: the nearer surface is visible."""
+        """Return the picture (H, W, 3) of `frame` composed with the backdrop: the nearer surface is visible."""
         # The renderer lets the surface that is drawn later win a tie, and the table is drawn first.
         in_front = (frame.bodies >= 0) & (frame.depth <= self.depth)
         picture = self.rgb.copy()
@@ -227,9 +227,9 @@ class Backdrop:
 # -- pictures on tiles ----------------------------------------------------------------------------------------
 
 TEXTURE_PIXELS = 256
-"""Side of a texture; a tile covers about 170 pixels of the rendered picture."""
+"""Side of a texture in pixels; a tile covers about 170 pixels of the rendered picture."""
 TEXTURE_BUDGET = 128
-"""Textures per loaded scene, 0.6 MB each. PyBullet frees none of them before the scene is reloaded."""
+"""Most textures per loaded scene, 0.6 MB each; PyBullet frees none of them before the scene is reloaded."""
 
 
 def write_quad(path: Path, side: float) -> None:
@@ -241,7 +241,7 @@ def write_quad(path: Path, side: float) -> None:
 
 
 def as_texture(picture: Image.Image) -> NDArray[np.uint8]:
-    """The pixels (256, 256, 3) of a square picture of any size."""
+    """Return the pixels (256, 256, 3) of a square picture of any size."""
     return np.asarray(picture.convert("RGB").resize((TEXTURE_PIXELS, TEXTURE_PIXELS), Image.Resampling.LANCZOS))
 
 
@@ -259,7 +259,7 @@ class TextureCache:
         return len(self._ids) + count <= self._budget
 
     def load(self, picture: Image.Image) -> int:
-        """The texture id of a picture."""
+        """Return the texture id of a picture."""
         pixels = as_texture(picture)
         key = hashlib.sha256(pixels.tobytes()).hexdigest()
         if key not in self._ids:
@@ -274,18 +274,22 @@ class TextureCache:
 
 # All colours and numbers of grain are chosen by eye. Pictures, and all that models make of them, depend on each.
 PLANK_WIDTH = 0.14
-"""Metres."""
+"""Width of a plank, in metres."""
 TABLE_END = 0.92
-"""x at which the table meets a wall, metres."""
+"""Position along x, in metres, at which the table meets a wall."""
 DARK_WOOD = np.array([118.0, 78.0, 46.0])
 LIGHT_WOOD = np.array([190.0, 146.0, 98.0])
 WALL = np.array([196.0, 198.0, 194.0])
 SUPERSAMPLING = 2
-"""Times as many pixels in each direction are drawn and then scaled down, so that seams are smooth."""
+"""Factor of the pixels in each direction that are drawn and then scaled down, so that seams are smooth."""
 
 
 def load_photo(path: Path, width: int, height: int) -> Picture:
-    """The photo at `path`, squeezed to (height, width, 3). Raises SceneError if it cannot be read."""
+    """Read the photo at `path`, squeezed to (height, width, 3).
+
+    Raises:
+        SceneError: If it cannot be read.
+    """
     remedy = "Give another file, or leave `background` out for our own wooden table."
     try:
         encoded = read_regular(path)
@@ -297,7 +301,7 @@ def load_photo(path: Path, width: int, height: int) -> Picture:
 
 @lru_cache(maxsize=8)
 def wooden_table(camera: Camera) -> Picture:
-    """A table of planks with a wall behind it, (H, W, 3), seen by `camera` in the right perspective."""
+    """Draw a table of planks with a wall behind it, (H, W, 3), seen by `camera` in the right perspective."""
     fine = camera.magnified(SUPERSAMPLING)
     rays = fine.rays()
     eye = np.array(fine.spec.eye)
@@ -312,7 +316,7 @@ def wooden_table(camera: Camera) -> Picture:
 
 
 def _wood(points: Array) -> Array:
-    """Colour of the table at world points (..., 3): planks along y, each with its own grain and tone."""
+    """Return the table's colour at world points (..., 3): planks along y, each with its own grain and tone."""
     x, y = points[..., 0], points[..., 1]
     plank = np.floor(x / PLANK_WIDTH)
     shift = 7.3 * plank
@@ -332,7 +336,7 @@ def _wall(points: Array) -> Array:
 
 
 def _noise(u: Array, v: Array, seed: int) -> Array:
-    """Smooth noise in [0, 1] on the plane: random values on a grid that repeats every 64 cells."""
+    """Return smooth noise in [0, 1] on the plane: random values on a grid that repeats every 64 cells."""
     grid: NDArray[np.float64] = np.random.default_rng(seed).random((64, 64))
     cell_u, cell_v = np.floor(u).astype(int), np.floor(v).astype(int)
     s, t = _ease(u - cell_u), _ease(v - cell_v)
@@ -348,14 +352,19 @@ def _ease(share: Array) -> Array:
 # -- films ----------------------------------------------------------------------------------------------------
 
 INVISIBLE = (0.0, 0.0, 0.0, 0.0)
-"""Colour of what the renderer leaves out."""
+"""Colour of bodies that the renderer leaves out."""
 REST = 2e-4
-"""How far resting bodies may drift, metres or parts of a unit quaternion: under a tenth of a film's pixel."""
+"""Largest drift of resting bodies, in metres or parts of a unit quaternion: under a tenth of a film's pixel."""
 
 
 @dataclass(frozen=True)
 class _Resting:
-    """The scene without its moving bodies. places: (bodies, 7) positions and quaternions; pictures: textures."""
+    """The scene without its moving bodies.
+
+    Attributes:
+        places: (bodies, 7) positions and quaternions of the resting bodies.
+        pictures: Textures that the resting bodies show.
+    """
 
     backdrop: Backdrop
     places: Array
@@ -363,9 +372,15 @@ class _Resting:
 
 
 class FilmCamera:
-    """Draws one scene with fewer pixels. resting, moving: its bodies; those that move are drawn later.
+    """A camera that draws one scene with fewer pixels.
 
     The colours of all bodies are those that they have when this is made.
+
+    Args:
+        client: Server of the scene.
+        backdrop: The scene without robot, cube and tiles.
+        resting: Bodies that are drawn once while they rest.
+        moving: Bodies that move, which are drawn later.
     """
 
     def __init__(
@@ -377,7 +392,14 @@ class FilmCamera:
         self._drawn: _Resting | None = None
 
     def picture(self, camera: Camera, light: LightSpec, level: float, pictures: tuple[int, ...]) -> Picture:
-        """The finished picture (h, w, 3). pictures: textures that the resting bodies show."""
+        """Return the finished picture (h, w, 3).
+
+        Args:
+            camera: Camera at the film's size.
+            light: The lamp.
+            level: Factor of all light.
+            pictures: Textures that the resting bodies show.
+        """
         backdrop = self._backdrop(camera, light, level, pictures)
         with self._without(self._resting):
             return backdrop.under(camera.render(self._client, light, level))
@@ -411,7 +433,10 @@ class FilmCamera:
 
 
 def _colors(client: BulletClient, body: int) -> list[tuple[int, int, tuple[float, ...]]]:
-    """Link, number of the shape in its link, and colour of every visual shape: what `changeVisualShape` takes."""
+    """Return link, number of the shape in its link, and colour of every visual shape.
+
+    These are the arguments of `changeVisualShape`.
+    """
     colors: list[tuple[int, int, tuple[float, ...]]] = []
     for shape in client.getVisualShapeData(body):
         number = sum(link == shape[1] for link, *_ in colors)
@@ -420,6 +445,6 @@ def _colors(client: BulletClient, body: int) -> list[tuple[int, int, tuple[float
 
 
 def _over(backdrop: Backdrop, frame: Frame) -> Backdrop:
-    """The backdrop with the bodies of a frame in front of it."""
+    """Return the backdrop with the bodies of a frame in front of it."""
     nearer = np.where(frame.bodies >= 0, np.minimum(frame.depth, backdrop.depth), backdrop.depth)
     return Backdrop(backdrop.under(frame), nearer)

@@ -1,7 +1,9 @@
 """All parameters of the scene in one frozen record, which is stored with every run.
 
-Frame: the world frame is the base frame of the WidowX of BridgeV2. +x points away from the robot, +y to its
-left, +z up, and the table top is z = 0. Units: metres, radians, seconds, kilograms, newtons.
+Frame: the world frame is the base frame of the WidowX of BridgeV2. The axis +x points away from the robot, +y to
+its left, +z up, and the table top is z = 0.
+
+Units: metres, radians, seconds, kilograms, newtons.
 """
 
 import hashlib
@@ -25,11 +27,11 @@ XYZ = tuple[float, float, float]
 Euler = Literal["zyx", "xyz"]
 
 EPSILON_MARGIN = 0.01
-"""What the default outcome radius adds to half a tile side, metres (the rule of VL-Think)."""
+"""Metres that the default outcome radius adds to half a tile side (the rule of VL-Think)."""
 
 
 LARGEST = 10.0
-"""Metres, kilograms, or times the default light: what a table top can hold, and the camera can see."""
+"""Largest metres, kilograms, or times the default light that suit a table top and a camera."""
 LARGEST_PICTURE = 8192
 _MOST = {"max_steps": 10_000}
 
@@ -39,13 +41,13 @@ class CameraSpec:
     """A pinhole camera without distortion; the default is the Bridge third-person view of SimplerEnv.
 
     Attributes:
-        eye: Position and viewing direction (any length) in the world; +z is up in the picture.
-        forward: As `eye`.
-        width: Rendered pixels.
-        height: As `width`.
+        eye: Position in the world, in metres.
+        forward: Viewing direction (any length) in the world; +z is up in the picture.
+        width: Width of the rendered picture in pixels.
+        height: Height of the rendered picture in pixels.
         fov: Vertical field of view in degrees.
-        near: Clipping planes.
-        far: As `near`.
+        near: Distance of the near clipping plane in metres.
+        far: Distance of the far clipping plane in metres.
     """
 
     eye: XYZ = (0.0, -0.16, 0.36)
@@ -58,16 +60,19 @@ class CameraSpec:
 
     @property
     def focal_length(self) -> float:
-        """Focal length in rendered pixels, the same in both directions."""
+        """The focal length in rendered pixels, the same in both directions."""
         return float(self.height / 2 / np.tan(np.radians(self.fov) / 2))
 
 
 @dataclass(frozen=True)
 class LightSpec:
-    """One lamp without shadows, and the share of light each way of reflection gives.
+    """One lamp without shadows, and the share of light of each way of reflection.
 
-    direction points towards the lamp. A white tile on the table reflects 0.77 of full scale, so that the
-    brightest ablation of the paper (30 % more) reaches white without clipping.
+    A white tile on the table reflects 0.77 of full scale. So the brightest ablation of the paper (30 % more)
+    reaches white without clipping.
+
+    Attributes:
+        direction: Direction towards the lamp.
     """
 
     direction: XYZ = (0.2, -0.6, 1.5)
@@ -80,8 +85,8 @@ class LightSpec:
 class PhysicsSpec:
     """The time of the simulation: 48 substeps at 240 Hz make one action at 5 Hz.
 
-    A strong grip on a light cube needs many solver iterations: 40 N with 30 iterations squeezes the cube out
-    of the hand every time, 15 N with 100 never did.
+    A strong grip on a light cube needs many solver iterations. 40 N with 30 iterations squeezes the cube out of
+    the hand every time, 15 N with 100 never did.
     """
 
     rate: float = 240.0
@@ -96,14 +101,17 @@ class PhysicsSpec:
 class LimitSpec:
     """The limits of the controller; anything beyond is clipped and counted.
 
+    For the first four fields, None means no such limit.
+
     Attributes:
-        translation: Largest change per action and axis.
-        rotation: As `translation`.
-        low: Corners of the box the commanded tool position stays in (its floor is raised to the finger clearance
-            of the arm). None means no such limit; without `low` nothing keeps the fingers off the table.
-        high: As `low`.
-        ik_error: What may remain to the wanted pose before the arm holds still instead of moving.
-        ik_turn_error: As `ik_error`.
+        translation: Largest change of the position per action and axis, in metres.
+        rotation: Largest change of the rotation per action and axis, in radians.
+        low: Lower corner of the box in which the commanded tool position stays; its floor is raised to the finger
+            clearance of the arm. Without `low`, nothing keeps the fingers off the table.
+        high: Upper corner of that box.
+        ik_error: Most metres that may remain to the requested pose; with more, the arm holds still instead of
+            moving.
+        ik_turn_error: Most radians that may remain to the requested pose, likewise.
     """
 
     translation: float | None = 0.10
@@ -115,11 +123,11 @@ class LimitSpec:
 
     @classmethod
     def off(cls) -> Self:
-        """No limit but the reach of the arm."""
+        """Return limits without any limit but the reach of the arm."""
         return cls(translation=None, rotation=None, low=None, high=None)
 
     def contain(self, position: XYZ) -> bool:
-        """Whether the box holds a tool position."""
+        """Whether the box contains a tool position."""
         above = self.low is None or all(a <= b for a, b in zip(self.low, position, strict=True))
         return above and (self.high is None or all(a <= b for a, b in zip(position, self.high, strict=True)))
 
@@ -128,45 +136,49 @@ class LimitSpec:
 class SceneSpec:
     """The whole experiment but the question: places, robot, camera, light, physics and limits.
 
-    Raises SceneError if the zones overlap, if the untouched cube would already lie in one, if the home pose is
-    outside the limits, or if a value makes no sense.
-
     Attributes:
-        name: The preset it was made from.
-        arm: `panda` or `widowx`.
-        arm_urdf: A description to load instead of ours.
-        tile_left: Tile centres (x, y).
-        tile_right: As `tile_left`.
+        name: Name of the preset that it was made from.
+        arm: Name of the arm, `panda` or `widowx`.
+        arm_urdf: Description of the arm to load instead of ours; None for ours.
+        tile_left: Centre (x, y) of the left tile.
+        tile_right: Centre (x, y) of the right tile.
         tile_yaw: Turn of both tiles about +z; at zero the top of a picture points away from the robot.
-        tile_side: Size of a tile.
-        tile_height: As `tile_side`.
-        cube_xy: Where the cube starts, give or take `start_jitter` per axis and `start_jitter_yaw`, drawn
-            uniformly from the seed of the episode. cube_side, cube_mass, cube_color (RGB in [0, 1]).
-        cube_yaw: As `cube_xy`.
+        tile_side: Side of a tile.
+        tile_height: Height of a tile.
+        cube_xy: Start of the cube, give or take `start_jitter` per axis, drawn uniformly from the seed of the
+            episode.
+        cube_yaw: Turn of the cube about +z at the start, give or take `start_jitter_yaw`, drawn likewise.
+        cube_color: RGB in [0, 1].
         epsilon: Radius of the outcome zones around the tile centres; None means tile_side / 2 + 0.01.
-        home: Tool position at the start, the gripper pointing down but for `home_rpy` (roll, pitch, yaw about the
-            world axes).
-        home_joints: The joint angles of that pose for `arm`; None to look for some.
-        home_opening: Of the gripper at the start, 1 is open.
-        start_grasped: Begin with the cube in hand.
-        closing_steps: How it gets there; with 0 it is put in the middle of the hand, otherwise it waits at
-            `cube_xy` and `cube_z` (the height of its middle) until the hand has closed for so many actions at
-            rest, without gravity during the first, and counts as untouched from then on.
-        forced_closed: Actions of an episode during which the gripper stays shut whatever is asked.
-        tile_mass: Of each tile; 0 fixes them to the table.
-        euler: How the rotation of an action is read, `zyx` as roll, pitch, yaw about fixed axes or `xyz` in the
+        home: Tool position at the start; the gripper points down, except for `home_rpy`.
+        home_rpy: Roll, pitch, yaw about the world axes by which the gripper is turned from pointing down.
+        home_joints: Joint angles of that pose for `arm`; None to search for some.
+        home_opening: Opening of the gripper at the start, 1 is open.
+        start_grasped: Whether the cube is in the hand at the start.
+        closing_steps: Number of actions at rest in which the hand closes around the cube at the start. With 0, the
+            cube is put in the middle of the hand. Otherwise it waits at `cube_xy` and `cube_z` until the hand has
+            closed, without gravity during the first action, and counts as untouched from then on.
+        cube_z: Height of the cube's middle at the start; None for lying on the table.
+        forced_closed: Number of actions at an episode's start during which the gripper stays shut, whatever the
+            policy commands.
+        tile_mass: Mass of each tile; 0 fixes them to the table.
+        euler: Convention of the rotation of an action: `zyx` is roll, pitch, yaw about fixed axes, `xyz` is the
             opposite order.
-        scoring_side: The box of the rule `box`, whatever size the tiles are drawn in. It reaches scoring_side / 2
-            + box_margin from the middle of a tile along x and y, and up from box_height over it.
-        box_margin: As `scoring_side`.
-        box_height: As `scoring_side`.
+        scoring_side: Tile side of the rule `box`, whatever size the tiles are drawn in. Its box reaches
+            scoring_side / 2 + box_margin from the middle of a tile along x and y, and up from box_height over it.
+        box_margin: Margin of that box around the tile side.
+        box_height: Least height in that box over the middle of a tile.
         max_steps: Actions per episode.
-        early_stop: End when the cube was released and lay still for 5 actions.
-        moved: How far the cube must end from its start to count as moved.
-        rendering: `raw`, or `visual-matching` to lay robot, cube and tiles over a photo (`background`; None means
-            our own wooden table).
-        picture_size: (width, height) handed to the policy, None for as rendered.
-        light_level: Scales all light; a photo behind the scene gets darker and brighter with it.
+        early_stop: Whether an episode ends when the cube was released and lay still for 5 actions.
+        moved: Distance from its start at which the cube counts as moved.
+        rendering: Name of the rendering: `raw`, or `visual-matching` to lay robot, cube and tiles over a photo.
+        background: Photo behind the scene; None for our own wooden table.
+        picture_size: Width and height in pixels of the policy's picture; None for the rendered size.
+        light_level: Factor of all light; a photo behind the scene gets darker and brighter with it.
+
+    Raises:
+        SceneError: If the zones overlap, or the untouched cube would already lie in one. Also if the home pose is
+            outside the limits, or a value makes no sense.
     """
 
     name: str = "bridge"
@@ -216,12 +228,12 @@ class SceneSpec:
 
     @classmethod
     def preset(cls, name: str, **changes: Any) -> Self:
-        """A named scene, with fields replaced: `bridge` (default), `frontal`, `vl-think` or `act2answer`.
+        """Return a named scene, with fields replaced: `bridge` (default), `frontal`, `vl-think` or `act2answer`.
 
         Another arm than the preset's starts from the same pose of its tool, with joint angles of its own.
 
         Raises:
-            SceneError: For an unknown name or field, and for a background that the rendering does not show.
+            SceneError: For an unknown name or field, or for a background that the rendering does not show.
         """
         if name not in PRESETS:
             raise SceneError(f"no scene preset {name!r}; there are {', '.join(PRESETS)}.")
@@ -244,28 +256,31 @@ class SceneSpec:
 
     @property
     def zone_radius(self) -> float:
-        """Radius of the outcome zones in metres: `epsilon`, or the rule when it is None."""
+        """The radius of the outcome zones in metres: `epsilon`, or the rule when it is None."""
         return self.tile_side / 2 + EPSILON_MARGIN if self.epsilon is None else self.epsilon
 
     @property
     def box_half(self) -> float:
-        """Half the side of the box of the rule `box`, metres."""
+        """Half the side of the box of the rule `box`, in metres."""
         return self.scoring_side / 2 + self.box_margin
 
     @property
     def cube_start_z(self) -> float:
-        """Height of the middle of the cube when it is put down, metres: `cube_z`, or lying on the table."""
+        """The height of the middle of the cube when it is put down, in metres: `cube_z`, or lying on the table."""
         return self.cube_side / 2 if self.cube_z is None else self.cube_z
 
     @property
     def picture_shape(self) -> tuple[int, int]:
-        """Height and width in pixels of what the policy is handed."""
+        """The height and width in pixels of the policy's picture."""
         width, height = self.picture_size or (self.camera.width, self.camera.height)
         return height, width
 
     @property
     def intrinsics(self) -> NDArray[np.float32]:
-        """(3, 3) pinhole matrix of that picture, in its pixels: x right, y down, (0, 0) the upper left corner."""
+        """The pinhole matrix (3, 3) of the policy's picture, in its pixels.
+
+        x points right, y down, and (0, 0) is the upper left corner.
+        """
         (height, width), camera = self.picture_shape, self.camera
         across, down = width / camera.width, height / camera.height
         focal = camera.focal_length
@@ -273,11 +288,11 @@ class SceneSpec:
         return np.array(matrix, np.float32)
 
     def tile_xy(self, side: Side) -> XY:
-        """Centre of the tile on `side`."""
+        """Return the centre of the tile on `side`."""
         return self.tile_left if side == "left" else self.tile_right
 
     def to_json(self) -> dict[str, Any]:
-        """The record as plain JSON values, with the outcome radius that is really used.
+        """Return the record as plain JSON values, with the outcome radius that is really used.
 
         A file is identified by the sha256 of its content, not by its path.
 
@@ -289,13 +304,14 @@ class SceneSpec:
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any], files: Mapping[str, Path] = MappingProxyType({})) -> Self:
-        """The record that `to_json` wrote, as a run stores it.
+        """Make the record from the values of `to_json`, as a run stores them.
 
         Args:
-            files: By field, where the files lie that it names by their hash.
+            values: Values that `to_json` returned.
+            files: By field, the file that the values name by its hash.
 
         Raises:
-            SceneError: If one is not given or holds something else, for one that it was made without, and for a
+            SceneError: If a file is not given or has other content, or the scene was made without it. Also for a
                 field of another version.
         """
         parts = {"camera": CameraSpec, "light": LightSpec, "physics": PhysicsSpec, "limits": LimitSpec}
@@ -377,7 +393,7 @@ def _as_tuples(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _file_of(name: str, expected: str, files: Mapping[str, Path]) -> Path:
-    """The file that a stored scene names by its hash."""
+    """Return the file that a stored scene names by its hash."""
     if name not in files:
         raise SceneError(f"the scene was made with a file as {name}, {expected[:19]}…; give that file again")
     if (content := _content_sha256(files[name])) != expected:
@@ -429,13 +445,17 @@ PRESETS: Mapping[str, dict[str, Any]] = MappingProxyType(
         },
     }
 )
-"""What each named scene changes in the default one.
+"""Changes of each named scene to the default one.
 
-bridge: places of VL-Think, camera of SimplerEnv, and a home pose 25 mm higher than theirs, so that the gripper
-hides nothing of either picture in the first frame, the one that probes read.
+bridge: places of VL-Think, camera of SimplerEnv, and a home pose 25 mm higher than theirs. So the gripper hides
+nothing
+of either picture in the first frame, the one that probes read.
+
 vl-think: their home pose as well; the gripper then hides 4 % of the left picture.
-act2answer: the protocol that was released with the paper, as far as it can be had here; the cube is in the hand
+
+act2answer: the protocol that was released with the paper, as far as it is available here. The cube is in the hand
 already, tiles are larger and can be pushed, and nothing limits an action.
-frontal: the same camera, but everything lies symmetric about its vertical plane and is turned towards it, so that
-both pictures have the same size and shape on screen.
+
+frontal: the same camera, but everything lies symmetric about its vertical plane and is turned towards it. So both
+pictures have the same size and shape on screen.
 """

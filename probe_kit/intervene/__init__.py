@@ -1,6 +1,6 @@
-"""Interventions: is what can be read also used? Changes what a policy sees or carries, and nothing else.
+"""Interventions change what a policy sees or carries, and nothing else: is decodable information also used?
 
-Needs the run's policy and pictures again; what is stored needs neither to be read.
+They need the run's policy and pictures again. Stored results need neither to be read.
 """
 
 from typing import TYPE_CHECKING

@@ -1,4 +1,7 @@
-"""`probe-kit intervene`, `run list` and `run show`. The meaning of an option to a kind is in the kind's file."""
+"""The commands `probe-kit intervene`, `run list` and `run show`.
+
+The meaning of an option for a kind is in the kind's file.
+"""
 
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -39,13 +42,17 @@ _inside_option = partial(typer.Option, rich_help_panel="Inside the network")
 
 
 class Numbers(tuple[float, ...]):
-    """Comma-separated numbers."""
+    """A tuple of numbers that are given as comma-separated text."""
 
     __slots__ = ()
 
     @classmethod
     def parse(cls, text: "str | Numbers") -> "Numbers":
-        """The numbers of `text`; a default that is no text is returned as it is. Raises UsageError."""
+        """Return the numbers of `text`; a default that is no text is returned as it is.
+
+        Raises:
+            UsageError: If a part of the text is no number.
+        """
         if not isinstance(text, str):
             return text
         try:
@@ -145,7 +152,7 @@ class KindHelp(PanelledHelp):
     """Help with the kinds; `--help-all` has a panel for each."""
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        """The most used options, then a line per kind."""
+        """Print the most used options, then a line per kind."""
         super().format_help(ctx, formatter)
         kinds = every_kind()
         width = max(len(kind.kind) for kind in kinds) + 1
@@ -154,7 +161,7 @@ class KindHelp(PanelledHelp):
         typer.echo()
 
     def format_whole_help(self, ctx: Any, formatter: Any) -> None:
-        """All options, then what each kind does and what the options mean to it."""
+        """Print all options, then what each kind does and what the options mean to it."""
         super().format_whole_help(ctx, formatter)
         for kind in every_kind():
             lines = [f"--{option.replace('_', '-')}: {meaning}" for option, meaning in kind.options.items()]
@@ -231,7 +238,15 @@ def intervene(
 
 
 def check_options(name: str, options: Mapping[str, Any]) -> None:
-    """Raise UsageError for an option that does not apply to a kind. options: by name, of the command line."""
+    """Refuse an option that does not apply to a kind.
+
+    Args:
+        name: Name of the kind.
+        options: Options of the command line, by name.
+
+    Raises:
+        UsageError: For an option that does not apply to the kind.
+    """
     for option in options:
         if option not in kind_of(name).options:
             kinds = [kind.kind for kind in every_kind() if option in kind.options]
@@ -268,7 +283,13 @@ def _run(run: "Run", intervention: "Intervention", source: "ReplaySource") -> "I
 
 
 def print_result(result: "InterventionResult", style: str = "table", details: bool = False) -> None:
-    """Its table, the notes, and last the finding. details: print every column."""
+    """Print the result's table, its notes, and last the finding.
+
+    Args:
+        result: Result of an intervention.
+        style: Format of the table, such as `table`, `json` or `csv`.
+        details: Whether to print every column, and sentences with numbers.
+    """
     # JSON and CSV hold the numbers of all rows, the other formats the table.
     print_table(result if style in ("json", "csv") else result.to_rich(details), style, result.notes)
     if style == "table":
@@ -279,7 +300,7 @@ def print_result(result: "InterventionResult", style: str = "table", details: bo
 # -- runs, and what they store -------------------------------------------------------------------------------
 
 _COLUMNS = ("run", "model", "suite", "episodes", "correct", "probes", "interventions")
-"""Facts that are shown, by their names."""
+"""Names of the facts that are shown."""
 
 
 def list_runs(
@@ -324,7 +345,7 @@ def _facts(run: "Run") -> dict[str, Any]:
 
 
 def _table(lines: list[dict[str, Any]], folder: Path) -> Table:
-    """The runs that can be read, a line each; the numbers name the others too."""
+    """Return the runs that can be read, a line each; the numbers also name the others."""
     rows = []
     for line in lines:
         if "error" not in line:
@@ -408,7 +429,10 @@ def show(
 
 
 def _show_action_errors(run: str, partial: bool, as_json: bool) -> None:
-    """Print how predicted actions differ from the recorded ones. Raises what `compare_actions` raises."""
+    """Print how predicted actions differ from the recorded ones.
+
+    Raises as `compare_actions`.
+    """
     from probe_kit.runs import compare_actions, open_run
     from probe_kit.runs.action_errors import action_error_table
 
@@ -420,6 +444,6 @@ def _show_action_errors(run: str, partial: bool, as_json: bool) -> None:
 
 
 def _plain(frame: "pd.DataFrame") -> list[dict[str, Any]]:
-    """Return the lines of a frame as JSON has them: NaN is null."""
+    """Return the lines of a frame as values for JSON: NaN is null."""
     rows = frame.to_dict("records")
     return [{str(name): None if value != value else value for name, value in row.items()} for row in rows]

@@ -1,12 +1,12 @@
 """Directions in which an answer can be written, each found without the episode that it is used on.
 
-A probe's weights are the direction in which the answer is best *read*: they are turned away from what else varies.
-Where it *lies* is the difference of the two class means, and that is the direction to write along.
+A probe's weights are the direction in which the answer is best *read*: they are turned away from all other
+variation. The answer *lies* along the difference of the two class means, and that is the direction to write along.
 
 Pooled directions are of a mean over tokens, from the run's columns. An answer that lies in *which* tokens are
-marked leaves no mean behind: marks on the left tile for one answer and on the right tile for the other cancel. The
-differences of class means at every position do not: they lie along few directions, which are the same for every
-token. These are found in the tokens themselves.
+marked leaves no mean behind. Marks on the left tile for one answer and on the right tile for the other cancel. The
+differences of class means at every position do not cancel. They lie along few directions, which are the same for
+every token. These are found in the tokens themselves.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -42,11 +42,11 @@ Vector = NDArray[np.float32]
 MEAN_DIFFERENCE, PROBE = "mean-difference", "probe"
 DIRECTIONS = (MEAN_DIFFERENCE, PROBE)
 FOLDS = 5
-"""Of groups; a direction used on an episode is fitted on the folds that its group is not in."""
+"""Number of folds of groups; a direction used on an episode is fitted on the folds that its group is not in."""
 _ROUNDING = 1e-6
 """Share of a number's size below which a difference of stored float32 means is rounding."""
 EVERY_EPISODE = ""
-"""In place of an episode: directions of a file are the same for all."""
+"""Key in place of an episode: the directions of a file are the same for all."""
 
 
 @dataclass(frozen=True)
@@ -55,10 +55,11 @@ class Directions:
 
     Attributes:
         bases: By name and episode, (K, D) float32, orthonormal.
-        halves: By episode, (K,) or (T, K), half the differences of the class means along those that were asked
-            for, of a mean over tokens or of the role's T positions.
-        control_names: Of the random ones beside the one that was asked for.
-        vectors: By name (D,), of a file: the step in place of a half difference.
+        halves: By episode, (K,) or (T, K) half the differences of the class means along the requested directions.
+            They are of a mean over tokens, or of the role's T positions.
+        control_names: Names of the random directions that serve as controls.
+        vectors: By name, (D,) the step of a file's direction, in place of a half difference; None for directions
+            that are not from a file.
     """
 
     bases: Mapping[tuple[str, str], Vector]
@@ -67,14 +68,22 @@ class Directions:
     vectors: Mapping[str, Vector] | None = None
 
     def basis(self, name: str, episode: str) -> Vector:
-        """Return (K, D)."""
+        """Return the basis (K, D) of one direction on an episode."""
         return self.bases[name, episode if self.vectors is None else EVERY_EPISODE]
 
     def shift(self, name: str, episode: str, strength: float) -> Vector:
-        """Return (D,) or (T, D) float32, so many half differences of the class means, toward `left`.
+        """Return a step of so many half differences of the class means, toward `left`.
 
-        (T, D): the t-th row belongs to the role's t-th token; a mark on either tile has its own sign at the
-        positions of each. Of a control: as far, along its own directions.
+        Along a control, the step has the same size.
+
+        Args:
+            name: Name of the direction or control.
+            episode: Id of the episode that is changed.
+            strength: Number of half differences; negative away from `left`.
+
+        Returns:
+            (D,) or (T, D) float32. The t-th row of (T, D) belongs to the role's t-th token. A mark on either tile
+            has its own sign at the positions of each.
         """
         if self.vectors is not None:
             return np.float32(strength) * self.vectors[name]
@@ -82,7 +91,11 @@ class Directions:
 
 
 def check_direction(direction: str) -> None:
-    """Raise UsageError for a name that is no direction to patch tokens within."""
+    """Refuse a name that is no direction to patch tokens within.
+
+    Raises:
+        UsageError: For an unknown direction.
+    """
     if direction.startswith(f"{MEAN_DIFFERENCE}:"):
         Method.of(direction)
     elif direction not in DIRECTIONS:
@@ -93,7 +106,7 @@ def check_direction(direction: str) -> None:
 
 
 def control_names(count: int) -> tuple[str, ...]:
-    """Return the names of so many random directions beside another one."""
+    """Return the names of so many random directions that serve as controls."""
     return tuple(f"control-{number + 1}" for number in range(count))
 
 
@@ -108,23 +121,25 @@ def fit_directions_in_cells(
     categories: Sequence[str] | None,
     vector: FileDirection | None,
 ) -> dict[Cell, Directions]:
-    """Return the meaning of a direction in every cell: of the run's columns, or of all its tokens.
+    """Find a direction in every cell, in the run's columns or in all its tokens.
 
-    `mean-difference:K`: the K directions along which the differences of class means at all positions lie most, the
-    same for every token; from one clean inference per episode and place.
+    `mean-difference:K` is the K directions along which the differences of class means at all positions lie most,
+    the same for every token. They come from one clean inference per episode and place.
 
     Args:
-        patterns: The places as they were named; those of a wildcard may be left out.
-        direction: Its name, see `check_direction`.
-        controls: How many random ones beside it.
-        seed: Of controls and folds.
-        categories: Of the run, None for all.
-        vector: The direction of a file; None for one that is found here.
+        session: Session of the run.
+        cells: Cells to find directions in.
+        patterns: Names of the places as the user wrote them; places of a wildcard may be left out.
+        direction: Name of the direction, see `check_direction`.
+        controls: Number of random directions that serve as controls.
+        seed: Seed of controls and folds.
+        categories: Categories of the run; None for all.
+        vector: Direction of a file; None for one that is found here.
 
     Raises:
-        UnknownSiteError: For a place of several sites or one that is not stored.
         NoDirectionError: For a named place without a direction.
-        UsageError: Where there are too few episodes to learn from.
+        UnknownSiteError: For a place of several sites or one that is not stored.
+        UsageError: If there are too few episodes to fit on.
     """
     if vector is not None:
         return {cell: _of_file(session, cell, vector, controls, seed) for cell in cells}
@@ -156,7 +171,11 @@ def fit_directions_in_cells(
 
 
 def _of_file(session: ReplaySession, cell: Cell, vector: FileDirection, controls: int, seed: int) -> Directions:
-    """Return a file's direction in a cell. Raises UsageError for another site, width or model."""
+    """Return a file's direction in a cell.
+
+    Raises:
+        UsageError: For another site, width or model than the file's.
+    """
     run, site = session.run, cell.site_group.only_site
     vector.check(cell.site_group.name, run.streams[site.stream].width, run.weights_sha256)
     basis, total = vector.basis.astype(np.float64), vector.vectors.sum(axis=0)
@@ -176,7 +195,7 @@ def _of_file(session: ReplaySession, cell: Cell, vector: FileDirection, controls
 
 
 class PassedOver:
-    """Places without a direction: one that is named raises, one of a wildcard is left out."""
+    """A record of places without a direction: one that is named raises, one of a wildcard is left out."""
 
     def __init__(self, session: ReplaySession, patterns: Sequence[str]) -> None:
         self._session = session
@@ -186,7 +205,7 @@ class PassedOver:
 
     @contextmanager
     def fitting(self, cell: Cell) -> Iterator[None]:
-        """Fit directions there; NoDirectionError is raised for a named place, and recorded for others."""
+        """Fit directions at a cell; NoDirectionError is raised for a named place, and recorded for others."""
         try:
             yield
         except NoDirectionError as error:
@@ -197,9 +216,10 @@ class PassedOver:
             self._session.passed_over[str(cell)] = str(error)
 
     def left[T](self, fitted: Mapping[Cell, T]) -> dict[Cell, T]:
-        """Return what was fitted without cells that a category passed over.
+        """Return the fits without the cells that a category passed over.
 
-        Raises the last NoDirectionError if no cell is left.
+        Raises:
+            NoDirectionError: If no cell is left; it is the last one recorded.
         """
         remaining = {cell: fit for cell, fit in fitted.items() if cell not in self._cells}
         if not remaining and self._last is not None:
@@ -224,7 +244,16 @@ def fit_pooled_directions(
     seed: int,
     categories: Sequence[str] | None = None,
 ) -> Directions:
-    """Directions of these categories, by default of all, from the pooled tokens of `role` at `site`.
+    """Find the directions of some categories in the pooled tokens of `role` at `site`.
+
+    Args:
+        run: Run with the stored streams.
+        site: Site of a residual stream.
+        role: Role of the tokens.
+        direction: Name of the direction, `mean-difference` or `probe`.
+        controls: Number of random directions that serve as controls.
+        seed: Seed of controls and folds.
+        categories: Categories to fit; None for all of the run.
 
     Raises:
         UsageError: For an unknown direction.
@@ -266,7 +295,7 @@ def fit_pooled_directions(
 
 
 def _direction(training: NDArray[np.float64], is_left: NDArray[np.bool_], direction: str) -> NDArray[np.float64]:
-    """(D,) of length 1, toward `left`."""
+    """Return a direction (D,) of length 1, toward `left`."""
     if direction == MEAN_DIFFERENCE:
         return _unit(training[is_left].mean(axis=0) - training[~is_left].mean(axis=0))
     from sklearn.linear_model import LogisticRegression
@@ -281,7 +310,7 @@ def _direction(training: NDArray[np.float64], is_left: NDArray[np.bool_], direct
 def _control(
     training: NDArray[np.float64], directions: list[NDArray[np.float64]], draw: np.random.Generator
 ) -> NDArray[np.float64]:
-    """(D,) of length 1, drawn from the training data's covariance and orthogonal to `directions`."""
+    """Draw a direction (D,) of length 1 from the training data's covariance, orthogonal to `directions`."""
     centred = training - training.mean(axis=0)
     drawn = centred.T @ draw.normal(size=len(centred))
     basis, _ = np.linalg.qr(np.stack(directions, axis=1))
@@ -298,7 +327,7 @@ def _unit(vector: NDArray[np.float64]) -> NDArray[np.float64]:
 Fits = Sequence[tuple[Fold, Mapping[str, Eraser]]]
 """Every fold, and by name the eraser fitted on its training episodes."""
 _Row = tuple[Pair, NDArray[np.float64]]
-"""The pair of one episode, and (T, D) its tokens."""
+"""The pair of one episode, and its tokens (T, D)."""
 
 
 @dataclass(frozen=True)
@@ -306,10 +335,10 @@ class TokenFeatures:
     """The tokens of one category in one cell, of N episodes.
 
     Attributes:
-        episodes: (N,).
-        groups: As `episodes`.
+        episodes: (N,) ids of the episodes.
+        groups: (N,) group of items of every episode.
         is_left: (N,) whether the correct picture lies left.
-        tokens: At position t the role's t-th token, see `erasers.PaddedTokens`.
+        tokens: The tokens; at position t the role's t-th token, see `erasers.PaddedTokens`.
     """
 
     episodes: tuple[str, ...]
@@ -323,9 +352,12 @@ def collect_token_features(
 ) -> Iterator[tuple[Cell, str, TokenFeatures]]:
     """Yield cell, category and the tokens there, from one clean inference per episode and place.
 
+    The tokens of one place and category are held at a time: 8 bytes per number, episodes × tokens × width.
+
     Args:
-        items: By id, all of their episodes. What is held at a time is of one place and category: 8 bytes per
-            number, episodes × tokens × width.
+        session: Session of the run.
+        items: Ids of the items, of which all episodes are used.
+        cells: Cells to collect.
 
     Raises:
         UnknownSiteError: For a place of several sites.
@@ -363,7 +395,7 @@ def _infer(session: ReplaySession, pair: Pair, site: Site, rows: Mapping[Cell, l
 
 
 def _pad(rows: Sequence[_Row]) -> TokenFeatures:
-    """Return sequences of different lengths as one array, their first tokens together."""
+    """Return sequences of different lengths as one array, aligned at their first tokens."""
     pairs, values = zip(*rows, strict=True)
     longest = max(map(len, values))
     tokens = np.zeros((len(rows), longest, values[0].shape[1]))
@@ -381,9 +413,10 @@ def _pad(rows: Sequence[_Row]) -> TokenFeatures:
 def fit_by_fold(
     features: TokenFeatures, cell: Cell, method: Method, controls: int, seed: int, category: str
 ) -> Fits:
-    """Return an eraser called `method` and its controls, for every fold of the groups of one category.
+    """Fit an eraser by `method` and its controls, for every fold of the groups of one category.
 
-    Raises as `fit_eraser` does, where there is nothing to learn from, and names category, site and role.
+    Raises as `fit_eraser` where the tokens are not enough to fit on; the message then names category, site and
+    role.
     """
     groups = min(FOLDS, np.unique(features.groups).size)
     site = cell.site_group.only_site
@@ -404,7 +437,7 @@ def fit_by_fold(
 
 
 def by_episode(features: TokenFeatures, fits: Fits) -> dict[str, dict[str, Eraser]]:
-    """Return by name and episode the eraser that never saw that episode."""
+    """Return by name and episode the eraser that was fitted without that episode."""
     erasers: dict[str, dict[str, Eraser]] = {}
     for fold, fitted in fits:
         for name, eraser in fitted.items():

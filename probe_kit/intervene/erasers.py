@@ -1,8 +1,8 @@
-"""Erasing what is linearly readable of an answer, token by token: LEACE, INLP and differences of class means.
+"""Erasing the linearly decodable part of an answer, token by token: LEACE, INLP and class-mean differences.
 
 LEACE: Belrose, Schneider-Joseph, Ravfogel, Cotterell, Raff, Biderman: LEACE: Perfect linear concept erasure in
-closed form, NeurIPS 2023. INLP: Ravfogel, Elazar, Gonen, Twiton, Goldberg: Null it out, ACL 2020. Written anew
-from the papers' formulas, for one binary answer, fewer episodes than dimensions, and one eraser per position.
+closed form, NeurIPS 2023. INLP: Ravfogel, Elazar, Gonen, Twiton, Goldberg: Null it out, ACL 2020. Both are written
+anew from the papers' formulas, for one binary answer, fewer episodes than dimensions, and one eraser per position.
 """
 
 from collections.abc import Iterator
@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 Way = Literal["leace", "mean-difference", "inlp"]
 WAYS: tuple[Way, ...] = get_args(Way)
 RANK = 5
-"""Directions that are taken away where several can be and none says how many; beyond, controls break as well."""
+"""Default number of directions that are removed where several can be; beyond, controls break as well."""
 FEWEST = 4
 """Episodes of either answer that a position must have in training; with fewer it is left as it is."""
 _TINY = 1e-10
@@ -27,19 +27,28 @@ NO_DIRECTION = (
     "the class means of left and right are equal, as before a layer combines picture and instruction; choose "
     "later --sites or other --roles (to patch whole tokens only: --direction none)"
 )
-"""What is true where directions of an answer are asked for and none exists."""
+"""Reason, for messages, why an answer has no direction."""
 
 
 @dataclass(frozen=True)
 class Method:
-    """A way to erase an answer. rank: directions per token, always 1 for `leace`, which needs no more."""
+    """A way to erase an answer.
+
+    Attributes:
+        way: Name of the way.
+        rank: Number of directions per token, always 1 for `leace`, which needs no more.
+    """
 
     way: Way = "leace"
     rank: int = 1
 
     @classmethod
     def of(cls, text: str) -> "Method":
-        """Return the method of a name: `leace`, `mean-difference:K` or `inlp:K`. Raises UsageError."""
+        """Return the method of a name: `leace`, `mean-difference:K` or `inlp:K`.
+
+        Raises:
+            UsageError: For another name, or a number of directions that does not fit.
+        """
         way, _, rank = text.partition(":")
         if way not in WAYS:
             raise UsageError(
@@ -59,22 +68,30 @@ class Method:
 
 @dataclass(frozen=True)
 class PaddedTokens:
-    """Tokens of N episodes at T positions. values: (N, T, D), anything where not present. present: (N, T)."""
+    """Tokens of N episodes at T positions.
+
+    Attributes:
+        values: (N, T, D) tokens; any value where not present.
+        present: (N, T) whether an episode has the position.
+    """
 
     values: Array
     present: NDArray[np.bool_]
 
     def only(self, rows: NDArray[np.int64]) -> "PaddedTokens":
-        """Some of the episodes."""
+        """Return some of the episodes."""
         return PaddedTokens(self.values[rows], self.present[rows])
 
     def usable(self, is_left: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """(T,) positions at which either answer has `FEWEST` episodes."""
+        """Return the positions (T,) at which either answer has `FEWEST` episodes."""
         counts = [self.present[is_left == side].sum(axis=0) for side in (True, False)]
         return np.asarray(np.minimum(*counts) >= FEWEST)
 
     def centred(self) -> "tuple[Array, Array]":
-        """(N, T, D) minus the means (T, D) over the samples that have the position; zero where none has."""
+        """Return the tokens (N, T, D) minus their means (T, D) over the samples with the position, and the means.
+
+        Both are zero at positions that no sample has.
+        """
         mask = self.present[..., None]
         counts = np.maximum(mask.sum(axis=0), 1)
         means = np.where(mask, self.values, 0).sum(axis=0) / counts
@@ -83,15 +100,16 @@ class PaddedTokens:
 
 @dataclass(frozen=True)
 class Eraser:
-    """x becomes x − Σ_k removed_k (read_k · (x − mean)), at every position of its own.
+    """An edit of tokens: x becomes x − Σ_k removed_k (read_k · (x − mean)), at every position of its own.
+
+    All numbers are float64. Rounding to fewer digits leaves traces of the answer in a plane that is otherwise
+    empty, where ordinary least squares find it.
 
     Attributes:
-        means: (T, D).
-        removed: (T, K, D) or, the same for all positions, (1, K, D).
-        read: As `removed`.
-        fitted: (T,) positions at which there was enough to learn from and a direction to find; the others are left
-            as they are. In float64: rounding to fewer digits leaves traces of the answer in a plane that is
-            otherwise empty, where ordinary least squares find it.
+        means: (T, D) means of the training tokens.
+        removed: (T, K, D) or, the same for all positions, (1, K, D) directions that are removed.
+        read: (T, K, D) or (1, K, D) directions that read how much is removed.
+        fitted: (T,) positions with enough episodes to fit on and a direction; the others are left as they are.
     """
 
     means: Array
@@ -100,7 +118,7 @@ class Eraser:
     fitted: NDArray[np.bool_]
 
     def __call__(self, values: Array) -> Array:
-        """(…, T, D) erased; T may be less than it was fitted for."""
+        """Return tokens (…, T, D) erased; T may be less than the number of positions that were fitted."""
         count = values.shape[-2]
         apart = np.where(self.fitted[:count, None], values - self.means[:count], 0.0)
         removed, read = (
@@ -112,11 +130,16 @@ class Eraser:
 
 
 def fit_eraser(tokens: PaddedTokens, is_left: NDArray[np.bool_], method: Method) -> Eraser:
-    """Return the eraser of the answer from such tokens. is_left: (N,) the answer.
+    """Fit the eraser of the answer to tokens.
+
+    Args:
+        tokens: Tokens of the training episodes.
+        is_left: (N,) the answer: whether the correct picture lies left.
+        method: Way to erase, with its number of directions.
 
     Raises:
         NoDirectionError: If no position has a direction.
-        UsageError: If none has episodes enough of either answer, or if there are fewer directions than the
+        UsageError: If no position has enough episodes of either answer, or if there are fewer directions than the
             method's name says.
     """
     _check(tokens, is_left)
@@ -140,12 +163,20 @@ def fit_eraser(tokens: PaddedTokens, is_left: NDArray[np.bool_], method: Method)
 def fit_control(
     tokens: PaddedTokens, is_left: NDArray[np.bool_], method: Method, eraser: Eraser, draw: np.random.Generator
 ) -> Eraser:
-    """Return an eraser of no answer: as many random directions of the data's covariance, orthogonal to `eraser`.
+    """Draw a control: an eraser of no answer, with as many random directions orthogonal to `eraser`.
 
-    For `leace` a label drawn at random, uncorrelated with the answer, is erased in the same way.
+    The directions have the data's covariance. For `leace`, a label drawn at random, uncorrelated with the answer,
+    is erased in the same way.
+
+    Args:
+        tokens: Tokens of the training episodes.
+        is_left: (N,) the answer: whether the correct picture lies left.
+        method: Way to erase, with its number of directions.
+        eraser: Eraser of the answer, fitted to the same tokens.
+        draw: Generator of the draws.
 
     Raises:
-        UsageError: If orthogonal to `eraser` no room is left for as many.
+        UsageError: If there is no room for as many directions orthogonal to `eraser`.
     """
     _check(tokens, is_left)
     centred, means = tokens.centred()
@@ -181,7 +212,7 @@ def fit_control(
 def ledoit_wolf(centred: Array) -> float:
     """Return in [0, 1] how far Ledoit and Wolf (2004) shrink the covariance of data (N, D) toward a sphere.
 
-    By the (N, N) products of episodes: dimensions are many and episodes few.
+    It is computed from the (N, N) products of episodes: dimensions are many and episodes few.
     """
     count, width = centred.shape
     gram = centred @ centred.T
@@ -193,14 +224,16 @@ def ledoit_wolf(centred: Array) -> float:
 
 
 def leace_direction(centred: Array, label: Array, shrinkage: float | None = None) -> tuple[Array, Array]:
-    """Return what LEACE removes of one label, and what it reads it by, both (D,): P = removed · readᵀ.
+    """Return the direction that LEACE removes for one label, and the one that reads it, both (D,).
+
+    The eraser is P = removed · readᵀ, with P = Σ_xz (Σ_xzᵀ Σ⁻¹ Σ_xz)⁻¹ Σ_xzᵀ Σ⁻¹ of the covariances. Whatever the
+    shrinkage, nothing correlated with the label is left in the data that it was fitted on. Without shrinkage, no
+    other affine map that achieves this changes the data less.
 
     Args:
-        centred: (N, D).
-        label: (N,), its mean 0. P = Σ_xz (Σ_xzᵀ Σ⁻¹ Σ_xz)⁻¹ Σ_xzᵀ Σ⁻¹ of the covariances: whatever the shrinkage,
-            nothing correlated with the label is left in the data it was fitted on; without any, no other affine
-            map that achieves this changes the data less.
-        shrinkage: None for `ledoit_wolf`.
+        centred: (N, D) data with mean 0.
+        label: (N,) label with mean 0.
+        shrinkage: Shrinkage in [0, 1]; None for `ledoit_wolf`.
     """
     amount = ledoit_wolf(centred) if shrinkage is None else shrinkage
     count, width = centred.shape
@@ -225,7 +258,11 @@ def _check(tokens: PaddedTokens, is_left: NDArray[np.bool_]) -> None:
 
 
 def _check_more(method: Method, available: int) -> None:
-    """A name says how many directions there are: it is not kept for fewer."""
+    """Refuse a method with more directions than there are: its name states the number.
+
+    Raises:
+        UsageError: For more directions than the tokens have.
+    """
     if method.rank > available:
         raise UsageError(
             f"{method} asks for {method.rank} directions, and these tokens have {available} to find; expected "
@@ -234,7 +271,7 @@ def _check_more(method: Method, available: int) -> None:
 
 
 def _answer(tokens: PaddedTokens, is_left: NDArray[np.bool_]) -> Array:
-    """(N, T) the answer as ±½, centred at every position over who is present there."""
+    """Return the answer (N, T) as ±½, centred at every position over the episodes that are present there."""
     values = np.where(tokens.present, is_left[:, None] - 0.5, 0.0)
     means = values.sum(axis=0) / np.maximum(tokens.present.sum(axis=0), 1)
     return np.where(tokens.present, values - means, 0.0)
@@ -248,7 +285,7 @@ def _rows(present: NDArray[np.bool_], usable: NDArray[np.bool_]) -> Iterator[tup
 def _leace(
     centred: Array, present: NDArray[np.bool_], label: Array, usable: NDArray[np.bool_]
 ) -> tuple[Array, Array]:
-    """(T, 1, D) each. label: (N, T)."""
+    """Return the directions of `leace_direction` at every position, (T, 1, D) each, for labels (N, T)."""
     removed, read = (np.zeros((usable.size, 1, centred.shape[2])) for _ in range(2))
     for position, rows in _rows(present, usable):
         removed[position, 0], read[position, 0] = leace_direction(centred[rows, position], label[rows, position])
@@ -258,7 +295,7 @@ def _leace(
 def _inlp(
     centred: Array, present: NDArray[np.bool_], is_left: NDArray[np.bool_], usable: NDArray[np.bool_], rank: int
 ) -> Array:
-    """(T, K, D): at every position, what a probe finds, then what one finds without it, and so on."""
+    """Return directions (T, K, D): at every position, a probe's, then that of a probe without it, and so on."""
     from sklearn.linear_model import LogisticRegression
 
     directions = np.zeros((usable.size, rank, centred.shape[2]))
@@ -277,7 +314,7 @@ def _inlp(
 
 
 def _differences(centred: Array, present: NDArray[np.bool_], is_left: NDArray[np.bool_]) -> Array:
-    """(T, D) between the means of either answer."""
+    """Return the differences (T, D) between the means of either answer."""
     sums = [
         centred[is_left == side].sum(axis=0) / np.maximum(present[is_left == side].sum(axis=0), 1)[:, None]
         for side in (True, False)
@@ -286,9 +323,9 @@ def _differences(centred: Array, present: NDArray[np.bool_], is_left: NDArray[np
 
 
 def half_differences(tokens: PaddedTokens, is_left: NDArray[np.bool_], eraser: Eraser) -> Array:
-    """(T, K) halves of the differences of class means along an eraser's shared directions, toward `left`.
+    """Return (T, K) half the differences of class means along an eraser's shared directions, toward `left`.
 
-    Zero at the positions at which nothing was fitted.
+    They are zero at the positions at which nothing was fitted.
     """
     centred, _ = tokens.centred()
     halves = _differences(centred, tokens.present, is_left) @ eraser.removed[0].T / 2
@@ -296,10 +333,12 @@ def half_differences(tokens: PaddedTokens, is_left: NDArray[np.bool_], eraser: E
 
 
 def _shared(differences: Array, rank: int, size: float) -> Array:
-    """(1, K, D): the directions along which differences (T, D) of positions lie most, the same for every token.
+    """Return the directions (1, K, D) along which positions' differences (T, D) lie most, the same for all.
 
     Args:
-        size: Of the largest number whose differences these are.
+        differences: (T, D) differences of class means by position.
+        rank: Most directions.
+        size: Size of the largest number whose differences these are.
     """
     _, values, axes = np.linalg.svd(differences, full_matrices=False)
     directions = axes[: min(rank, int((values > _TINY * max(values[0], size)).sum()))]
@@ -307,7 +346,7 @@ def _shared(differences: Array, rank: int, size: float) -> Array:
 
 
 def _basis(directions: Array, past: Array) -> Array:
-    """(K, D) orthonormal: directions (K, D) without what `past` (J, D) spans; zero where nothing is left."""
+    """Return directions (K, D) without the span of `past` (J, D), orthonormal; zero where nothing is left."""
     past_units = [direction / np.linalg.norm(direction) for direction in past if np.linalg.norm(direction) > 0]
     units: list[Array] = []
     for direction in directions:

@@ -1,4 +1,4 @@
-"""The places at which stored interventions found that the answer passes and is read. Needs no model."""
+"""The places at which stored interventions found that the answer passes and is read; no model is needed."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -48,10 +48,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class StoredEvidence:
-    """All that a run's stored interventions say of the answer, by category; each part is computed once.
+    """All evidence of a run's stored interventions on the answer, by category; each part is computed once.
+
+    Reading a part raises RunDamagedError if a stored intervention was changed.
 
     Attributes:
-        classified: Image swaps that count whatever else is stored of their categories. Raises RunDamagedError.
+        run: Run with the stored interventions.
+        classified: Image swaps that count, whatever else is stored of their categories.
     """
 
     run: RunReader
@@ -109,40 +112,54 @@ class StoredEvidence:
         return verdicts
 
     def verdict(self, category: str, encoded: bool | None, tie: str = "") -> UseVerdict:
-        """Return the verdict of a category whose images were swapped. encoded, tie: see `classify_use`."""
+        """Return the verdict of a category whose images were swapped.
+
+        Args:
+            category: Category with an image swap.
+            encoded: Whether the answer can be read in the backbone, see `classify_use`; None without probes.
+            tie: Words of `describe_tie`; empty if the tie was not tested.
+        """
         control, other = control_for(category, self.swaps), self.other_readouts.get(category)
         return classify_use(encoded, self.swaps[category], control, self.places.get(category), tie, other)
 
     def verdicts(self, results: "ProbeResults | None") -> dict[str, UseVerdict]:
-        """Return every verdict, with what the first view of the newest probes says; None without probes."""
+        """Return every verdict, with the evidence of the first view of the newest probes."""
         encoded, ties = encoded_in(results), stored_ties(self, results)
         return {name: self.verdict(name, encoded.get(name), ties.get(name, "")) for name in self.swaps}
 
 
 # The tie: is what probes read the thing that is used? Rules and words are those of `docs/causal.md`, *Tie*.
 TieAtSite = Literal["read", "unread", "another code", "in part", "not tested"]
-"""read: a subspace that probes find carries the effect. unread: the whole site carries nothing, and is no part
-of several that are read together. another code: the site carries it, every such subspace nothing. in part:
-between, or against the effect. not tested: no interchange there."""
+"""The tie of the readable copy to the behaviour at one site.
+
+read: a subspace that probes find carries the effect. unread: the whole site carries nothing, and is no part of
+several that are read together. another code: the site carries it, every such subspace nothing. in part: between,
+or against the effect. not tested: no interchange there.
+"""
 OPEN = "whether the readable copy is the one used remains open"
 UNPROBED = "probes find no copy beyond chance, but a linear direction carries it"
-"""Where the items are too few for the probes. The direction is fitted without the tested episode's groups."""
+"""Words for the case that the items are too few for the probes.
+
+The direction is fitted without the tested episode's groups.
+"""
 Sites = Mapping[tuple[str, str], TieAtSite]
-"""By place and role."""
+"""The tie by place and role."""
 
 
 def tie_at_site(
     full: PatchEffect | None, along: Sequence[PatchEffect], layer: Sequence[PatchEffect] = ()
 ) -> TieAtSite:
-    """The tie at one place and role. full: its tokens patched in full. along: within subspaces, no controls.
+    """Return the tie at one place and role.
 
-    Weights of a probe point away from what else varies, and may carry nothing of a copy that is read. That it is
-    another code is said only where a direction of the class means carries nothing either.
+    Weights of a probe point away from all other variation, and may carry nothing of a copy that is read. So
+    another code is found only where a direction of the class means carries nothing either.
 
     Args:
-        layer: The same place at every role. A role that carries nothing alone can be one of several parts that
-            decide together. It is unread if all tokens of the layer carry nothing either, or another role carries
-            the effect.
+        full: Effect of the tokens there, patched in full; None if that was not tested.
+        along: Effects of patches within subspaces there, without controls.
+        layer: Effects of the same place at every role. A role that carries nothing alone can be one of several
+            parts that decide together. It is unread if all tokens of the layer carry nothing either, or another
+            role carries the effect.
     """
     if any(map(_is_read_along, along)):
         return "read"
@@ -170,18 +187,19 @@ def _is_read_along(row: PatchEffect) -> bool:
 
 
 def _tie(rows: Sequence[PatchEffect], along: Sequence[PatchEffect], site: str, role: str) -> TieAtSite:
-    """Return `tie_at_site` of one place and role. rows, along: of one category."""
+    """Return `tie_at_site` of one place and role, from the effects of one category."""
     full = next((row for row in rows if (row.sites, row.role) == (site, role)), None)
     within = [row for row in along if (row.sites, row.role) == (site, role) and not row.is_control]
     return tie_at_site(full, within, [row for row in rows if row.sites == site])
 
 
 def describe_tie(sites: Sites, is_joint: bool = False) -> str:
-    """The tie of all sites together, in words; empty if that was not tested at enough of them.
+    """Return the tie of all sites together, in words; empty if it was not tested at enough of them.
 
     Args:
-        is_joint: Whether joint places found that the answer is read at several places together. What carries
-            nothing alone can then be one of them.
+        sites: Tie by place and role.
+        is_joint: Whether joint places found that the answer is read at several places together. A site that
+            carries nothing alone can then be one of them.
     """
     at = {
         tie: [f"{site} {role}" for (site, role), site_tie in sites.items() if site_tie == tie]
@@ -203,11 +221,14 @@ def stored_ties(
 ) -> dict[str, str]:
     """Return by category `describe_tie` of the sites at which probes of a view are significant.
 
-    So are sites at which a direction of the same means carries the effect: it is read out of other episodes. The
-    first layer counts only where a direction was patched, because its tokens carry the effect by construction.
+    Sites at which a direction of the same means carries the effect count as well: it is fitted on other episodes.
+    The first layer counts only where a direction was patched, because its tokens carry the effect by construction.
+    Empty without probes, and for views that are no mean over a role.
 
     Args:
-        view: None for the first that was probed. Empty without probes, and for views that are no mean over a role.
+        evidence: Evidence of the run.
+        results: Probes of the run; None without any.
+        view: View of the probes; None for the first that was probed.
     """
     if results is None or (role := role_of_view(view or results.settings.views[0])) is None:
         return {}
@@ -236,7 +257,7 @@ def stored_ties(
 
 
 ALONG = f"{MEAN_DIFFERENCE}:1"
-"""Direction that moves an answer in every token alike, and one that lies in which tokens are marked."""
+"""Direction that moves an answer that is in every token alike, and one that lies in which tokens are marked."""
 _TIES: dict[TieAtSite, str] = {
     "read": "is read",
     "unread": "is unread",
@@ -251,11 +272,13 @@ def which_layer(
 ) -> dict[str, list[str]]:
     """Return by category where the answer passes and where to steer, and, as later parts, what else is known.
 
-    The later parts say where it is read, and whether the probes' best site is read.
+    The later parts say where it is read, and whether the probes' best site is read. For interchanges and joint
+    places that are not stored, the command that tests them is named.
 
     Args:
-        results: The newest probes, None without any. Of stored interchanges and joint places; what was not tested
-            is named with the command that tests it.
+        evidence: Evidence of the run.
+        results: The newest probes; None without any.
+        categories: Categories to describe.
     """
     family = get_family(evidence.run.model)
     has_kv = family is not None and family.interventions.supports("kv")

@@ -14,9 +14,9 @@ from probe_kit.statistics.significance import SIGNIFICANCE
 
 Values = NDArray[np.float64]
 CARRIES, NOTHING = 0.5, 0.1
-"""Shares of the swap from which a set carries it, and below which, on both sides of 0, it carries nothing.
+"""Shares of the swap from which a set carries it, and within which, on both sides of 0, it carries nothing.
 
-Choices. The second is `SMALLEST_SHARE_OF_INTEREST` of the image swap.
+Both are choices. The second is `SMALLEST_SHARE_OF_INTEREST` of the image swap.
 """
 
 
@@ -31,7 +31,10 @@ class SwapShare(NamedTuple):
 def share_of_whole(
     moved: NDArray[np.float64], full: NDArray[np.float64], groups: NDArray[np.str_], seed_text: str
 ) -> SwapShare | None:
-    """Return Σ moved · whole / Σ whole² over episodes (E,), with its interval by groups (E,); None of nothing."""
+    """Return Σ moved · whole / Σ whole² over episodes (E,), with its interval by groups (E,).
+
+    None where the whole is zero in every episode.
+    """
     if not full.any():
         return None
     # Items of a group share a picture and are not independent of each other, so that whole groups are drawn.
@@ -64,12 +67,19 @@ def pooled_share(moved: NDArray[np.float64], full: NDArray[np.float64]) -> float
 
 
 def carries_nothing(low: float, high: float) -> bool:
-    """Whether an interval of a share of the swap excludes, on both sides of 0, what would matter."""
+    """Whether an interval of a share of the swap excludes, on both sides of 0, effects that would matter."""
     return low > -NOTHING and high < NOTHING
 
 
 def finding_of_cell(alone: SwapShare | None, needed: SwapShare | None, every: SwapShare | None, p: float) -> str:
-    """Return a cell's finding from its shares alone and needed, all cells' share, and p of it alone."""
+    """Return a cell's finding.
+
+    Args:
+        alone: Share of the swap with this cell alone patched; None where the swap is not significant.
+        needed: Share of the swap that all cells lose without it; None likewise.
+        every: Share of the swap with all cells patched; None likewise.
+        p: The p-value of the cell alone.
+    """
     if alone is None or needed is None or every is None:
         return "n/a"
     carries = alone.value >= CARRIES and p < SIGNIFICANCE
@@ -92,10 +102,11 @@ class CellReading(NamedTuple):
     """One of several cells that are read in parallel.
 
     Attributes:
-        alone: Share with this cell alone patched.
-        needed: What all cells lose without it.
-        p: That it moves the output alone, p_fwe against all cells.
-        p_fwe: As `p`.
+        alone: Share with this cell alone patched; None where the source is not significant.
+        needed: Share that all cells lose without it; None likewise.
+        p: The p-value that it moves the output alone.
+        p_fwe: Family-wise p-value of the same, against all cells.
+        finding: Finding in words, see `finding_of_cell`.
     """
 
     alone: SwapShare | None
@@ -110,13 +121,13 @@ class Exchange:
     """The outputs of E clean inferences and of their sources.
 
     Attributes:
-        clean: (E,) numbers such as metres to the left.
-        source: As `clean`.
-        toward: (E,) ±1, where the source should move them.
-        groups: (E,).
-        items: As `groups`.
-        seed_text: Groups are drawn with a seed made of it.
-        flips_seed: Of sign flips.
+        clean: (E,) outputs of the clean inferences, as numbers such as metres to the left.
+        source: (E,) outputs of the sources' inferences, likewise.
+        toward: (E,) ±1, the direction in which the source should move the output.
+        groups: (E,) group of items of every inference.
+        items: (E,) item of every inference.
+        seed_text: Text from which the seed of resampled groups is made.
+        flips_seed: Seed of sign flips.
     """
 
     clean: Values
@@ -129,31 +140,35 @@ class Exchange:
 
     @property
     def full(self) -> Values:
-        """(E,) by how much the source differs from the clean inference."""
+        """The difference (E,) of the source's output from the clean one."""
         return self.source - self.clean
 
     @cached_property
     def p_values(self) -> tuple[float, float]:
-        """(p, p) that the source moves the output where it should, and that it moves it away; exact sign tests."""
+        """The p-values that the source moves the output where it should, and that it moves it away.
+
+        They are of exact sign tests.
+        """
         moved = self.toward * self.full
         toward, away = (paired_greater_p(sign * moved, self.items, self.groups) for sign in (1.0, -1.0))
         return toward, away
 
     @property
     def sign(self) -> float:
-        """Return −1 where it is shown that the source moves the output away from where it should, else 1.
+        """The sign of the source's effect: −1 where it is shown to move the output away, else 1.
 
-        Patches that carry the effect of the source move the output where it does: their p are of that direction.
+        Patches that carry the effect of the source move the output where the source does: their p are of that
+        direction.
         """
         return -1.0 if self.p_values[1] < SIGNIFICANCE else 1.0
 
     @property
     def leads(self) -> Values:
-        """(E,) ±1, where the source moves the output."""
+        """The direction (E,), ±1, in which the source moves the output."""
         return self.sign * self.toward
 
     def share(self, moved: Values) -> SwapShare | None:
-        """Return `moved` (E,) as a share of the source's effect. Groups are drawn for both sums together.
+        """Return `moved` (E,) as a share of the source's effect; groups are drawn for both sums together.
 
         None if the source moves the output by no more than chance: a share would be a ratio of noise.
         """
@@ -164,17 +179,17 @@ class Exchange:
     def test(self, moved: Values) -> tuple[Values, Values, Values]:
         """Return t, p and p_fwe (K,) that each of `moved` (K, E) is where the source leads.
 
-        One-sided, by sign flips of whole groups; p_fwe against the largest t of all K.
+        The tests are one-sided, by sign flips of whole groups; p_fwe is against the largest t of all K.
         """
         return max_t(self.leads * moved, self.items, self.groups, self.flips_seed)
 
     def readings(self, every: Values, alone: Values, lost: Values) -> Iterator[CellReading]:
-        """Yield what C cells do.
+        """Yield the readings of C cells.
 
         Args:
             every: (E,) how far all cells together move the output.
-            alone: (C, E) how far each does.
-            lost: (C, E) what all of them lose without it.
+            alone: (C, E) how far each cell moves it alone.
+            lost: (C, E) how much of the movement all cells lose without each.
         """
         share_of_every = self.share(every)
         _, p, p_fwe = self.test(alone)

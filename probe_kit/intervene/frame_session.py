@@ -1,6 +1,6 @@
 """The session of a run without sides: frames of recordings, or first observations of an environment.
 
-A pair is two frames: the source is the clean frame with one of the inputs of a donor, another frame of another
+A pair is two frames. The source is the clean frame with one of the inputs of a donor, another frame of another
 group.
 """
 
@@ -42,18 +42,24 @@ if TYPE_CHECKING:
 from probe_kit.intervene.sessions import ReplaySession, ReplaySource
 
 CACHED = 256
-"""Observations that are kept: those of the nearest frames are compared again and again."""
+"""Number of observations that are kept: those of the nearest frames are compared again and again."""
 _CONTENT = "content_blake2b"
 
 
 class Frames:
-    """All frames of a run that can be shown again: of each row those that its source gives without an action.
+    """All frames of a run that can be shown again: those of each row that its source gives without an action.
 
-    cameras: of the policy, those that get a picture. index: the frames, in the order of rows and inferences.
+    `cameras` are the policy's cameras that get a picture. `index` lists the frames, in the order of rows and
+    inferences.
     """
 
     def __init__(self, run: Run, source: ReplaySource) -> None:
-        """Raises UsageError if files of the source are gone, OtherFramesError for another version of it."""
+        """Open the source of the run again and list its frames.
+
+        Raises:
+            UsageError: If files of the source are gone.
+            OtherFramesError: For another version of the source.
+        """
         from probe_kit.extract.config_files import source_again
         from probe_kit.extract.sources.source import Played
 
@@ -75,13 +81,21 @@ class Frames:
         return names | {(frame.episode, frame.number): frame for frame in self.index}
 
     def check_varied(self, vary: str) -> None:
-        """Raise UsageError for an input that the frames do not have, such as a mistyped camera."""
+        """Refuse an input that the frames do not have, such as a mistyped camera.
+
+        Raises:
+            UsageError: For an input that the frames do not have.
+        """
         inputs = (INSTRUCTION, PICTURE, *(f"{PICTURE}.{name}" for name in self.cameras), STATE)
         if vary not in inputs:
             raise UsageError(f"vary is {vary!r}; expected one of {', '.join(inputs)}")
 
     def observe(self, frame: Frame) -> Observation:
-        """Show a frame. Raises OtherFramesError if it is not the run's."""
+        """Show a frame.
+
+        Raises:
+            OtherFramesError: If it is not the run's.
+        """
         row = self._rows[frame.episode]
         stored = self.run.episodes.iloc[frame.row].get(_CONTENT)
         if stored != row.columns.get(_CONTENT):
@@ -103,7 +117,7 @@ class Frames:
         )
 
     def close(self) -> None:
-        """Free what the player holds."""
+        """Free the player's resources."""
         self._player.close()
 
     def _listed(self) -> Iterator[Frame]:
@@ -136,21 +150,34 @@ class Frames:
 
 
 FRAMES = 4
-"""Frames of an episode that are used if nothing is said.
+"""Default number of frames of an episode.
 
-Frames of one episode are alike, and the unit of tests is its group: more of them cost inferences and tell little.
+Frames of one episode are alike, and the unit of tests is its group: more frames cost inferences and add little
+evidence.
 """
 
 
 class FrameSession(ReplaySession):
     """A policy and frames of recordings, or first observations of an environment.
 
-    vary: the input that the source has of its donor. frames_each: of an episode. table: pairs of the user's own,
-    by which donors are chosen. items: those whose clean actions are the unit of displacements.
+    `vary` is the input that the source has of its donor. `frames_each` is the number of frames of an episode.
+    `table` has pairs of the user's own, by which donors are chosen. The clean actions of `items` are the unit of
+    displacements.
+
+    Args:
+        run: Run without sides.
+        policy: The run's policy.
+        frames: Frames of the run.
+        choice: Settings of the intervention; None for pictures of donors, the default number of frames, and all
+            items.
     """
 
     def __init__(self, run: Run, policy: "Policy", frames: Frames, choice: Choice | None = None) -> None:
-        """Raises UsageError for a varied input that no other group varies; see also `Frames.check_varied`."""
+        """Set up the session of a run's frames; see also `Frames.check_varied`.
+
+        Raises:
+            UsageError: For a varied input that no other group varies.
+        """
         super().__init__(run, policy)
         self.frames = frames
         self.vary, self.frames_each = PICTURE, FRAMES
@@ -207,12 +234,16 @@ class FrameSession(ReplaySession):
 
     @cached_property
     def _tabled(self) -> list[tuple[Frame, Frame]]:
-        """Frames and donors of the user's own table, which `open_session` has checked."""
+        """The frames and donors of the user's own table, which `open_session` has checked."""
         by_name = self.frames.by_name
         return [(by_name[row[:2]], by_name[row[2:]]) for row in self.table]
 
     def _check_vary(self) -> None:
-        """Raise UsageError for an input that no frame of another group varies."""
+        """Refuse an input that no frame of another group varies.
+
+        Raises:
+            UsageError: If no frame of another group varies the input.
+        """
         if not any(self._donors(item) for item in self.items):
             raise UsageError(
                 f"no frame of another group has another {self.vary}; extract more episodes, or choose another "
@@ -222,7 +253,7 @@ class FrameSession(ReplaySession):
     # -- actions and readout -----------------------------------------------------------------------------
 
     def act(self, model_input: Given, seed: int) -> Chunk:
-        """Return (chunk, D): one prediction in the checkpoint's own units, alone in its batch."""
+        """Return one prediction (chunk, D) in the checkpoint's own units, alone in its batch."""
         assert isinstance(model_input, Observation)
         with while_acting(self.run.model, self.policy.card.checkpoint):
             return np.asarray(self.policy.predict(copied([model_input]), [seed])[0], np.float32)
@@ -233,7 +264,11 @@ class FrameSession(ReplaySession):
         return float((chunk.astype(np.float64).ravel() - clean.astype(np.float64).ravel()) @ direction)
 
     def slope(self, pair: Pair) -> "Callable[[Tensor], Tensor]":
-        """Return the same up to a constant. Raises UsageError for a family whose gradients are in other units."""
+        """Return `displacement` up to a constant, as a function of actions with their graph.
+
+        Raises:
+            UsageError: For a family whose gradients are in other units.
+        """
         clean, direction = self._end(pair)
         assert isinstance(pair.clean, Observation)
         if not np.array_equal(clean, self.policy.act(copied([pair.clean]), [pair.seed])[0]):
@@ -244,7 +279,7 @@ class FrameSession(ReplaySession):
         return lambda actions: (actions.flatten() * actions.new_tensor(direction)).sum()
 
     def _end(self, pair: Pair) -> tuple[Chunk, NDArray[np.float64]]:
-        """Return the clean chunk, and the direction (N,) that displacements of this pair are read along."""
+        """Return the clean chunk, and the direction (N,) along which displacements of this pair are measured."""
         at = pair.row, pair.step, pair.donor_name  # a table may give a frame several donors
         if at not in self._ends:
             clean, source = self.act(pair.clean, pair.seed), self.act(pair.source, pair.seed)
@@ -255,7 +290,7 @@ class FrameSession(ReplaySession):
 
     @cached_property
     def weights(self) -> NDArray[np.float64]:
-        """Return (N,) 1 / spread² of every number of the clean actions, over all pairs of the items."""
+        """The weights (N,), 1 / spread² of every number of the clean actions, over all pairs of the items."""
         clean = [self.act(pair.clean, pair.seed).ravel() for item in self.items for pair in self.pairs(item)]
         return spread_of(np.array(clean))
 
@@ -266,12 +301,12 @@ class FrameSession(ReplaySession):
         return bool(self._donors(item))
 
     def with_other_instruction(self, pair: Pair) -> Observation | None:
-        """Return the source: a swap of the instruction varies just that."""
+        """Return the source: a swap of the instruction varies the instruction alone. None for a question."""
         return pair.source if isinstance(pair.source, Observation) else None
 
 
 def _state_spread(frames: Sequence[Frame]) -> NDArray[np.float64]:
-    """Return (D,) the standard deviation of every number of the state, 1 where it has none."""
+    """Return the standard deviation (D,) of every number of the state, 1 where it has none."""
     spread = np.std([frame.state for frame in frames], axis=0)
     # 1 where a number never changes: `hardly_changed` then moves it by a hundredth of its unit.
     return np.where(spread > 0, spread, 1.0)

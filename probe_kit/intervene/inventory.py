@@ -1,4 +1,4 @@
-"""The list of a run's stored interventions, and which of them tables and figures read. Loads no model."""
+"""The list of a run's stored interventions, and which of them tables and figures read; loads no model."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from probe_kit.runs.run import Run
 COMMON = frozenset(
     {"format", "kind", "run_settings", "stamp", "weights", "wording", "categories", "items", "readout", "donors"}
 )
-"""Settings of every intervention; the rest of its settings is its kind's own."""
+"""Names of the settings of every intervention; its other settings are its kind's own."""
 
 
 @dataclass(frozen=True)
@@ -22,9 +22,13 @@ class ListedIntervention:
     """One stored intervention.
 
     Attributes:
-        state: `used` by verdicts, tables and figures, or of a kind that none of them reads; `other` if others say
-            all that it says, of more episodes or newly; `other episodes` if the run has others by now.
-        parameters: The settings of its kind alone, as stored.
+        state: Use of the result. It is `used` by verdicts, tables and figures, or of a kind that none of them
+            reads. It is `other` if other results contain all of it, of more episodes or newly. It is `other
+            episodes` if the run has different ones by now.
+        created: ISO time (UTC).
+        items: Number of items of each category; None for all.
+        wording: Name of the wording; empty for the items' own words.
+        parameters: Settings of its kind alone, as stored.
     """
 
     key: str
@@ -38,7 +42,7 @@ class ListedIntervention:
 
     @property
     def words(self) -> str:
-        """Return a line about it."""
+        """A line about the intervention."""
         parts = [f"{self.kind} of {', '.join(self.categories)}"]
         parts += [] if self.items is None else [f"{counted(self.items, 'item')} each"]
         parts += [f"wording {self.wording}"] * bool(self.wording)
@@ -51,7 +55,11 @@ class ListedIntervention:
 
 
 def listed_interventions(run: Any) -> list[ListedIntervention]:
-    """All of a run, oldest first. Raises RunDamagedError if one was changed."""
+    """Return all interventions of a run, oldest first.
+
+    Raises:
+        RunDamagedError: If one was changed.
+    """
     readers: list[RunReader] = [run.in_wording(name) for name in run.wordings] or [run]
     current: set[str] = set()
     used: set[str] = set()
@@ -83,9 +91,12 @@ def listed_interventions(run: Any) -> list[ListedIntervention]:
 
 
 def readers_of_results(run: Run) -> Iterator[Callable[[], object]]:
-    """A function per stored intervention, which reads all of it. Raises RunDamagedError where one is none.
+    """Yield a function per stored intervention, which reads all of it.
 
-    Those of episodes that the run has no more are listed alone, as reading does.
+    Those of episodes that the run no longer has are only listed, which finds changed ones too.
+
+    Raises:
+        RunDamagedError: If a stored intervention was changed.
     """
     read_interventions(run.location)
     for wording in run.wordings or (None,):

@@ -1,4 +1,4 @@
-"""Opening the session of a run: its policy and its source are loaded again, and compared with the run's."""
+"""Opening of a run's session: its policy and its source are loaded again, and compared with the run's."""
 
 from collections.abc import Collection, Sequence
 from contextlib import ExitStack
@@ -50,7 +50,11 @@ def load_policy_of(run: Run, source: ReplaySource) -> "Policy":
 
 
 def check_policy(run: Run, policy: "Policy") -> None:
-    """Raise SettingsMismatchError for other weights or options than the run's."""
+    """Refuse another policy than the run's.
+
+    Raises:
+        SettingsMismatchError: For other weights or options than the run's.
+    """
     card = policy.card
     if card.weights_sha256 != run.weights_sha256:
         checkpoint = origin_of(run).checkpoint or "an unknown checkpoint"
@@ -66,11 +70,19 @@ def check_policy(run: Run, policy: "Policy") -> None:
 
 
 MOST_FRAMES = 8
-"""Numbers of frames that a message names."""
+"""Number of frames that a message names."""
 
 
 def check_pairs(table: Sequence[PairRow], frames: Collection[tuple[str, int]]) -> None:
-    """Raise UsageError for a row that names none of the `frames`, each an episode and a number."""
+    """Refuse a table of pairs with frames that the run lacks.
+
+    Args:
+        table: Rows of the table.
+        frames: Frames of the run, each an episode and a number.
+
+    Raises:
+        UsageError: For a row that names none of the frames.
+    """
     for episode, number in (part for row in table for part in (row[:2], row[2:])):
         if (episode, number) not in frames:
             numbers = sorted(frame for name, frame in frames if name == episode)
@@ -92,17 +104,19 @@ def open_session(
     """Load the run's policy and set up its observations.
 
     Args:
-        load: How the policy is found, if not by its name.
-        choice: Of pairs of a run without sides.
-        table: Pairs of the user's own, by default those of the choice; the frames that it names are looked up
+        run: Run to open again.
+        source: Places of the policy, the pictures and the files.
+        load: Function that loads the policy; None to load it by its name.
+        choice: Settings that choose pairs of a run without sides; None for the defaults.
+        table: Pairs of the user's own; empty for those of the choice. The frames that it names are looked up
             before the policy is loaded.
 
     Raises:
-        SettingsMismatchError: If it is another one.
-        SuiteError: For another suite.
-        SuiteNotFoundError: For one that is neither given nor can be drawn again.
-        SceneError: For a scene that needs a file which is not given.
         UsageError: For a table with a frame that the run lacks.
+        SettingsMismatchError: For another policy than the run's.
+        SuiteError: For another suite.
+        SuiteNotFoundError: For a suite that is neither given nor can be drawn again.
+        SceneError: For a scene that needs a file which is not given.
     """
 
     def policy() -> "Policy":
@@ -130,14 +144,19 @@ def open_session(
 def find_pairs(session: ReplaySession, category: str, items: int | None = None) -> list[Pair]:
     """Return the inferences of a category's episodes in a run, each paired with its source's.
 
-    In the scene these are first inferences, and those before swapped images; the metric that fits is
-    `session.lateral_displacement`: metres, left positive.
+    In the scene these are first inferences, and those before swapped images. The metric that fits is
+    `session.lateral_displacement`: metres, left positive. Every clean inference is repeated and compared with the
+    action that the run executed.
 
     Args:
-        items: How many items, both layouts of each; None for all. Every clean inference is repeated and compared
-            with the action that the run executed. Raises UnknownCategoryError for a category that the run does not
-            have, OtherFramesError and CaptureChangedActionError for pictures or actions that are not those of the
-            run.
+        session: Session of the run.
+        category: Name of the category.
+        items: Number of items, both layouts of each; None for all.
+
+    Raises:
+        UnknownCategoryError: For a category that the run does not have.
+        OtherFramesError: For pictures that are not those of the run.
+        CaptureChangedActionError: For actions that are not those of the run.
     """
     pairs = []
     for item in items_of(session.run, (category,), items):

@@ -17,13 +17,13 @@ CLEAN, IMAGE_SWAP, INSTRUCTION_SWAP, NOISE = "clean", "image_swap", "instruction
 RECORDED = "recorded"
 """The condition with recorded attention weights."""
 DONOR, CONTROL_INPUT = "frame_swap", "control_input"
-"""Conditions without sides: all inputs of the donor, and a change of the input that means nothing."""
+"""Conditions without sides: all inputs of the donor, and a meaningless change of the input."""
 UNCHANGED = frozenset({CLEAN, IMAGE_SWAP, INSTRUCTION_SWAP, NOISE, RECORDED, DONOR, CONTROL_INPUT})
 """Conditions in which nothing inside the network is changed."""
 
 
 def arrays_of(record: object, without: Sequence[str] = ()) -> dict[str, NDArray[Any]]:
-    """Return the attributes of an object that are there, as arrays by name."""
+    """Return the attributes of an object that are not None, as arrays by name."""
     return {
         name: np.asarray(value)
         for name, value in vars(record).items()
@@ -32,7 +32,7 @@ def arrays_of(record: object, without: Sequence[str] = ()) -> dict[str, NDArray[
 
 
 def arrays_to_bytes(record: object, without: Sequence[str] = ()) -> bytes:
-    """Return the same as a `.npz`; the same numbers give the same bytes."""
+    """Return `arrays_of` an object as a `.npz`; the same numbers give the same bytes."""
     file = BytesIO()
     np.savez_compressed(file, allow_pickle=False, **arrays_of(record, without))
     return file.getvalue()
@@ -58,12 +58,15 @@ def spread_of(clean: NDArray[np.float32]) -> Array:
 
 
 def directions_of(clean: Array, source: Array, weights: Array) -> tuple[Array, Array]:
-    """Return (E, N) the directions that displacements are read along, and (E,) the sources' own displacements.
+    """Return the directions (E, N) along which displacements are measured, and the sources' own (E,).
+
+    A displacement of x is (x − clean) · direction: its component toward the source, in root mean squares of
+    spreads. It is zero where the source changes nothing.
 
     Args:
-        clean: (E, N). A displacement of x is (x − clean) · direction: its component toward the source, in root
-            mean squares of spreads. Zero where the source changes nothing.
-        source: As `clean`.
+        clean: (E, N) clean actions.
+        source: (E, N) actions of the sources.
+        weights: (N,) weights of the numbers, see `spread_of`.
     """
     apart = source - clean
     count = max(int((weights > 0).sum()), 1)
@@ -74,7 +77,12 @@ def directions_of(clean: Array, source: Array, weights: Array) -> tuple[Array, A
 
 
 def displacements_toward(chunks: NDArray[np.float32], source: int) -> Array:
-    """Return (K, E) displacements toward the source's action of K conditions. chunks: (K, E, N), clean first."""
+    """Return the displacements (K, E) toward the source's action of K conditions.
+
+    Args:
+        chunks: (K, E, N) actions, clean ones first.
+        source: Row of the source's condition.
+    """
     values = np.ascontiguousarray(chunks, np.float64)  # sums are rounded by how an array lies
     directions, _ = directions_of(values[0], values[source], spread_of(chunks[0]))
     return np.asarray(((values - values[0]) * directions).sum(axis=2))
@@ -98,30 +106,31 @@ UNSTORED = ("seed_text", "chunks", "mass", "inferences", "patches")
 class ConditionOutcomes:
     """The numbers of K conditions in E episodes of a run.
 
-    While an intervention is made:
+    `chunks`, `mass`, `inferences` and `patches` are there while an intervention is made.
 
     Attributes:
-        conditions: Names of the K, the clean one first.
-        episodes: (E,), `sides` those of the correct picture.
-        items: As `episodes`.
-        groups: As `episodes`.
-        categories: As `episodes`.
-        sides: As `episodes`.
+        conditions: Names of the K conditions, the clean one first.
+        episodes: (E,) ids of the episodes.
+        items: (E,) item of every episode.
+        groups: (E,) group of items of every episode.
+        categories: (E,) category of every episode.
+        sides: (E,) side of the correct picture; empty without sides.
         displacement: (K, E) metres from the middle, left positive; without sides toward the source's action.
-        max_action_change: (K, E) largest difference of any action from the clean one's. edit_log: (K, E, 5), see
-            `LOG_FIELDS`.
-        replay_error: (E,) of the clean inference from the stored one; NaN where the run does not say.
-        episode_outcomes: (K, E) where the cube ended, correct, wrong or oob, for episodes that were played to
-            their end; then `displacement` is the cube's, and `max_action_change` and `replay_error` are of the
-            trajectory; None where nothing was executed.
-        toward: (K, E) displacement toward the source's action and size of the change, in spreads of clean actions;
-            None where whole episodes were played.
-        size: As `toward`.
-        seed_text: Of the run, by which random draws are made.
-        chunks: (K, E, N) all numbers of the actions of first inferences.
-        mass: (N, B, I, H, R) the attention of N inferences, inferences: (N, 2) their rows in the run's episodes
-            and their calls; None where attention was not recorded.
-        patches: (N, B, P) of single patches; None where they are not known.
+        max_action_change: (K, E) largest difference of any action from the clean one's.
+        edit_log: (K, E, 5) logs of the edits, see `LOG_FIELDS`.
+        replay_error: (E,) difference of the clean inference from the stored one; NaN where the run has none.
+        episode_outcomes: (K, E) zone where the cube ended, correct, wrong or oob, for episodes that were played to
+            their end; None where nothing was executed. With it, `displacement` is the cube's, and
+            `max_action_change` and `replay_error` are of the trajectory.
+        toward: (K, E) displacement toward the source's action, in spreads of clean actions; None where whole
+            episodes were played.
+        size: (K, E) size of the change, in spreads of clean actions; None where whole episodes were played.
+        seed_text: Text of the run by which random draws are made.
+        chunks: (K, E, N) all numbers of the actions of first inferences; None where whole episodes were played,
+            and in stored outcomes.
+        mass: (N, B, I, H, R) attention of N inferences; None where it was not recorded.
+        inferences: (N, 2) rows of these inferences in the run's episodes, and their calls; None likewise.
+        patches: (N, B, P) attention on single patches; None where it is not known.
     """
 
     conditions: tuple[str, ...]
@@ -153,12 +162,12 @@ class ConditionOutcomes:
         return bool(self.sides.size) and bool(self.sides[0])
 
     def of(self, condition: str) -> NDArray[np.float64]:
-        """(E,) lateral of one condition."""
+        """Return the displacement (E,) of one condition."""
         return np.asarray(self.displacement[self.conditions.index(condition)])
 
     @property
     def correct_sign(self) -> NDArray[np.float64]:
-        """(E,) +1 where the correct picture lies left, −1 where it lies right, or where nothing has a side."""
+        """The side of the correct picture (E,): +1 for left, −1 for right, or where nothing has a side."""
         return np.where(self.sides == "left", 1.0, -1.0)
 
     def exchange(self, source: str = IMAGE_SWAP) -> Exchange | None:
@@ -171,12 +180,12 @@ class ConditionOutcomes:
 
     @property
     def counts(self) -> dict[str, Any]:
-        """Return category, and numbers of episodes, items and groups, as columns of a row; of one category."""
+        """The category, and numbers of episodes, items and groups, as columns of a row; of one category."""
         sizes = {"n_items": np.unique(self.items).size, "n_groups": np.unique(self.groups).size}
         return {"category": str(self.categories[0]), "n_episodes": self.episodes.size, **sizes}
 
     def of_episodes(self, selected: NDArray[np.bool_]) -> "ConditionOutcomes":
-        """Some of the episodes. selected: (E,)."""
+        """Return some of the episodes, those where `selected` (E,) is true."""
         cut: dict[str, Any] = {
             name: np.compress(selected, value, int(name in BY_CONDITION))
             for name, value in vars(self).items()
@@ -185,12 +194,12 @@ class ConditionOutcomes:
         return replace(self, **cut)
 
     def by_category(self) -> "list[tuple[str, ConditionOutcomes]]":
-        """Every category with its episodes, in the order of the episodes."""
+        """Return every category with its episodes, in the order of the episodes."""
         names = dict.fromkeys(map(str, self.categories))
         return [(name, self.of_episodes(self.categories == name)) for name in names]
 
     def in_spreads(self) -> "ConditionOutcomes":
-        """Return the same with displacements toward the source's action, and sizes; of first inferences."""
+        """Return the outcomes with displacements toward the source's action, and sizes; of first inferences."""
         if self.chunks is None:
             return self
         # Toward the source's action, of all its inputs if they were played.
@@ -220,7 +229,7 @@ class ConditionOutcomes:
 
 @dataclass(frozen=True, kw_only=True)
 class Effect:
-    """One row of effects, read from outcomes; every kind adds columns."""
+    """One row of effects, made from outcomes; every kind adds columns."""
 
     category: str
 

@@ -27,24 +27,26 @@ Chunk = NDArray[np.float32]
 class Pair:
     """Two inferences with the same seed.
 
-    Pairs of a run have more.
+    Pairs of a run have values in all fields that apply to it.
 
     Attributes:
-        clean: What is patched into.
-        source: What activations are patched from; it must have as many tokens. toward: +1 or −1, the direction of
-            the metric in which the source should move the output.
-        group: The unit that is resampled and flipped, such as a couple of items.
-        item: The unit that is averaged before; both may be empty for pairs that are independent of each other.
-        row: Of the run.
-        episode: As `row`.
-        category: As `row`.
-        side: Of the correct picture; None without sides.
-        donor: Of frames without sides, the other frame of which the source has one input.
-        donor_name: Of that frame.
-        control: The clean one after a change of that input that means nothing.
-        tiles: (H, W) where each tile is seen in the clean picture.
-        stored: (n, D) actions of the clean inference that the run has, None where it does not say.
-        step: Which inference of the episode it is, or the recorded frame.
+        clean: Input of the inference that is patched into.
+        source: Input of the inference that activations are patched from; it must have as many tokens.
+        seed: Seed of both inferences.
+        toward: +1 or −1, the direction of the metric in which the source should move the output.
+        group: Name of the unit that is resampled and flipped, such as a couple of items; empty for a pair that is
+            independent of all others.
+        item: Name of the unit that is averaged before; empty likewise.
+        row: Row of the episode in the run.
+        episode: Id of the episode.
+        category: Category of the episode.
+        side: Side of the correct picture; None without sides.
+        donor: In runs without sides, the other frame of which the source has one input; None in the scene.
+        donor_name: Name of that frame.
+        control: The clean input after a meaningless change of the varied input; None in the scene.
+        tiles: (H, W) mask of each tile in the clean picture, by side.
+        stored: (n, D) actions of the clean inference in the run; None where it has none.
+        step: Number of the inference in the episode, or of the recorded frame.
     """
 
     clean: Given
@@ -66,7 +68,7 @@ class Pair:
 
 
 def groups_and_items(pairs: Sequence[Pair]) -> tuple[list[str], list[str]]:
-    """The group and the item of every pair; a pair without one is alone in its own."""
+    """Return the group and the item of every pair; a pair without one is alone in its own."""
     groups = [pair.group or f"pair {at}" for at, pair in enumerate(pairs)]
     return groups, [pair.item or f"{groups[at]}, pair {at}" for at, pair in enumerate(pairs)]
 
@@ -83,7 +85,8 @@ PAIR_COLUMNS = ("episode", "frame", "donor_episode", "donor_frame")
 def read_pairs(path: Path) -> tuple[PairRow, ...]:
     """Return the rows of a table with the columns episode, frame, donor_episode, donor_frame.
 
-    Raises UsageError.
+    Raises:
+        UsageError: For a table without one of the columns, without a row, or with a frame that is no number.
     """
     table = open_table(path, PAIR_COLUMNS)
     if missing := [name for name in PAIR_COLUMNS if name not in table.names]:

@@ -15,16 +15,16 @@ if TYPE_CHECKING:
     from probe_kit.hooks import Model, Policy, Stream
 
 TILE_ROLES = ("image.left", "image.right")
-"""Roles of the patches that see one of the two pictures; see `tiles`."""
+"""Roles of the patches that see one of the two pictures; see `tokens`."""
 TILES: Mapping[str, Side] = dict(zip(TILE_ROLES, ("left", "right"), strict=True))
-"""Roles by tile, and the tile."""
+"""Tile of each of these roles."""
 ALL = "all"
-"""The role of every token but padding."""
+"""Role of every token but padding."""
 RESIDUAL = "residual"
 SEPARATOR = "|"
-"""Between the parts of a condition's name, such as `backbone.02|image`."""
+"""Separator between the parts of a condition's name, such as `backbone.02|image`."""
 SHORTEST_RANGE = 3
-"""Consecutive layers that are named by their first and last."""
+"""Number of consecutive layers from which on they are named by their first and last."""
 _POSITIONS = re.compile(r"(?P<first>\d+)(-(?P<last>\d+))?")
 _PATTERN = re.compile(
     r"(?P<stream>[a-z][a-z_0-9]*)\.(?P<layer>\*|\d+)(\.(?P<quantity>[a-z_]+)(\.(?P<head>\*|\d+))?)?"
@@ -37,9 +37,9 @@ class PlaceName:
     """The parts of a place's name: `backbone.02`, `kv.01.values`, `backbone.02.heads.3`, `expert.03@0-4`.
 
     Attributes:
-        quantity: Empty where it is not named: the residual stream, of `kv` keys and values.
-        head: Of the quantity `heads`.
-        iterations: First and last one; None for all.
+        quantity: Name of the quantity; empty where it is not named: the residual stream, for `kv` keys and values.
+        head: Number of the head, for the quantity `heads`; None for all.
+        iterations: First and last iteration; None for all.
     """
 
     stream: str
@@ -50,7 +50,11 @@ class PlaceName:
 
     @classmethod
     def parse(cls, name: str) -> "PlaceName":
-        """Take the name of one place apart. Raises UnknownSiteError for another form."""
+        """Split the name of one place into its parts.
+
+        Raises:
+            UnknownSiteError: For another form.
+        """
         match = _PATTERN.fullmatch(name)
         if match is None or "*" in name:
             raise UnknownSiteError(f"{name!r} is not the name of a place, such as backbone.02 or expert.03@0-4")
@@ -78,17 +82,18 @@ class PlaceName:
 
     @property
     def depth(self) -> tuple[object, ...]:
-        """Return a key that sorts places of one stream: shallow before deep, a layer before its parts."""
+        """A key that sorts places of one stream: shallow before deep, a layer before its parts."""
         return self.layer, self.iterations or (0, 0), self.quantity, -1 if self.head is None else self.head
 
 
 def list_places(names: Sequence[str], most: int | None = None) -> str:
-    """Places, each with its role if it has one, in words: `backbone.01 to backbone.07 language, kv.02 image`.
+    """Return places in words: `backbone.01 to backbone.07 language, kv.02 image`.
 
     Three or more of one kind in consecutive layers become one range.
 
     Args:
-        most: How many places and ranges are named, by default all; the number of others follows.
+        names: Names of the places, each with its role if it has one.
+        most: Most places and ranges by name, followed by the number of others; None for all.
     """
     ranges: list[list[tuple[PlaceName, str]]] = []
     for name in names:
@@ -109,10 +114,11 @@ def list_places(names: Sequence[str], most: int | None = None) -> str:
 
 @dataclass(frozen=True)
 class SiteGroup:
-    """One quantity of a layer of a stream, over some of its iterations; of `kv` keys and values together.
+    """One quantity of a layer of a stream, over some of its iterations; for `kv` keys and values together.
 
     Attributes:
-        head: Which of the `heads` heads is meant, of sites of that quantity; None for all of them.
+        head: Number of the head that is meant, of sites with `heads` heads; None for all of them.
+        heads: Number of heads of such sites; 0 for others.
     """
 
     name: str
@@ -122,7 +128,11 @@ class SiteGroup:
 
     @property
     def only_site(self) -> Site:
-        """Its one site, where a direction can be found. Raises UnknownSiteError if it has several, or no mean."""
+        """The only site of the group, where a direction can be found.
+
+        Raises:
+            UnknownSiteError: If it has several sites, or no mean in the run.
+        """
         if self.stream == KV_STREAM or self.sites[0].quantity != RESIDUAL:
             what = "keys and values" if self.stream == KV_STREAM else f"of the quantity {self.sites[0].quantity}"
             raise UnknownSiteError(
@@ -138,30 +148,32 @@ class SiteGroup:
 
     @property
     def stream(self) -> str:
-        """Return the stream of all its sites."""
+        """The stream of all its sites."""
         return self.sites[0].stream
 
     @property
     def layer(self) -> tuple[str, int, str]:
-        """Stream, layer and quantity: heads of one block are parallel, layers come one after the other."""
+        """The stream, layer and quantity: heads of one block are parallel, layers come one after the other."""
         return self.stream, self.sites[0].layer, self.sites[0].quantity
 
     def limit(self, change: TokenEdit) -> TokenEdit:
-        """The change within this place: of one head, if it is one."""
+        """Return the change within this place: of one head, if it is one."""
         return change if self.head is None else OfOneHead(change, self.head, self.heads)
 
 
 def resolve_sites(pattern: str, policy: "Model") -> list[SiteGroup]:
-    """The places that a pattern names.
+    """Return the places that a pattern names.
 
-    `backbone.*` every layer, each a place; `backbone.02` one; `expert.03@0-4` a layer over iterations 0 to 4,
-    changed at each of them; `expert.03` over all; `kv.02` what block 2 hands over to the acting stream, keys and
-    values together. A quantity may follow the layer: `kv.02.values`, `backbone.02.mlp`, `backbone.02.heads` for
-    all heads of a block, `backbone.02.heads.3` for one, `backbone.*.heads.*` for each.
+    The pattern `backbone.*` is every layer, each a place, and `backbone.02` is one. The pattern `expert.03@0-4` is
+    a layer over iterations 0 to 4, changed at each of them, and `expert.03` is over all. The pattern `kv.02` is
+    what block 2 passes to the acting stream, keys and values together.
+
+    A quantity may follow the layer: `kv.02.values`, `backbone.02.mlp`, `backbone.02.heads` for all heads of a
+    block, `backbone.02.heads.3` for one, `backbone.*.heads.*` for each.
 
     Raises:
-        UnknownSiteError: For `kv` of a family that has none.
         UnsupportedInterventionError: For `kv` of a family that has none.
+        UnknownSiteError: For a pattern that names no place.
     """
     match, streams = _PATTERN.fullmatch(pattern), policy.every_stream()
     if match is not None and match["stream"] == KV_STREAM:
@@ -191,7 +203,10 @@ def resolve_sites(pattern: str, policy: "Model") -> list[SiteGroup]:
 
 
 def resolve_all(patterns: Sequence[str], policy: "Model") -> dict[str, SiteGroup]:
-    """The places of several patterns by name, each once. Raises as `resolve_sites` does."""
+    """Return the places of several patterns by name, each once.
+
+    Raises as `resolve_sites`.
+    """
     return {site_group.name: site_group for pattern in patterns for site_group in resolve_sites(pattern, policy)}
 
 
@@ -223,7 +238,7 @@ def positions_of(role: str) -> tuple[int, int] | None:
 
 
 def roles_of(policy: "Policy", stream: str, roles: Sequence[str]) -> list[str]:
-    """Return the roles that tokens of a stream play, of some; `all` included, tiles where it has a picture."""
+    """Return the roles, of some, that tokens of a stream have; `all` included, tiles where it has a picture."""
     declared = policy.role_names.get(policy.tokens_of(stream), ())
     tiles = TILE_ROLES if any(plays(name, "image") for name in declared) else ()
     return [role for role in roles if role == ALL or role in tiles or any(plays(name, role) for name in declared)]
@@ -238,8 +253,9 @@ def unread_places(
     """Return those of some places that lie at the end of an unread stream: an edit there changes no action.
 
     Args:
-        streams: Of the run or the policy, by name.
-        interventions: Declared by the family.
+        names: Names of the places.
+        streams: Streams of the run or the policy, by name.
+        interventions: Interventions that the family declares.
     """
     unread = []
     for name in names:
@@ -253,7 +269,7 @@ def unread_places(
 
 
 def unread_note(places: Iterable[str]) -> str:
-    """The sentence about unread places."""
+    """Return the sentence about unread places."""
     return (
         f"unread: {', '.join(places)}. Nothing that acts reads the end of this stream, so that an edit there "
         "changes no action whatever probes read in it: a control, no place to steer at"

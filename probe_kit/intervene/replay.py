@@ -1,4 +1,4 @@
-"""Conditions: the ways in which one inference is made again, and the numbers of each. Loads no model."""
+"""Conditions: the ways in which one inference is made again, and the numbers of each; loads no model."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 
 @dataclass
 class ConditionContext:
-    """One pair, with what its conditions share.
+    """One pair, with the values that its conditions share.
 
     Attributes:
-        clean: (chunk, D) of the first condition, empty before that was played.
+        clean: (chunk, D) actions of the first condition; empty before that was played.
     """
 
     session: "ReplaySession"
@@ -40,11 +40,11 @@ class ConditionContext:
         return PairTokens(self.session.policy, self.pair)
 
     def act(self) -> Chunk:
-        """Return (chunk, D), the action on the clean input."""
+        """Return the action (chunk, D) on the clean input."""
         return self.session.act(self.pair.clean, self.pair.seed)
 
     def source(self, sites: Sequence[Site]) -> "ActivationCache":
-        """Return the activations of all these sites in the source's inference; made once."""
+        """Return the activations of all these sites in the source's inference, which is made once."""
         from probe_kit.hooks import capture
 
         if self._source is None:
@@ -55,11 +55,14 @@ class ConditionContext:
 
 @dataclass(frozen=True)
 class ConditionResult:
-    """The actions (chunk, D) of one inference, and the log of its edits, if any.
+    """The result of one inference.
 
     Attributes:
-        mass: (B, I, H, R) the attention shares of it, if recorded; see `AttentionShares`.
-        patches: (B, P) those on the patches of the first camera's picture, means over iterations and heads.
+        chunk: (chunk, D) actions.
+        edit_log: Log of the edits; None without any.
+        mass: (B, I, H, R) shares of its attention; None if not recorded; see `AttentionShares`.
+        patches: (B, P) shares on the patches of the cameras' pictures, means over iterations and heads; None if
+            not recorded.
         estimated: Displacement that an estimate adds to the chunk's, without an inference that makes it.
     """
 
@@ -75,9 +78,10 @@ class Condition:
     """One way of making an inference again.
 
     Attributes:
-        name: Tells it from the others of its intervention.
-        places: Names of those that it edits, by which it is known whether anything reads them.
-        details: What `Intervention.extra_files` reads of it.
+        name: Name that is unique within its intervention.
+        play: Function that makes the inference.
+        places: Names of the places that it edits, by which it is known whether anything reads them.
+        details: Values for `Intervention.extra_files`.
     """
 
     name: str
@@ -98,13 +102,13 @@ def _of_input(name: str, which: str) -> Condition:
 
 
 CLEAN_RUN = _of_input(CLEAN, "clean")
-"""The inference as the run made it."""
+"""Condition of the inference as the run made it."""
 SOURCE_RUN = _of_input(IMAGE_SWAP, "source")
-"""The source's inference: in the scene, the two pictures in each other's place."""
+"""Condition of the source's inference: in the scene, the two pictures in each other's place."""
 DONOR_RUN = _of_input(DONOR, "donor")
-"""The donor's inference: all inputs are its own."""
+"""Condition of the donor's inference: all inputs are its own."""
 CONTROL_RUN = _of_input(CONTROL_INPUT, "control")
-"""The clean inference after a change of the varied input that means nothing."""
+"""Condition of the clean inference after a meaningless change of the varied input."""
 
 
 def patched_run(
@@ -114,12 +118,14 @@ def patched_run(
     direction: str = "",
     bases: "Directions | None" = None,
 ) -> Condition:
-    """Return the clean inference with activations of cells from the source's: one inference, however many cells.
+    """Return the clean inference with activations of cells from the source's: one inference for all cells.
 
     Args:
-        cells: By category, and for all other categories under the empty name.
+        name: Name of the condition.
+        cells: Cells by category, and for all other categories under the empty name.
         source_sites: All sites at which the source's inference is captured, once for all conditions.
-        direction: The name of one of `bases`, empty to patch tokens in full.
+        direction: Name of one of `bases`; empty to patch tokens in full.
+        bases: Directions of the cell; None to patch tokens in full.
     """
 
     def play(context: ConditionContext) -> ConditionResult:
@@ -139,7 +145,7 @@ AttentionRecord = tuple[int, int, NDArray[np.float32], NDArray[np.float32] | Non
 
 
 def room_for(pairs: Sequence[Pair], conditions: Sequence[Condition]) -> ConditionOutcomes:
-    """Return room for the numbers of these conditions in these pairs."""
+    """Return outcomes with room for the numbers of these conditions in these pairs."""
     shape = len(conditions), len(pairs)
     columns: dict[str, Any] = {
         name: np.array([getattr(pair, field) or "" for pair in pairs], str)

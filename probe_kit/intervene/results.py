@@ -1,4 +1,4 @@
-"""The result of an intervention: a table, the verdicts, the ways to write them down, and what a run stores."""
+"""The result of an intervention: a table, the verdicts, the ways to write them, and what a run stores."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -50,11 +50,11 @@ _VERDICT_COLUMNS = ("verdict", "behaviour", "reversed", "reason", "where", "tie"
 
 @dataclass(frozen=True)
 class InterventionResult(Measurement):
-    """One intervention: its settings, what it gave, and what that means with all else that its run stores."""
+    """One intervention: its settings, its effects, and their meaning together with all else its run stores."""
 
     @classmethod
     def of_stored(cls, stored: Measurement) -> "InterventionResult":
-        """Return what a stored intervention means."""
+        """Return the result of a stored intervention."""
         return cls(stored.run, stored.settings, stored.read, stored.files, stored.key, stored.created)
 
     @property
@@ -68,7 +68,7 @@ class InterventionResult(Measurement):
 
     @property
     def table(self) -> "pd.DataFrame":
-        """One line per row of `effects`, with its columns; of a kind with verdicts also those of `UseVerdict`."""
+        """The effects as one line per row, with their columns; for a kind with verdicts also its `UseVerdict`."""
         frame = frame_of(self.effects)
         if self._kind.has_verdict and self.outcomes.has_sides:
             verdicts = [self.verdicts.get(str(category), None) for category in frame["category"]]
@@ -78,7 +78,7 @@ class InterventionResult(Measurement):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Return what a reader must know, a sentence each."""
+        """The notes that a reader must know, a sentence each."""
         certificate, notes = self.certificate, list[str]()
         check = certificate["replay"]
         what = "clean inferences" if self.outcomes.episode_outcomes is None else "unedited trajectories"
@@ -126,7 +126,7 @@ class InterventionResult(Measurement):
         ]
 
     def to_json(self) -> str:
-        """Key, settings, certificate and the table as JSON."""
+        """Return key, settings, certificate and the table as JSON."""
         content = {
             "key": self.key,
             "label": self.run.label,
@@ -137,7 +137,7 @@ class InterventionResult(Measurement):
         return json.dumps(content, indent=2, ensure_ascii=False)
 
     def to_csv(self) -> str:
-        """The table as comma-separated values with a header.
+        """Return the table as comma-separated values with a header.
 
         A text that a spreadsheet would compute has a `'` in front.
         """
@@ -150,15 +150,15 @@ class InterventionResult(Measurement):
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """The same with numbers, reasons, and all that is known of the layer."""
+        """The findings with numbers, reasons, and all that is known of the layer."""
         return *self._kind.sentences(self.effects, self), *self._which_layer(None)
 
     def to_rich(self, details: bool = True) -> "Table":
-        """The table for a terminal.
+        """Return the table for a terminal.
 
         Args:
-            details: Split it where it is wide, and say below it what each verdict rests on; else leave columns out
-                by name.
+            details: Whether to split the table where it is wide, and to state below it the reasons of each
+                verdict. Else columns are left out by name.
         """
         table = self._kind.table(self.effects, self)
         if not details:
@@ -172,7 +172,7 @@ class InterventionResult(Measurement):
 
     @property
     def legend(self) -> str:
-        """Return what a reader of its verdicts must know."""
+        """The explanation of its verdicts that a reader must know."""
         uses = (self.verdicts.get(row.category) for row in self.effects)
         swaps = [row for row in self.effects if isinstance(row, ImageSwapEffect)]
         reasons = (verdict.explanation for verdict in self.verdicts.values())
@@ -183,11 +183,12 @@ class InterventionResult(Measurement):
 
     @cached_property
     def verdicts(self) -> dict[str, UseVerdict]:
-        """The verdicts by category, from this and what else is stored when they are first asked for.
+        """The verdicts by category, from this result and what else is stored at the first access.
 
         Empty without sides.
 
-        Raises RunDamagedError.
+        Raises:
+            RunDamagedError: If a stored intervention was changed.
         """
         if self.lacks_sides:
             return {}
@@ -209,12 +210,12 @@ class InterventionResult(Measurement):
 
 
 def load_effects(run: RunReader, key: str | None = None, kind: str | None = None) -> InterventionResult:
-    """The stored intervention whose key begins with `key`, or the newest (of `kind`).
+    """Load the stored intervention whose key begins with `key`, or the newest (of `kind`).
 
     Raises:
-        NoInterventionsError: For a key that is not there.
-        UsageError: For a key that is not there.
         RunDamagedError: If it was changed.
+        NoInterventionsError: If there is none.
+        UsageError: For a key that does not exist or is not the only one.
     """
     result = InterventionResult.of_stored(find_stored(run, key, kind))
     _ = result.outcomes, result.certificate  # read now, so that a changed file is refused here and not in a table
@@ -243,12 +244,16 @@ def save(
     certificate: Mapping[str, Any],
     extra_files: Mapping[str, bytes] = MappingProxyType({}),
 ) -> str:
-    """Write `interventions/<key>/`, all or nothing; what is there is kept. Return the key.
+    """Write `interventions/<key>/`, all or nothing, and return the key; results that exist already are kept.
 
     The effects are stored without verdicts, which later probes may change.
 
     Args:
-        extra_files: By name.
+        run: Run to store them in.
+        settings: Settings that decide the numbers, see `settings_of`.
+        outcomes: Numbers of the conditions.
+        certificate: Record of what was loaded and checked.
+        extra_files: Further files by name.
     """
     key = key_of(settings)
     if is_stored(run.location, key):

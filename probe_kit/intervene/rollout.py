@@ -1,8 +1,8 @@
-"""Playing episodes again, step by step: with an edit at every inference, or along the unedited episode.
+"""Playing of episodes step by step: with an edit at every inference, or along the unedited episode.
 
-Per-step readout is teacher-forced. Where one inference is one action in greedy bins, the first one says little of
-where the hand will go. There every condition is evaluated at every state of the unedited episode, and the lateral
-displacements of its actions are summed.
+The per-step readout is teacher-forced. Where one inference is one action in greedy bins, the first one carries
+little information about where the hand will go. There every condition is evaluated at every state of the unedited
+episode, and the lateral displacements of its actions are summed.
 """
 
 from collections.abc import Callable, Sequence
@@ -29,7 +29,14 @@ from probe_kit.intervene.sessions import ReplaySession
 
 @dataclass(frozen=True)
 class RolloutResult:
-    """One episode to its end. outcome: correct, wrong or oob. frames: (T + 1, C) as in `env.trajectory`."""
+    """One episode that was played to its end.
+
+    Attributes:
+        outcome: Zone where the cube ended: correct, wrong or oob.
+        cube: End of the cube in the plane, in metres.
+        frames: (T + 1, C) frames of the trajectory, as in `env.trajectory`.
+        edit_log: Log of all edits.
+    """
 
     outcome: str
     cube: tuple[float, float]
@@ -42,8 +49,8 @@ def play_episodes(
 ) -> ConditionOutcomes:
     """Play every episode under every condition; the first one changes nothing and repeats the run.
 
-    `max_action_change` is the largest difference of any number of the trajectory from the first condition's,
-    `replay_error` that of the first condition's from the stored one's.
+    `max_action_change` is the largest difference of any number of the trajectory from the first condition's.
+    `replay_error` is that of the first condition's from the stored one's.
 
     Raises:
         CaptureChangedActionError: If an outcome is not the stored one.
@@ -64,10 +71,13 @@ def play_episodes(
 
 
 def roll_out(session: SceneSession, pair: Pair, condition: Condition, swapping: bool = True) -> RolloutResult:
-    """Play one episode under a condition that is in force at every inference.
+    """Play one episode under a condition that applies at every inference.
 
     Args:
-        swapping: Whether the condition looks at swapped images; they are then drawn at every inference.
+        session: Session of the run.
+        pair: First pair of the episode.
+        condition: Condition to play.
+        swapping: Whether the condition needs swapped images; they are then drawn at every inference.
     """
     edit_logs: list[EditLog] = []
 
@@ -85,7 +95,7 @@ def evaluate_per_step(
 ) -> ConditionOutcomes:
     """Evaluate every condition along every episode; the first one, which edits nothing, is executed.
 
-    `displacement` is where the hand began plus what the actions of all calls would add laterally, in metres from
+    `displacement` is the start of the hand plus what the actions of all calls would add laterally, in metres from
     the middle, left positive.
 
     Raises:
@@ -107,7 +117,7 @@ def _evaluate(
     column: int,
     attention_records: list[AttentionRecord],
 ) -> None:
-    """Fill one column of a outcomes."""
+    """Evaluate one episode and fill its column of the outcomes."""
     edit_logs: list[list[EditLog]] = [[] for _ in conditions]
     outcomes.displacement[:, column] = _offset(session, pair.clean)
 
@@ -185,7 +195,7 @@ def apart_from_stored(session: SceneSession, pair: Pair, clean: RolloutResult) -
 
 
 def _largest(first: NDArray[np.float32], second: NDArray[np.float32]) -> float:
-    """Return the largest difference over the frames that both have; 0 only if they are the same bit for bit."""
+    """Return the largest difference over the frames that both have; 0 only if they are bit for bit the same."""
     if np.array_equal(first, second, equal_nan=True):
         return 0.0
     both = min(len(first), len(second))

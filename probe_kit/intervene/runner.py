@@ -1,4 +1,4 @@
-"""Running an intervention: replay what is missing, store it, and read the result."""
+"""Running of an intervention: it replays what is missing, stores it, and reads the result."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import fields
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from probe_kit.hooks import Policy
 
 REDO = "the same `probe-kit intervene` then plays it again"
-"""The remedy for a damaged piece of an unfinished intervention."""
+"""Remedy for a damaged piece of an unfinished intervention."""
 
 
 def run_intervention(
@@ -45,18 +45,22 @@ def run_intervention(
 ) -> InterventionResult:
     """Intervene on a run's policy and store the result with the run; a stored result is loaded.
 
+    An interrupted intervention is resumed. Raises as `open_session` too.
+
     Args:
-        intervention: `ImageSwap()` by default.
-        source: Where policy and pictures are, by default the embedded suite and the model's own checkpoint.
-        load: How the policy is found, if not by its name.
-        progress: Called after every item replayed.
-        on_fit_progress: After every item inferred before that, where directions or erasers are fitted.
-        on_note: Called before the replay with a sentence about edits that cannot change anything; `notes` has it
-            too. What was interrupted is continued.
+        run: Run whose policy acted.
+        intervention: Kind with its settings; None for `ImageSwap()`.
+        source: Places of the policy and the pictures; None for the embedded suite and the model's own checkpoint.
+        load: Function that loads the policy; None to load it by its name.
+        progress: Function that is called after every replayed item; None for a progress bar in a notebook.
+        on_fit_progress: Function that is called after every item inferred before that, where directions or erasers
+            are fitted; None likewise.
+        on_note: Function that is called before the replay with a sentence about edits that cannot change anything;
+            `notes` has it too.
 
     Raises:
         UsageError: For a run whose policy did not act.
-        UnknownCategoryError: And what `open_session` raises.
+        UnknownCategoryError: For a category that the run lacks.
     """
     intervention = intervention or ImageSwap()
     check_intervention(run, intervention)
@@ -99,9 +103,12 @@ def run_intervention(
 
 
 def check_roles(intervention: Intervention, policy: "Policy") -> None:
-    """Raise UsageError for a role that no token at its sites plays: the table would be silent about it.
+    """Refuse a role that no token at its sites has: it would be missing from the table without notice.
 
     The default roles are tried where none are named; then one of them that the policy has is enough.
+
+    Raises:
+        UsageError: For a role that no token has.
     """
     default_roles = next((field.default for field in fields(intervention) if field.name == "roles"), ())
     patterns_of: dict[tuple[str, ...], list[str]] = {}
@@ -120,10 +127,12 @@ def check_roles(intervention: Intervention, policy: "Policy") -> None:
 
 
 def check_intervention(run: Run, intervention: Intervention) -> None:
-    """Raise, before anything is loaded, for a run that an intervention cannot be made on.
+    """Refuse, before anything is loaded, a run on which an intervention cannot be made.
 
-    UsageError for a run without actions to compare or an option that does not apply to it, UnknownCategoryError,
-    UnsupportedInterventionError for what the run's family does not do.
+    Raises:
+        UsageError: For a run without actions to compare, or an option that does not apply to it.
+        UnknownCategoryError: For a category that the run lacks.
+        UnsupportedInterventionError: For an intervention that the run's family does not support.
     """
     check_run_fits(run)
     intervention.check_run(run)
@@ -182,7 +191,7 @@ def _replay_check(outcomes: ConditionOutcomes) -> dict[str, Any]:
 
 
 def _ledgers(outcomes: ConditionOutcomes) -> dict[str, dict[str, float]]:
-    """Per condition that changed streams: fires, fires that moved nothing, and norms as means over fires.
+    """Return per condition that changed streams: fires, fires that moved nothing, and norms as means over fires.
 
     Raises:
         CaptureChangedActionError: If coefficient 0 changed an action.

@@ -38,8 +38,13 @@ _OTHER: Mapping[Layout, Layout] = {"original": "swapped", "swapped": "original"}
 class SceneSession(ReplaySession):
     """A policy and a scene.
 
+    `counterparts` has the counterparts of the items that have one, see `counterparts_of`.
+
     Args:
-        items: Of the run's suite, by id. counterparts: of those that have one, see `counterparts_of`.
+        run: Run in the scene.
+        policy: The run's policy.
+        scene: Specification of the run's scene.
+        items: Items of the run's suite, by id.
     """
 
     def __init__(self, run: Run, policy: "Policy", scene: SceneSpec, items: Mapping[str, Item]) -> None:
@@ -54,7 +59,13 @@ class SceneSession(ReplaySession):
 
     @classmethod
     def of(cls, run: Run, source: ReplaySource, load: "Callable[[], Policy]") -> "SceneSession":
-        """Return that of a run. Raises SuiteError, SuiteNotFoundError, SceneError for a missing file."""
+        """Return the session of a run.
+
+        Raises:
+            SuiteError: For another suite than the run's.
+            SuiteNotFoundError: For a suite that is neither given nor can be drawn again.
+            SceneError: For a missing file of the scene.
+        """
         files = {name: path for name, path in origin_of(run).scene_files.items() if path.is_file()}
         moved = {field.removeprefix(OF_SCENE): Path(path) for field, path in source.moved.items()}
         scene = SceneSpec.from_json(run.settings["scene"], {**files, **moved})

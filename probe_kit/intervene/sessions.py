@@ -1,6 +1,6 @@
 """Replay sessions: a run's policy and observations, set up again to repeat and edit its inferences.
 
-In the scene both layouts of an item are drawn again from the same state. Of other runs a pair is two frames: the
+In the scene, both layouts of an item are drawn again from the same state. In other runs, a pair is two frames. The
 source is the clean frame with one of the inputs of a donor, another frame of another group.
 """
 
@@ -31,17 +31,17 @@ if TYPE_CHECKING:
 
 
 FAR = 0.01
-"""By how much a number of a repeated first action may differ from the stored one, in its unit.
+"""Largest difference of a number of a repeated first action from the stored one, in its unit.
 
-Batches of another size, threads and GPUs round otherwise. More is another policy or scene.
+Batches of another size, threads and GPUs round differently. A larger difference means another policy or scene.
 """
 
 
 class Progress(Protocol):
-    """Called after every item."""
+    """A function that is called after every item."""
 
     def __call__(self, count: int, total: int, what: str, /) -> None:
-        """Take items so far, of `total`, and the last one."""
+        """Report the number of items so far, their total, and the name of the last one."""
 
 
 @dataclass(frozen=True)
@@ -49,15 +49,15 @@ class ReplaySource:
     """The places of a run's policy, pictures and files; their hashes must be the run's.
 
     Attributes:
-        suite: Folder; None for that of the run, see `suite_of`.
-        checkpoint: As for `probe-kit extract`; by default those of the run, of a checkpoint its folder if it is
-            still there. Options of the run stay but for those that are named anew.
-        options: As `checkpoint`.
-        weights_seed: As `checkpoint`.
-        device: Of the model.
-        moved: Parts of the run's source that lie elsewhere now, by field of its settings: `folder` and `table` of
-            recordings and pictures, `environment` (and `options`, beside those of the run), `scene.background`,
-            `scene.arm_urdf`; by default where the run had them.
+        suite: Folder of the suite; None for that of the run, see `suite_of`.
+        checkpoint: Checkpoint as for `probe-kit extract`; None for the run's, for a checkpoint its folder if that
+            still exists.
+        options: Options of the model that are added to the run's or replace them.
+        weights_seed: Seed of untrained weights; None for the run's.
+        device: Device of the model.
+        moved: New places of parts of the run's source, by field of its settings: `folder` and `table` of
+            recordings and pictures, `environment` (and `options`, added to those of the run), `scene.background`,
+            `scene.arm_urdf`. Parts that are not named are where the run had them.
     """
 
     suite: Path | None = None
@@ -74,9 +74,9 @@ LoadPolicy = Callable[[Run, ReplaySource], "Policy"]
 class ReplaySession(ABC):
     """A policy and its observations; a context manager, because it can hold a simulator.
 
-    on_fit_progress: called after every item that is inferred beforehand, for directions and erasers. passed_over:
-    places of a wildcard, each with its role, at which an answer has no direction, and why.
-    certificate: entries of the kind's own.
+    `on_fit_progress` is called after every item that is inferred beforehand, for directions and erasers.
+    `passed_over` has the places of a wildcard, each with its role, at which an answer has no direction, and why.
+    `certificate` has entries of the kind's own.
     """
 
     def __init__(self, run: Run, policy: "Policy") -> None:
@@ -97,15 +97,19 @@ class ReplaySession(ABC):
 
     @abstractmethod
     def pairs(self, item: str) -> list[Pair]:
-        """Return the pairs of an item's episodes. Raises OtherFramesError for other observations."""
+        """Return the pairs of an item's episodes.
+
+        Raises:
+            OtherFramesError: For other observations than the run's.
+        """
 
     @abstractmethod
     def displacement(self, chunk: Chunk, pair: Pair) -> float:
-        """Return the number that is read off a chunk (chunk, D) of actions after the pair's clean observation."""
+        """Return the displacement of a chunk (chunk, D) of actions after the pair's clean observation."""
 
     @abstractmethod
     def slope(self, pair: Pair) -> "Callable[[Tensor], Tensor]":
-        """Return the same up to a constant, as a function of actions (chunk, D) that keeps their graph."""
+        """Return `displacement` up to a constant, as a function of actions (chunk, D) that keeps their graph."""
 
     @abstractmethod
     def with_other_instruction(self, pair: Pair) -> Observation | None:
@@ -129,7 +133,11 @@ class ReplaySession(ABC):
             yield
 
     def act(self, model_input: Given, seed: int) -> Chunk:
-        """Return (chunk, D): one inference, alone in its batch. Raises PolicyFailedError if the policy raises."""
+        """Return the actions (chunk, D) of one inference, alone in its batch.
+
+        Raises:
+            PolicyFailedError: If the policy raises.
+        """
         assert isinstance(model_input, Observation), "pairs of runs are of observations"
         with while_acting(self.run.model, self.policy.card.checkpoint):
             return np.asarray(self.policy.act(copied([model_input]), [seed])[0], np.float32)
@@ -138,7 +146,7 @@ class ReplaySession(ABC):
         """Return by how much a clean inference differs from the stored actions; NaN where there are none.
 
         Raises:
-            CaptureChangedActionError: If it is another action altogether.
+            CaptureChangedActionError: If it is a different action.
         """
         if pair.stored is None:
             return nan

@@ -1,4 +1,4 @@
-"""The settings of an intervention: the part of a run that it is made on, and what decides its numbers."""
+"""The settings of an intervention: the part of a run that it is made on, and all that decides its numbers."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -21,12 +21,12 @@ PER_STEP: Readout = "per-step"
 class Choice:
     """The part of a run that an intervention is made on, as settings; see `kinds.base.Intervention`.
 
-    Fields are those of every intervention.
+    The fields are those of every intervention. The class is separate from `Intervention`, because sessions read it
+    and interventions are built on sessions.
 
     Attributes:
-        kind: Of the class. Apart from `Intervention`, because sessions read it and interventions are built on
-            sessions.
-        usual_vary: As `kind`.
+        kind: Name of the kind; an attribute of the class.
+        usual_vary: Default of `vary`; an attribute of the class.
     """
 
     kind: ClassVar[str]
@@ -47,7 +47,7 @@ class Choice:
 
     @property
     def varied(self) -> str:
-        """Return the input that the source has of its donor."""
+        """The input that the source has of its donor."""
         return self.vary or self.usual_vary
 
     def items_in(self, run: Run) -> list[str]:
@@ -66,7 +66,11 @@ class Choice:
 
 
 def categories_in(run: Run, categories: Sequence[str] | None) -> tuple[str, ...]:
-    """Return some categories, by default all of a run. Raises UnknownCategoryError for one that it lacks."""
+    """Return some categories; None for all of a run.
+
+    Raises:
+        UnknownCategoryError: For a category that the run lacks.
+    """
     available = list(dict.fromkeys(run.episodes["category"].astype(str)))
     for category in categories or ():
         if category not in available:
@@ -77,7 +81,11 @@ def categories_in(run: Run, categories: Sequence[str] | None) -> tuple[str, ...]
 
 
 def items_of(run: Run, categories: Sequence[str] | None, items: int | None) -> list[str]:
-    """Return the items that are replayed, category by category. Raises UsageError if there is none."""
+    """Return the items that are replayed, category by category.
+
+    Raises:
+        UsageError: If there is none.
+    """
     if items is not None and items < 1:
         raise UsageError(f"items is {items}; expected at least 1")
     episodes, selected = run.episodes, list[str]()
@@ -117,12 +125,16 @@ def has_sides(run: Run) -> bool:
 
 
 def key_of(settings: Mapping[str, Any]) -> str:
-    """First 12 hex digits of the settings' sha256: the name of the results' folder."""
+    """Return the first 12 hex digits of the settings' sha256: the name of the results' folder."""
     return sha256_json(settings)[:12]
 
 
 def check_run_fits(run: Run) -> None:
-    """Raise UsageError for a run whose policy did not act, or acted in a way that is not done again here."""
+    """Refuse a run whose policy did not act, or acted in a way that cannot be repeated here.
+
+    Raises:
+        UsageError: If effects of an intervention cannot be measured on the run.
+    """
     settings = run.settings
     why = None
     if run.ask is not None:

@@ -7,9 +7,9 @@ attention.npz      of the kind `attention`: shares per inference, block, iterati
 attention_patches.npz  of it, where the family says which token sees what: shares per inference, block and patch
 certificate.json   what was loaded, and what was checked
 
-A stored intervention is chosen by what it is about, never by when it was made: another map, role, direction,
-coefficient, or a try on fewer episodes replaces nothing. Conditions that were played on the same episodes are
-pooled, whichever intervention they came with. Needs no model.
+A stored intervention is chosen by its subject, never by the time at which it was made: another map, role,
+direction, coefficient, or a try on fewer episodes replaces nothing. Conditions that were played on the same
+episodes are pooled, whichever intervention they came with. No model is needed.
 """
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
@@ -40,19 +40,19 @@ from probe_kit.runs.store import Location
 EPISODES, EFFECTS, CERTIFICATE = "episodes.npz", "effects.csv", "certificate.json"
 # As in Act2Answer's scene; `env.SceneSpec` has the positions.
 TILES_APART = 0.31
-"""Metres between the tiles of the default scene; taken for a run that stores no scene."""
+"""Metres between the tiles of the default scene; also used for a run that stores no scene."""
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """One intervention of a run, stored or about to be: what effects, their table and their sentences are made of.
+    """One intervention of a run, stored or not yet: the source of effects, their table and their sentences.
 
     Attributes:
-        settings: What decided its numbers, see `settings_of`.
-        read: A stored file by its name; raises RunDamagedError if it was changed.
-        files: Their names.
-        key: Of its folder.
-        created: ISO time (UTC), empty before it is stored.
+        settings: Settings that decided its numbers, see `settings_of`.
+        read: Function that reads a stored file by its name; it raises RunDamagedError if the file was changed.
+        files: Names of the stored files.
+        key: Key, the name of its folder.
+        created: ISO time (UTC); empty before it is stored.
     """
 
     run: RunReader = field(repr=False)
@@ -64,23 +64,23 @@ class Measurement:
 
     @classmethod
     def of(cls, run: RunReader, bundle: Bundle) -> Self:
-        """Return one that a run stores."""
+        """Return the measurement of a stored bundle."""
         settings, created = bundle.head["settings"], bundle.times.get("created", "")
         return cls(run, settings, bundle.read, bundle.files, bundle.key, created)
 
     @property
     def kind(self) -> str:
-        """Return the kind of the intervention."""
+        """The kind of the intervention."""
         return str(self.settings["kind"])
 
     @property
     def readout(self) -> str:
-        """Return `first-chunk` or `per-step`."""
+        """The readout, `first-chunk` or `per-step`."""
         return str(self.settings.get("readout", FIRST_CHUNK))
 
     @property
     def newest(self) -> tuple[str, str]:
-        """Return the time at which it was made, and the key, which decide between equals."""
+        """The time at which it was made, and the key, which decide between equals."""
         return self.created, self.key
 
     @cached_property
@@ -101,7 +101,11 @@ class Measurement:
 
     @cached_property
     def certificate(self) -> dict[str, Any]:
-        """The record of what was loaded and checked. Raises RunDamagedError if it was changed."""
+        """The record of what was loaded and checked.
+
+        Raises:
+            RunDamagedError: If it was changed.
+        """
         certificate: dict[str, Any] = parse_json(self.read(CERTIFICATE))
         return certificate
 
@@ -115,7 +119,7 @@ class Measurement:
 
     @property
     def subject(self) -> str:
-        """Return model and suite, as titles have them."""
+        """The model and suite, as in titles."""
         label = full_name(self.run.label, self.run.random_weights)
         # The label of a run of recordings says on what already.
         name = self.run.suite.partition("#")[0]
@@ -128,26 +132,26 @@ class Measurement:
 
     @property
     def exchange(self) -> str:
-        """Return the change of inputs that effects are shares of."""
+        """The change of inputs of which effects are shares, in words."""
         return f"exchange of the {self.settings.get('vary') or ''}" if self.lacks_sides else "image swap"
 
     def in_words(self, text: str) -> str:
-        """Return a text about the image swap, about what was exchanged in this run."""
+        """Return a text about the image swap, with the change of inputs of this run in its place."""
         return text.replace("image swap", self.exchange)
 
     @property
     def verdicts(self) -> Mapping[str, Any]:
-        """Return by category the `UseVerdict`; those of an `InterventionResult`, here none."""
+        """The `UseVerdict` by category: those of an `InterventionResult`, here none."""
         return {}
 
     @property
     def legend(self) -> str:
-        """Return what a reader of the verdicts must know."""
+        """The explanation of the verdicts that a reader must know."""
         return ""
 
     @property
     def tiles_apart(self) -> float:
-        """Return metres between the middles of the tiles of the run's scene, or of the default one."""
+        """The metres between the middles of the tiles of the run's scene, or of the default one."""
         scene: Any = self.run.settings.get("scene", {})
         if "tile_left" not in scene or "tile_right" not in scene:
             return TILES_APART
@@ -156,12 +160,16 @@ class Measurement:
 
 
 def is_stored(run: Location, key: str) -> bool:
-    """Whether complete results called `key` are there."""
+    """Whether the run has complete results with this key."""
     return run.exists(f"{INTERVENTIONS}/{key}/{HEAD}")
 
 
 def read_interventions(run: Location) -> dict[str, Bundle]:
-    """Every complete intervention by key. Raises RunDamagedError if one was changed or has another format."""
+    """Return every complete intervention by key.
+
+    Raises:
+        RunDamagedError: If one was changed or has another format.
+    """
     bundles = read_bundles(run, INTERVENTIONS)
     for key, bundle in bundles.items():
         bundle.check_format(FORMAT)
@@ -171,10 +179,11 @@ def read_interventions(run: Location) -> dict[str, Bundle]:
 
 
 def stored_interventions(run: RunReader, kind: str | None = None) -> list[Measurement]:
-    """Return those of the episodes that the run has now, in the wording it is in, oldest first.
+    """Return the interventions on the episodes that the run has now, in its wording, oldest first.
 
     Args:
-        kind: Only these.
+        run: Run with the stored interventions.
+        kind: Only those of this kind; None for all.
 
     Raises:
         RunDamagedError: If any of the run was changed, lost its settings or has another format.
@@ -192,11 +201,11 @@ def stored_interventions(run: RunReader, kind: str | None = None) -> list[Measur
 
 
 def find_stored(run: RunReader, key: str | None = None, kind: str | None = None) -> Measurement:
-    """The one whose key begins with `key`, or the newest of `kind`.
+    """Return the stored intervention whose key begins with `key`, or the newest of `kind`.
 
     Raises:
         NoInterventionsError: If there is none.
-        UsageError: For a key that is not there or not the only one.
+        UsageError: For a key that does not exist or is not the only one.
     """
     candidates = stored_interventions(run, kind)
     if key is None:
@@ -214,15 +223,21 @@ def find_stored(run: RunReader, key: str | None = None, kind: str | None = None)
 
 
 Rank = tuple[bool, int, bool]
-"""The larger, the more a result says: rightly read, of more episodes, as its family says it should be read.
+"""The rank of a result: the larger, the more it tells.
 
-Wrongly read is the first inference of a family in which that says little (`per-step`).
+It compares whether the readout is right, the number of episodes, and whether the readout is the one that its
+family prefers. The readout is wrong for the first inference of a family in which that carries little information
+(`per-step`).
 """
 
 
 @dataclass(frozen=True)
 class StoredResult:
-    """The part of one stored intervention that is of one category. outcomes: of its episodes alone."""
+    """The part of one stored intervention that is of one category.
+
+    Attributes:
+        outcomes: Outcomes of the category's episodes alone.
+    """
 
     stored: Measurement
     category: str
@@ -231,11 +246,12 @@ class StoredResult:
 
 
 def stored_results(run: RunReader, kind: str) -> list[StoredResult]:
-    """Return results by category as the run has them; of each what says most comes last.
+    """Return results by category in the order of the run, with the one that tells most last in each.
 
-    Of what says as much the newest.
+    Of equal ones, the newest is last.
 
-    Raises RunDamagedError.
+    Raises:
+        RunDamagedError: If a stored intervention was changed.
     """
     order = {name: at for at, name in enumerate(dict.fromkeys(run.episodes["category"].astype(str)))}
     results = []
@@ -255,10 +271,15 @@ def stored_results(run: RunReader, kind: str) -> list[StoredResult]:
 
 
 def preferred_by_category(run: RunReader, kind: str, readout: str | None = None) -> dict[str, StoredResult]:
-    """Return by category, of all that is stored of a kind, the result that says most. Raises RunDamagedError.
+    """Return by category the stored result of a kind that tells most.
 
     Args:
-        readout: Of those alone; None for any.
+        run: Run with the stored interventions.
+        kind: Name of the kind.
+        readout: Readout of the results, `first-chunk` or `per-step`; None for any.
+
+    Raises:
+        RunDamagedError: If a stored intervention was changed.
     """
     results = stored_results(run, kind)
     return {result.category: result for result in results if readout in (None, result.stored.readout)}
@@ -269,15 +290,15 @@ class PooledConditions:
     """Conditions that several interventions played on the same episodes of one category.
 
     Attributes:
-        like: One of them.
-        sources: By condition, of whom it is; without those in which nothing was changed.
+        like: One of the results.
+        sources: By condition, the result it is from; without conditions in which nothing was changed.
     """
 
     like: StoredResult
     sources: dict[str, StoredResult]
 
     def outcomes(self, conditions: Sequence[str]) -> ConditionOutcomes:
-        """Some of the conditions, in the order that is asked for, behind what was unchanged."""
+        """Return some of the conditions, in the requested order, behind the unchanged ones."""
         base = self.like.outcomes
         unchanged = [name for name in (CLEAN, IMAGE_SWAP) if name in base.conditions]
         every = [(base, name) for name in unchanged] + [(self.sources[name].outcomes, name) for name in conditions]
@@ -293,10 +314,10 @@ class PooledConditions:
 
 
 def pool_conditions(results: Iterable[StoredResult], setting: Sequence[str] = ()) -> list[PooledConditions]:
-    """Pool what was played on the same episodes, with the same actions where nothing was changed.
+    """Pool conditions that were played on the same episodes, with the same actions where nothing was changed.
 
     Args:
-        results: As `stored_results` orders them.
+        results: Results in the order of `stored_results`.
         setting: Names of settings in which they must agree as well.
     """
     pooled: dict[tuple[object, ...], PooledConditions] = {}

@@ -1,8 +1,8 @@
-"""The tokens of a role in one inference, tiles of the picture among them, and where on a picture a token looks.
+"""The tokens of a role in one inference, tiles of the picture among them, and the places that a token sees.
 
-Tiles are roles of a pair's picture. Halves of the picture are not tiles: the camera looks from aside. The renderer
-says where a tile is seen. The policy itself says which patches see it, by its own crop and resize: the embeddings
-that change when just those pixels do, before any patch looks at another.
+Tiles are roles of a pair's picture. Halves of the picture are not tiles, because the camera looks from aside. The
+renderer gives the pixels of a tile. The policy itself shows which patches see it, by its own crop and resize. They
+are those whose embeddings change when just those pixels change, before any patch attends to another.
 """
 
 from functools import cached_property
@@ -24,9 +24,9 @@ if TYPE_CHECKING:
 ENOUGH = 0.1
 """Share of the largest change of any patch by which a patch of the tile changes; less is the filter's blur."""
 HALF, NEARLY = 0.5, 0.9
-"""Shares of a token's largest change from which a band is its own, and of the largest share in that band."""
+"""Shares of a token's largest change from which on a band is its own, and of the largest share in that band."""
 BANDS = 32
-"""Bands of rows, and of columns, in which a token is looked for."""
+"""Number of bands of rows, and of columns, in which a token is searched."""
 ANSWERS_NOTHING = "{} answers no questions: give it an observation"
 
 
@@ -44,7 +44,11 @@ def roles_of_tokens(model: "Model", model_input: Given) -> "dict[str, Roles]":
 
 
 def mask_of(roles: "Roles", stream: str, role: str) -> NDArray[np.bool_]:
-    """Return (T,) the tokens that play `role`, or are at positions such as `7-11`; EmptyRoleError if none does."""
+    """Return (T,) the tokens that have the role `role`, or are at positions such as `7-11`.
+
+    Raises:
+        EmptyRoleError: If there is none.
+    """
     if (positions := positions_of(role)) is not None:
         first, last = positions
         if not first <= last < len(roles):
@@ -58,15 +62,19 @@ def mask_of(roles: "Roles", stream: str, role: str) -> NDArray[np.bool_]:
 
 
 def token_mask(model: "Model", model_input: Given, stream: str, role: str) -> NDArray[np.bool_]:
-    """Return (T,) the tokens of a stream that play `role`. Raises EmptyRoleError if none does."""
+    """Return (T,) the tokens of a stream that have the role `role`.
+
+    Raises:
+        EmptyRoleError: If there is none.
+    """
     return mask_of(roles_of_tokens(model, model_input)[stream], stream, role)
 
 
 class PairTokens:
     """The tokens of a pair's clean inference by role, tiles among the roles.
 
-    All patches of a pair share one of these: the model says once which token plays what, and once which patch sees
-    which tile.
+    All patches of a pair share one of these. So the model determines only once the role of every token, and the
+    patches that see each tile.
     """
 
     def __init__(self, model: "Model", pair: Pair) -> None:
@@ -76,10 +84,10 @@ class PairTokens:
         self._on_tile: dict[str, NDArray[np.bool_]] = {}
 
     def mask(self, stream: str, role: str) -> NDArray[np.bool_]:
-        """Return (T,) the tokens of a stream that play `role`.
+        """Return (T,) the tokens of a stream that have the role `role`.
 
         Raises:
-            EmptyRoleError: If none does.
+            EmptyRoleError: If there is none.
             UnsupportedInterventionError: For a tile and a family that does not say which token sees what.
         """
         if (stream, role) not in self._masks:
@@ -91,7 +99,7 @@ class PairTokens:
         return self._masks[stream, role]
 
     def selection(self, stream: str, role: str) -> TokenSelection:
-        """Return where the tokens of `mask` are, as edits take them."""
+        """Return the places of the tokens of `mask`, in the form that edits take."""
         if (stream, role) not in self._selections:
             selection = TokenSelection.of(self.mask(stream, role), self.model.card.device)
             self._selections[stream, role] = selection
@@ -128,12 +136,15 @@ def tokens_overlapping(
     pixels: NDArray[np.bool_],
     before: NDArray[np.float32] | None = None,
 ) -> NDArray[np.bool_]:
-    """Return (tokens of the picture,) which of them come of patches that see any of some pixels (H, W).
+    """Return (tokens of the picture,) whether each comes from patches that see any of some pixels (H, W).
 
-    Of the first camera's picture, in which the renderer says where tiles are.
+    The pixels are of the first camera's picture, in which the renderer gives the places of tiles.
 
     Args:
-        before: What `patch_embeddings` gives of `observation`, if it is known.
+        policy: Policy with a vision tower.
+        observation: Observation with the picture.
+        pixels: (H, W) mask of the pixels.
+        before: Result of `patch_embeddings` on `observation`; None to compute it.
     """
     if not pixels.any():
         return np.zeros(int(policy.patch_order().max()) + 1, bool)
@@ -150,7 +161,7 @@ def _patch_changes(
     before: NDArray[np.float32],
     camera: str,
 ) -> NDArray[np.float32]:
-    """Return (V,) by how much the embeddings of patches change with some pixels (H, W) of a camera's picture."""
+    """Return (V,) by how much the patches' embeddings change with some pixels (H, W) of a camera's picture."""
     picture = picture_of(observation, camera)
     # Every pixel changes by at least half of what it can.
     inverted = np.where(picture < 128, 255, 0)
@@ -175,10 +186,11 @@ def shown_cameras(policy: "Policy", stream: str) -> tuple[str, ...]:
 
 
 def token_boxes(policy: "Policy", observation: Observation, camera: str) -> NDArray[np.float32]:
-    """Return (tokens of a camera's picture, 4) where each looks: left, top, right, bottom, as shares of it.
+    """Return (tokens of a camera's picture, 4) the box that each sees: left, top, right, bottom, as shares of it.
 
-    Found by changing a band of rows, then of columns, at a time, so that crops, padding and turns of the policy's
-    own preprocessing are in it. NaN for a token that no pixel moves. Costs 2 × `BANDS` + 2 inferences.
+    Boxes are measured by changing a band of rows, then of columns, at a time. So crops, padding and turns of the
+    policy's own preprocessing are included. NaN for a token that no pixel moves. It takes 2 × `BANDS` + 2
+    inferences.
     """
     before, ends = patch_embeddings(policy, observation, camera), []
     height, width, _ = picture_of(observation, camera).shape
@@ -203,7 +215,7 @@ def token_boxes(policy: "Policy", observation: Observation, camera: str) -> NDAr
 
 
 def patch_embeddings(policy: "Policy", observation: Observation, camera: str) -> NDArray[np.float32]:
-    """Return (V, D) a camera's patches as they enter the first block of the vision tower."""
+    """Return a camera's patches (V, D) as they enter the first block of the vision tower."""
     from probe_kit.hooks import capture
 
     # A tower that sees one picture at a time has the cameras as its iterations, in their order.

@@ -1,8 +1,8 @@
 """The verdict: does the action use the answer, and where inside does it pass? Loads no model.
 
-`classify_use` alone makes a verdict; `docs/causal.md` has its rules. Three questions have answers of their own:
-the behaviour (of the image swap), the place (of interchanges) and the tie (is what probes read the thing that is
-used?).
+`classify_use` alone makes a verdict; `docs/causal.md` has its rules. Three questions have answers of their own.
+The behaviour is that of the image swap. The place is found by interchanges. The tie tells whether the copy that
+probes read is the one that is used.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -33,14 +33,14 @@ Behaviour = Literal[
     "undecided",
 ]
 USES: tuple[Behaviour, ...] = ("used", "partly used, one-sided", "partly used, graded")
-"""Those in which the answer decides something."""
+"""Behaviours in which the answer decides something."""
 # Choices, which `docs/causal.md` states as the rule; `docs/notes/causal.md` has how often they are wrong.
 DECIDES = 0.50
 """Net follow rate, and share of the reach, from which the answer decides; of the episodes of one side as well."""
 FEW = 0.10
 """Net follow rate from which single decisions count."""
 TRACE = 0.01
-"""Of the reach. A displacement below it is not worth a sentence."""
+"""Share of the reach below which a displacement is not worth a sentence."""
 NO_COPY, NOT_TESTED = "no readable copy found", "whether the readable copy is the one used was not tested"
 NOT_LOCATED = "no place that was tried carries half of it"
 MANY = 1000
@@ -49,22 +49,22 @@ _READOUTS: Mapping[str, str] = MappingProxyType(
     {FIRST_CHUNK: "in the first chunk", PER_STEP: "over the whole episode"}
 )
 UNTESTED = "whether the answer is used was not tested"
-"""What is said without an image swap."""
+"""Words of a verdict without an image swap."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class UseVerdict:
-    """The verdict: is the answer used, where does it pass, and is what probes read what is used?
+    """The verdict: is the answer used, where does it pass, and is the copy that probes read the one used?
 
     Attributes:
-        behaviour: Of the image swap.
-        reason: The numbers it rests on, or why there is none.
-        reversed: The same, away from the correct picture.
-        side: Of a behaviour that is one-sided.
-        where: The answer passes or is read, by interchanges; empty if none was stored.
-        tie: Between the readable copy and the behaviour; empty without probes.
-        readout: `first-chunk` or `per-step`, of all of these.
-        lacks_control: Whether *not used* is missing nothing but another category of the run that is used.
+        behaviour: Behaviour in the image swap.
+        reason: Numbers on which the verdict rests, or why there is none.
+        reversed: Whether the behaviour is away from the correct picture.
+        side: Side of a behaviour that is one-sided; None for others.
+        where: Places at which the answer passes or is read, by interchanges; empty if none was stored.
+        tie: Tie between the readable copy and the behaviour; empty without probes.
+        readout: Readout of all of these, `first-chunk` or `per-step`.
+        lacks_control: Whether nothing is missing for *not used* but another category of the run that is used.
         other: The behaviour by the other readout; None if that is not stored.
     """
 
@@ -82,13 +82,13 @@ class UseVerdict:
     def is_used(self) -> bool:
         """Whether it decides something, wholly or in part, toward the correct picture or away from it.
 
-        By either readout: what is used in the first chunk is used, and so is what is used later.
+        Either readout counts: an answer that is used in the first chunk is used, and so is one that is used later.
         """
         return any(verdict.behaviour in USES for verdict in self.by_readout)
 
     @property
     def by_readout(self) -> "tuple[UseVerdict, ...]":
-        """Return this verdict, and that of the other readout if it is stored; the first chunk comes first."""
+        """The verdict and that of the other readout, if it is stored; the first chunk comes first."""
         verdicts = (self,) if self.other is None else (self, self.other)
         return tuple(sorted(verdicts, key=lambda verdict: verdict.readout != FIRST_CHUNK))
 
@@ -102,7 +102,7 @@ class UseVerdict:
 
     @property
     def own_verdict(self) -> str:
-        """The same of its own readout alone."""
+        """The behaviour, its direction and its side, of its own readout alone."""
         return f"{'against: ' * self.reversed}{self.behaviour}{f' ({self.side})' if self.side else ''}"
 
     @property
@@ -117,14 +117,14 @@ class UseVerdict:
 
     @property
     def explanation(self) -> str:
-        """Reason, place and tie."""
+        """The reason, place and tie."""
         first, *second = self.by_readout
         reasons = [first.reason, *(f"over the whole episode: {verdict.reason}" for verdict in second)]
         return "; ".join(filter(None, (*reasons, self.where, self.tie)))
 
     @property
     def sentence(self) -> str:
-        """Behaviour by every stored readout, place and tie; with the reason where it is not used."""
+        """The behaviour by every stored readout, place and tie; with the reason where it is not used."""
         first, *second = self.by_readout
         if second and first.own_verdict == second[0].own_verdict:
             both = " and ".join(_READOUTS[verdict.readout] for verdict in (first, *second))
@@ -139,12 +139,12 @@ class UseVerdict:
 
     @property
     def needs_reason(self) -> bool:
-        """Whether a reader asks for its numbers: of what is not used by its own readout."""
+        """Whether a reader needs its numbers: those of an answer that is not used by its own readout."""
         return self.behaviour not in USES
 
     @property
     def finding(self) -> tuple[str, str]:
-        """The verdict in a word or two, and what the action does, without numbers."""
+        """The verdict in a word or two, and the action's behaviour, without numbers."""
         first, *later = self.by_readout
         if later and (first.behaviour in USES) != (later[0].behaviour in USES):
             if first.behaviour in USES:
@@ -166,15 +166,15 @@ class UseVerdict:
         return "use undecided", "the items do not tell"
 
     def describe(self, swap: Any) -> str:
-        """Return what an image swap showed, in sentences."""
+        """Return the result of an image swap, in sentences."""
         return f"{describe_swap(swap, self)}. {self.sentence}"
 
     def clause(self, answer: str, readout: str = "") -> str:
-        """The behaviour by its own readout, with the reason where it is not used.
+        """Return the behaviour by its own readout, with the reason where the answer is not used.
 
         Args:
-            answer: How the answer is called.
-            readout: In words; empty for its own.
+            answer: Noun for the answer.
+            readout: The readout in words; empty for its own.
         """
         when = readout or _READOUTS[self.readout]
         against = ", against the correct picture" * self.reversed
@@ -202,7 +202,16 @@ def describe_readouts(uses: Iterable[UseVerdict | None]) -> str:
 
 
 class _Numbers(NamedTuple):
-    """The numbers of an effect toward the correct picture, or of its mirror. ends: of the intervals."""
+    """The numbers of an effect toward the correct picture, or of its mirror.
+
+    Attributes:
+        p: The p-value of the direction.
+        follow: Net follow rate.
+        follow_ends: Ends of its interval.
+        share: Displacement as a share of the reach.
+        share_ends: Ends of its interval.
+        reached: By side of the correct picture, how much more often that side is reached.
+    """
 
     p: float
     follow: float
@@ -224,7 +233,7 @@ class _Numbers(NamedTuple):
 
     @property
     def only_side(self) -> Side | None:
-        """The side that is reached where the answer lies there, if the other one is not."""
+        """The side that is reached where the answer lies there, if the other one is not; else None."""
         at_left, at_right = self.reached["left"], self.reached["right"]
         if max(at_left, at_right) < DECIDES or min(at_left, at_right) >= SMALLEST_EFFECT_OF_INTEREST:
             return None
@@ -251,11 +260,12 @@ class _Numbers(NamedTuple):
 
 
 def classify_behaviour(effect: ImageSwapEffect, control: str | None) -> UseVerdict:
-    """The verdict of the image swap alone.
+    """Return the verdict of the image swap alone.
 
     Args:
-        control: Another category of the run that is used, which shows that use would have been seen; None if there
-            is none, and then nothing is *not used*.
+        effect: Effect of the image swap in one category.
+        control: Another category of the run that is used, which shows that use would have been visible. None if
+            there is none, and then nothing is *not used*.
     """
     for mirrored in (False, True):  # toward the correct picture, then the same rules against it
         numbers = _Numbers.of(effect, mirrored)
@@ -281,14 +291,14 @@ def classify_behaviour(effect: ImageSwapEffect, control: str | None) -> UseVerdi
 
 
 def is_bounded(effect: ImageSwapEffect) -> bool:
-    """Whether both intervals exclude, on both sides, what would matter."""
+    """Whether both intervals exclude, on both sides, effects that would matter."""
     (low, high), (least, most) = effect.net_follow_rate_ci, effect.reach_share_ci
     flips, share = SMALLEST_EFFECT_OF_INTEREST, SMALLEST_SHARE_OF_INTEREST
     return -flips < low and high < flips and -share < least and most < share
 
 
 def _measured(effect: ImageSwapEffect) -> str:
-    """Displacement and net follow rate with their intervals."""
+    """Return displacement and net follow rate with their intervals, in words."""
     return (
         f"moved by {effect.reach_share:z.2f} {_ends(effect.reach_share_ci)} of its reach, net follow rate "
         f"{effect.net_follow_rate:z.2f} {_ends(effect.net_follow_rate_ci)}"
@@ -296,7 +306,7 @@ def _measured(effect: ImageSwapEffect) -> str:
 
 
 def _open(effect: ImageSwapEffect) -> str:
-    """Why it is undecided."""
+    """Return the reason why it is undecided."""
     is_graded = min(effect.follow_p, effect.reversal_p) < SIGNIFICANCE
     is_other = effect.moved_share >= SMALLEST_EFFECT_OF_INTEREST and not is_graded
     if is_other and abs(effect.reach_share) < effect.moved_share / 2:
@@ -323,10 +333,13 @@ _WOULD_TELL = "groups would tell"
 
 
 def size_of_groups(texts: Iterable[str], counts: Iterable[tuple[int, int]]) -> str:
-    """Return how many items a group holds where a text says how many groups would tell; else an empty text.
+    """Return how many items a group has where a text says how many groups would tell; else an empty text.
+
+    Tables count items, which are what a user adds.
 
     Args:
-        counts: Items and groups of each category. Tables count items, which are what a user adds.
+        texts: Texts of the verdicts.
+        counts: Number of items and groups of each category.
     """
     sizes = sorted({round(items / groups, 1) for items, groups in counts if groups})
     if not sizes or not any(_WOULD_TELL in text for text in texts):
@@ -355,9 +368,9 @@ class Places:
         located: Places that carry half of the effect, see `localised_sites`; None if an interchange did not search
             for them.
         carried: Places and the directions along which half of it passes there.
-        jointly: What joint places found, in words; they tell the tokens apart where an interchange has those of a
-            block together, and sets of places.
-        remainder: What of it these places leave out, in words.
+        jointly: Finding of joint places, in words. They distinguish tokens where an interchange has those of a
+            block together, and they have sets of places.
+        remainder: Part of the effect that these places leave out, in words.
     """
 
     located: tuple[str, ...] | None = None
@@ -383,16 +396,17 @@ def classify_use(
     tie: str = "",
     other: UseVerdict | None = None,
 ) -> UseVerdict:
-    """The verdict of the image swap, with what probes and interventions inside the network say of it.
+    """Return the verdict of the image swap, with the findings of probes and interventions inside the network.
 
     Args:
         encoded: Whether the answer can be read in the backbone, beyond chance and every control that was run; None
             without probes.
-        control: See `classify_behaviour`.
-        places: None if nothing was tried inside.
-        tie: See `evidence.describe_tie`; empty if it was not tested.
-        other: The behaviour by the other readout, see `evidence.stored_other_readouts`; None if that is not
-            stored.
+        effect: Effect of the image swap in one category.
+        control: Another category of the run that is used, see `classify_behaviour`; None if there is none.
+        places: Findings inside the network; None if nothing was tried there.
+        tie: Tie in words, see `evidence.describe_tie`; empty if it was not tested.
+        other: The behaviour by the other readout, see `evidence.StoredEvidence.other_readouts`; None if that is
+            not stored.
     """
     use = replace(classify_behaviour(effect, control), other=other)
     if all(verdict.behaviour in ("not used", "undecided") for verdict in use.by_readout):
@@ -404,8 +418,8 @@ def classify_use(
 def describe_sites(located: Sequence[str], carried: Sequence[str] = ()) -> str:
     """Return where the answer passes, where the acting stream reads it, and along which directions, in words.
 
-    A patch in the backbone shows that something downstream depends on that place; one in `kv`, which only the
-    acting stream reads, that it is read there.
+    A patch in the backbone shows that something downstream depends on that place. One in `kv`, which only the
+    acting stream reads, shows that it is read there.
     """
     read = [site for site in located if site.partition(".")[0] == KV_STREAM]
     passes = [site for site in located if site not in read]
@@ -420,7 +434,7 @@ def describe_sites(located: Sequence[str], carried: Sequence[str] = ()) -> str:
 
 
 def control_for(category: str, effects: Mapping[str, ImageSwapEffect]) -> str | None:
-    """Another category of the run that is used, the one in which most episodes follow; None if there is none."""
+    """Return another category of the run that is used, the one with most episodes that follow; None if none is."""
     used = [
         effect
         for effect in effects.values()
@@ -438,12 +452,14 @@ def classify_all(
 ) -> dict[str, UseVerdict]:
     """Return the verdict of every category that was intervened on.
 
+    A category that is missing in a mapping was not probed, not searched inside, or measured by one readout alone.
+
     Args:
-        encoded: By category; one that is not there was not probed, not looked for inside, or measured by one
-            readout alone.
-        places: As `encoded`.
-        ties: As `encoded`.
-        other_readouts: As `encoded`.
+        effects: Effects of the image swap, by category.
+        encoded: Whether the answer can be read in the backbone, by category; None without probes.
+        places: Findings inside the network, by category.
+        ties: Tie in words, by category.
+        other_readouts: The behaviour by the other readout, by category.
     """
     return {
         name: classify_use(
@@ -461,10 +477,11 @@ def classify_all(
 def encoded_in(results: "ProbeResults | None", view: str | None = None) -> dict[str, bool | None]:
     """Return by category whether the backbone's best site beats chance and every control that was run.
 
-    As `retention` has it.
+    The rule is that of `retention`. Empty without probes.
 
     Args:
-        view: None for the first that was probed. Empty without probes.
+        results: Probes of the run; None without any.
+        view: View of the probes; None for the first that was probed.
     """
     if results is None:
         return {}
@@ -477,7 +494,7 @@ def encoded_in(results: "ProbeResults | None", view: str | None = None) -> dict[
 
 
 def describe_swap(swap: Any, use: UseVerdict) -> str:
-    """Return what a swap of the pictures does to the action, with the numbers that the verdict's sentence lacks.
+    """Return the effect of a swap of the pictures on the action, with numbers that the verdict's sentence lacks.
 
     Numbers and words are of the verdict's own readout.
     """

@@ -12,13 +12,13 @@ from probe_kit.statistics.significance import SIGNIFICANCE
 Matrix = NDArray[np.float64]
 
 Bounds = tuple[float, float]
-"""The least and the largest value a score can have."""
+"""The least and the largest value that a score can have."""
 
 SHARES: Bounds = (0.0, 1.0)
 GAINS: Bounds = (-1.0, 1.0)
-"""What the difference of two shares can be."""
+"""Bounds of a difference of two shares."""
 BOOTSTRAP_DRAWS = 2000
-"""Resamples of whole groups; with another number every interval by resampling moves a little."""
+"""Number of resamples of whole groups; with another number, every interval by resampling moves a little."""
 
 
 def group_bootstrap(
@@ -28,11 +28,14 @@ def group_bootstrap(
     draws: int = BOOTSTRAP_DRAWS,
     bounds: Bounds = SHARES,
 ) -> tuple[Matrix, Matrix]:
-    """95 % interval of the mean over episodes, with whole groups resampled.
+    """The 95 % interval of the mean over episodes, with whole groups resampled.
 
     Args:
         values: (E, S), a score per episode in each of S columns, within `bounds`.
-        groups: (E,).
+        groups: (E,) group of items of every episode.
+        seed: Seed of the resamples.
+        draws: Number of resamples.
+        bounds: The least and the largest value that a score can have.
 
     Returns:
         Low and high, (S,) each. Where groups agree, or all but a few, resampling claims more certainty than there
@@ -44,7 +47,7 @@ def group_bootstrap(
 
 
 def interval(draws: Matrix, value: Matrix) -> tuple[Matrix, Matrix]:
-    """95 % percentile interval of (B, S) draws, (S,) low and high; it holds the (S,) `value` itself."""
+    """The 95 % percentile interval of (B, S) draws, (S,) low and high; it includes the (S,) `value` itself."""
     low, high = np.percentile(draws, [2.5, 97.5], axis=0)
     return np.minimum(low, value), np.maximum(high, value)
 
@@ -52,9 +55,9 @@ def interval(draws: Matrix, value: Matrix) -> tuple[Matrix, Matrix]:
 def bootstrap_means(
     values: NDArray[np.floating] | NDArray[np.bool_], groups: ArrayLike, seed: int, draws: int = BOOTSTRAP_DRAWS
 ) -> Matrix:
-    """Means over episodes in every draw of whole groups, (draws, S) from (E, S) values and (E,) groups.
+    """Return the means over episodes in every draw of whole groups, (draws, S) from (E, S) values and (E,) groups.
 
-    The same names of groups and seed draw the same groups, whatever the values.
+    With the same seed and the same names of groups, the same groups are drawn, whatever the values.
     """
     sums, sizes = _sums(values, groups)
     times = draw_groups(sizes.size, seed, draws)
@@ -63,14 +66,14 @@ def bootstrap_means(
 
 
 def group_means(values: NDArray[np.floating] | NDArray[np.bool_], groups: ArrayLike) -> Matrix:
-    """(G, S) means of (E, S) values over the episodes of each group, in the order of their names."""
+    """Return the (G, S) means of (E, S) values over the episodes of each group, sorted by the groups' names."""
     sums, sizes = _sums(values, groups)
     means: Matrix = sums / sizes[:, None]
     return means
 
 
 def _sums(values: NDArray[np.floating] | NDArray[np.bool_], groups: ArrayLike) -> tuple[Matrix, Matrix]:
-    """(G, S) sums of (E, S) values over the episodes of each group, and (G,) how many these are."""
+    """Return the (G, S) sums of (E, S) values over each group's episodes, and (G,) how many episodes it has."""
     names, group_of = np.unique(np.asarray(groups), return_inverse=True)
     sums = np.zeros((names.size, values.shape[1]))
     np.add.at(sums, group_of, values.astype(np.float64))
@@ -78,15 +81,20 @@ def _sums(values: NDArray[np.floating] | NDArray[np.bool_], groups: ArrayLike) -
 
 
 def widened(draws: Matrix, value: Matrix, each: Matrix, seed: int, bounds: Bounds = SHARES) -> Matrix:
-    """(B, S) draws, of which no quantile lies nearer to the (S,) `value` than that of `unseen` groups.
+    """Return the (B, S) draws, with no quantile nearer to the (S,) `value` than the same quantile of `unseen`.
 
-    Draws of groups hold nothing that was not seen. Where fifteen of sixteen agree, hardly any of them has three of
-    the other kind, and the interval would be narrower than where all sixteen do. Now one group that is otherwise
-    moves both quantiles that are compared, and so the outer one, toward it.
+    Draws of groups contain nothing that was not observed. Where fifteen of sixteen groups agree, hardly any draw
+    has three groups of the other kind. The interval would then be narrower than where all sixteen agree. Here, one
+    group that differs moves both quantiles that are compared, and so the outer one, toward it.
+
+    Draws keep their order, so that those of two runs on the same groups stay paired.
 
     Args:
-        each: (G, S) means of the groups. Draws keep their order, so that those of two runs on the same groups stay
-            paired; equal ones are ordered by `seed`.
+        draws: (B, S) means of resampled groups.
+        value: (S,) means over episodes.
+        each: (G, S) means of the groups.
+        seed: Seed of the order in which equal draws are ranked.
+        bounds: The least and the largest value that a score can have.
     """
     mixed = np.random.default_rng(derive_seed("unseen", seed)).permutation(len(draws))
     order = mixed[np.argsort(draws[mixed].round(12), axis=0, kind="stable")]  # equal up to the rounding of sums
@@ -102,13 +110,17 @@ def widened(draws: Matrix, value: Matrix, each: Matrix, seed: int, bounds: Bound
 def unseen(
     value: NDArray[np.floating], each: Matrix, draws: int = BOOTSTRAP_DRAWS, bounds: Bounds = SHARES
 ) -> Matrix:
-    """(draws, S) quantiles, from least to largest, of a mean that unobserved groups could have.
+    """The quantiles (draws, S), from least to largest, of a mean that unobserved groups could have.
+
+    Unobserved groups may lie at either bound, with half of the chance each. Where the most common value lies at a
+    bound, only the other bound is left and has all of the chance. Where all groups agree at a bound, this is
+    Clopper and Pearson's interval.
 
     Args:
-        value: (S,) the mean.
-        each: (G, S) those of the groups. Groups that were not seen may lie at either bound, with half of the
-            chance each; where what is most common lies at a bound only the other one is left, and has all of it:
-            of groups that all agree there it is Clopper and Pearson's interval.
+        value: (S,) means over episodes.
+        each: (G, S) means of the groups.
+        draws: Number of quantiles.
+        bounds: The least and the largest value that a score can have.
     """
     tails = np.linspace(0, 1, draws, dtype=np.float64)[:, None]
     low, high = np.minimum(bounds[0], value), np.maximum(bounds[1], value)
@@ -120,13 +132,16 @@ def unseen(
 
 
 def reach(each: NDArray[np.floating], tail: float | Matrix = SIGNIFICANCE / 2) -> Matrix:
-    """(…, S) which share of groups may be otherwise, and not have been seen, with chance `tail` for either side.
+    """The share of groups, (…, S), that may differ without having been observed, with chance `tail` per side.
+
+    Where at most one group differs from most, it is the share of which nothing is observed with chance 2 · tail.
+    At 0.025 that is about 3 / G. One group that differs says that such groups exist, and not what others are like.
+    Where more differ, the next one may as well be like any of them. With k that differ, only one in k is like
+    nothing observed.
 
     Args:
-        each: (G, S) means of the groups. Where at most one is otherwise than most, it is a share of which nothing
-            is seen with chance 2 · tail, at 0.025 about 3 / G. (One that is otherwise says that there are such,
-            and not what others are like.) Of more the next one may as well be like any of them: with k only one in
-            k is like nothing seen.
+        each: (G, S) means of the groups.
+        tail: Chance for either side, one number or an array (…, 1).
     """
     chance = np.minimum(2 * tail * np.maximum(unlike(each), 1), 1.0)
     share: Matrix = 1 - chance ** (1 / len(each))
@@ -134,14 +149,14 @@ def reach(each: NDArray[np.floating], tail: float | Matrix = SIGNIFICANCE / 2) -
 
 
 def unlike(each: NDArray[np.floating]) -> NDArray[np.int64]:
-    """(S,) how many of (G, S) means of groups are not what most of them are."""
+    """Return (S,) how many of (G, S) means of groups differ from the most common one."""
     # Rounded, because means of equal shares differ by the order in which they are summed.
     most = [np.unique(column, return_counts=True)[1].max() for column in each.round(9).T]
     return len(each) - np.array(most, np.int64)
 
 
 def _commonest(each: NDArray[np.floating]) -> tuple[Matrix, Matrix]:
-    """(S,) least and largest of the values that most of (G, S) means of groups have."""
+    """Return the least and the largest, (S,) each, of the most common values of (G, S) means of groups."""
     ends = []
     for column in each.round(9).T:
         values, counts = np.unique(column, return_counts=True)
@@ -152,11 +167,13 @@ def _commonest(each: NDArray[np.floating]) -> tuple[Matrix, Matrix]:
 
 
 def units_seed(names: ArrayLike, seed_text: str) -> int:
-    """The seed by which groups or items of these names are drawn, wherever an interval is made of them.
+    """The seed by which groups or items of these names are drawn for every interval.
+
+    One number then has the same interval in every table, and runs on the same units are paired.
 
     Args:
-        seed_text: Of the suite whose groups they are, see `suite.Suite.seed_text`. One number then has one
-            interval, in whatever table it stands; and runs on the same units are paired.
+        names: Names of the groups or items; their order and repetitions do not matter.
+        seed_text: Text of the suite whose groups they are, see `suite.Suite.seed_text`.
     """
     return derive_seed("units", 0, seed_text, *np.unique(np.asarray(names)).tolist())
 
@@ -175,12 +192,16 @@ def draw_groups(count: int, seed: int, draws: int = BOOTSTRAP_DRAWS) -> NDArray[
 def student_interval(
     values: NDArray[np.floating], groups: ArrayLike, seed: int, bounds: Bounds = GAINS
 ) -> tuple[float, float]:
-    """95 % interval of the mean over episodes, by Student's t with whole groups as the unit.
+    """The 95 % interval of the mean over episodes, by Student's t with whole groups as the unit.
+
+    For shares, which many groups have alike, `group_bootstrap` is better. It is used, with `seed`, where all
+    groups agree. A single group carries no information about others: its interval is `bounds`.
 
     Args:
-        values: (E,) measured, within `bounds`, at which the interval ends.
-        groups: (E,). Of shares, which many groups have alike, `group_bootstrap` is the better one; it is taken,
-            with `seed`, where all groups agree. A single group carries no information about others.
+        values: (E,) measured values, within `bounds`.
+        groups: (E,) group of items of every episode.
+        seed: Seed of the resamples where all groups agree.
+        bounds: The least and the largest possible value; the interval ends there.
     """
     if np.unique(np.asarray(groups)).size == 1:
         return bounds
@@ -194,9 +215,13 @@ def student_interval(
 def unbounded_student_interval(
     values: NDArray[np.floating], groups: ArrayLike, tail: float = SIGNIFICANCE / 2
 ) -> tuple[float, float]:
-    """The same of (E,) values without bounds: of no width where all groups agree, infinite for a single group.
+    """The interval of `student_interval` without bounds.
+
+    It has no width where all groups agree, and is infinite for a single group.
 
     Args:
+        values: (E,) measured values.
+        groups: (E,) group of items of every episode.
         tail: Chance that the mean lies beyond one limit. With SIGNIFICANCE, each limit alone is a one-sided test.
     """
     names, group_of = np.unique(np.asarray(groups), return_inverse=True)
@@ -213,14 +238,16 @@ def explained_interval(
 ) -> tuple[float, float]:
     """Return an approximate 95 % interval of R², with whole groups as the unit; up to 1.
 
+    R² is 1 − q with q = A / B, where A is the sum of squared errors and B that of the deviations. The variance of
+    q is that of the ratio of two sums over groups: v = Σ (a − q b)² · G / (G − 1) / B² (Cochran, “Sampling
+    techniques”, 1977, section 6.13). The limits are 1 − q exp(± t √v / q), symmetric in log q. For a single group
+    they are minus infinity and 1.
+
     Args:
-        scores: (n,), their mean is R²; see `explained_scores`.
-        deviations: (n,) squared deviations of the labels from the mean that R² compares with, in any unit. R² is 1
-            − q with q = A / B, A the sum of squared errors and B that of the deviations. The variance of q is that
-            of the ratio of two sums over groups (Cochran, “Sampling techniques”, 1977, section 6.13), v = Σ (a − q
-            b)² · G / (G − 1) / B². The limits are 1 − q exp(± t √v / q), symmetric in log q.
-        widening: Factor of the standard error, SHARED_TRAINING for held-out scores of several folds. Minus
-            infinity to 1 for a single group.
+        scores: (n,) scores whose mean is R²; see `explained_scores`.
+        deviations: (n,) squared deviations of the labels from the mean that R² compares with, in any unit.
+        groups: (n,) group of items of every score.
+        widening: Factor of the standard error; SHARED_TRAINING for held-out scores of several folds.
     """
     names, group_of = np.unique(np.asarray(groups), return_inverse=True)
     if names.size == 1:
@@ -238,11 +265,12 @@ def explained_interval(
 
 
 def _student_reach(residuals: NDArray[np.floating], count: int, tail: float = SIGNIFICANCE / 2) -> float:
-    """Student's quantile times the standard error of a mean over `count` episodes of G groups.
+    """Return Student's quantile times the standard error of a mean over `count` episodes of G groups.
 
     Args:
-        residuals: (G,) sums over the episodes of a group of the values without their mean.
-        tail: Beyond the quantile.
+        residuals: (G,) sums over a group's episodes of the values minus their mean.
+        count: Number of episodes.
+        tail: Chance beyond the quantile.
     """
     from scipy.special import stdtrit  # type: ignore[import-untyped]
 

@@ -14,19 +14,20 @@ from probe_kit.errors import UsageError
 Matrix = NDArray[np.float64]
 
 FEWEST = 4
-"""Episodes that the unbiased estimator needs."""
+"""Number of episodes that the unbiased estimator needs."""
 
 
 def unbiased_cka(first: Matrix, second: Matrix) -> float:
-    """Linear CKA of features (E, D) and (E, D') of the same episodes: 1 up to turning and scaling, 0 on average
+    """Return the linear CKA of features (E, D) and (E, D') of the same episodes.
 
-    where they are independent, whatever D.
+    It is 1 for features that are equal up to rotation and scaling. It is 0 on average where they are independent,
+    whatever D. It is NaN where one set does not vary.
 
-    HSIC = (tr KL + 1ᵀK1 · 1ᵀL1 / ((E − 1)(E − 2)) − 2 · 1ᵀKL1 / (E − 2)) / (E (E − 3)), with K and L the products
-    of the features, whose diagonal is 0. NaN where one set does not vary.
+    HSIC = (tr KL + 1ᵀK1 · 1ᵀL1 / ((E − 1)(E − 2)) − 2 · 1ᵀKL1 / (E − 2)) / (E (E − 3)). K and L are the products
+    of the features, with 0 on the diagonal.
 
     Raises:
-        UsageError: For fewer than FEWEST episodes, or another number of episodes.
+        UsageError: For fewer than FEWEST episodes, or different numbers of episodes.
     """
     count = len(first)
     if count != len(second) or count < FEWEST:
@@ -39,7 +40,7 @@ def unbiased_cka(first: Matrix, second: Matrix) -> float:
 
 
 def _products(features: Matrix) -> Matrix:
-    """(E, E) inner products, of centred and scaled features so that they are of the order of 1; diagonal 0."""
+    """Return the (E, E) inner products of centred features, scaled to the order of 1; the diagonal is 0."""
     centred = np.asarray(features, np.float64) - features.mean(axis=0, dtype=np.float64)
     scale = np.sqrt((centred**2).sum(axis=1).mean())
     products: Matrix = (centred / (scale or 1.0)) @ (centred / (scale or 1.0)).T

@@ -2,8 +2,8 @@
 
 Missing episodes of one side favour no site, and chance is always one half. The choice of a site is repeated on
 resampled groups, and sites share it by how often they are best. The spread over the resamples says what the choice
-adds to the variance: Efron, “Estimation and accuracy after model selection”, Journal of the American Statistical
-Association 109 (2014).
+adds to the variance. See Efron, “Estimation and accuracy after model selection”, Journal of the American
+Statistical Association 109 (2014).
 """
 
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ class GroupSums:
     """Weighted correct decisions per group of items, the unit of every resampling.
 
     Attributes:
-        sums: (S, G) per site and group.
+        sums: (S, G) weighted correct decisions per site and group.
         sizes: (G,) weights of the groups, which add up to the number of episodes.
     """
 
@@ -39,36 +39,38 @@ class GroupSums:
 
     @property
     def n_groups(self) -> int:
-        """G."""
+        """The number of groups, G."""
         return int(self.sizes.size)
 
     @property
     def n_episodes(self) -> float:
-        """E."""
+        """The number of episodes, E: the sum of the weights."""
         return float(self.sizes.sum())
 
     @property
     def accuracies(self) -> Matrix:
-        """(S,) balanced accuracies."""
+        """The balanced accuracy of each site, (S,)."""
         shares: Matrix = self.sums.sum(axis=1) / self.sizes.sum()
         return shares
 
     def only(self, sites: ArrayLike) -> "GroupSums":
-        """The same for some of the sites, by position or by mask."""
+        """Return the sums of some of the sites, by position or by mask."""
         return GroupSums(self.sums[np.asarray(sites)], self.sizes)
 
 
 def balanced_sums(
     decisions: Matrix, labels: NDArray[np.bool_], fold_of: ArrayLike, groups: ArrayLike
 ) -> GroupSums:
-    """Weighted correct decisions per site and group, in the order of the groups' names.
+    """Return the weighted correct decisions per site and group, in the order of the groups' names.
+
+    An episode of a side with n of E episodes weighs E / (2 n). In a complete run every weight is 1 and no decision
+    is shifted. Raises as `remove_fold_priors`.
 
     Args:
         decisions: (S, E) out-of-fold logits for True.
         labels: (E,) side of every episode.
-        fold_of: (E,) outer fold.
-        groups: (E,) names. An episode of a side with n of E episodes weighs E / (2 n). In a complete run every
-            weight is 1 and no decision is shifted. Raises as `remove_fold_priors` does.
+        fold_of: (E,) outer fold that tests an episode.
+        groups: (E,) name of every episode's group of items.
     """
     right = (remove_fold_priors(decisions, labels, fold_of) > 0) == labels
     count = int(labels.sum())
@@ -80,18 +82,19 @@ def balanced_sums(
 
 
 def remove_fold_priors(decisions: Matrix, labels: NDArray[np.bool_], fold_of: ArrayLike) -> Matrix:
-    """(S, E) out-of-fold logits without what each fold's probe learned from the shares of the sides.
+    """Return the out-of-fold logits (S, E) without what each fold's probe learned from the shares of the sides.
 
-    The intercept of a probe that was trained on n episodes of True and m of False holds ln(n / m), and more of its
-    decisions hang on that the less it knows otherwise.
+    The intercept of a probe that was trained on n episodes of True and m of False holds ln(n / m). The less a
+    probe knows otherwise, the more of its decisions depend on that.
 
     Args:
-        labels: (E,) bool.
+        decisions: (S, E) out-of-fold logits for True.
+        labels: (E,) side of every episode.
         fold_of: (E,) outer fold that tests an episode; all others trained its probe.
 
     Raises:
         UsageError: For a shape that does not fit, fewer than two folds, or NaN.
-        UnbalancedEpisodesError: Where a fold was trained on one side alone.
+        UnbalancedEpisodesError: If a fold was trained on one side alone.
     """
     folds = np.asarray(fold_of)
     if decisions.ndim != 2 or not decisions.shape[1] == labels.size == folds.size:
@@ -125,9 +128,9 @@ def remove_fold_priors(decisions: Matrix, labels: NDArray[np.bool_], fold_of: Ar
 # -- cross-fitted scores -------------------------------------------------------------------------------------
 
 RESAMPLES = 1000
-"""Resamples of the groups in which the sites are chosen anew."""
+"""Number of resamples of the groups; in each, the sites are chosen anew."""
 FEWEST_GROUPS = OUTER_FOLDS
-"""Every outer fold tests a group of its own."""
+"""The fewest groups of a cross-fit: every outer fold tests at least one group."""
 _EQUAL = 1e-9
 """Qualities closer than this, as a share of the largest, differ by rounding only."""
 
@@ -137,9 +140,9 @@ class StreamScores:
     """The sites of one stream, on G groups in F outer folds.
 
     Attributes:
-        scores: What a site scores in every group, held out by the outer folds.
-        guide: (S, F, G) what sites are chosen by, the larger the better: quality of a group's predictions in the
-            inner folds of an outer fold, 0 for the groups that the outer fold tests.
+        scores: The scores of each site in every group, held out by the outer folds.
+        guide: (S, F, G) qualities by which sites are chosen, the larger the better. They are of a group's
+            predictions in the inner folds of an outer fold, and 0 for the groups that the outer fold tests.
         fold_of: (G,) outer fold that tests a group, a position along F.
     """
 
@@ -156,14 +159,21 @@ class StreamScores:
         layers: ArrayLike,
         iterations: ArrayLike | None = None,
     ) -> "StreamScores":
-        """Sites at (S,) layers and (S,) iterations, in any order. inner: (S, F, G) qualities, see `guide`.
+        """Make the scores of a stream from those of its sites, in any order.
 
-        A stream that runs once is chosen by its qualities. With several iterations the guide is half a site's
+        A stream that runs once is chosen by its qualities. With several iterations, the guide is half a site's
         quality and half that of its surroundings, smoothed along layers and iterations.
 
+        Args:
+            scores: Held-out scores of S sites in G groups.
+            inner: (S, F, G) qualities in the inner folds, see `guide`.
+            fold_of: (G,) outer fold that tests a group, a position along F.
+            layers: (S,) layer of each site.
+            iterations: (S,) iteration of each site; None for a stream that runs once.
+
         Raises:
-            UsageError: For another number of places than of sites, no site, qualities of other folds or groups,
-                and a quality of a group in the fold that tests it.
+            UsageError: For other numbers of places, folds or groups, no site, or a quality other than 0 of a group
+                in the fold that tests it.
         """
         at, folds = np.asarray(layers), np.asarray(fold_of, np.intp)
         steps = np.zeros_like(at) if iterations is None else np.asarray(iterations)
@@ -180,12 +190,12 @@ class StreamScores:
 
     @property
     def peak(self) -> float:
-        """Accuracy of the most accurate site, above what choosing it will hold up to."""
+        """The accuracy of the most accurate site: more than a choice of that site reaches on new groups."""
         return float(self.scores.accuracies.max())
 
     @property
     def best(self) -> NDArray[np.intp]:
-        """(F,) position of the site that is best in the inner folds of each outer fold, the first one on ties."""
+        """The position (F,) of the site that is best in each outer fold's inner folds, the first one on ties."""
         first: NDArray[np.intp] = _are_best(self.guide.sum(axis=2)).argmax(axis=0)
         return first
 
@@ -197,10 +207,11 @@ class CrossFit:
     Attributes:
         above: (K,) mean held-out accuracy of the chosen sites, above chance.
         peaks: (K,) accuracy of the site that is best on all groups, scored on them too.
-        influence: (K, G) how much a score grows by a group, through its own score and through the choice of sites.
-        n_episodes: E.
-        groups: Their G names.
-        suite: What the names are from.
+        influence: (K, G) how much a group increases a score, through its own score and through the choice of
+            sites.
+        n_episodes: E, the least of all streams.
+        groups: Names of the G groups.
+        suite: Name of the suite that the groups are from.
     """
 
     above: Matrix
@@ -212,15 +223,15 @@ class CrossFit:
 
     @property
     def n_groups(self) -> int:
-        """G."""
+        """The number of groups, G."""
         return len(self.groups)
 
     @property
     def covariance(self) -> Matrix:
-        """(K, K) of `above`, where no score is known better than unseen groups allow.
+        """The covariance (K, K) of `above`, where no score is known better than unseen groups allow.
 
-        A share t of groups at chance costs t of a score above chance. Where all G groups agree, t² is
-        2 / ((G + 1)(G + 2)) on average; a variance is at least that times the squared score.
+        A share t of groups at chance costs t of a score above chance. Where all G groups agree, t² is 2 / ((G +
+        1)(G + 2)) on average. A variance is at least that times the squared score.
         """
         covariance = self.covariance_with(self)
         unseen = 2 / ((self.n_groups + 1) * (self.n_groups + 2)) * self.above**2
@@ -229,7 +240,7 @@ class CrossFit:
 
     @property
     def df(self) -> int:
-        """Degrees of freedom of the covariance: a group less."""
+        """The degrees of freedom of the covariance: G − 1."""
         return self.n_groups - 1
 
     def shares_groups_with(self, other: "CrossFit") -> bool:
@@ -237,7 +248,7 @@ class CrossFit:
         return (self.suite, self.groups) == (other.suite, other.groups)
 
     def covariance_with(self, other: "CrossFit") -> Matrix:
-        """(K, L) covariance with the scores of `other`; 0 where the two are of other groups."""
+        """Return the covariance (K, L) with the scores of `other`; 0 where the two are of other groups."""
         if not self.shares_groups_with(other):
             return np.zeros((self.above.size, other.above.size))
         covariance: Matrix = self.influence @ other.influence.T * (self.n_groups / (self.n_groups - 1))
@@ -249,15 +260,17 @@ def crossfit(
 ) -> CrossFit:
     """Score each stream by the sites that its inner folds choose, on the outer folds.
 
+    Sites that are equally good share the choice, so that their order does not matter.
+
     Args:
-        streams: On the same groups, in the order of the names `groups`.
-        suite: What the names are from; runs on equal groups of one suite are paired.
-        chance: 0 for sums from which the chance of every site is subtracted already. Sites that are equally good
-            share the choice, so that their order does not matter.
+        streams: Streams on the same groups, in the order of the names `groups`.
+        groups: Names of the G groups.
+        suite: Name of the suite that the groups are from; runs on equal groups of one suite are paired.
+        chance: Score of guessing; 0 for sums from which the chance of every site is subtracted already.
 
     Raises:
         TooFewGroupsError: For fewer than 5 groups.
-        UsageError: For NaN or streams on other groups.
+        UsageError: For NaN, or streams on other groups.
     """
     _check(streams, groups)
     scored = [_scored(stream) for stream in streams]
@@ -272,7 +285,7 @@ def crossfit(
 
 
 def _scored(stream: StreamScores) -> tuple[float, Matrix]:
-    """The score of a stream, and (G,) the influence of every group on it."""
+    """Return the score of a stream, and (G,) the influence of every group on it."""
     sums, sizes = stream.scores.sums, stream.scores.sizes
     # One seed for all streams and runs: on equal groups their choices are made in the same resamples.
     times = draw_groups(sizes.size, 0, RESAMPLES).T.astype(np.float64)
@@ -291,16 +304,17 @@ def _scored(stream: StreamScores) -> tuple[float, Matrix]:
 
 
 def _are_best(quality: Matrix) -> NDArray[np.bool_]:
-    """(S, R) whether no site has a larger quality, up to rounding."""
+    """Return (S, R) whether no site has a larger quality, up to rounding."""
     best: NDArray[np.bool_] = quality >= quality.max(axis=0) - _EQUAL * np.abs(quality).max(axis=0)
     return best
 
 
 def _influence_on_choice(times: Matrix, scores: Matrix) -> Matrix:
-    """(G,) covariance of how often a group is drawn, (G, R), with (R,) scores: the infinitesimal jackknife.
+    """Return the covariance (G,) of how often a group is drawn, (G, R), with (R,) scores.
 
-    So few resamples give covariances even where there are none, G / R of the variance of the scores in sum of
-    squares (Wager, Hastie and Efron, JMLR 15, 2014). The covariances are shrunk by that.
+    This is the infinitesimal jackknife. So few resamples give covariances even where there are none. Their sum of
+    squares is then G / R of the variance of the scores (Wager, Hastie and Efron, JMLR 15, 2014). The covariances
+    are shrunk by that.
     """
     influence: Matrix = (times - 1) @ (scores - scores.mean()) / scores.size
     influence -= influence.mean()
@@ -310,9 +324,9 @@ def _influence_on_choice(times: Matrix, scores: Matrix) -> Matrix:
 
 
 def smoothing(layers: ArrayLike, iterations: ArrayLike) -> Matrix:
-    """(S, S) weights ¼, ½, ¼ along layers times those along iterations, of sites at (S,) places.
+    """Return the weights (S, S), ¼, ½, ¼ along layers times those along iterations, of sites at (S,) places.
 
-    At an edge, or beside a site that was not captured, the site stands for its missing neighbour.
+    At an edge, or next to a site that was not captured, the site itself replaces its missing neighbour.
     """
     places = [np.unique(np.asarray(axis), return_inverse=True)[1] for axis in (layers, iterations)]
     row_at = {position: row for row, position in enumerate(zip(*(axis.tolist() for axis in places), strict=True))}

@@ -15,13 +15,16 @@ if TYPE_CHECKING:
     import pandas as pd
 
 OUTER_FOLDS, INNER_FOLDS = 5, 4
-"""Folds that score probes, and folds of a training side that choose C. A fold needs a group of its own."""
+"""Number of folds that score probes, and of folds of a training side that choose C.
+
+Every fold needs a group of its own.
+"""
 
 SHARED_TRAINING = sqrt(1 + OUTER_FOLDS / (OUTER_FOLDS - 1))
 """Factor, 1.5, by which folds that share training groups widen the standard error of a held-out mean.
 
-Nadeau and Bengio, “Inference for the generalization error”, Machine Learning 52 (2003): with K folds the variance
-is 1/K + n_test/n_train in place of 1/K, which is 1 + K / (K − 1) times as much.
+With K folds, the variance is 1/K + n_test/n_train in place of 1/K, which is 1 + K / (K − 1) times as much. See
+Nadeau and Bengio, “Inference for the generalization error”, Machine Learning 52 (2003).
 """
 
 FoldUnit = Literal["groups", "concepts"]
@@ -40,12 +43,16 @@ class Fold:
 
 
 def grouped_folds(labels: ArrayLike, groups: ArrayLike, n_folds: int, seed: int) -> list[Fold]:
-    """`n_folds` folds in which no group is split and every fold has nearly the same class shares.
+    """Make `n_folds` folds in which no group is split and every fold has nearly the same class shares.
+
+    The same arguments give the same folds.
 
     Args:
         labels: (E,) class of every episode.
-        groups: (E,) group of every episode; the layouts of an item, and all items that share a picture, are one
-            group. Same arguments, same folds.
+        groups: (E,) group of every episode. The layouts of an item, and all items that share a picture, are one
+            group.
+        n_folds: Number of folds.
+        seed: Seed of the order in which groups of equal size are placed.
 
     Raises:
         TooFewGroupsError: If there are fewer groups than folds or a training side holds a single class.
@@ -65,10 +72,14 @@ def grouped_folds(labels: ArrayLike, groups: ArrayLike, n_folds: int, seed: int)
 def stratified_folds(strata: ArrayLike, groups: ArrayLike, n_folds: int, seed: int) -> list[Fold]:
     """Return `n_folds` folds of whole groups, balanced by stratum and size.
 
+    Folds that do not depend on labels keep p-values exact where groups exchange labels. A training side may hold a
+    single class.
+
     Args:
-        strata: (E,). Folds that do not depend on labels keep p-values exact where groups exchange labels. A
-            training side may hold a single class.
-        groups: As `strata`.
+        strata: (E,) stratum of every episode.
+        groups: (E,) group of every episode.
+        n_folds: Number of folds.
+        seed: Seed of the order in which groups of equal size are placed.
 
     Raises:
         TooFewGroupsError: If there are fewer groups than folds.
@@ -77,12 +88,12 @@ def stratified_folds(strata: ArrayLike, groups: ArrayLike, n_folds: int, seed: i
 
 
 def split_by_fold(fold_of: NDArray[np.integer], numbers: Iterable[int]) -> list[Fold]:
-    """The splits of (E,) fold numbers, one for each of `numbers`."""
+    """Return the splits of (E,) fold numbers, one for each of `numbers`."""
     return [Fold(np.flatnonzero(fold_of != number), np.flatnonzero(fold_of == number)) for number in numbers]
 
 
 def fold_numbers(folds: Sequence[Fold]) -> NDArray[np.int64]:
-    """Return (E,) the number of the fold that tests an episode; `split_by_fold` makes the folds of them again."""
+    """Return (E,) the number of the fold that tests an episode; `split_by_fold` makes the same folds from it."""
     fold_of = np.empty(folds[0].train.size + folds[0].test.size, np.int64)
     for number, fold in enumerate(folds):
         fold_of[fold.test] = number
@@ -90,23 +101,24 @@ def fold_numbers(folds: Sequence[Fold]) -> NDArray[np.int64]:
 
 
 def fold_of_groups(fold_of: ArrayLike, groups: ArrayLike) -> NDArray[np.intp]:
-    """Return the fold of each of G groups, in the order of their names, from (E,) folds and groups."""
+    """Return the fold of each of G groups, sorted by their names, from the (E,) folds and groups of episodes."""
     folds: NDArray[np.intp] = np.asarray(fold_of, np.intp)[np.unique(np.asarray(groups), return_index=True)[1]]
     return folds
 
 
 def sums_by_group(values: NDArray[np.floating], groups: ArrayLike) -> NDArray[np.float64]:
-    """Return (..., G) sums of (..., E) values over the episodes of each group, in the order of the names."""
+    """Return the sums (..., G) of values (..., E) over the episodes of each group, sorted by the groups' names."""
     names, group_of = np.unique(np.asarray(groups), return_inverse=True)
     return np.asarray(values, np.float64) @ np.eye(names.size)[group_of]
 
 
 def fold_units(episodes: "pd.DataFrame", unit: FoldUnit) -> NDArray[np.str_]:
-    """(E,) name of what folds must not separate: the group, or all groups about the same two concepts.
+    """Return (E,) the name of what folds must not separate: the group, or all groups about the same two concepts.
 
     Args:
-        episodes: Column `group_id`, and for concepts `target_concept` and `distractor_concept`, whose order does
-            not matter.
+        episodes: The run's episodes, with the column `group_id`. For concepts also `target_concept` and
+            `distractor_concept`, whose order does not matter.
+        unit: A key of FOLD_UNITS.
 
     Raises:
         UsageError: For an unknown unit or a missing column.
@@ -128,7 +140,7 @@ def fold_units(episodes: "pd.DataFrame", unit: FoldUnit) -> NDArray[np.str_]:
 
 
 def _components(groups: NDArray[np.str_], pairs: NDArray[np.intp]) -> NDArray[np.intp]:
-    """(E,) connected component of every episode, where a group or a pair of concepts in common connects."""
+    """Return the connected component (E,) of every episode; a group or a pair of concepts in common connects."""
     from scipy.sparse import coo_array  # type: ignore[import-untyped]
     from scipy.sparse.csgraph import connected_components  # type: ignore[import-untyped]
 
@@ -140,10 +152,10 @@ def _components(groups: NDArray[np.str_], pairs: NDArray[np.intp]) -> NDArray[np
 
 
 def assign_folds(labels: ArrayLike, groups: ArrayLike, n_folds: int, seed: int) -> NDArray[np.intp]:
-    """The fold of every episode, (E,) values 0 … n_folds − 1.
+    """Return the fold of every episode, (E,) values 0 … n_folds − 1.
 
-    Groups are placed one by one, the largest first and equals in an order drawn from `seed`, each where its
-    classes are scarcest so far.
+    Groups are placed one by one, the largest first, and those of equal size in an order drawn from `seed`. Each is
+    placed in the fold where its classes are scarcest so far.
 
     Raises:
         TooFewGroupsError: If there are fewer groups than folds.

@@ -1,12 +1,14 @@
-"""Intervals of shares, ratios (Fieller), differences and means (MOVER), groups of items as the unit.
+"""Intervals of shares, ratios (Fieller), differences and means (MOVER), with groups of items as the unit.
 
-Success rates and other outcomes have Korn and Graubard's interval, accuracies of probes have Wilson's: see `Share`
+Success rates and other outcomes have Korn and Graubard's interval. Accuracies of probes have Wilson's. See `Share`
 and `Accuracy`.
 
 Korn and Graubard, “Confidence intervals for proportions with small expected number of positive counts estimated
 from survey data”, Survey Methodology 24 (1998).
+
 Wilson, “Probable inference, the law of succession, and statistical inference”, Journal of the American Statistical
 Association 22 (1927). Kish, “Survey sampling” (1965), for the design effect.
+
 Zou and Donner, “Construction of confidence limits about effect measures”, Statistics in Medicine 27 (2008).
 """
 
@@ -42,11 +44,16 @@ class Interval:
 def fieller_interval(
     numerator: float, denominator: float, covariance: NDArray[np.float64], quantile: float
 ) -> Interval:
-    """All ratios θ for which numerator − θ · denominator lies within `quantile` standard errors of zero.
+    """Return all ratios θ for which numerator − θ · denominator lies within `quantile` standard errors of zero.
+
+    Where the denominator may be zero, on at least one side no ratio can be excluded, and the interval is
+    unbounded.
 
     Args:
-        covariance: (2, 2) of (numerator, denominator). When the denominator may be zero no ratio can be excluded
-            on one side at least, and the interval is unbounded.
+        numerator: Estimate of the numerator.
+        denominator: Estimate of the denominator.
+        covariance: (2, 2) covariance of (numerator, denominator).
+        quantile: Quantile of the level, in standard errors.
     """
     cut = quantile**2
     square = denominator**2 - cut * covariance[1, 1]
@@ -66,12 +73,17 @@ NEGLIGIBLE_VARIANCE = 1e-12
 def difference_interval(
     first: float, first_limits: Interval, second: float, second_limits: Interval, correlation: float = 0.0
 ) -> Interval:
-    """Interval of `first` − `second`, at the level of the two intervals.
+    """Return the interval of `first` − `second`, at the level of the two intervals.
+
+    a and b are the values, l and u their limits, and ρ is the correlation. Then low = a − b − √((a − l_a)² + (u_b
+    − b)² − 2 ρ (a − l_a)(u_b − b)), and high has the other limits. There are no limits where either has none.
 
     Args:
-        correlation: Of the two estimates; 0 where they share no group. With a, b the values, l, u their limits and
-            ρ the correlation: low = a − b − √((a − l_a)² + (u_b − b)² − 2 ρ (a − l_a)(u_b − b)), high with the
-            other limits. No limits where either has none.
+        first: Value of the first estimate.
+        first_limits: Interval of the first estimate.
+        second: Value of the second estimate.
+        second_limits: Interval of the second estimate, at the same level.
+        correlation: Correlation of the two estimates; 0 where they share no group.
 
     Raises:
         UsageError: For a correlation outside −1 … 1.
@@ -87,9 +99,10 @@ def difference_interval(
 
 
 def mean_interval(values: Sequence[float], limits: Sequence[Interval]) -> Interval:
-    """Interval of the mean of independent estimates, at the level of their intervals.
+    """Return the interval of the mean of independent estimates, at the level of their intervals.
 
-    low = mean − √(Σ (value − its low)²) / n, high alike. No limits where one of them has none.
+    The lower limit is mean − √(Σ (value − its low)²) / n, and the upper one alike. There are no limits where an
+    estimate has none.
 
     Raises:
         UsageError: Without estimates.
@@ -108,18 +121,18 @@ def mean_interval(values: Sequence[float], limits: Sequence[Interval]) -> Interv
 def allowing_for_unseen_groups(
     covariance: float, variances: tuple[float, float], n_groups: int, most: float
 ) -> float:
-    """The covariance of two estimates on the same groups, less where their difference would be known too well.
+    """Return the covariance of two estimates on the same groups, reduced where their difference is known too well.
 
-    Two runs that agree in all G groups may differ in unseen ones: in a share t of them, by `most`
-    each. As in `CrossFit.covariance` t² is 2 / ((G + 1)(G + 2)) on average, and the variance of the difference is
-    at least t² · most².
+    Two runs that agree in all G groups may differ in unseen ones: in a share t of them, by `most` each. As in
+    `CrossFit.covariance`, t² is 2 / ((G + 1)(G + 2)) on average. The variance of the difference is at least t² ·
+    most².
     """
     unseen = 2 * most**2 / ((n_groups + 1) * (n_groups + 2))
     return min(covariance, max(0.0, (sum(variances) - unseen) / 2))
 
 
 def correlation_of(covariance: float, variances: tuple[float, float]) -> float:
-    """Correlation of two estimates; 0 where one of them does not vary, or is of a single group."""
+    """Return the correlation of two estimates; 0 where one of them does not vary, or is of a single group."""
     scale = sqrt(variances[0] * variances[1]) if all(map(isfinite, variances)) else 0.0
     return max(-1.0, min(1.0, covariance / scale)) if scale > NEGLIGIBLE_VARIANCE else 0.0
 
@@ -142,8 +155,8 @@ class Share:
 
     Attributes:
         groups: (G,) names of the groups of items, sorted.
-        sums: (G,) hits and episodes of each group.
-        sizes: As `sums`.
+        sums: (G,) hits of each group.
+        sizes: (G,) episodes of each group.
     """
 
     groups: NDArray[np.str_]
@@ -152,10 +165,12 @@ class Share:
 
     @classmethod
     def of(cls, values: ArrayLike, groups: ArrayLike, weights: ArrayLike | None = None) -> "Share":
-        """The mean of (E,) values from 0 to 1 over the episodes of (E,) groups.
+        """Make the share from (E,) values from 0 to 1, one per episode.
 
         Args:
-            weights: (E,) how much of an episode counts, such as whether it has an answer; each 1 by default.
+            values: (E,) values from 0 to 1.
+            groups: (E,) name of every episode's group of items.
+            weights: (E,) how much an episode counts, such as whether it has an answer; None counts each as 1.
                 Groups without weight are left out.
 
         Raises:
@@ -180,17 +195,17 @@ class Share:
 
     @property
     def value(self) -> float:
-        """Hits over episodes."""
+        """The share: hits over episodes."""
         return float(self.sums.sum() / self.sizes.sum())
 
     @property
     def n_groups(self) -> float:
-        """G*, how many groups of equal size are worth as much: E² / Σ size²."""
+        """The effective number of groups, G*: so many groups of equal size vary as little, E² / Σ size²."""
         return effective_groups(self.sizes)
 
     @property
     def df(self) -> float:
-        """Degrees of freedom of the variance: G* − 1, at least 1."""
+        """The degrees of freedom of the variance: G* − 1, at least 1."""
         return max(self.n_groups - 1, 1.0)
 
     @property
@@ -204,7 +219,7 @@ class Share:
         return residuals
 
     def covariance(self, other: "Share") -> float:
-        """Covariance of two shares on the same groups; 0 where the groups are not the same."""
+        """Return the covariance of two shares on the same groups; 0 where the groups are not the same."""
         if not np.array_equal(self.groups, other.groups):
             return 0.0
         if self.groups.size == 1:
@@ -212,13 +227,14 @@ class Share:
         return float(self._residuals @ other._residuals) * self.groups.size / (self.groups.size - 1)
 
     def correlation(self, other: "Share") -> float:
-        """Correlation of two shares; 0 where the groups are not the same, or one of them does not vary."""
+        """Return the correlation of two shares; 0 where the groups differ, or one share does not vary."""
         return correlation_of(self.covariance(other), (self.variance, other.variance))
 
     def difference(self, other: "Share") -> Interval:
-        """95 % interval of this share minus another (MOVER), paired where both are of the same groups.
+        """The 95 % interval of this share minus another (MOVER), paired where both are of the same groups.
 
-        Where the two agree in all groups it leaves room for unseen ones, see `allowing_for_unseen_groups`.
+        Where the two agree in all groups, the interval leaves room for unseen ones, see
+        `allowing_for_unseen_groups`.
         """
         related = 0.0
         if np.array_equal(self.groups, other.groups):
@@ -228,7 +244,7 @@ class Share:
         return difference_interval(self.value, self.interval(), other.value, other.interval(), related)
 
     def interval(self) -> Interval:
-        """95 % interval by `share_interval`; 0 to 1 with a single group."""
+        """The 95 % interval by `share_interval`; 0 to 1 with a single group."""
         if self.groups.size == 1:
             return Interval(0.0, 1.0)
         low, high = share_interval(self.value, self.variance, self.groups.size, self.sizes.sum(), self.df)
@@ -238,11 +254,13 @@ class Share:
 class Accuracy(Share):
     """The held-out accuracy of a probe, with Wilson's interval.
 
-    sums, sizes: (G,) weights of the right and of all decisions of each group, as `balanced_sums` gives them.
+    `sums` and `sizes` (G,) are the weights of the right and of all decisions of each group, as `balanced_sums`
+    gives
+    them.
     """
 
     def interval(self) -> Interval:
-        """95 % interval by `wilson_interval`; 0 to 1 with a single group."""
+        """The 95 % interval by `wilson_interval`; 0 to 1 with a single group."""
         if self.groups.size == 1:
             return Interval(0.0, 1.0)
         low, high = wilson_interval(self.value, self.variance, self.n_groups, self.sizes.sum(), self.df)
@@ -250,7 +268,7 @@ class Accuracy(Share):
 
 
 def effective_groups(sizes: Matrix) -> float:
-    """G* of (G,) sizes: as many groups of equal size vary as little, E² / Σ size²."""
+    """Return G* of (G,) sizes: so many groups of equal size vary as little, E² / Σ size²."""
     return float(sizes.sum() ** 2 / (sizes @ sizes))
 
 
@@ -267,9 +285,9 @@ def effective_episodes(
 
 
 def group_shares(sums: Matrix, sizes: Matrix) -> tuple[Matrix, Matrix]:
-    """Shares and their variances, groups as the unit; (S,) each from (S, G) sums and (G,) sizes.
+    """Return shares and their variances, groups as the unit; (S,) each from (S, G) sums and (G,) sizes.
 
-    variance = Σ (sum − share · size)² · G / (G − 1) / E², with E = Σ size. Needs two groups or more.
+    variance = Σ (sum − share · size)² · G / (G − 1) / E², with E = Σ size. Two groups or more are needed.
     """
     total, count = sizes.sum(), sizes.size
     shares: Matrix = sums.sum(axis=1) / total
@@ -286,18 +304,23 @@ def share_interval(
     df: float,
     tail: float = TAIL,
 ) -> tuple[Matrix, Matrix]:
-    """Clopper and Pearson's limits with as many episodes as count (Korn and Graubard 1998), for arrays of shares.
+    """Return Clopper and Pearson's limits for arrays of shares, with the effective number of episodes.
+
+    The method is that of Korn and Graubard (1998). The effective number is n = min(s (1 − s) / v, E) · (t(1 −
+    tail, E − 1) / t(1 − tail, df))². The limits are Beta⁻¹(tail; s n, n − s n + 1) and Beta⁻¹(1 − tail; s n + 1, n
+    − s n).
+
+    Where nothing varies, n is `n_groups`, whatever their sizes: G groups that are alike with chance p all agree
+    with chance p^G. No share is better known than there. Without this rule, a share near 1 of unequal groups with
+    few errors is covered in 88 %.
 
     Args:
-        share: The estimates and their variances with groups as the unit.
-        variance: As `share`.
-        n_episodes: E of them.
+        share: The estimates s.
+        variance: Their variances v, with groups as the unit.
+        n_groups: Number of groups, G.
+        n_episodes: Number of episodes, E.
         df: Degrees of freedom of the variance.
-        tail: Chance of either side. With n = min(s (1 − s) / v, E) · (t(1 − tail, E − 1) / t(1 − tail, df))² the
-            limits are Beta⁻¹(tail; s n, n − s n + 1) and Beta⁻¹(1 − tail; s n + 1, n − s n). Where nothing varies,
-            n is `n_groups`, whatever their sizes: G groups that are alike with chance p all agree with chance p^G.
-            No share is better known than there. Without this rule a share near 1 of unequal groups with few errors
-            is covered in 88 %.
+        tail: Chance of either side.
     """
     from scipy.special import betaincinv, stdtrit  # type: ignore[import-untyped]
 
@@ -317,16 +340,19 @@ def wilson_interval(
 ) -> tuple[Matrix, Matrix]:
     """Return Wilson's limits (1927) with the effective number of episodes, for arrays of accuracies.
 
+    n is the number of `effective_episodes`, at least G. With t the quantile of Student's distribution, the limits
+    are (s + t²/2n ± t √(s (1 − s)/n + t²/4n²)) / (1 + t²/n).
+
+    Where all groups agree, the variance knows nothing of other groups: n is G, and t is the normal quantile. No
+    accuracy is better known than there.
+
     Args:
-        share: The estimates s and their variances v with groups as the unit.
-        variance: As `share`.
-        n_groups: G, of unequal groups G* (`effective_groups`).
-        n_episodes: E of them.
+        share: The estimates s.
+        variance: Their variances v, with groups as the unit.
+        n_groups: Number of groups G; of unequal groups G* (`effective_groups`).
+        n_episodes: Number of episodes, E.
         df: Degrees of freedom of the variance.
-        tail: Chance of either side. n is the number of `effective_episodes`, at least G. With t the quantile of
-            Student's distribution the limits are (s + t²/2n ± t √(s (1 − s)/n + t²/4n²)) / (1 + t²/n). Where all
-            groups agree the variance knows nothing of other groups: n is G, and t is the normal quantile. No
-            accuracy is better known than there.
+        tail: Chance of either side.
     """
     from scipy.special import stdtrit
 

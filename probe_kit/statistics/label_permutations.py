@@ -1,9 +1,9 @@
 """Label permutations of whole groups, and the p-values that they give.
 
-A label permutation treats a group of items as a whole, because items that share a picture share features:
-flipped one by one, they would look more independent than they are. It keeps the number of episodes of each
-class, because a probe that names the larger class is no signal. Under "the answer is not encoded" every such
-label permutation is as likely as the real labels, which makes the p-values exact.
+A label permutation treats a group of items as a whole, because items that share a picture share features. Flipped
+one by one, they would look more independent than they are. It keeps the number of episodes of each class, because
+a probe that names the larger class is no signal. Under "the answer is not encoded", every such label permutation
+is as likely as the real labels. That makes the p-values exact.
 """
 
 from collections.abc import Hashable, Iterator, Mapping, Sequence
@@ -18,11 +18,15 @@ from probe_kit.statistics.significance import SIGNIFICANCE
 
 
 def flip_items(labels: NDArray[np.bool_], items: ArrayLike, count: int, seed: int) -> NDArray[np.bool_]:
-    """`count` label permutations (E, count) in which the labels of a random half of the items are all flipped.
+    """Draw `count` label permutations (E, count) that flip all labels of a random half of the items.
+
+    They suit the correct side, which a suite draws freely.
 
     Args:
-        labels: (E,).
-        items: (E,) item of every episode. Right for the correct side, which a suite draws freely.
+        labels: (E,) class of every episode.
+        items: (E,) item of every episode.
+        count: Number of permutations.
+        seed: Seed of the draws.
     """
     names, item_of = np.unique(np.asarray(items), return_inverse=True)
     flips = np.random.default_rng(seed).random((names.size, count)) < 0.5
@@ -31,19 +35,26 @@ def flip_items(labels: NDArray[np.bool_], items: ArrayLike, count: int, seed: in
 
 
 ENUMERATED_BELOW = 12
-"""With fewer groups every label permutation there is is made, 1,023 at most where all groups are balanced."""
+"""Number of groups below which all possible label permutations are made.
+
+They are 1,023 at most where all groups are balanced.
+"""
 
 
 def flip_groups(labels: NDArray[np.bool_], groups: ArrayLike, count: int, seed: int) -> NDArray[np.bool_]:
-    """About `count` permutations (E, P) that flip all labels of some groups and keep the size of both classes.
+    """Draw about `count` permutations (E, P) that flip all labels of some groups and keep both classes' sizes.
+
+    A group with as many episodes of either class is flipped or not, freely. The others exchange their signs among
+    those with the same surplus. The permutations suit the correct side, which a suite draws freely.
+
+    With fewer than ENUMERATED_BELOW groups, these are all permutations but the real one, in an order drawn from
+    `seed`. None of them only mirrors another: a probe of mirrored labels is as accurate.
 
     Args:
-        labels: (E,).
-        groups: (E,) group of every episode. A group with as many episodes of either class is flipped or not,
-            freely; the others exchange their signs among those with the same surplus. Right for the correct side,
-            which a suite draws freely. With fewer than ENUMERATED_BELOW groups these are all permutations but the
-            real one, in an order drawn from `seed`, and none that only mirrors another: a probe of mirrored labels
-            is as accurate.
+        labels: (E,) class of every episode.
+        groups: (E,) group of every episode.
+        count: Number of permutations where they are drawn; 0 for none.
+        seed: Seed of the draws, or of the order.
     """
     names, group_of = np.unique(np.asarray(groups), return_inverse=True)
     surplus = 2 * np.bincount(group_of[labels], minlength=names.size) - np.bincount(group_of)
@@ -63,7 +74,10 @@ def flip_groups(labels: NDArray[np.bool_], groups: ArrayLike, count: int, seed: 
 
 
 def _every_flip(surplus: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """(G, P) all flips that keep the sum of every surplus but no flip at all, and one of every mirrored two."""
+    """Return the flips (G, P) that keep the sum of every surplus, without the one that flips nothing.
+
+    Of two flips that mirror each other, one is returned.
+    """
     numbers = np.arange(2**surplus.size)
     flips = (numbers >> np.arange(surplus.size)[:, None]) & 1 == 1
     keeps = np.ones(numbers.size, bool)
@@ -82,14 +96,18 @@ def _every_flip(surplus: NDArray[np.int64]) -> NDArray[np.bool_]:
 def exchange_groups(
     labels: NDArray[np.bool_], groups: ArrayLike, items: ArrayLike, layouts: ArrayLike, count: int, seed: int
 ) -> NDArray[np.bool_]:
-    """`count` label permutations (E, count) in which groups exchange their labels, layout by layout.
+    """Draw `count` label permutations (E, count) in which groups exchange their labels, layout by layout.
+
+    Only groups whose items are present in the same layouts are exchanged. This keeps the share of every class, and
+    so any side preference: it suits the chosen side.
 
     Args:
-        labels: (E,). Only groups whose items are present in the same layouts are exchanged. Keeps the share of
-            every class, and so any side preference: right for the chosen side.
-        groups: As `labels`.
-        items: As `labels`.
-        layouts: As `labels`.
+        labels: (E,) class of every episode.
+        groups: (E,) group of every episode.
+        items: (E,) item of every episode.
+        layouts: (E,) layout of every episode.
+        count: Number of permutations.
+        seed: Seed of the draws.
     """
     generator = np.random.default_rng(seed)
     exchanged = np.repeat(labels[:, None], count, axis=1)
@@ -106,7 +124,7 @@ Shape = tuple[tuple[str, ...], ...]
 
 
 def _shapes(groups: ArrayLike, items: ArrayLike, layouts: ArrayLike) -> list[tuple[Shape, list[int]]]:
-    """Shape and episodes of every group, the episodes in the order of the shape."""
+    """Return the shape and the episodes of every group, the episodes in the order of the shape."""
     members: dict[str, dict[str, dict[str, int]]] = {}
     columns = (np.asarray(column).astype(str).tolist() for column in (groups, items, layouts))
     for row, (group, item, layout) in enumerate(zip(*columns, strict=True)):
@@ -122,19 +140,23 @@ def _shapes(groups: ArrayLike, items: ArrayLike, layouts: ArrayLike) -> list[tup
 Positions = NDArray[np.intp]
 
 ENUMERATED = factorial(6)
-"""Up to so many exchanges, those of six groups, all are made."""
+"""Number of exchanges, those of six groups, up to which all are made."""
 
 
 def exchange_blocks(
     blocks: Mapping[str, Positions], kinds: Mapping[str, Hashable], count: int, seed: int
 ) -> Positions:
-    """(n, P) the sample whose label each of n samples has in P exchanges of groups, never the real labelling.
+    """Draw P exchanges of groups: (n, P) the sample whose label each of n samples has, never the real labelling.
+
+    With up to six groups, or where there are no more than `count` exchanges, these are all exchanges. Else they
+    are `count` different ones.
 
     Args:
         blocks: By group, its samples in an order that corresponds between groups; together 0 … n − 1.
         kinds: By group, what it must have in common with the groups with which it exchanges, so also the number of
-            samples. With up to six groups, or whenever there are no more than `count` exchanges, these are all;
-            else `count` different ones.
+            samples.
+        count: Number of exchanges where they are drawn; 0 for none.
+        seed: Seed of the draws.
     """
     size = sum(len(block) for block in blocks.values())
     families = _families(blocks, kinds)
@@ -156,13 +178,13 @@ def exchange_blocks(
 
 
 def movable_share(blocks: Mapping[str, Positions], kinds: Mapping[str, Hashable]) -> float:
-    """Share of the samples whose group has another one of its kind to exchange with."""
+    """Return the share of the samples whose group has another one of its kind to exchange with."""
     moving = sum(family.size for family in _families(blocks, kinds) if len(family) > 1)
     return moving / sum(len(block) for block in blocks.values())
 
 
 def _families(blocks: Mapping[str, Positions], kinds: Mapping[str, Hashable]) -> list[Positions]:
-    """(groups, samples) of the groups of every kind."""
+    """Return, for every kind, the samples of its groups (groups, samples)."""
     families: dict[Hashable, list[Positions]] = {}
     for group, block in blocks.items():
         families.setdefault(kinds[group], []).append(block)
@@ -172,7 +194,7 @@ def _families(blocks: Mapping[str, Positions], kinds: Mapping[str, Hashable]) ->
 def _drawn(
     sizes: Sequence[int], count: int, generator: np.random.Generator
 ) -> Iterator[tuple[tuple[int, ...], ...]]:
-    """`count` different orders of families, none of them the identity; there are more than `count`."""
+    """Draw `count` different orders of families, none of them the identity; there are more than `count`."""
     drawn = {tuple(tuple(range(size)) for size in sizes)}
     while len(drawn) <= count:
         order = tuple(tuple(generator.permutation(size).tolist()) for size in sizes)
@@ -184,21 +206,21 @@ def _drawn(
 def possible_flips(groups: int) -> int:
     """Return how many permutations `flip_groups` makes of groups that have as many episodes of either class.
 
-    Below ENUMERATED_BELOW groups; of more it draws as many as it is asked for.
+    This holds below ENUMERATED_BELOW groups; with more groups, `flip_groups` draws the requested number.
     """
     return 2 ** (groups - 1) - 1 if groups else 0
 
 
 def smallest_p(permutations: int) -> float:
-    """The smallest p-value that so many label permutations can give; 1 without any."""
+    """Return the smallest p-value that so many label permutations can give; 1 without any."""
     return 1 / (1 + permutations)
 
 
 def permutations_for(tests: int = 1) -> int:
-    """Fewest label permutations with which p can be below the level: 19 give 1/20, which is not.
+    """Return the fewest label permutations with which p can be below the level: 19 give 1/20, which is not.
 
     Args:
-        tests: The number that p is corrected for.
+        tests: Number of tests that p is corrected for.
     """
     return floor(tests / SIGNIFICANCE + 1e-9)  # 0.05 is not exact in binary
 
@@ -208,8 +230,9 @@ def shortage(least_p: float, permutations: int, tests: int = 1) -> Literal["", "
 
     Args:
         least_p: The smallest p that is possible.
-        permutations: The number that was asked for; where so many would give a smaller p, the groups are too few.
-        tests: The number that p is corrected for.
+        permutations: Number of permutations that was requested. Where so many would give a smaller p, the groups
+            are too few.
+        tests: Number of tests that p is corrected for.
     """
     if round(tests * least_p, 12) < SIGNIFICANCE:
         return ""
@@ -218,17 +241,18 @@ def shortage(least_p: float, permutations: int, tests: int = 1) -> Literal["", "
 
 
 def max_statistic_p(observed: NDArray[np.float64], null: NDArray[np.float64]) -> NDArray[np.float64]:
-    """p-value of every site (S,) against the best of all: how often the maximum of a null curve is as high.
+    """Return the p-value of every site (S,) against the best of all sites of each null curve.
 
-    The probability that any site without signal falls below 0.05 is then at most 0.05. NaN without a null.
+    It is the share of null curves whose maximum is as high as the site. The probability that any site without
+    signal falls below 0.05 is then at most 0.05. NaN without a null.
     """
     return p_value(observed, null.max(axis=0, keepdims=True) if observed.size else null)
 
 
 def p_value(observed: NDArray[np.float64], null: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(S,) share of draws in `null` (S, P) or (1, P) that are as high as `observed` (S,), which counts as one.
+    """Return (S,) the share of draws in `null`, (S, P) or (1, P), that are as high as `observed` (S,).
 
-    The p of every site on its own. NaN without a null.
+    The observation counts as one of the draws. This is the p of every site on its own. NaN without a null.
     """
     draws = null.shape[1]
     if draws == 0:

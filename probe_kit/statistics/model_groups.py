@@ -13,13 +13,19 @@ from probe_kit.statistics.intervals import NO_LIMITS, Interval
 from probe_kit.statistics.significance import SIGNIFICANCE
 
 MOST_EXACT = 200_000
-"""Ways of exchanging labels that are all tried; beyond, `EXCHANGES` of them are drawn."""
+"""Number of ways of exchanging labels up to which all are tried; beyond, `EXCHANGES` of them are drawn."""
 EXCHANGES = 20_000
-"""Drawn exchanges of labels, with which no p is below 1 / 20,001."""
+"""Number of drawn exchanges of labels, with which no p is below 1 / 20,001."""
 
 
 class ModelsP(NamedTuple):
-    """p: two-sided, over models. smallest: the least that so few models allow. exact: all ways were tried."""
+    """The p-value of a comparison of two groups of models.
+
+    Attributes:
+        p: Two-sided p over models.
+        smallest: The least p that so few models allow.
+        exact: Whether all ways of exchanging labels were tried.
+    """
 
     p: float
     smallest: float
@@ -27,15 +33,15 @@ class ModelsP(NamedTuple):
 
 
 def exchange_p(first: Sequence[float], second: Sequence[float], seed: int = 0) -> ModelsP:
-    """p of two groups of models having equal distributions, their labels exchanged in all ways.
+    """Return the p of two groups of models having equal distributions, with their labels exchanged in all ways.
 
     The statistic is the difference of the means. A small p may also come from unequal spreads, where the sizes
-    differ too; see `is_exchangeable`.
+    differ too; see `is_exchangeable`. With 3 + 3 models, p cannot be below 0.1.
 
     Args:
-        first: One value per model. 3 + 3 models cannot be below 0.1. seed: of the draws where there are more ways
-            than `MOST_EXACT`.
-        second: As `first`.
+        first: One value per model of the first group.
+        second: One value per model of the second group.
+        seed: Seed of the draws where there are more ways than `MOST_EXACT`.
 
     Raises:
         UsageError: For an empty group or a value that is not finite.
@@ -57,7 +63,7 @@ def exchange_p(first: Sequence[float], second: Sequence[float], seed: int = 0) -
 def is_exchangeable(first: Sequence[float], second: Sequence[float]) -> bool:
     """Return whether `exchange_p` holds its level for the difference of the means of two groups.
 
-    It does with equal sizes, and where the smaller group has no larger spread. Otherwise a spread five times as
+    It does with equal sizes, and where the smaller group has no larger spread. Otherwise, a spread five times as
     large gives p ≤ 0.05 in 22 to 36 % of groups of equal means. A group of one model has no spread of its own, and
     passes.
     """
@@ -68,17 +74,16 @@ def is_exchangeable(first: Sequence[float], second: Sequence[float]) -> bool:
 
 
 def welch_interval(first: Sequence[float], second: Sequence[float], largest: float = inf) -> Interval:
-    """95 % interval of the first group's mean minus the second's, by Welch's t over models.
+    """Return the 95 % interval of the first group's mean minus the second's, by Welch's t over models.
 
-    A group of one model has no spread of its own, and is given that of the other one (Student's t). No limits
-    where both have one model, or where no model differs from its group.
+    A group of one model has no spread of its own; that of the other group is used (Student's t). No limits where
+    both groups have one model, or where no model differs from its group. Raises as `exchange_p`.
 
     Args:
-        largest: The difference that no two means can exceed, 1 for rates; limits beyond it are cut there, and
-            where both are, there are none.
-
-    Raises:
-        UsageError: As `exchange_p` does.
+        first: One value per model of the first group.
+        second: One value per model of the second group.
+        largest: The difference that no two means can exceed, 1 for rates. Limits beyond it are cut there; where
+            both are, there are none.
     """
     from scipy.special import stdtrit  # type: ignore[import-untyped]
 
@@ -112,11 +117,11 @@ def _values(first: Sequence[float], second: Sequence[float]) -> NDArray[np.float
 
 
 def _gaps(values: NDArray[np.float64], sums: NDArray[np.float64], size: int) -> NDArray[np.float64]:
-    """Absolute differences of the means where the first group's values add up to `sums`."""
+    """Return the absolute differences of the means where the first group's values add up to `sums`."""
     gaps: NDArray[np.float64] = np.abs(sums / size - (values.sum() - sums) / (values.size - size))
     return gaps
 
 
 def _slack(values: NDArray[np.float64]) -> float:
-    """Gaps that differ by less are equal up to the rounding of sums."""
+    """Return the difference below which gaps are equal up to the rounding of sums."""
     return 1e-12 * max(1.0, float(np.abs(values).max()))

@@ -18,12 +18,12 @@ Matrix = NDArray[np.float64]
 # -- controls and other models -------------------------------------------------------------------------------
 
 EXCHANGES = 999
-"""With the observed one 1,000, so that no p is below 0.001."""
+"""Number of drawn exchanges: with the observed one 1,000, so that no p is below 0.001."""
 SHARED_PROBE = 1.25
 """Factor of the drawn differences of squared errors.
 
 Groups share a probe, so two networks that know a quantity equally well differ by more than exchanges of groups
-allow. Without the factor one exceeds the other in 6 to 14 % of experiments, with it in 2 to 6 %
+allow. Without the factor, one exceeds the other in 6 to 14 % of experiments, with it in 2 to 6 %
 (`benchmarks/label_coverage.py`).
 """
 
@@ -31,14 +31,17 @@ allow. Without the factor one exceeds the other in 6 to 14 % of experiments, wit
 def better_than_reference(
     correct: NDArray[np.bool_] | Matrix, reference: Matrix, groups: ArrayLike, seed: int, widening: float = 1.0
 ) -> Matrix:
-    """Family-wise p (S,) of every site against one control: is its mean score higher?
+    """Return the family-wise p (S,) that a site's mean score is higher than one control's.
+
+    If a site is no better, a group is as likely to favour it as to oppose it. So the signs of the groups'
+    differences are drawn anew, the same for all sites, and the largest of them counts.
 
     Args:
         correct: (S, E) scores, such as whether a decision is right.
-        reference: (E,) what the control scores in each episode.
-        groups: (E,). If a site is no better, a group is as likely to favour it as to oppose it: the signs of the
-            groups' differences are drawn anew, the same for all sites, and the largest of them counts. widening:
-            factor of the drawn differences; SHARED_PROBE for R², whose groups share a probe and so are not
+        reference: (E,) score of the control in each episode.
+        groups: (E,) group of items of every episode.
+        seed: Seed of the signs.
+        widening: Factor of the drawn differences; SHARED_PROBE for R², whose groups share a probe and so are not
             independent.
     """
     gain = _group_sums(correct - reference, groups)
@@ -53,13 +56,17 @@ def better_than_best(
     seed: int,
     widening: float = 1.0,
 ) -> Matrix:
-    """Family-wise p (S,) of every site against the best of another model's: is its mean score higher?
+    """Return the family-wise p (S,) that a site's mean score is higher than that of another model's best site.
+
+    If the models are alike, a group's scores could as well have come from either. So whole groups change places,
+    and both best sites are chosen anew.
 
     Args:
         correct: (S, E) scores, such as whether a decision is right.
-        references: (S', E) on the same episodes. groups: (E,). If the models are alike, a group's scores could as
-            well have come from either: whole groups change places, and both best sites are chosen anew.
-        widening: As in `better_than_reference`.
+        references: (S', E) scores of the other model's sites on the same episodes.
+        groups: (E,) group of items of every episode.
+        seed: Seed of the exchanges.
+        widening: Factor of the drawn differences, as in `better_than_reference`.
     """
     sums, reference_sums = _group_sums(correct, groups), _group_sums(references, groups)
     stays = (np.random.default_rng(seed).random((sums.shape[1], EXCHANGES)) < 0.5).astype(float)
@@ -72,19 +79,19 @@ def better_than_best(
 
 
 def _mixed(sums: Matrix, other: Matrix, stays: Matrix) -> Matrix:
-    """(S, draws) sums over groups, of `sums` where a group `stays` and of `other` elsewhere."""
+    """Return the sums (S, draws) over groups, of `sums` where a group `stays` and of `other` elsewhere."""
     mixed: Matrix = sums @ stays + other @ (1 - stays)
     return mixed
 
 
 def _matching(count: int, shared: int) -> NDArray[np.intp]:
-    """Return for each of `count` sites the other model's that stands for it: of the same number, or the last."""
+    """Return the other model's site for each of `count` sites: the one of the same number, or the last."""
     matching: NDArray[np.intp] = np.minimum(np.arange(count), shared - 1)
     return matching
 
 
 def _group_sums(values: NDArray[np.bool_] | Matrix, groups: ArrayLike) -> Matrix:
-    """(S, G) sums of (S, E) over the episodes of each group."""
+    """Return the sums (S, G) of (S, E) values over the episodes of each group."""
     names, group_of = np.unique(np.asarray(groups), return_inverse=True)
     sums = np.zeros((len(values), names.size))
     np.add.at(sums.T, group_of, values.T.astype(np.float64))
@@ -95,31 +102,32 @@ def _group_sums(values: NDArray[np.bool_] | Matrix, groups: ArrayLike) -> Matrix
 
 
 def heads_p(heads: int, tosses: int) -> float:
-    """Chance of at least so many heads in the tosses of a fair coin; 1.0 without any."""
+    """Return the chance of at least so many heads in the tosses of a fair coin; 1.0 without any."""
     return float(sum(comb(tosses, count) for count in range(heads, tosses + 1)) / 2**tosses)
 
 
 def sign_p(more: int, less: int) -> float:
-    """Exact two-sided p that `more` against `less` is a fair coin's; 1.0 without any.
+    """Return the exact two-sided p that `more` against `less` is a fair coin's; 1.0 without any.
 
-    Of episodes that one condition alone got right against those the other alone did, it is McNemar's exact test.
+    For episodes that only one condition got right against those that only the other did, it is McNemar's exact
+    test.
     """
     return min(1.0, 2 * heads_p(max(more, less), more + less))
 
 
 ROUNDING = 1e-9
-"""Effects so small (metres) come from the order of sums, and have no sign."""
+"""Effects so small (in metres) come from the order of sums, and have no sign."""
 
 
 def unit_means(values: NDArray[np.float64], units: ArrayLike) -> NDArray[np.float64]:
-    """Mean of (…, E) values over the episodes of each unit, (…, U) in the order of their names."""
+    """Return the means of (…, E) values over the episodes of each unit, (…, U), sorted by the units' names."""
     names, unit_of = np.unique(np.asarray(units), return_inverse=True)
     means = np.stack([values[..., unit_of == unit].mean(axis=-1) for unit in range(names.size)], axis=-1)
     return np.asarray(means, np.float64)
 
 
 def greater_p(effects: NDArray[np.float64]) -> float:
-    """Chance that at least so many of the effects (U,) are positive, if each sign were a fair coin's.
+    """Return the chance that at least so many of the effects (U,) are positive, if each sign were a fair coin's.
 
     Effects that are zero, up to rounding, take no part; 1 where there is none.
     """
@@ -128,22 +136,24 @@ def greater_p(effects: NDArray[np.float64]) -> float:
 
 
 def paired_greater_p(values: NDArray[np.float64], items: ArrayLike, groups: ArrayLike) -> float:
-    """The same by item and by group, the larger of the two: items that share pictures are not independent.
+    """Return the larger p of `greater_p` over items and over groups.
+
+    Items that share pictures are not independent.
 
     Args:
         values: (E,) effect per episode.
-        items: (E,).
-        groups: As `items`.
+        items: (E,) item of every episode.
+        groups: (E,) group of items of every episode.
     """
     return max(greater_p(unit_means(values, units)) for units in (items, groups))
 
 
 Right = NDArray[np.bool_]
-"""(N,) whether each item is right."""
+"""Whether each item is right, (N,)."""
 
 
 def mcnemar_p(first: Right, second: Right) -> float:
-    """Exact two-sided p of two ways of answering the same items being right equally often.
+    """Return the exact two-sided p of two ways of answering the same items being right equally often.
 
     Only items on which they differ count, each as a toss of a fair coin; 1 where there is none.
     """
@@ -155,20 +165,27 @@ def mcnemar_p(first: Right, second: Right) -> float:
 
 
 def flip_p(first: Right, second: Right, groups: ArrayLike) -> float:
-    """Exact two-sided p of the same, where the items of a group are one toss: all their differences turn together.
+    """Return the exact two-sided p of `mcnemar_p` with a group of items as one toss.
+
+    All differences in a group turn together.
 
     Args:
-        groups: (N,).
+        first: (N,) whether the first way is right.
+        second: (N,) whether the second way is right.
+        groups: (N,) group of every item.
     """
     return flip_gains_p(first.astype(np.int64) - second, groups)
 
 
 def flip_gains_p(gains: NDArray[np.int64], groups: ArrayLike) -> float:
-    """Exact two-sided p that (N,) gains, in whole units, have no direction; those of a group turn together.
+    """Return the exact two-sided p that (N,) gains, in whole units, have no direction.
+
+    The gains of a group turn together. The distribution of the sum of gains over all flips of signs is added up
+    group by group. So no draw is needed, for any number of groups.
 
     Args:
-        groups: (N,). The distribution of the sum of gains over all flips of signs is added up group by group, so
-            that no draw is needed for any number of groups.
+        gains: (N,) differences of two conditions, in whole units.
+        groups: (N,) group of every gain.
     """
     names, group_of = np.unique(np.asarray(groups), return_inverse=True)
     totals_of = np.zeros(names.size, np.int64)
@@ -185,7 +202,7 @@ def flip_gains_p(gains: NDArray[np.int64], groups: ArrayLike) -> float:
 
 
 def clopper_pearson(hits: int, trials: int) -> tuple[float, float]:
-    """Exact 95 % interval of a share; (0, 1) without trials."""
+    """Return the exact 95 % interval of a share; (0, 1) without trials."""
     from scipy.stats import beta
 
     low = 0.0 if hits == 0 else float(beta.ppf(SIGNIFICANCE / 2, hits, trials - hits + 1))
@@ -194,7 +211,7 @@ def clopper_pearson(hits: int, trials: int) -> tuple[float, float]:
 
 
 def fisher_p(first: Right, second: Right) -> float:
-    """Exact two-sided p of two properties of the same items having nothing to do with each other."""
+    """Return the exact two-sided p that two properties of the same items are independent."""
     from scipy.stats import fisher_exact
 
     table = [[int((first & second).sum()), int((first & ~second).sum())],
@@ -203,7 +220,10 @@ def fisher_p(first: Right, second: Right) -> float:
 
 
 def overlap_p(first: Right, second: Right, strata: ArrayLike, seed: int, draws: int = 10_000) -> float:
-    """Two-sided p of the same over several strata: `second` is dealt anew within each, the overlap is counted."""
+    """Return the two-sided p that two properties are independent within each stratum.
+
+    `second` is dealt anew within each stratum, and the overlap is counted.
+    """
     names, stratum_of = np.unique(np.asarray(strata), return_inverse=True)
     generator = np.random.default_rng(seed)
     drawn = np.zeros(draws)
@@ -220,7 +240,7 @@ def overlap_p(first: Right, second: Right, strata: ArrayLike, seed: int, draws: 
 
 
 def holm(p_values: Sequence[float | None]) -> list[float | None]:
-    """Holm's family-wise p of each; None stays None and takes no part."""
+    """Return Holm's family-wise p of each; None stays None and takes no part."""
     order = sorted((p, position) for position, p in enumerate(p_values) if p is not None)
     corrected: list[float | None] = [None] * len(p_values)
     highest = 0.0
@@ -236,12 +256,15 @@ def corrected[Row](
     summary: Callable[[Row], bool] = lambda _: False,
     test: Callable[[Row], Hashable] | None = None,
 ) -> list[float | None]:
-    """The corrected p of every row, in order; None where it has none.
+    """Return Holm's family-wise p of every row, in order; None where a row has no p.
 
     Args:
-        summary: Whether a row is over several categories; such rows are a family of their own.
-        test: What a row tests; several rows of one test, such as the views of one success rate, count once. By
-            default each its own.
+        rows: Rows of a table.
+        p: Function that returns a row's own p, or None.
+        summary: Function that returns whether a row is over several categories; such rows are a family of their
+            own.
+        test: Function that returns what a row tests. Several rows of one test, such as the views of one success
+            rate, count once. None: each row is a test of its own.
     """
     tests = list(range(len(rows))) if test is None else [test(row) for row in rows]
     corrected_of: dict[Hashable, float | None] = {}
@@ -254,27 +277,35 @@ def corrected[Row](
 # -- many effects together -----------------------------------------------------------------------------------
 
 FLOOR = 1e-6
-"""Metres added to every standard error: a site that nothing reads has effects of exactly 0, and a finite T."""
+"""Metres added to every standard error, so that T is finite at a site that nothing reads.
+
+The effects at such a site are exactly 0.
+"""
 EXACT = 12
-"""Up to so many groups every pattern of signs is tried; beyond, `SIGN_PATTERNS` of them."""
+"""Number of groups up to which every pattern of signs is tried; beyond, `SIGN_PATTERNS` are drawn."""
 SIGN_PATTERNS = 2000
-"""Drawn patterns of signs, or of places; the observed ones are among them, so that no p is below 1 / 2,000."""
+"""Number of drawn patterns of signs, or of places.
+
+The observed ones are among them, so that no p is below 1 / 2,000.
+"""
 
 
 def max_t(
     values: NDArray[np.float64], items: ArrayLike, groups: ArrayLike, seed: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """One-sided tests of S effects that are positive in the mean, together.
+    """Test together, one-sided, whether S effects are positive in the mean.
+
+    An item's episodes are averaged, and the items of a group change signs together.
 
     Args:
         values: (S, E) effect per episode.
-        items: (E,); an item's episodes are averaged, and the items of a group change signs together.
-        groups: As `items`.
-        seed: Of the draws.
+        items: (E,) item of every episode.
+        groups: (E,) group of items of every episode.
+        seed: Seed of the draws of signs.
 
     Returns:
-        (S,) each: T = mean / (standard error + FLOOR), its p, and its p against the largest T of all S under the
-        same signs (family-wise).
+        (S,) each: T = mean / (standard error + FLOOR), its p, and its family-wise p: against the largest T of all
+        S under the same signs.
     """
     names, first = np.unique(np.asarray(items), return_index=True)
     means = unit_means(values, items)
@@ -293,13 +324,16 @@ def max_t(
 
 
 def least_column_p(values: NDArray[np.float64], groups: ArrayLike, seed: int) -> float:
-    """Chance that the first of K exchangeable columns lies so far below the others in the mean, one-sided.
+    """Return the one-sided chance that the first of K exchangeable columns lies so far below the others' mean.
+
+    The place of the first column is drawn anew, the same in all rows of a group. Any column may be the first where
+    none differs. With two columns it is a test by signs. The level is exact, because the observed places are one
+    of the draws.
 
     Args:
-        values: (E, K), K at least 2.
-        groups: (E,). The place of the first column is drawn anew, the same in all rows of a group: any column may
-            be the first where none differs. With two columns it is a test by signs.
-        seed: Of the draws. The level is exact, because the observed places are one of them.
+        values: (E, K) values, with K at least 2.
+        groups: (E,) group of items of every episode.
+        seed: Seed of the draws.
     """
     names, group_of = np.unique(np.asarray(groups), return_inverse=True)
     columns = values.shape[1]
@@ -313,12 +347,12 @@ def least_column_p(values: NDArray[np.float64], groups: ArrayLike, seed: int) ->
 
 
 def smallest_flip_p(groups: int) -> float:
-    """The smallest p-value of `max_t` with so many groups: one pattern of all that are tried."""
+    """Return the smallest p-value of `max_t` with so many groups: one pattern of all that are tried."""
     return 0.5**groups if groups <= EXACT else 1 / SIGN_PATTERNS
 
 
 def _signs(groups: int, seed: int) -> NDArray[np.float64]:
-    """(draws, groups) of ±1, the first row all +1."""
+    """Return the signs (draws, groups) of ±1, the first row all +1."""
     if groups <= EXACT:
         return np.array(list(product((1.0, -1.0), repeat=groups)))
     drawn = np.random.default_rng(seed).choice((1.0, -1.0), (SIGN_PATTERNS - 1, groups))

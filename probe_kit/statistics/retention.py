@@ -22,7 +22,13 @@ from probe_kit.statistics.intervals import (
 
 @dataclass(frozen=True)
 class Scores:
-    """K scores above chance: above (K,), their covariance (K, K) and its degrees of freedom."""
+    """K scores above chance.
+
+    Attributes:
+        above: (K,) scores above chance.
+        covariance: (K, K) covariance of the scores.
+        df: Degrees of freedom of the covariance.
+    """
 
     above: Matrix
     covariance: Matrix
@@ -30,16 +36,17 @@ class Scores:
 
     @classmethod
     def of(cls, fit: CrossFit) -> "Scores":
-        """The scores of one category."""
+        """Return the scores of one category."""
         return cls(fit.above, fit.covariance, fit.df)
 
     @classmethod
     def mean(cls, parts: Sequence["Scores"]) -> "Scores":
-        """Means over categories that share no group: the covariances' sum over n².
+        """Return the means over categories that share no group.
 
-        Degrees of freedom are (Σ v)² / Σ (v² / df), with v the sum of a category's variances (Satterthwaite, “An
-        approximate distribution of estimates of variance components”, Biometrics Bulletin 2, 1946): a category
-        that varies more than all others is known no better for them.
+        Their covariance is the sum of the covariances over n². The degrees of freedom are (Σ v)² / Σ (v² / df),
+        with v the sum of a category's variances. So a category that varies more than all others is not known
+        better because of them. See Satterthwaite, “An approximate distribution of estimates of variance
+        components”, Biometrics Bulletin 2 (1946).
 
         Raises:
             UsageError: Without categories.
@@ -63,7 +70,7 @@ def accuracy_interval(fit: CrossFit, row: int) -> Interval:
 
 
 def t_quantile(df: float, tail: float = TAIL) -> float:
-    """Quantile 1 − tail of Student's t, by default 97.5 %."""
+    """Return the quantile 1 − tail of Student's t, by default 97.5 %."""
     from scipy.special import stdtrit  # type: ignore[import-untyped]
 
     return float(stdtrit(df, 1 - tail))
@@ -79,9 +86,9 @@ A score that may be a quarter of its estimate makes the upper limit of a ratio f
 OTHER_TRAINING = 1.1
 """Factor of the standard errors of both scores, for what other training questions would change.
 
-A group influences a score also through the probes of the other folds, which no variance over tested groups knows.
-Without the factor intervals cover 90.8 % at least in seven simulated settings of 480 draws, with it 94.2 %. In a
-weak one 88.7 % of those with limits cover (`benchmarks/retention_coverage.py`).
+A group also influences a score through the probes of the other folds, which no variance over tested groups
+includes. Without the factor, intervals cover 90.8 % at least in seven simulated settings of 480 draws, with it
+94.2 %. In a weak one, 88.7 % of those with limits cover (`benchmarks/retention_coverage.py`).
 """
 
 
@@ -94,7 +101,7 @@ class Ratio:
 
 
 def retention(scores: Scores) -> Ratio:
-    """First score over the second one, (expert, backbone), with Fieller's limits (Fieller 1954).
+    """Return the first score over the second one, (expert, backbone), with Fieller's limits (Fieller 1954).
 
     Of a mean over categories it is the ratio of the mean scores. The limits allow for other training questions,
     see OTHER_TRAINING. There are none where the backbone is not known well enough to divide by, see LEAST_KNOWN.
@@ -110,12 +117,14 @@ def retention(scores: Scores) -> Ratio:
 
 
 def retention_difference(first: Scores, second: Scores, between: Matrix | None = None) -> Ratio:
-    """Retention of the first minus that of the second, of two runs or two means, with MOVER's limits.
+    """Return the retention of the first minus that of the second, with MOVER's limits.
 
     Args:
+        first: Scores (expert, backbone) of a run, or their means over categories.
+        second: Those of another run, or of another mean.
         between: (2, 2) covariance of the first's (expert, backbone) with the second's, where both are of the same
-            groups (`CrossFit.covariance_with`; of means the sum over categories divided by n²). None for other
-            groups.
+            groups; see `CrossFit.covariance_with`. For means it is the sum over categories divided by n². None for
+            other groups.
     """
     a, b = retention(first), retention(second)
     correlation = 0.0 if between is None else _correlation(first, second, between)
@@ -124,7 +133,10 @@ def retention_difference(first: Scores, second: Scores, between: Matrix | None =
 
 
 def _correlation(first: Scores, second: Scores, between: Matrix) -> float:
-    """Correlation of two ratios by the delta method; 0 where one of them is not defined or does not vary."""
+    """Return the correlation of two ratios by the delta method.
+
+    It is 0 where one of them is not defined or does not vary.
+    """
     if not (first.above[1] and second.above[1]):
         return 0.0
     by_first, by_second = _slope(first), _slope(second)
@@ -134,7 +146,7 @@ def _correlation(first: Scores, second: Scores, between: Matrix) -> float:
 
 
 def _slope(scores: Scores) -> Matrix:
-    """(2,) derivatives of the ratio by its two scores."""
+    """Return the derivatives (2,) of the ratio by its two scores."""
     expert, backbone = scores.above[:2]
     slope: Matrix = np.array([1.0, -expert / backbone]) / backbone
     return slope

@@ -6,13 +6,13 @@ from statistics import NormalDist
 from probe_kit.errors import UsageError
 
 SIGNIFICANCE = 0.05
-"""Below this a p-value is called evidence; intervals cover one minus it."""
+"""The p-value below which a result is called evidence; intervals cover one minus it."""
 
 
 def detectable(items: int, power: float = 0.8) -> float:
-    """Accuracy at which a baseline is flagged as above chance in a share `power` of suites with so many items.
+    """Return the accuracy at which a share `power` of suites with so many items flag a baseline as above chance.
 
-    One-sided at 0.05, an item as one trial: its two layouts are one question.
+    The test is one-sided at 0.05, with an item as one trial: its two layouts are one question.
 
     Raises:
         UsageError: Without items.
@@ -24,19 +24,19 @@ def detectable(items: int, power: float = 0.8) -> float:
 
 
 def chance_margin(n: float, alpha: float = SIGNIFICANCE) -> float:
-    """Δ: how far a success rate over `n` trials may lie from 0.5 by guessing alone, at level `alpha`."""
+    """Return Δ: how far a success rate over `n` trials may lie from 0.5 by guessing alone, at level `alpha`."""
     if n < 1:
         raise UsageError(f"the margin around chance needs at least one trial, got n={n}")
     return NormalDist().inv_cdf(1 - alpha / 2) * sqrt(0.25 / n)
 
 
 def items_for_width(width: float) -> int:
-    """Items per category for which a 95 % interval of a rate near one half is at most `width` wide.
+    """Return the items per category with which a 95 % interval of a rate near one half is at most `width` wide.
 
     Items that share a picture and are answered alike count as fewer.
 
     Raises:
-        UsageError: For no width.
+        UsageError: If the width is not between 0 and 1.
     """
     if not 0 < width < 1:
         raise UsageError(f"an interval {width} wide; expected a share between 0 and 1")

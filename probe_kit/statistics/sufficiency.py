@@ -24,15 +24,15 @@ from probe_kit.statistics.significance import SIGNIFICANCE
 Verdict = Literal["shown", "not shown", "absent"]
 
 ABSENT_BELOW = 0.65
-"""Accuracy below which the best site counts as nothing."""
+"""Accuracy below which the best site counts as no signal."""
 POWER = 0.8
-"""Share of experiments that must find an accuracy for it to be called absent where they do not."""
+"""Share of experiments that must find an accuracy, so that it can be called absent where it is not found."""
 FEWEST_PERMUTATIONS = 20
-"""Fewer have no 95 % point."""
+"""Number of permutations below which there is no 95 % point."""
 
 
 def at_most(sites: GroupSums) -> float:
-    """The highest of all sites' own one-sided 95 % upper limits of accuracy (Korn and Graubard).
+    """Return the highest of all sites' own one-sided 95 % upper limits of accuracy (Korn and Graubard).
 
     The truly best site is one of them, and below its own limit in 95 % of experiments. So the number is an upper
     limit of the best site's accuracy, whatever the number of sites.
@@ -52,12 +52,14 @@ def at_most(sites: GroupSums) -> float:
 
 
 def findable(sites: GroupSums, threshold: float) -> float:
-    """The least accuracy of a site that a share `POWER` of such experiments finds above chance.
+    """Return the least accuracy of a site that a share `POWER` of such experiments finds above chance.
+
+    The accuracy b solves b − threshold = z √(b (1 − b) / n). Here n is the median of the sites' effective
+    episodes, min(s (1 − s) / v, E), and z the quantile of `POWER`. Infinite without a threshold.
 
     Args:
-        threshold: What the best site of a stream must exceed, see `permuted_threshold`. The accuracy b solves b −
-            threshold = z √(b (1 − b) / n), with n the median of the sites' effective episodes, min(s (1 − s) / v,
-            E), and z the quantile of `POWER`. Infinite without a threshold.
+        sites: Correct decisions of a stream's sites.
+        threshold: Accuracy that the best site of a stream must exceed, see `permuted_threshold`.
     """
     if not threshold < 1:
         return inf
@@ -79,8 +81,9 @@ def is_absent(most: float, least: float, absent_below: float = ABSENT_BELOW) -> 
     """Whether the best site is below a bound at most, and the experiment would have found it at the bound.
 
     Args:
-        most: As `at_most` gives it.
-        least: As `findable` gives it.
+        most: Upper limit of the best site's accuracy, as `at_most` gives it.
+        least: Least accuracy that would be found, as `findable` gives it.
+        absent_below: The bound, an accuracy.
     """
     return most < absent_below and least <= absent_below
 
@@ -88,9 +91,13 @@ def is_absent(most: float, least: float, absent_below: float = ABSENT_BELOW) -> 
 def verdict(signal: bool, most: float, least: float, absent_below: float = ABSENT_BELOW) -> Verdict:
     """Return the verdict: `shown`, `absent` as `is_absent` says, else `not shown`.
 
+    An accuracy that is absent is one of a linear probe of so many items: with more items, a probe may have more.
+
     Args:
-        signal: Above chance family-wise and better than every control that was run. What is absent is an accuracy
-            that a linear probe of so many items has: with more items a probe may have more.
+        signal: Whether the stream is above chance, family-wise, and better than every control that was run.
+        most: Upper limit of the best site's accuracy, as `at_most` gives it.
+        least: Least accuracy that would be found, as `findable` gives it.
+        absent_below: Accuracy below which the best site counts as no signal.
     """
     if signal:
         return "shown"
@@ -100,18 +107,18 @@ def verdict(signal: bool, most: float, least: float, absent_below: float = ABSEN
 # -- numbers of groups ---------------------------------------------------------------------------------------
 
 GROUPS_FOR_PROBES = OUTER_FOLDS
-"""With fewer, `train` refuses the category."""
+"""The fewest groups of a category that `train` accepts."""
 GROUPS_FOR_RETENTION = FEWEST_GROUPS
-"""With fewer there are no cross-fitted scores."""
+"""The fewest groups with cross-fitted scores."""
 SMALLEST_EFFECT_OF_INTEREST = 0.25
 """Net share of episodes below which a category is not acted on, and an edit or erasure is without effect."""
 
 
 def probe_command(run: object, groups: Mapping[Any, int]) -> str:
-    """Return the command that fits probes of the categories with groups enough for them; empty without any.
+    """Return the command that fits probes of the categories with enough groups; empty where none has enough.
 
     Args:
-        run: Its location.
+        run: Location of the run.
         groups: Number of independent groups by category.
     """
     enough = [name for name, count in groups.items() if count >= GROUPS_FOR_PROBES]
@@ -122,34 +129,36 @@ def probe_command(run: object, groups: Mapping[Any, int]) -> str:
 
 
 def least_probe_p(groups: int) -> float:
-    """The smallest p that label permutations of so many groups can give, if there are enough permutations."""
+    """Return the smallest p that label permutations of so many groups can give, with enough permutations."""
     return smallest_p(possible_flips(groups))
 
 
 def groups_for_signal() -> int:
-    """Fewest groups of which a probe can be significant."""
+    """Return the fewest groups with which a probe can be significant."""
     return _fewest(lambda groups: least_probe_p(groups) < SIGNIFICANCE, GROUPS_FOR_PROBES)
 
 
 def groups_for_interventions() -> int:
-    """Fewest groups of which an effect can be beyond chance."""
+    """Return the fewest groups with which an effect can be beyond chance."""
     return _fewest(lambda groups: smallest_flip_p(groups) < SIGNIFICANCE, 1)
 
 
 @cache
 def groups_for_not_used() -> int:
-    """Fewest groups with which an image swap can find *not used* at all, in episodes that never follow."""
+    """Return the fewest groups with which an image swap can find *not used* in episodes that never follow."""
     return _fewest(lambda groups: _net_limit_of_none(groups) < SMALLEST_EFFECT_OF_INTEREST, 2)
 
 
 def groups_to_decide(groups: int, effects: Sequence[tuple[float, float, float]]) -> float:
     """Return about how many groups tell *used* from *not used*, if the effects stay as these groups measured them.
 
+    *Not used* takes all effects below their sizes, *used* takes one of them above. A width is taken to fall with
+    the root of the number of groups. Without any interval, it is the fewest groups with which something can be
+    *not used*. Infinite for an effect at its bound.
+
     Args:
-        effects: Each measure, the width of its interval, and the size below which it does not matter. *Not used*
-            takes all of them below, use takes one of them above. A width is taken to fall with the root of the
-            number of groups. Without any interval: the fewest with which something can be *not used*. Infinite for
-            an effect at its bound.
+        groups: Number of groups that were measured.
+        effects: Each measure, the width of its interval, and the size below which it does not matter.
     """
     if all(isinf(width) for _, width, _ in effects):
         return max(groups_for_not_used(), groups + 1)
@@ -165,10 +174,12 @@ def groups_to_decide(groups: int, effects: Sequence[tuple[float, float, float]])
 def items_for_absence(items: int, groups: int, episodes: int) -> int:
     """Return the fewest items with which a stream that knows nothing can be called absent, at best.
 
+    More groups are taken to be of the same size as the measured ones.
+
     Args:
-        items: Of what is measured. More groups are taken to be of the same size.
-        groups: As `items`.
-        episodes: As `items`.
+        items: Number of items that were measured.
+        groups: Number of groups of these items.
+        episodes: Number of episodes of these items.
     """
     return ceil(groups_for_absence(round(episodes / groups)) * items / groups)
 
@@ -181,18 +192,18 @@ def _net_limit_of_none(groups: int) -> float:
 
 @lru_cache
 def groups_for_absence(episodes: int) -> int:
-    """Fewest groups of so many episodes with which a stream that knows nothing can be called absent.
+    """Return the fewest groups of so many episodes with which a stream that knows nothing can be called absent.
 
-    That is at best: for a single site, right in half of the episodes, which differ as much within groups as
+    That is at best: for a single site that is right in half of the episodes. These differ as much within groups as
     between them. `probe-kit power` simulates how often it happens.
     """
     return _fewest(lambda groups: _limit_at_chance(groups, episodes) < ABSENT_BELOW, GROUPS_FOR_RETENTION)
 
 
 def _limit_at_chance(groups: int, episodes: int) -> float:
-    """The larger of `at_most` and `findable` of one site that is right in half of the episodes.
+    """Return the larger of `at_most` and `findable` of one site that is right in half of the episodes.
 
-    Groups vary as episodes do: half of them lie a standard deviation above one half, half of them as far below.
+    Groups vary as episodes do. Half of them lie a standard deviation above one half, half of them as far below.
     """
     sizes = np.full(groups, float(episodes))
     around = np.resize([1.0, -1.0], groups) * np.sqrt(episodes * CHANCE * (1 - CHANCE))

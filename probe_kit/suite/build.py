@@ -1,8 +1,8 @@
 """Building of the embedded suite `a2a-embedded`: no downloads, and the same bytes for the same options.
 
 Its items are procedural. They follow Act2Answer's procedure with pictures of our own, so results on them must
-never be mixed with, or called, the paper's numbers. Each couple of tiles gives two items: the same pictures in
-the same places, each the target once. Neither the pictures alone nor the text alone can give the answer away.
+never be mixed with, or called, the paper's numbers. Each couple of tiles gives two items: the same pictures in the
+same places, each the target once. Neither the pictures alone nor the text alone can give the answer away.
 """
 
 import os
@@ -34,7 +34,7 @@ class Twins:
 
 
 def draw_twins(category: str, count: int, seed: int) -> Iterator[Twins]:
-    """The first `count` twins of one category; a smaller count gives the beginning of a larger one."""
+    """Draw the first `count` twins of one category; a smaller count gives the beginning of a larger one."""
     generator = GENERATORS[category]
     for number, couple in enumerate(islice(draw_couples(generator, seed), count)):
         left_picture, right_picture = (
@@ -62,7 +62,7 @@ def _item(
     gen: dict[str, Any],
     generator: Generator[Any],
 ) -> Item:
-    """The item that asks for what lies on `side`; its group is not known yet."""
+    """Make the item that asks for the picture on `side`; its group is not known yet."""
     category = gen["generator"]
     target, distractor = (couple.left, couple.right) if side == "left" else (couple.right, couple.left)
     pair_id = f"{SUITE_NAME}-{category}-s{gen['seed']}-{gen['couple']:04d}"
@@ -109,7 +109,7 @@ Progress = Callable[[int, int], None]
 
 
 ITEMS = 150
-"""Items per category, unless another number is asked for."""
+"""Default number of items per category."""
 
 
 def build_suite(
@@ -119,18 +119,21 @@ def build_suite(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Suite:
-    """The embedded suite, drawn and written to `folder`.
+    """Draw the embedded suite and write it to `folder`.
 
     Args:
-        categories: Slugs, all embedded ones by default. Which others are built changes no item of a category, and
-            fewer items per category are the beginning of more.
-        items_per_category: One number, or a number for each of `categories`.
-        progress: Called with items done and items in all.
+        folder: Folder to write; new or empty, or with this very suite.
+        categories: Names of categories, None for all embedded ones. The items of a category do not depend on which
+            other ones are built, and fewer items per category are the beginning of more.
+        items_per_category: One number, or a number for each of `categories`; positive and even.
+        seed: Seed of the drawn items.
+        progress: Function that is called with the number of items done and of all items; None for no reports.
 
     Raises:
-        UnknownCategoryError: For a number of items that is not a positive even one or that a category lacks.
-        UsageError: For a number of items that is not a positive even one or that a category lacks.
-        SuiteError: If `folder` holds anything but this very suite.
+        UnknownCategoryError: For a category that is not embedded.
+        UsageError: For no category, a number of items that is not positive and even, or a category without a
+            number.
+        SuiteError: If `folder` contains anything but this very suite.
     """
     folder = Path(folder)
     options = _options(categories, items_per_category, seed)
@@ -154,7 +157,7 @@ def default_suite(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Suite:
-    """The embedded suite, built on first use and kept in `$PROBE_KIT_CACHE` or `~/.cache/probe_kit`.
+    """Return the embedded suite, built on first use and kept in `$PROBE_KIT_CACHE` or `~/.cache/probe_kit`.
 
     Arguments and errors are those of `build_suite`.
     """
@@ -174,14 +177,14 @@ def default_folder(
 
 
 def default_identity() -> str:
-    """`name@version` of what `default_suite` draws."""
+    """Return `name@version` of the suite that `default_suite` draws."""
     return f"{SUITE_NAME}@{SUITE_VERSION}"
 
 
 def _options(
     categories: Sequence[str] | None, items_per_category: int | Mapping[str, int], seed: int
 ) -> dict[str, Any]:
-    """The arguments in one spelling, checked: equal numbers of items are one number."""
+    """Check the arguments and return them in one spelling: equal numbers of items are one number."""
     embedded = [slug for slug in CATEGORIES if slug in GENERATORS]
     requested = embedded if categories is None else check_categories(categories, embedded)
     if not requested:
@@ -222,10 +225,10 @@ def _stats(suite: Suite) -> dict[str, dict[str, int]]:
 
 
 def _cache_key(options: Mapping[str, Any]) -> str:
-    """A name for all that a built suite depends on, so that a changed drawing is never served from an old cache.
+    """Return a name for all that a built suite depends on, so that changed code never uses an old cache.
 
-    The libraries that draw and the code that draws, words, groups and lays out. The art needs no hash of its own:
-    the notice beside it holds its checksums.
+    It depends on the libraries that draw, and on the code that draws, words, groups and lays out. The art needs no
+    hash of its own: the notice in its folder contains its checksums.
     """
     folder = Path(__file__).parent
     modules = ("build", "categories", "items", "manifest", "pictures", "suite")

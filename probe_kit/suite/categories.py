@@ -8,15 +8,15 @@ from difflib import get_close_matches
 from probe_kit.errors import UnknownCategoryError, UsageError
 
 OWN_DOMAIN = "own"
-"""The domain of every category that is none of the paper's."""
+"""The domain of every category that is not one of the paper's."""
 RESERVED = ("all", "mean")
-"""Names that tables use for what is over all categories."""
+"""Names that tables use for results over all categories."""
 _SLUG = re.compile(r"[a-z0-9]([a-z0-9-]{0,38}[a-z0-9])?")
 
 
 @dataclass(frozen=True)
 class Category:
-    """One kind of knowledge the suite asks for."""
+    """One kind of knowledge that the suite asks for."""
 
     slug: str
     title: str
@@ -41,7 +41,7 @@ CATEGORIES: dict[str, Category] = {category.slug: category for category in _ALL}
 
 
 def category_of(slug: str) -> Category:
-    """The category of this name: one of the paper's, or one of a suite's own."""
+    """Return the category of this name: one of the paper's, or one of a suite's own."""
     return CATEGORIES.get(slug) or Category(slug, slug.replace("-", " ").capitalize(), OWN_DOMAIN)
 
 
@@ -51,7 +51,11 @@ def is_slug(name: str) -> bool:
 
 
 def check_slug(name: str) -> str:
-    """The name as given. Raises UsageError if no category may have it."""
+    """Return the name unchanged.
+
+    Raises:
+        UsageError: If no category may have this name.
+    """
     if not is_slug(name):
         raise UsageError(
             f"{name!r} cannot name a category: expected up to 40 small letters, digits and inner hyphens, such as "
@@ -61,16 +65,17 @@ def check_slug(name: str) -> str:
 
 
 def in_order(slugs: Iterable[str]) -> tuple[str, ...]:
-    """Each name once: the paper's categories in its order, then the others by the alphabet."""
+    """Return each name once: the paper's categories in its order, then the others alphabetically."""
     names = set(slugs)
     return (*(slug for slug in CATEGORIES if slug in names), *sorted(names - CATEGORIES.keys()))
 
 
 def check_categories(names: Sequence[str], available: Sequence[str]) -> tuple[str, ...]:
-    """The names as given, if all are available.
+    """Return the names unchanged, if all are available.
 
     Raises:
-        UnknownCategoryError: Naming the first one that is not, its nearest match, and what there is.
+        UnknownCategoryError: For a name that is not available; the message has its nearest match and all available
+            names.
     """
     for name in names:
         if name not in available:

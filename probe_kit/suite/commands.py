@@ -1,4 +1,4 @@
-"""`probe-kit suite`: build, convert, check and show suites."""
+"""The command `probe-kit suite`: build, convert, check and show suites."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -246,7 +246,7 @@ def convert(
 
 
 def _options(pairs: list[str]) -> dict[str, Any]:
-    """NAME=VALUE pairs; a value that is valid JSON is read as such, anything else is text."""
+    """Parse NAME=VALUE pairs; a value that is valid JSON is read as such, anything else is text."""
     options = {}
     for pair in pairs:
         name, separator, value = pair.partition("=")

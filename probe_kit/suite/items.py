@@ -1,11 +1,11 @@
-"""Items and episodes: one question with two pictures, and one rollout of it in one layout. Their words and groups.
+"""Items and episodes: questions with two pictures, and rollouts of them in one layout; their words and groups.
 
-Of the wordings, `knowledge` is the item's own instruction; `named` says what the correct picture literally
-shows; `side` says where it is; `neutral` asks for any picture. A model that fails `knowledge` and passes `named`
-lacks the knowledge. One that fails `side` lacks the skill. The score of `neutral` is the share that needs no
-instruction.
+The wording `knowledge` is the item's own instruction, and `named` says what the correct picture literally shows.
+The wording `side` says where it is, and `neutral` asks for any picture. A model that fails `knowledge` and passes
+`named` lacks the knowledge. One that fails `side` lacks the skill. The score of `neutral` is the share that needs
+no instruction.
 
-Folds must not separate a group. Counterparts show the same pictures, the other as target.
+Folds must not separate a group. Counterparts show the same pictures, with the other one as target.
 """
 
 import re
@@ -43,7 +43,7 @@ _CONTENT = (*_QUESTION, "pair_id", "schema_version")
 
 
 def other_side(side: Side) -> Side:
-    """The side opposite to `side`, seen from the robot base (left is +y)."""
+    """Return the side opposite to `side`, seen from the robot base (left is +y)."""
     return "right" if side == "left" else "left"
 
 
@@ -51,13 +51,13 @@ def other_side(side: Side) -> Side:
 class Item:
     """One question: an imperative instruction, a correct and a wrong picture.
 
-    `left` and `right` refer to the *original* layout; the swapped layout is derived, never stored. `side_word`
-    marks a sign whose name holds a side word, such as "no left turn sign".
+    `left` and `right` refer to the *original* layout; the swapped layout is derived, never stored.
 
     Attributes:
-        wordings: What else the item can be asked in, by name, see `WORDINGS`; no part of the item's identity.
-            `folder` is what the file names are relative to on this machine; it takes no part in the item's
+        side_word: Whether the item is a sign whose name contains a side word, such as "no left turn sign".
+        wordings: Other texts in which the item can be asked, by name, see `WORDINGS`; no part of the item's
             identity.
+        folder: Folder to which the file names are relative on this machine; no part of the item's identity.
     """
 
     item_id: str
@@ -98,7 +98,7 @@ class Item:
 
     @property
     def question(self) -> dict[str, str]:
-        """The words, pictures, side and group of this item, by name: what `Suite.seed_text` is made of."""
+        """The words, pictures, side and group of this item, by name, from which `Suite.seed_text` is made."""
         return {name: getattr(self, name) for name in _QUESTION}
 
     @property
@@ -108,33 +108,33 @@ class Item:
 
     @property
     def content_sha256(self) -> str:
-        """Hex sha256 of `content`: items with equal hashes ask and show the same, and have the same twin."""
+        """The hex sha256 of `content`: items with equal hashes ask and show the same, and have the same twin."""
         return sha256_json(self.content)
 
     def file_name(self, side: Side) -> str:
-        """Name, relative to `folder`, of the picture that lies on `side` in the original layout."""
+        """Return the name, relative to `folder`, of the picture that lies on `side` in the original layout."""
         return self.left_file_name if side == "left" else self.right_file_name
 
     def file_sha256(self, side: Side) -> str:
-        """Hex sha256 of the bytes of that file."""
+        """Return the hex sha256 of the bytes of that file."""
         return self.left_sha256 if side == "left" else self.right_sha256
 
     def pixels_sha256(self, side: Side) -> str:
-        """Hash of the pixels of that picture, see `pictures.pixels_sha256`."""
+        """Return the hash of the pixels of that picture, see `pictures.pixels_sha256`."""
         return self.left_pixels_sha256 if side == "left" else self.right_pixels_sha256
 
     def picture(self, side: Side) -> Path:
-        """Absolute path of the picture that lies on `side` in the original layout."""
+        """Return the absolute path of the picture that lies on `side` in the original layout."""
         return self.folder / self.file_name(side)
 
     @classmethod
     def from_json(cls, record: dict[str, Any], folder: Path) -> "Item":
-        """The item that `to_json` gave; fields that a later 1.x schema may add are left out."""
+        """Make the item from the record of `to_json`; fields that a later 1.x schema may add are left out."""
         names = {f.name for f in fields(cls)} - {"folder"}
         return cls(**{name: value for name, value in record.items() if name in names}, folder=folder)
 
     def to_json(self) -> dict[str, Any]:
-        """The item as one line of `metadata.jsonl`; without other wordings it has no field for them."""
+        """Return the item as one line of `metadata.jsonl`; without other wordings it has no field for them."""
         left_out = {"folder"} if self.wordings else {"folder", "wordings"}
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in left_out}
 
@@ -144,7 +144,7 @@ class Episode:
     """One rollout of an item in one layout.
 
     Attributes:
-        wording: The name of the wording that `item.instruction` is in, None where only its own was asked for.
+        wording: Name of the wording of `item.instruction`; None where only the item's own was requested.
     """
 
     item: Item
@@ -153,7 +153,7 @@ class Episode:
 
     @property
     def episode_id(self) -> str:
-        """`<item_id>:o` or `<item_id>:s`, and `:<wording>` behind it for all but the item's own words."""
+        """The id `<item_id>:o` or `<item_id>:s`, followed by `:<wording>` for all but the item's own words."""
         is_plain = self.wording in (None, "knowledge")
         return f"{self.item.item_id}:{self.layout[0]}" + ("" if is_plain else f":{self.wording}")
 
@@ -164,16 +164,16 @@ class Episode:
 
     @property
     def side_correct(self) -> Side:
-        """Side on which the correct picture lies in this layout."""
+        """The side on which the correct picture lies in this layout."""
         side = self.item.correct_side
         return side if self.layout == "original" else other_side(side)
 
     def picture(self, side: Side) -> Path:
-        """Absolute path of the picture that lies on `side` in this layout."""
+        """Return the absolute path of the picture that lies on `side` in this layout."""
         return self.item.picture(self._original(side))
 
     def pixels_sha256(self, side: Side) -> str:
-        """Hash of the pixels of that picture, see `pictures.pixels_sha256`."""
+        """Return the hash of the pixels of that picture, see `pictures.pixels_sha256`."""
         return self.item.pixels_sha256(self._original(side))
 
     def _original(self, side: Side) -> Side:
@@ -193,12 +193,15 @@ _SIDE_WORDS = frozenset(
 
 
 def instruction_for(object_phrase: str, article: str) -> str:
-    """The imperative that names the object, with `article` "the", or "none" for bare names."""
+    """Return the imperative that names the object, with `article` "the", or "none" for bare names."""
     return f"Put the cube on {'the ' if article == 'the' else ''}{object_phrase}"
 
 
 def side_words(text: str) -> tuple[str, ...]:
-    """Words that name a side or a place in a row: they would collide with the answers left and right."""
+    """Return the words that name a side or a place in a row: they would collide with the answers.
+
+    The answers are left and right.
+    """
     return tuple(word for word in re.findall(r"[a-z]+", text.lower()) if word in _SIDE_WORDS)
 
 
@@ -206,11 +209,15 @@ Wording = Literal["knowledge", "named", "side", "neutral"]
 WORDINGS: tuple[Wording, ...] = ("knowledge", "named", "side", "neutral")
 SIDE = "Put the cube on the {side} picture"
 NEUTRAL = "Put the cube on one of the two pictures"
-"""What `side` and `neutral` say where an item has no words of its own for them."""
+"""Texts of `side` and `neutral` where an item has no words of its own for them."""
 
 
 def check_wordings(names: Sequence[str]) -> tuple[Wording, ...]:
-    """The names, each once. Raises UsageError for an unknown one, for none, and for one that comes twice."""
+    """Return the names, each once.
+
+    Raises:
+        UsageError: For an unknown name, for no name, or for one that comes twice.
+    """
     unknown = [name for name in names if name not in WORDINGS]
     if unknown or not names:
         problem = repr(unknown[0]) if unknown else "empty"
@@ -221,10 +228,12 @@ def check_wordings(names: Sequence[str]) -> tuple[Wording, ...]:
 
 
 def in_words(episode: Episode, wording: Wording) -> Episode | None:
-    """The episode with its instruction in `wording`, or None where the item has none.
+    """Return the episode with its instruction in `wording`, or None where the item has none.
 
-    An item's `wordings` say what it has; `{side}` stands for the side of the correct picture in the layout. Raises
-    SuiteError if its wording `side` never says where, because it would then tell both layouts the same.
+    An item's `wordings` are its texts by name; `{side}` stands for the side of the correct picture in the layout.
+
+    Raises:
+        SuiteError: If the item's wording `side` lacks `{side}`: it would then be the same in both layouts.
     """
     item = episode.item
     wording_text = item.wordings.get(wording)
@@ -258,11 +267,13 @@ def ties(item: Item) -> tuple[str, ...]:
 
 
 def with_groups(items: Sequence[Item], groups: Mapping[str, str] | None = None) -> tuple[Item, ...]:
-    """The items with `group_id` set to their connected component over shared ties.
+    """Return the items with `group_id` set to their connected component over shared ties.
+
+    The name of a group is a hash of its members' ids, so it does not depend on the order of the items.
 
     Args:
-        groups: By item id, a group that a user gave; it ties as a shared picture does. A group is called by a hash
-            of its members' ids, so the name does not depend on the order of the items.
+        items: Items of one suite.
+        groups: By item id, a group that a user gave; it ties as a shared picture does. None without such groups.
     """
     forest = _Forest()
     for item in items:
@@ -297,8 +308,9 @@ class _Forest:
 def counterparts_of(items: Iterable[Item]) -> Mapping[str, Item]:
     """Return by item id the twin of every item that has one.
 
-    A twin shows the same two pictures, asks for the other one in other words, and is of the same category; how the
-    two lie, which suite they come from and how ids are made plays no part. Of several, the first by item id.
+    A twin shows the same two pictures, asks for the other one in other words, and is of the same category. The
+    places of the two pictures, their suite and the form of ids do not matter. Of several twins, it is the first by
+    item id.
     """
     by_pictures: dict[tuple[str, frozenset[str]], list[Item]] = defaultdict(list)
     for item in items:

@@ -1,9 +1,9 @@
 """Suites on disk: written atomically and checked whenever they are read.
 
-    suite.json            identity card
-    items/metadata.jsonl  one line per item; `datasets.load_dataset("imagefolder", data_dir=".../items")` reads it
-    items/images/<xx>/<first 16 of the pixel hash>.png
-    LICENSES.md  ATTRIBUTION.csv  stats.json
+  suite.json            identity card
+  items/metadata.jsonl  one line per item; `datasets.load_dataset("imagefolder", data_dir=".../items")` reads it
+  items/images/<xx>/<first 16 of the pixel hash>.png
+  LICENSES.md  ATTRIBUTION.csv  stats.json
 
 Nothing written depends on the clock or the machine's name: the same suite is the same bytes.
 """
@@ -37,23 +37,26 @@ CARD = "suite.json"
 ITEMS = "items"
 METADATA = "metadata.jsonl"
 MOST_ITEMS = 100_000
-"""Of a suite that is read; the largest there is has a twentieth of it."""
+"""Most items of a suite that is read; the largest existing suite has a twentieth of it."""
 
 
 # -- writing -----------------------------------------------------------------------------------------
 
 
 def save_suite(suite: Suite, pictures: Mapping[str, bytes], stats: Mapping[str, Any], folder: Path) -> Suite:
-    """The suite as loaded from `folder`.
+    """Write a suite, and return it as loaded from `folder`.
+
+    The folder appears complete or not at all. If it exists already with this very suite, it is left alone. That is
+    also how the slower of two processes that build at once ends.
 
     Args:
+        suite: Suite in memory, see `new_suite`.
         pictures: PNG bytes by file name.
-        stats: Per category, how many candidates each stage left. The folder appears complete or not at all. If it
-            is there already and holds this very suite, it is left alone; that is also how the slower of two
-            processes building at once ends.
+        stats: By category, how many candidates each stage left.
+        folder: Folder to write; new or empty, or with this very suite.
 
     Raises:
-        SuiteError: If the folder holds anything else.
+        SuiteError: If the folder contains anything else.
     """
     if not _is_taken(folder):
         with draft_of(folder) as draft:
@@ -74,7 +77,11 @@ def save_suite(suite: Suite, pictures: Mapping[str, bytes], stats: Mapping[str, 
 
 
 def check_foreign_folder(folder: Path) -> None:
-    """Raises SuiteError if `folder` is in use for something that is not a suite."""
+    """Refuse a folder that is in use for something that is not a suite.
+
+    Raises:
+        SuiteError: If `folder` is such a folder.
+    """
     if _is_taken(folder) and not (folder / CARD).is_file():
         raise SuiteError(
             f"{folder} exists and holds no suite; expected a new folder. Choose another one, or delete it."
@@ -130,11 +137,11 @@ def _licenses(items: Iterable[Item]) -> str:
 
 
 def load_suite(folder: Path | str) -> Suite:
-    """The suite in `folder`, with every file found to be what was written.
+    """Load the suite in `folder`, and check that every file is as it was written.
 
     Raises:
         UsageError: If there is no suite.
-        SuiteError: Listing everything that is wrong with it.
+        SuiteError: For a suite with errors; the message lists all of them.
     """
     folder = Path(folder).absolute()
     suite, findings = read_suite(folder)
@@ -148,7 +155,9 @@ def load_suite(folder: Path | str) -> Suite:
 
 
 def read_suite(folder: Path) -> tuple[Suite | None, list[Finding]]:
-    """The suite as far as it can be read, None if its card cannot, and every error found on the way.
+    """Read the suite as far as possible, and every error found on the way.
+
+    The suite is None if its card cannot be read.
 
     Raises:
         UsageError: If there is no suite.

@@ -38,15 +38,15 @@ class Terms:
 
 @dataclass(frozen=True)
 class PicturePair:
-    """Two pictures that lie side by side, and what each of them is called.
+    """Two pictures that lie side by side, and the name of each.
 
     Attributes:
-        category: One of the paper's or any name of your own, such as `ripe-fruit`; the row of a table in which the
-            questions are counted.
-        phrase: Complete "Put the cube on the …", such as `fox` or `open door`.
-        picture: Files that Pillow reads; they are padded to a white square of 224 to 512 pixels.
-        other_phrase: As `phrase`.
-        other_picture: As `picture`.
+        category: One of the paper's or any name of your own, such as `ripe-fruit`. It is the row of a table in
+            which the questions are counted.
+        phrase: Name of the picture that completes "Put the cube on the …", such as `fox` or `open door`.
+        picture: File that Pillow reads; it is padded to a white square of 224 to 512 pixels.
+        other_phrase: Name of the other picture, in the same form.
+        other_picture: File of the other picture.
     """
 
     category: str
@@ -61,13 +61,14 @@ class Row:
     """One line of the table.
 
     Attributes:
-        line: Its number in the file, from 1.
+        line: Number of the line in the file, from 1.
         instruction: The imperative.
-        correct: Files, beside the table.
-        wrong: As `correct`.
-        group: Rows of one group are never in training and test at once; empty where pictures alone decide. object:
-            what the correct picture is called, part of the instruction.
-        other_object: What the wrong one is called; empty for what its twin calls it, or else for its file's name.
+        correct: File of the correct picture; a relative path starts at the table's folder.
+        wrong: File of the wrong picture, likewise.
+        group: Name of a group; rows of one group are never in training and test at once. Empty where pictures
+            alone decide.
+        object: Name of the correct picture, part of the instruction.
+        other_object: Name of the wrong picture; empty for its name in its twin, or else for its file's name.
     """
 
     line: int
@@ -88,20 +89,35 @@ class _Questions:
         self.items: list[Item] = []
 
     def picture(self, path: Path) -> Picture:
-        """The picture in a file as it is stored. Raises SuiteError if it is missing or Pillow cannot decode it."""
+        """Return the picture in a file as it is stored.
+
+        Raises:
+            SuiteError: If the file is missing or Pillow cannot decode it.
+        """
         stored = squared_picture("", load_picture(path))
         self._pictures[stored.file_name] = stored.png
         return replace(stored, image_id=f"{path.name}-{stored.pixels_sha256[:16]}")
 
     def pair_id(self, category: str, content: Sequence[object]) -> str:
-        """The id of the twins with this content."""
+        """Return the id of the twins with this content."""
         return f"{self._name}-{category}-{sha256_json(content)[:12]}"
 
     def ask(
         self, item_id: str, pair_id: str, category: str, instruction: str, article: str, side: Side,
         correct: tuple[Picture, str], wrong: tuple[Picture, str],
     ) -> None:  # fmt: skip
-        """Add a question. article: as in `instruction_for`. correct, wrong: picture, and what it is called."""
+        """Add a question.
+
+        Args:
+            item_id: Id of the item.
+            pair_id: Id that the item shares with its twin.
+            category: Name of the item's category.
+            instruction: The imperative.
+            article: Article of the object, as in `instruction_for`.
+            side: Side of the correct picture in the original layout.
+            correct: The correct picture, and its name.
+            wrong: The wrong picture, and its name.
+        """
         origin = {"benchmark": self._name, "version": self._version, "split": "eval"}
         item = make_item(
             item_id,
@@ -127,7 +143,12 @@ class _Questions:
         self, options: Mapping[str, int], groups: Mapping[str, str] | None = None,
         places: Mapping[str, str] | None = None,
     ) -> Suite:  # fmt: skip
-        """Write the suite. groups, places: by item id, the group that a user gave and where he wrote the question.
+        """Write the suite.
+
+        Args:
+            options: Number of pairs or rows, for the suite's card.
+            groups: By item id, the group that a user gave; None without such groups.
+            places: By item id, the line of the table with the question, for messages; None without a table.
 
         Raises:
             SuiteError: For a broken rule of the format, before anything is written.
@@ -159,23 +180,28 @@ def suite_from_pictures(
     redistributable: bool = False,
     contains_real_face: bool = False,
 ) -> Suite:
-    """A suite in `folder` in which every pair is asked for both ways: neither pictures nor words alone tell.
+    """Make a suite in `folder` in which every pair is asked for both ways: neither pictures nor words alone tell.
 
-    The first picture lies left and right in turn.
+    The first picture lies left and right in turn. Pairs that share a file share a group, and folds never separate
+    them.
 
-    Nothing is written then.
-
-    pair = PicturePair("living-world", "fox", Path("fox.jpg"), "hare", Path("hare.jpg")) suite =
-    suite_from_pictures("suites/mine", [pair], name="mine", license="CC-BY-4.0", attribution="me")
+    pair = PicturePair("living-world", "fox", Path("fox.jpg"), "hare", Path("hare.jpg"))
+    suite = suite_from_pictures("suites/mine", [pair], name="mine", license="CC-BY-4.0", attribution="me")
 
     Args:
-        license: An SPDX name, or whatever says what others may do with the pictures. Pairs that share a file share
-            a group, and folds never separate them.
+        folder: Folder to write; new or empty, or with this very suite. After an error, nothing is written.
+        pairs: Pairs of pictures, each once; the suite asks every pair both ways.
+        name: Name of the suite.
+        version: Version of the suite, such as `1.0.0`.
+        license: SPDX name of a licence, or another text that says what others may do with the pictures.
+        attribution: Author to credit for the pictures.
+        redistributable: Whether others may pass the pictures on.
+        contains_real_face: Whether some pictures show real people.
 
     Raises:
         UsageError: For no pair, a pair asked twice or an impossible category name.
         SuiteError: For a picture that cannot be read, for questions that break a rule of the format, or if
-            `folder` holds anything else.
+            `folder` contains anything else.
     """
     if not pairs:
         raise UsageError("no pair of pictures given; expected at least one PicturePair")
@@ -212,20 +238,24 @@ def suite_from_csv(
     category: str = DEFAULT_CATEGORY,
     terms: Terms,
 ) -> Suite:
-    """The suite in `folder` that asks what the rows of `table` say; the answer lies left and right in turn.
+    """Make a suite in `folder` of the questions in the rows of `table`; the answer lies left and right in turn.
 
-    Columns `instruction`, `correct` and `wrong` are needed; `group`, `category` (otherwise `category`), `object`
-    (otherwise what follows "on the" in the instruction) and `other_object` may be there.
+    Columns `instruction`, `correct` and `wrong` are needed. Optional columns are `group`, `category` (otherwise
+    the argument `category`), `object` (otherwise the words after "on the" in the instruction) and `other_object`.
 
-    Nothing is written then.
+    Two rows over the same two pictures that ask the other way round are twins.
 
     Args:
-        name: Of the suite; None for the table's. Two rows over the same two pictures that ask the other way round
-            are twins.
+        table: CSV file with a row per question; paths of pictures are relative to it.
+        folder: Folder to write; new or empty, or with this very suite. After an error, nothing is written.
+        name: Name of the suite; None for the table's file name.
+        version: Version of the suite, such as `1.0.0`.
+        category: Category of rows that name none.
+        terms: Terms of use of the pictures.
 
     Raises:
-        UsageError: Naming the line for a table that cannot be used.
-        SuiteError: For a picture that cannot be read, questions that break a rule, or a `folder` that holds
+        UsageError: For a table that cannot be used; the message names the line.
+        SuiteError: For a picture that cannot be read, questions that break a rule, or a `folder` that contains
             anything else.
     """
     table = Path(table)
@@ -267,7 +297,11 @@ def _ask_rows(questions: _Questions, drawn: Sequence[tuple[Row, Picture, Picture
 
 
 def _picture(questions: _Questions, table: Path, row: Row, column: str) -> Picture:
-    """A row's picture. Raises SuiteError naming line, column and the folder that was searched."""
+    """Return the picture in one column of a row.
+
+    Raises:
+        SuiteError: If it cannot be read; the message names the line, the column and the folder that was searched.
+    """
     path = row.correct if column == "correct" else row.wrong
     where = f"{table}, line {row.line}, column {column}"
     if not path.is_file():
@@ -282,7 +316,11 @@ def _picture(questions: _Questions, table: Path, row: Row, column: str) -> Pictu
 
 
 def read_rows(table: Path, category: str = DEFAULT_CATEGORY) -> list[Row]:
-    """The rows of the table, one per question. Raises UsageError, naming the line that cannot be used."""
+    """Read the rows of the table, one per question.
+
+    Raises:
+        UsageError: For a line that cannot be used; the message names it.
+    """
     opened = open_table(table, COLUMNS)
     headings = [column for column in opened.names if column]
     missing = [column for column in COLUMNS if column not in headings]
@@ -307,7 +345,11 @@ def read_rows(table: Path, category: str = DEFAULT_CATEGORY) -> list[Row]:
 
 
 def _check_contradictions(rows: Sequence[Row], table: Path) -> None:
-    """Raise UsageError for a question that is asked twice, or with another answer."""
+    """Refuse a question that is asked twice, or with another answer.
+
+    Raises:
+        UsageError: For a question that comes twice, with the same answer or the opposite one.
+    """
     lines: dict[tuple[str, Path, Path], int] = {}
     for row in rows:
         first = lines.setdefault((row.instruction, row.correct, row.wrong), row.line)
@@ -349,7 +391,7 @@ def _row(record: Mapping[str, str | None], line: int, opened: TextTable, categor
 
 
 def _object_of(instruction: str) -> str | None:
-    """The words behind the first "on" or "onto", without their article."""
+    """Return the words behind the first "on" or "onto", without their article."""
     words = instruction.split()
     for number, word in enumerate(words):
         if word.lower() in ("on", "onto"):

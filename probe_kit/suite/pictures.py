@@ -17,13 +17,13 @@ from probe_kit._system.bounded_files import read_regular
 from probe_kit.errors import ProbeKitError, SuiteError
 
 RESTORE = "Restore the suite's files or build it again."
-"""What to do about a picture of a suite."""
+"""Advice on a broken picture of a suite, for messages."""
 WHITE = (255, 255, 255)
 LARGEST_PICTURE = 8192
-"""Pixels of the longer side: a few kilobytes can claim to be a picture that fills all memory once decoded."""
+"""Most pixels of the longer side: a few kilobytes can claim to be a picture that fills all memory once decoded."""
 
 JPEG_QUALITY = 95
-"""Of a round trip that controls use."""
+"""Quality of the JPEG round trip that controls use."""
 FORMATS = ("PNG", "JPEG", "WEBP", "GIF", "BMP")
 """Formats that are decoded, as Pillow names them."""
 
@@ -34,7 +34,7 @@ _DECODING_ERRORS = (
 )  # fmt: skip
 _PNG = b"\x89PNG\r\n\x1a\n"
 _PNG_DEPTH = 24
-"""Place of the byte that holds the bits per channel of a PNG."""
+"""Position of the byte with the bits per channel of a PNG."""
 _REFUSED = (
     (b"II*\0", "TIFF"), (b"MM\0*", "TIFF"), (b"II+\0", "TIFF"), (b"MM\0+", "TIFF"), (b"%PDF", "PDF"),
     (b"8BPS", "Photoshop"), (b"\0\0\1\0", "ICO"), (b"\0\0\2\0", "CUR"), (b"<svg", "SVG"), (b"<?xml", "SVG or XML"),
@@ -48,7 +48,7 @@ _REFUSED = (
 
 
 def pixels_sha256(image: Image.Image) -> str:
-    """Hex sha256 of `W,H,RGB;` and the raw RGB bytes: the same for every lossless encoding."""
+    """Return the hex sha256 of `W,H,RGB;` and the raw RGB bytes: the same for every lossless encoding."""
     rgb = image.convert("RGB")
     digest = hashlib.sha256(f"{rgb.width},{rgb.height},RGB;".encode())
     digest.update(rgb.tobytes())
@@ -56,12 +56,12 @@ def pixels_sha256(image: Image.Image) -> str:
 
 
 def picture_file_name(pixels_sha256: str) -> str:
-    """Return the file name of a picture inside `items/`; the name gives away nothing but its content."""
+    """Return the file name of a picture inside `items/`; the name identifies nothing but its content."""
     return f"images/{pixels_sha256[:2]}/{pixels_sha256[:16]}.png"
 
 
 def encode_png(image: Image.Image) -> bytes:
-    """The picture as PNG bytes that depend on its RGB pixels alone; no metadata is kept."""
+    """Return the picture as PNG bytes that depend on its RGB pixels alone; no metadata is kept."""
     rgb = image.convert("RGB")
     bare = Image.frombytes("RGB", rgb.size, rgb.tobytes())
     buffer = BytesIO()
@@ -70,7 +70,7 @@ def encode_png(image: Image.Image) -> bytes:
 
 
 def picture_size(encoded: bytes) -> tuple[int, int] | None:
-    """Width and height in pixels as the file's header states them, None if it is not a picture of `FORMATS`."""
+    """Return width and height in pixels from the file's header; None if it is no picture of `FORMATS`."""
     try:
         with _opened(encoded) as image:
             return image.size
@@ -79,13 +79,14 @@ def picture_size(encoded: bytes) -> tuple[int, int] | None:
 
 
 def load_picture(path: Path, pixels: str | None = None) -> Image.Image:
-    """A square RGB picture, upright, on white; the shorter side is padded with white.
+    """Read a square RGB picture, upright, on white; the shorter side is padded with white.
 
     Args:
-        pixels: The hash its pixels must have.
+        path: File of the picture.
+        pixels: Hash that its pixels must have; None for no check.
 
     Raises:
-        SuiteError: As `decode_picture` does, and for other pixels.
+        SuiteError: For pixels with another hash, and as `decode_picture`.
     """
     picture = decode_picture(path)
     if pixels is not None and (other := pixels_sha256(picture)) != pixels:
@@ -96,10 +97,10 @@ def load_picture(path: Path, pixels: str | None = None) -> Image.Image:
 
 
 def decode_picture(path: Path) -> Image.Image:
-    """The RGB picture in a file, as `decode_bytes` has it.
+    """Read the RGB picture in a file, see `decode_bytes`.
 
     Raises:
-        SuiteError: Naming the file if it is missing or cannot be decoded.
+        SuiteError: If the file is missing or cannot be decoded; the message names it.
     """
     try:
         encoded = read_regular(path)
@@ -117,16 +118,22 @@ def decode_bytes(
     upright: bool = True,
     largest: int = LARGEST_PICTURE,
 ) -> Image.Image:
-    """An RGB picture in its own size from the bytes of a file of `FORMATS`.
+    """Return an RGB picture in its own size from the bytes of a file of `FORMATS`.
 
     The orientation of EXIF is applied, and transparency becomes white. Palettes and grey become RGB. CMYK becomes
     RGB by Pillow's formula, without a colour profile.
 
+    Raises `error` for another format, damaged or incomplete bytes, a larger picture, several frames, and more than
+    8 bits per channel.
+
     Args:
-        name: What the picture is, at the beginning of messages.
-        upright: False for textures, whose orientation belongs to their mesh.
-        largest: Pixels of the longer side. Raises `error` for another format, damaged or incomplete bytes, a
-            larger picture, several frames, and more than 8 bits per channel.
+        encoded: Bytes of the file.
+        name: Description of the picture, at the beginning of messages.
+        error: Class of the exceptions.
+        remedy: Advice at the end of messages.
+        upright: Whether to apply the orientation of EXIF; False for textures, whose orientation belongs to their
+            mesh.
+        largest: Most pixels of the longer side.
     """
     if refused := _refused_format(encoded):
         raise error(
@@ -146,11 +153,11 @@ def decode_bytes(
 
 
 def rgb_of(image: Image.Image, name: str, remedy: str) -> Image.Image:
-    """The RGB pixels of a picture that another library opened: transparency becomes white.
+    """Return the RGB pixels of a picture that another library opened: transparency becomes white.
 
     Raises:
         SuiteError: For a format outside `FORMATS`, a picture that is too large or has several frames, more than 8
-            bits per channel, and damaged bytes.
+            bits per channel, or damaged bytes.
     """
     if image.format not in (None, *FORMATS):
         raise SuiteError(f"{name} is {image.format}; expected one of {', '.join(FORMATS)}. {remedy}")
@@ -163,23 +170,24 @@ def rgb_of(image: Image.Image, name: str, remedy: str) -> Image.Image:
 
 
 def through_jpeg(pixels: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-    """Return (H, W, 3) uint8 as they are after JPEG of `JPEG_QUALITY`: a change that means nothing."""
+    """Return pixels (H, W, 3) uint8 as they are after JPEG of `JPEG_QUALITY`: a change without meaning."""
     buffer = BytesIO()
     Image.fromarray(pixels).save(buffer, "JPEG", quality=JPEG_QUALITY)
     return np.asarray(decode_bytes(buffer.getvalue(), "a JPEG round trip:", largest=max(pixels.shape))).copy()
 
 
 def stored_picture(path: Path, mode: str) -> Image.Image:
-    """A picture of this package, whose transparency is part of it. mode: of Pillow, such as RGBA."""
+    """Read a picture of this package, whose transparency is part of it, in a `mode` of Pillow such as RGBA."""
     with _opened(path.read_bytes()) as image:
         return image.convert(mode)
 
 
 @contextmanager
 def _opened(encoded: bytes) -> Iterator[Image.Image]:
-    """A picture of `FORMATS` that is decoded wholly or not at all, whatever other libraries set for Pillow.
+    """Open a picture of `FORMATS` that is decoded wholly or not at all, whatever other libraries set for Pillow.
 
-    Pillow warns of a huge picture when it is opened; we refuse it, and need its size to say so.
+    Pillow warns of a huge picture when it is opened. Here it is refused instead, and its size is needed for the
+    message.
     """
     incomplete, ImageFile.LOAD_TRUNCATED_IMAGES = ImageFile.LOAD_TRUNCATED_IMAGES, False
     try:
@@ -193,7 +201,7 @@ def _opened(encoded: bytes) -> Iterator[Image.Image]:
 
 
 def _refused_format(encoded: bytes) -> str | None:
-    """The name of a known format that is not decoded."""
+    """Return the name of a known format that is not decoded; None for other bytes."""
     start = encoded[:64].lstrip(b"\xef\xbb\xbf \t\r\n") if encoded[:1] in b"\xef <\t\r\n" else encoded[:64]
     if encoded[4:8] == b"ftyp":
         return "AVIF" if encoded[8:12] in (b"avif", b"avis") else "HEIF"
@@ -219,7 +227,7 @@ def _check_deep(image: Image.Image, encoded: bytes, name: str, error: type[Probe
 
 
 def on_white(image: Image.Image) -> Image.Image:
-    """An RGB picture: transparency becomes white."""
+    """Return an RGB picture: transparency becomes white."""
     if not image.has_transparency_data:
         return image.convert("RGB")
     rgba = image.convert("RGBA")
@@ -229,7 +237,7 @@ def on_white(image: Image.Image) -> Image.Image:
 
 
 def letterboxed(image: Image.Image) -> Image.Image:
-    """The picture in the middle of a white square as large as its longer side."""
+    """Return the picture in the middle of a white square as large as its longer side."""
     side = max(image.size)
     if image.size == (side, side):
         return image
@@ -239,7 +247,7 @@ def letterboxed(image: Image.Image) -> Image.Image:
 
 
 def difference_hash(image: Image.Image) -> int:
-    """64 bits that say where brightness falls from left to right; nearly equal for nearly equal pictures."""
+    """Return 64 bits that say where brightness falls from left to right; similar for similar pictures."""
     small = image.convert("L").resize((9, 8), Image.Resampling.LANCZOS).tobytes()
     bits = 0
     for row in range(8):
@@ -249,16 +257,18 @@ def difference_hash(image: Image.Image) -> int:
 
 
 NEAR_DUPLICATE_BITS = 4
-"""Of the 64 of a difference hash."""
+"""Most bits, of the 64 of a difference hash, in which nearly equal pictures differ."""
 _BLOCKS = 8
 _SAME_COLOUR = 24.0  # levels, mean over channels, in every one of 8 × 8 blocks
 
 
 @dataclass(frozen=True)
 class Look:
-    """Pixels, brightness and, as one shape comes in several colours, colour.
+    """The look of a picture: pixels, brightness and, as one shape comes in several colours, colour.
 
     Attributes:
+        pixels_sha256: Hash of the pixels.
+        brightness: Difference hash of the brightness.
         colours: (8, 8, 3) float64, the mean colour of every block, 0 to 255.
     """
 
@@ -276,6 +286,6 @@ class Look:
 
 
 def look_of(image: Image.Image) -> Look:
-    """The look of one picture."""
+    """Compute the look of one picture."""
     blocks = image.convert("RGB").resize((_BLOCKS, _BLOCKS), Image.Resampling.BOX)
     return Look(pixels_sha256(image), difference_hash(image), np.asarray(blocks, np.float64))

@@ -1,6 +1,6 @@
-"""E01 to E15: the lines of `metadata.jsonl`, the card, every item, and the suite as a whole.
+"""Rules E01 to E15: the lines of `metadata.jsonl`, the card, every item, and the suite as a whole.
 
-E01 to E04 look at records before items are made of them. Every other rule has one shape, a Suite in and findings
+E01 to E04 check records before items are made of them. Every other rule has one shape, a Suite in and findings
 out. Those in `LOADING_RULES` run each time a suite is opened; they are fast, because pictures are hashed but not
 decoded. `DECODING_RULES` run in `validate_suite`.
 """
@@ -40,17 +40,17 @@ class Finding:
 
 
 def error(rule: str, where: str, message: str) -> Finding:
-    """A finding that makes the suite unusable."""
+    """Make a finding that makes the suite unusable."""
     return Finding(rule, "error", where, message)
 
 
 def warning(rule: str, where: str, message: str) -> Finding:
-    """A finding that results survive, if one knows of it."""
+    """Make a finding with which results are still valid, if it is known."""
     return Finding(rule, "warning", where, message)
 
 
 def listing(findings: Iterable[Finding]) -> str:
-    """The findings as lines sorted by rule, at most 20 of each rule and then how many more there are."""
+    """Return the findings as lines sorted by rule, at most 20 of each rule and then how many more there are."""
     lines = []
     for rule, same_rule in groupby(sorted(findings, key=attrgetter("rule")), key=attrgetter("rule")):
         lines_of_rule = [str(finding) for finding in same_rule]
@@ -65,9 +65,9 @@ def listing(findings: Iterable[Finding]) -> str:
 
 SCHEMA_MAJOR = "1"
 LONGEST_FIELD = 4096
-"""Characters of any text in a record; only an attribution comes anywhere near."""
+"""Most characters of any text in a record; only an attribution comes near."""
 LONGEST_NAME = 255
-"""Bytes of a file name or id, as file systems have it."""
+"""Most bytes of a file name or id, as in file systems."""
 _NAMES = ("item_id", "left_file_name", "right_file_name", "group_id", "pair_id")
 
 _ENUMS: dict[str, tuple[str, ...]] = {
@@ -86,7 +86,7 @@ _REQUIRED = [f.name for f in fields(Item) if f.default is MISSING and f.default_
 
 
 def parse_line(line: bytes, where: str) -> dict[str, Any] | Finding:
-    """E01: the JSON object on one line, or why it is none."""
+    """Check E01: return the JSON object on one line, or why there is none."""
     try:
         record = parse_json(line)
     except ValueError as problem:
@@ -105,7 +105,7 @@ def _is_finite(value: object) -> bool:
 
 
 def check_card(card: dict[str, Any]) -> Iterator[Finding]:
-    """E02 for `suite.json`: it holds what identifies a suite."""
+    """Check E02 for `suite.json`: it has the fields that identify a suite."""
     for name, expected in _CARD_TYPES.items():
         if not isinstance(card.get(name), expected):
             yield error(
@@ -116,7 +116,7 @@ def check_card(card: dict[str, Any]) -> Iterator[Finding]:
 
 
 def check_record(record: dict[str, Any], where: str) -> Iterator[Finding]:
-    """E02: every field is there, has its type, and is one of the values it may have."""
+    """Check E02: every field is present, has its type, and has one of its allowed values."""
     for name in _REQUIRED:
         expected = _TYPES.get(name, str)
         if name not in record:
@@ -148,7 +148,10 @@ def _check_wordings(wordings: object, where: str) -> Iterator[Finding]:
 
 
 def _check_text(name: str, text: str, where: str) -> Iterator[Finding]:
-    """E02: no text is endless, holds what a terminal would obey, or looks like another that is other bytes."""
+    """Check E02: no text is endless, contains terminal control characters, or looks like other bytes.
+
+    A text in decomposed characters looks like the same text in Unicode's form NFC.
+    """
     longest = LONGEST_NAME if name in _NAMES else LONGEST_FIELD
     if len(text.encode(errors="replace")) > longest:
         yield error("E02", where, f"field {name!r} has {len(text)} characters; expected at most {longest}")
@@ -161,14 +164,14 @@ def _check_text(name: str, text: str, where: str) -> Iterator[Finding]:
 
 
 def check_schema(record: dict[str, Any], where: str) -> Iterator[Finding]:
-    """E03: the record follows a schema this tool can read."""
+    """Check E03: the record follows a schema that this tool can read."""
     version = str(record.get("schema_version", "none"))
     if version.split(".")[0] != SCHEMA_MAJOR:
         yield error("E03", where, f"uses schema {terminal_safe(version[:80])}; this tool reads {SCHEMA_MAJOR}.x")
 
 
 def unique_ids(lines_of: Mapping[str, Sequence[int]]) -> Iterator[Finding]:
-    """E04: no id is that of two items; `lines_of` holds the line numbers of each."""
+    """Check E04: no two items have one id; `lines_of` are the line numbers of each."""
     for item_id, lines in lines_of.items():
         if len(lines) > 1:
             listed = ", ".join(map(str, lines[:-1]))
@@ -180,15 +183,18 @@ def unique_ids(lines_of: Mapping[str, Sequence[int]]) -> Iterator[Finding]:
 
 SMALLEST_PICTURE = 64
 MOST_PICTURE_BYTES = 64 << 20
-"""Of a picture's file; a photograph of the largest size has a tenth of it."""
+"""Most bytes of a picture's file; a photograph of the largest size has a tenth of it."""
 MOST_PIXELS = 1 << 37
-"""Of all pictures of a suite: 2,048 of the largest size, or 200,000 of 800 × 800. Half a day to decode."""
+"""Most pixels of all pictures of a suite: 2,048 of the largest size, or 200,000 of 800 × 800.
+
+They take half a day to decode.
+"""
 SIGN_CATEGORIES = ("traffic", "public-info")  # a sign may be named after a side
 SIDES: tuple[Side, Side] = ("left", "right")
 
 
 def pictures_unchanged(suite: Suite) -> Iterator[Finding]:
-    """E05 to E07: every picture is a file inside the suite, has the recorded bytes, and is large enough.
+    """Check E05 to E07: every picture is a file inside the suite, has the recorded bytes, and is large enough.
 
     All pictures together have at most `MOST_PIXELS`.
     """
@@ -240,14 +246,17 @@ def _check_size(encoded: bytes, item: Item, side: Side) -> Generator[Finding, No
 
 
 def sides_differ(suite: Suite) -> Iterator[Finding]:
-    """E08: the two pictures of an item are different ones."""
+    """Check E08: the two pictures of an item are different."""
     for item in suite.items:
         if item.left_pixels_sha256 == item.right_pixels_sha256:
             yield error("E08", f"item {item.item_id}", "both sides are the same picture")
 
 
 def instruction_names_object(suite: Suite) -> Iterator[Finding]:
-    """E09: one short line without a full stop that contains the object phrase. A source's own may be long."""
+    """Check E09: the instruction is one short line without a full stop that contains the object phrase.
+
+    A source's own instruction may be long.
+    """
     for item in suite.items:
         words = len(item.instruction.split())
         problems = {
@@ -269,7 +278,10 @@ def instruction_names_object(suite: Suite) -> Iterator[Finding]:
 
 
 def no_side_words(suite: Suite) -> Iterator[Finding]:
-    """E10: no side is named, except by signs and a source's own questions marked `side_word` (W07 lists them)."""
+    """Check E10: no side is named, except by signs and a source's own questions marked `side_word`.
+
+    W07 lists those.
+    """
     for item in suite.items:
         if item.side_word and item.rule_id == VERBATIM:
             continue
@@ -286,7 +298,7 @@ def no_side_words(suite: Suite) -> Iterator[Finding]:
 
 
 def concepts_differ(suite: Suite) -> Iterator[Finding]:
-    """E11: the wrong picture does not show what is asked for."""
+    """Check E11: the wrong picture does not show the requested concept."""
     for item in suite.items:
         if item.target_concept == item.distractor_concept:
             message = f"target and distractor concept are both {item.target_concept!r}"
@@ -294,7 +306,7 @@ def concepts_differ(suite: Suite) -> Iterator[Finding]:
 
 
 def groups_closed(suite: Suite) -> Iterator[Finding]:
-    """E12: items that share a picture or are twins are in the same group."""
+    """Check E12: items that share a picture or are twins are in the same group."""
     first_with: dict[str, Item] = {}
     for item in suite.items:
         for tie in ties(item):
@@ -305,7 +317,7 @@ def groups_closed(suite: Suite) -> Iterator[Finding]:
 
 
 def card_agrees(suite: Suite) -> Iterator[Finding]:
-    """E13: counts, and the hash of name, version and items, are those of `suite.json`."""
+    """Check E13: counts, and the hash of name, version and items, are those of `suite.json`."""
     recorded = suite.card["counts"], suite.card["content_sha256"]
     counted = count_by_category(suite.items), suite.content_sha256
     for what, expected, actual in zip(("count per category", "content hash"), recorded, counted, strict=True):
@@ -314,7 +326,7 @@ def card_agrees(suite: Suite) -> Iterator[Finding]:
 
 
 def license_present(suite: Suite) -> Iterator[Finding]:
-    """E14: every item has a licence, and a licence that forbids passing pictures on is marked so."""
+    """Check E14: every item has a licence, and a licence that forbids passing pictures on is marked so."""
     for item in suite.items:
         if not item.license.strip():
             yield error("E14", f"item {item.item_id}", "licence missing")
@@ -324,7 +336,7 @@ def license_present(suite: Suite) -> Iterator[Finding]:
 
 
 def real_faces_declared(suite: Suite) -> Iterator[Finding]:
-    """E15: the card says whether there are pictures of real people."""
+    """Check E15: the card says whether there are pictures of real people."""
     declared = bool(suite.card.get("contains_real_faces", False))
     with_face = [item.item_id for item in suite.items if item.contains_real_face]
     if with_face and not declared:
@@ -347,7 +359,7 @@ LOADING_RULES: Sequence[Callable[[Suite], Iterator[Finding]]] = (
 
 
 def pixels_as_recorded(suite: Suite) -> Iterator[Finding]:
-    """E07: every picture decodes, and E06: to the recorded pixels."""
+    """Check E07: every picture decodes; and E06: it decodes to the recorded pixels."""
     checked: set[tuple[str, str]] = set()
     for item in suite.items:
         recorded = {"left": item.left_pixels_sha256, "right": item.right_pixels_sha256}

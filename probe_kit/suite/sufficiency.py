@@ -1,6 +1,7 @@
 """The uses for which a suite has enough items: success rate, probes, retention, verdicts, interventions.
 
-A plan says it before any work; what refuses later goes by the same numbers, see `statistics.sufficiency`.
+A plan states it before any work. The later commands that refuse too few items use the same numbers, see
+`statistics.sufficiency`.
 """
 
 from collections.abc import Iterator
@@ -33,16 +34,16 @@ __all__ = [
 
 
 MARGIN = 0.1
-"""Margin of a success rate that the plan gives a number of items for."""
+"""Margin of a success rate for which the plan gives a number of items."""
 
 
 @dataclass(frozen=True)
 class Sufficiency:
-    """One thing that items are to be enough for.
+    """One use for which there must be enough items.
 
     Attributes:
-        enough: Whether it is, None where it is a matter of degree.
-        words: Why, and how many items are enough.
+        enough: Whether there are enough items; None where it is a matter of degree.
+        words: The reason, and how many items are enough.
     """
 
     name: str
@@ -52,7 +53,13 @@ class Sufficiency:
 
 @dataclass(frozen=True)
 class Smallest:
-    """The category with the fewest independent groups. suite: the one that the items were selected from."""
+    """The category with the fewest independent groups.
+
+    Attributes:
+        items: Number of its items.
+        groups: Number of its independent groups.
+        suite: The suite that the items were selected from.
+    """
 
     category: str
     items: int
@@ -75,7 +82,7 @@ class Smallest:
         return f"{self.category}: {counted(self.items, 'item')} in {counted(self.groups, 'independent group')}"
 
     def items_for(self, groups: int) -> int | None:
-        """The fewest items that `--items` can select with so many groups; None if the whole suite lacks them."""
+        """Return the fewest items that `--items` can select with so many groups; None if the suite lacks them."""
         items = [item for item in self.suite.items if item.category == self.category]
         for number in range(1, len(items) + 1):
             apart = {member.pair_id for member in items[:number]} & {member.pair_id for member in items[number:]}
@@ -84,7 +91,13 @@ class Smallest:
         return None
 
     def has(self, groups: int, otherwise: str, at_best: bool = False) -> tuple[bool, str]:
-        """Tell whether there are so many groups, and what follows. otherwise: what happens with fewer."""
+        """Tell whether there are so many groups, and what follows.
+
+        Args:
+            groups: Number of groups that are needed.
+            otherwise: Consequence of fewer groups, in words.
+            at_best: Whether so many groups only make the use possible.
+        """
         need = f"{self.groups} groups of {groups} needed"
         if self.groups >= groups:
             return True, f"{'possible' if at_best else 'yes'}, {need}"
@@ -100,6 +113,7 @@ def sufficiencies(suite: Suite, scored: bool, probed: bool) -> Iterator[Sufficie
     """Yield the uses for which the smallest category of `suite` has enough items, or too few.
 
     Args:
+        suite: Suite whose items are used.
         scored: Whether there will be success rates.
         probed: Whether there will be activations.
     """
@@ -122,5 +136,5 @@ def sufficiencies(suite: Suite, scored: bool, probed: bool) -> Iterator[Sufficie
 
 
 def _chances(groups: int) -> str:
-    """The smallest p where the groups decide it; of more groups the command that simulates the power."""
+    """Return the smallest p where the groups decide it; for more groups the command that simulates the power."""
     return f", p from {least_probe_p(groups):.2g}" if groups < ENUMERATED_BELOW else "; power: `probe-kit power`"

@@ -23,7 +23,10 @@ from probe_kit.version import __version__
 
 
 def questions_sha256(items: Iterable[Item]) -> str:
-    """Hex sha256 of what the items ask and show, and of their groups, in any order. Seeds are made of it."""
+    """Return the hex sha256 of what the items ask and show, and of their groups, in any order.
+
+    Seeds are made of it.
+    """
     return _sha256_of_lines(item.question for item in _by_id(items))
 
 
@@ -36,15 +39,15 @@ def _sha256_of_lines(records: Iterable[dict[str, str]]) -> str:
 
 
 def count_by_category(items: Iterable[Item]) -> dict[str, int]:
-    """Number of items per category slug, in the order of `in_order`."""
+    """Return the number of items per category name, in the order of `in_order`."""
     counts = Counter(item.category for item in items)
     return {slug: counts[slug] for slug in in_order(counts)}
 
 
 def missing_categories(items: Iterable[Item]) -> list[str]:
-    """Slugs of the twelve categories without any item: an average over the others must say so.
+    """Return the names of the twelve categories without any item: an average over the others must say so.
 
-    None of questions of one's own alone, which are not measured against these categories.
+    None are missing in a suite of one's own categories alone, which is not measured against the twelve.
     """
     present = count_by_category(items)
     if not any(slug in CATEGORIES for slug in present):
@@ -54,10 +57,11 @@ def missing_categories(items: Iterable[Item]) -> list[str]:
 
 @dataclass(frozen=True)
 class Suite:
-    """Items with a name, a version and a content hash; `card` is what `suite.json` says about them.
+    """Items with a name, a version and a content hash.
 
     Attributes:
-        selected_from: The suite that `select` chose these items from, None for a whole suite.
+        card: Content of `suite.json`.
+        selected_from: The suite from which `select` chose these items; None for a whole suite.
     """
 
     name: str
@@ -73,35 +77,36 @@ class Suite:
 
     @cached_property
     def content_sha256(self) -> str:
-        """Hex sha256 of the suite's identity, see `content_sha256_of`."""
+        """The hex sha256 of the suite's identity, see `content_sha256_of`."""
         return self.content_sha256_of(self.items)
 
     def content_sha256_of(self, items: Iterable[Item]) -> str:
-        """Hex sha256 of name, version, format, and the content of items in any order: its own, or some of them.
+        """Return the hex sha256 of name, version, format, and the content of items in any order.
 
-        Suites are compared by this hash. Seeds come from `questions_sha256`, which pairs and versions leave alone.
+        The items are those of the suite, or some of them. Suites are compared by this hash. Seeds come from
+        `questions_sha256`, which does not depend on pairs and versions.
         """
         head = {"name": self.name, "version": self.version, "schema_version": self.schema_version}
         return _sha256_of_lines([head, *(item.content for item in _by_id(items))])
 
     @cached_property
     def questions_sha256(self) -> str:
-        """Hex sha256 of what the items ask and show, see `questions_sha256`."""
+        """The hex sha256 of what the items ask and show, see `questions_sha256`."""
         return questions_sha256(self.items)
 
     @property
     def schema_version(self) -> str:
-        """Version of the format that `suite.json` names."""
+        """The version of the format that `suite.json` names."""
         return str(self.card.get("schema_version", SCHEMA_VERSION))
 
     @property
     def identity(self) -> str:
-        """`name@version#first12`, as results name the suite they were made with."""
+        """The name `name@version#first12` under which results name the suite that they were made with."""
         return f"{self.name}@{self.version}#{self.content_sha256[:12]}"
 
     @property
     def seed_text(self) -> str:
-        """`name@version#first12` of the questions: what intervals and p values of the suite are seeded with.
+        """The text `name@version#first12` of the questions; it seeds the suite's intervals and p values.
 
         Two suites of one name and version that differ in pairs alone give the same draws.
         """
@@ -109,30 +114,30 @@ class Suite:
 
     @property
     def parent(self) -> str | None:
-        """Content hash of the suite this one was selected from, None for a whole suite."""
+        """The content hash of the suite that this one was selected from; None for a whole suite."""
         return self.card.get("parent")
 
     @property
     def complete(self) -> "Suite":
-        """The suite that this one was selected from, itself for a whole suite."""
+        """The suite that this one was selected from; the suite itself if it is whole."""
         return self if self.selected_from is None else self.selected_from.complete
 
     @property
     def categories(self) -> tuple[str, ...]:
-        """Slugs of the categories that have items, in the order of `in_order`."""
+        """The names of the categories that have items, in the order of `in_order`."""
         return tuple(count_by_category(self.items))
 
     def episodes(self) -> list[Episode]:
-        """Every item in both layouts, in the order of the items."""
+        """Return every item in both layouts, in the order of the items."""
         return [Episode(item, layout) for item in self.items for layout in LAYOUTS]
 
     def select(self, categories: Sequence[str] | None = None, items_per_category: int | None = None) -> "Suite":
-        """The first items of some categories, as a suite with its own hash and this one as its parent.
+        """Select the first items of some categories, as a suite with its own hash and this one as its parent.
 
         Raises:
             UnknownCategoryError: For a category the suite lacks.
-            UsageError: For a number that is not positive, exceeds what a category has, or would separate
-                role-exchanged twins.
+            UsageError: For no category, or a number that is not positive, exceeds what a category has, or would
+                separate role-exchanged twins.
         """
         selected = self.categories if categories is None else check_categories(categories, self.categories)
         if not selected:
@@ -177,10 +182,16 @@ def new_suite(
     options: Mapping[str, Any],
     extra: Mapping[str, Any] | None = None,
 ) -> Suite:
-    """A suite in memory, ready to be saved; `options` are what it was built or converted with.
+    """Make a suite in memory, ready to be saved.
+
+    The card has no date: the same options give the same bytes.
 
     Args:
-        extra: What else its card shall say. The card holds no date: the same options give the same bytes.
+        name: Name of the suite.
+        version: Version of the suite, such as `1.0.0`.
+        items: Items with their groups, see `with_groups`.
+        options: Options that the suite was built or converted with.
+        extra: Further entries of its card; None for none.
     """
     card = {
         "name": name,
@@ -203,7 +214,7 @@ def new_suite(
 
 
 def drawing_libraries() -> dict[str, str]:
-    """Versions that the pixels of a drawn picture can depend on."""
+    """Return the versions of libraries on which the pixels of a drawn picture can depend."""
     freetype = features.version("freetype2") or "none"
     return {"pillow": PIL.__version__, "freetype": freetype, "numpy": np.__version__}
 
@@ -215,7 +226,7 @@ _TRANSFER_TYPES = {
     **dict.fromkeys(("shape", "symmetry", "counting", "time", "celebrity"), "moderate"),
     "living-world": "heavy",
 }
-"""Of the paper's categories; `near` for all others."""
+"""Transfer types of the paper's categories; `near` for all others."""
 _LARGEST, _SMALLEST = 512, 224  # pixels of a stored picture's side
 
 
@@ -224,8 +235,8 @@ class Picture:
     """An encoded picture with all that an item records about it.
 
     Attributes:
-        original_pixels: Hash of the pixels that it was made from.
-        operation: What was done to them before.
+        original_pixels: Hash of the pixels that it was made from; empty where they are its own.
+        operation: Description of how those pixels were changed before.
     """
 
     image_id: str
@@ -241,12 +252,12 @@ class Picture:
 
 
 def picture_of(image_id: str, image: Image.Image) -> Picture:
-    """The picture as it is."""
+    """Encode the picture without a change."""
     return Picture(image_id, encode_png(image), pixels_sha256(image))
 
 
 def squared_picture(image_id: str, image: Image.Image, operation: str = "none") -> Picture:
-    """The picture on a white square of 224 to 512 pixels. operation: what was done to it before."""
+    """Encode the picture on a white square of 224 to 512 pixels; `operation` describes earlier changes to it."""
     square = letterboxed(image)
     size = min(max(square.width, _SMALLEST), _LARGEST)
     stored = square if square.width == size else square.resize((size, size), Image.Resampling.BICUBIC)
@@ -254,12 +265,17 @@ def squared_picture(image_id: str, image: Image.Image, operation: str = "none") 
 
 
 def make_item(item_id: str, category: str, side: Side, pictures: tuple[Picture, Picture], **fields: Any) -> Item:
-    """An item whose group is not known yet.
+    """Make an item whose group is not known yet.
+
+    Texts are composed (Unicode's form NFC).
 
     Args:
-        side: Where the correct one of `pictures`, left and right, lies.
-        **fields: All others of an `Item` that are not those of most items. Texts are composed (Unicode's form
-            NFC).
+        item_id: Id of the item.
+        category: Name of the category, the paper's or one's own.
+        side: Side of the correct picture.
+        pictures: The left and the right picture.
+        **fields: Other fields of an `Item`: those without a common value for most items, and those with another
+            value.
     """
     left, right = pictures
     record = {

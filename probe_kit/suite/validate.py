@@ -1,9 +1,9 @@
-"""`validate_suite`: all rules, W01 to W09 and, on request, the leakage checks, in one report.
+"""The check of a suite (`validate_suite`): all rules, W01 to W09 and, on request, the leakage checks.
 
 Leakage: can pictures alone, text alone or a fixed side identify the correct picture? Each baseline predicts the
-correct side of every episode (both layouts of every item), trained on other groups. Chance is one half. A
-category passes if no baseline is further above chance than the interval that a coin has over that many *items*:
-the two layouts of an item are not independent.
+correct side of every episode (both layouts of every item), trained on other groups. Chance is one half. A category
+passes if no baseline is further above chance than the interval of a coin over that many *items*. The two layouts
+of an item are not independent.
 """
 
 import json
@@ -45,14 +45,14 @@ _LEAST_SPREAD = 8.0  # standard deviation of the grey levels
 
 
 def sides_balanced(suite: Suite) -> Iterator[Finding]:
-    """W01: per category, as many answers lie left as right in the original layout."""
+    """Check W01: per category, as many answers lie left as right in the original layout."""
     for category, sides in side_counts(suite.items).items():
         if abs(sides["left"] - sides["right"]) > 1:
             yield warning("W01", category_of(category).title, f"{sides['left']} left / {sides['right']} right")
 
 
 def side_counts(items: Sequence[Item]) -> dict[str, Counter[str]]:
-    """Per category, how often the answer lies on each side of the original layout."""
+    """Return by category how often the answer lies on each side of the original layout."""
     counts: dict[str, Counter[str]] = {category: Counter() for category in count_by_category(items)}
     for item in items:
         counts[item.category][item.correct_side] += 1
@@ -60,7 +60,7 @@ def side_counts(items: Sequence[Item]) -> dict[str, Counter[str]]:
 
 
 def roles_balanced(suite: Suite) -> Iterator[Finding]:
-    """W02: every concept that occurs a few times is target about as often as distractor."""
+    """Check W02: every concept that occurs a few times is target about as often as distractor."""
     for (category, concept), (target, distractor) in role_counts(suite.items).items():
         uses = target + distractor
         if uses >= _FEWEST_USES and min(target, distractor) / uses < LEAST_ROLE_BALANCE:
@@ -69,10 +69,10 @@ def roles_balanced(suite: Suite) -> Iterator[Finding]:
 
 
 def role_counts(items: Sequence[Item]) -> dict[tuple[str, str], tuple[int, int]]:
-    """Per category and concept, how often it is the target and how often the distractor.
+    """Return by category and concept how often it is the target and how often the distractor.
 
-    What the wrong picture shows is what its counterpart asks for, where there is one: a table of one's own names
-    the correct picture alone.
+    Where an item has a counterpart, the concept of its wrong picture is the one that the counterpart asks for. A
+    table of one's own names the correct picture alone.
     """
     twins = counterparts_of(items)
     targets = Counter((item.category, item.target_concept) for item in items)
@@ -87,7 +87,7 @@ def _distractor(item: Item, twin: Item | None) -> str:
 
 
 def pictures_distinct(suite: Suite) -> Iterator[Finding]:
-    """W03: no two pictures of different groups look nearly the same.
+    """Check W03: no two pictures of different groups look nearly the same.
 
     Procedural items are left out: two drawings of one sign or one clock always look alike.
     """
@@ -118,7 +118,7 @@ def _near_duplicates(looks: Sequence[Look]) -> Iterator[tuple[int, int]]:
 
 
 def enough_items(suite: Suite) -> Iterator[Finding]:
-    """W04: at least 30 items per category, and as many as were asked for."""
+    """Check W04: there are at least 30 items per category, and as many as were requested."""
     option = suite.card.get("options", {}).get("items_per_category")
     for category, count in count_by_category(suite.items).items():
         requested = option.get(category) if isinstance(option, dict) else option
@@ -131,7 +131,7 @@ def enough_items(suite: Suite) -> Iterator[Finding]:
 
 
 def enough_groups(suite: Suite) -> Iterator[Finding]:
-    """W09: enough independent groups per category for probes to be trained on some and tested on others."""
+    """Check W09: every category has enough independent groups to train probes on some and test them on others."""
     groups: dict[str, set[str]] = {category: set() for category in suite.categories}
     for item in suite.items:
         groups[item.category].add(item.group_id)
@@ -142,7 +142,7 @@ def enough_groups(suite: Suite) -> Iterator[Finding]:
 
 
 def legible(suite: Suite) -> Iterator[Finding]:
-    """W06: at the size a tile has on the screen, something large enough stands out from the picture's border."""
+    """Check W06: at a tile's size on the screen, something large enough stands out from the picture's border."""
     checked = set()
     for item in suite.items:
         for side in SIDES:
@@ -170,7 +170,7 @@ def _illegible(image: Image.Image) -> str | None:
 
 
 def side_word_signs(suite: Suite) -> Iterator[Finding]:
-    """W07: signs with a side word in their name, which E10 lets pass."""
+    """Report W07: signs with a side word in their name, which E10 lets pass."""
     marked = sorted((item for item in suite.items if item.side_word), key=attrgetter("category", "object_phrase"))
     for (category, phrase), items in groupby(marked, key=attrgetter("category", "object_phrase")):
         message = (
@@ -180,9 +180,10 @@ def side_word_signs(suite: Suite) -> Iterator[Finding]:
 
 
 def categories_meant(suite: Suite) -> Iterator[Finding]:
-    """W08: a category of one's own is not one of the paper's misspelt.
+    """Check W08: a category of one's own is not one of the paper's misspelt.
 
-    Beside categories of the paper alone: questions of one's own may be called as they like.
+    It is checked only next to categories of the paper: in a suite of one's own questions alone, categories may
+    have any name.
     """
     if all(category_of(slug).domain == OWN_DOMAIN for slug in suite.categories):
         return
@@ -225,9 +226,9 @@ class Baseline:
     """The accuracy of one baseline on the correct side in one category.
 
     Attributes:
-        interval: 95 %, groups as the unit.
-        limit: What it may not exceed.
-        grouping: What folds kept together.
+        interval: Low and high of the 95 % interval, groups as the unit.
+        limit: Largest accuracy with which the category passes.
+        grouping: Column of the groups that folds kept together, `group_id` or `pair_id`.
     """
 
     category: str
@@ -251,14 +252,14 @@ class Baseline:
 
 
 def limit_for(items: int) -> float:
-    """0.5 plus the half width of a coin's 95 % interval over that many items."""
+    """Return 0.5 plus the half width of a coin's 95 % interval over that many items."""
     return 0.5 + chance_margin(items)
 
 
 def run_baselines(
     suite: Suite, seed: int = 0, progress: Callable[[int, int], None] | None = None
 ) -> tuple[Baseline, ...]:
-    """Every baseline on every category of the suite that has at least two groups or pairs to learn from."""
+    """Run every baseline on every category that has at least two groups or pairs to learn from."""
     results: list[Baseline] = []
     for number, category in enumerate(suite.categories, start=1):
         results += _category_baselines(suite.select([category]), category, seed)
@@ -268,7 +269,10 @@ def run_baselines(
 
 
 def save_baselines(suite: Suite, baselines: Sequence[Baseline]) -> Path:
-    """`baselines.json` in the suite's folder, with the balance of sides and roles; no part of the suite's hash."""
+    """Write `baselines.json` to the suite's folder, with the balance of sides and roles.
+
+    The file is no part of the suite's hash.
+    """
     path = suite.folder / FILE_NAME
     roles: dict[str, dict[str, dict[str, int]]] = {}
     for (category, concept), (target, distractor) in role_counts(suite.items).items():
@@ -359,7 +363,7 @@ def _statistics(episodes: Sequence[Episode]) -> Array:
 
 
 def _words(episodes: Sequence[Episode]) -> Array:
-    """Hashed bag of the instruction's words."""
+    """Return the hashed bag of the instruction's words."""
     counts = np.zeros((len(episodes), _WORD_BUCKETS))
     for row, episode in enumerate(episodes):
         for word in episode.item.instruction.lower().split():
@@ -394,8 +398,9 @@ class Report:
     """The findings on a suite: violated rules, warnings, and baselines.
 
     Attributes:
-        suite: Its identity, or its folder if the card cannot be read.
-        baselines: None if they were not run.
+        suite: Identity of the suite, or its folder if the card cannot be read.
+        missing: Names of the paper's categories without items.
+        baselines: Results of the baselines; None if they were not run.
     """
 
     suite: str
@@ -405,7 +410,7 @@ class Report:
 
     @property
     def errors(self) -> tuple[Finding, ...]:
-        """Findings that make the suite unusable."""
+        """The findings that make the suite unusable."""
         return tuple(finding for finding in self.findings if finding.severity == "error")
 
     @property
@@ -419,7 +424,7 @@ class Report:
         return not self.errors and all(baseline.ok for baseline in self.baselines or ())
 
     def to_json(self) -> dict[str, Any]:
-        """All of it as plain values, every finding included."""
+        """Return the report as plain values, every finding included."""
         baselines = None if self.baselines is None else [asdict(b) | {"ok": b.ok} for b in self.baselines]
         return {
             "suite": self.suite,
@@ -448,12 +453,15 @@ def validate_suite(
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> Report:
-    """A report on the suite in `folder`.
+    """Check the suite in `folder` and return a report.
 
     Args:
-        baselines: Also runs the leakage gates and stores them in the suite's `baselines.json`; not on a suite with
-            errors.
-        progress: Called with categories done and categories in all.
+        folder: Folder of the suite.
+        baselines: Whether to run the leakage checks too and store them in the suite's `baselines.json`; not done
+            for a suite with errors.
+        seed: Seed of the baselines' folds and trees.
+        progress: Function that is called with the number of categories done and of all categories; None for no
+            reports.
 
     Raises:
         UsageError: If there is no suite.

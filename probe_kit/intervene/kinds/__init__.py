@@ -1,6 +1,6 @@
 """Kinds of intervention, one file each: options, conditions, effects with columns, and the sentence.
 
-A file here, or a module that `register` is called with, is a kind; see `base.Intervention`.
+A file in this folder, or a module that `register` is called with, is a kind; see `base.Intervention`.
 """
 
 from importlib import import_module
@@ -26,7 +26,11 @@ def kind_names() -> tuple[str, ...]:
 
 
 def kind_of(name: str) -> "type[Intervention]":
-    """Return the kind of a name. Raises UsageError for one that does not exist."""
+    """Return the kind of a name.
+
+    Raises:
+        UsageError: For a name that does not exist.
+    """
     if name not in _HOMES:
         raise UsageError(f"unknown kind of intervention {name!r}; expected one of {', '.join(_HOMES)}")
     kind: type[Intervention] = import_module(_HOMES[name]).KIND

@@ -1,4 +1,4 @@
-"""Attention: the share of the acting stream's attention on images, tiles, instruction and state. Descriptive.
+"""Attention: the share of the acting stream's attention on images, tiles, instruction and state; descriptive.
 
 An attended token need not be used, and a used one may get little attention. So this enters no verdict, and nothing
 is edited. Every inference runs twice, with and without recording, and both actions must be bit-identical.
@@ -41,19 +41,22 @@ if TYPE_CHECKING:
     from probe_kit.intervene.sessions import ReplaySession
 
 ATTENTION, ATTENTION_FILE, PATCHES_FILE = "attention", "attention.npz", "attention_patches.npz"
-"""The kind, and its files: shares by role, and those on single patches with where these lie in the picture."""
+"""The kind, and its files: shares by role, and shares of single patches with their places in the picture."""
 ROLES = ("image", *TILES, "language", "state", "special")
-"""Whose tokens are asked about, where a family has them and, of tiles, says which tokens see them."""
+"""Roles that are recorded, where a family has them and, for tiles, says which tokens see them."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class AttentionReadout(Intervention):
-    """Two inferences per episode, or with the readout `per-step` per call of it: clean, and recorded.
+    """Two inferences per episode, or per call with the readout `per-step`: clean, and with attention recorded.
+
+    The role `all` is always recorded. Its difference to 1 is the attention on the acting part's own tokens.
 
     Attributes:
-        roles: Of the backbone's tokens; empty for `ROLES`, as many of them as the family has. `all` is always
-            recorded: what is missing to 1 lies on the acting part's own tokens. Raises UsageError for a role that
-            comes twice.
+        roles: Roles of the backbone's tokens; empty for `ROLES`, as many of them as the family has.
+
+    Raises:
+        UsageError: For a role that comes twice.
     """
 
     kind: ClassVar[str] = ATTENTION
@@ -71,7 +74,11 @@ class AttentionReadout(Intervention):
             raise UsageError(f"roles are {', '.join(self.roles)}; give each once")
 
     def conditions(self, session: "ReplaySession") -> Sequence[Condition]:
-        """Clean, and the same with its attention recorded. Raises UsageError for a role it lacks."""
+        """Return the clean inference, and the same with its attention recorded.
+
+        Raises:
+            UsageError: For a role that the policy lacks.
+        """
         policy, stream = session.policy, backbone_of(session.policy)
         boxes: dict[str, NDArray[np.float32]] = {}
         if policy.interventions.supports("tiles"):
@@ -86,7 +93,7 @@ class AttentionReadout(Intervention):
     def extra_files(
         self, session: "ReplaySession", conditions: Sequence[Condition], outcomes: ConditionOutcomes
     ) -> dict[str, bytes]:
-        """The attention of every inference; the certificate gets the axes of the array.
+        """Return the attention of every inference as files; the certificate gets the axes of the array.
 
         Raises:
             CaptureChangedActionError: If recording changed an action.
@@ -121,7 +128,11 @@ class AttentionReadout(Intervention):
 
     @staticmethod
     def effects(measurement: Measurement) -> "list[AttentionRow]":
-        """Return shares by block, iteration, head and role. Raises RunDamagedError."""
+        """Return shares by block, iteration, head and role.
+
+        Raises:
+            RunDamagedError: If a stored file was changed.
+        """
         return AttentionShares.from_bytes(measurement.read(ATTENTION_FILE)).rows()
 
     @staticmethod
@@ -145,7 +156,7 @@ class AttentionReadout(Intervention):
 
     @staticmethod
     def notes(rows: "Sequence[AttentionRow]") -> list[str]:
-        """Return that it is descriptive, and what tests more."""
+        """Return a note that attention is descriptive, and what tests more."""
         del rows
         return [
             "Attention is descriptive, not causal, and does not enter the verdict. To test what is read, run "
@@ -154,7 +165,11 @@ class AttentionReadout(Intervention):
 
     @staticmethod
     def keys_in_use(run: RunReader) -> set[str]:
-        """Return keys of the stored ones that tables and figures read. Raises RunDamagedError."""
+        """Return keys of the stored interventions that tables and figures read.
+
+        Raises:
+            RunDamagedError: If a stored intervention was changed.
+        """
         return {result.stored.key for result, _ in preferred_attention(run).values()}
 
     def _roles(self, policy: "Policy") -> tuple[str, ...]:
@@ -176,8 +191,9 @@ def attention_recorded(
     """Return the clean inference with attention weights recorded; nothing is changed.
 
     Args:
-        stream: Whose tokens are attended to.
-        boxes: By camera (patches, 4) where its patches lie; empty where the family does not say.
+        stream: Name of the stream whose tokens are attended to.
+        roles: Roles of the recorded shares, in their order.
+        boxes: By camera, the boxes (patches, 4) of its patches; empty where the family does not say.
     """
 
     def play(context: ConditionContext) -> ConditionResult:
@@ -199,7 +215,7 @@ def attention_recorded(
 
 
 def _on_patches(mass: "AttentionMass", masks: Sequence[NDArray[np.bool_]]) -> NDArray[np.float32]:
-    """Return (B, P) shares on the patches of all cameras in turn, means over iterations and heads."""
+    """Return the shares (B, P) on the patches of all cameras in turn, means over iterations and heads."""
     tokens = np.concatenate([np.flatnonzero(mask) for mask in masks])
     shares: list[list[NDArray[np.floating]]] = [[] for _ in range(max(block for block, _ in mass.by_head) + 1)]
     for (block, _), weights in mass.by_head.items():
@@ -213,11 +229,11 @@ class PatchAttention:
     """The attention of N inferences on the P patches of the cameras' pictures.
 
     Attributes:
-        episodes: (N,), as of `AttentionShares`.
-        calls: As `episodes`.
+        episodes: (N,) episode of every inference.
+        calls: (N,) inference of the episode, counted from 0.
         weights: (N, B, P) float16, shares of the acting stream's attention, means over iterations and heads.
-        cameras: (P,) names, those of a camera together.
-        boxes: (P, 4), see `token_boxes`.
+        cameras: (P,) names, with those of one camera together.
+        boxes: (P, 4) places of the patches, see `token_boxes`.
     """
 
     episodes: NDArray[np.str_]
@@ -227,13 +243,16 @@ class PatchAttention:
     boxes: NDArray[np.float32]
 
     def only(self, selected: NDArray[np.bool_]) -> Self:
-        """Some of the inferences. selected: (N,)."""
+        """Return some of the inferences, those where `selected` (N,) is true."""
         return replace(
             self, episodes=self.episodes[selected], calls=self.calls[selected], weights=self.weights[selected]
         )
 
     def on_frame(self, pictures: int) -> Self:
-        """Return it on a frame with the first cameras' pictures side by side: boxes are shares of the frame."""
+        """Return the attention on a frame with the first cameras' pictures side by side.
+
+        Boxes are then shares of the frame.
+        """
         first = list(dict.fromkeys(self.cameras.tolist()))[:pictures]
         visible = np.isin(self.cameras, first)
         offset = np.array([[first.index(name), 0.0] * 2 for name in self.cameras[visible]], np.float32)
@@ -246,7 +265,8 @@ class PatchAttention:
 def stored_patch_attention(run: RunReader) -> dict[str, PatchAttention]:
     """Return by category the patches of the attention that tables read; without those stored without patches.
 
-    Raises RunDamagedError.
+    Raises:
+        RunDamagedError: If a stored intervention was changed.
     """
     stored = {category: result.stored for category, (result, _) in preferred_attention(run).items()}
     read = {
@@ -258,12 +278,13 @@ def stored_patch_attention(run: RunReader) -> dict[str, PatchAttention]:
 
 
 def shares_by_role(mass: "AttentionMass", masks: Sequence[NDArray[np.bool_] | None]) -> NDArray[np.float32]:
-    """(B, I, H, R) shares by block, iteration, head and role.
+    """Return the shares (B, I, H, R) of one observation by block, iteration, head and role.
 
-    NaN where a block is not read in an iteration, and of a role that no token has. Of one observation.
+    NaN where a block is not read in an iteration, and for a role that no token has.
 
     Args:
-        masks: (T,) each, None for no token.
+        mass: Recorded attention of one inference.
+        masks: (T,) tokens of each role; None for a role without tokens.
 
     Raises:
         CaptureError: For blocks with different numbers of heads.
@@ -282,7 +303,7 @@ def shares_by_role(mass: "AttentionMass", masks: Sequence[NDArray[np.bool_] | No
 
 
 def backbone_of(policy: "Policy") -> str:
-    """Name of the stream that the acting stream reads."""
+    """Return the name of the stream that the acting stream reads."""
     name = first_of("backbone", policy.streams.values())
     assert name is not None, "every policy has a backbone"
     return name
@@ -291,22 +312,23 @@ def backbone_of(policy: "Policy") -> str:
 Axis = Literal["block", "iteration", "head", "call"]
 _AXES: Mapping[str, int] = {"block": 1, "iteration": 2, "head": 3}
 CORRECT, OTHER, ACTION = "image.correct", "image.other", "action"
-"""Made of what is stored: the tile of the correct picture, the other one, and the acting stream itself."""
+"""Roles made of the stored ones: the correct picture's tile, the other tile, and the acting stream itself."""
 Shares = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class AttentionShares:
-    """Attention of N inferences. roles: names of R, the first one `all`.
+    """Attention of N inferences.
 
     Attributes:
-        episodes: (N,), `sides` those of the correct picture.
-        groups: As `episodes`.
-        categories: As `episodes`.
-        sides: As `episodes`.
+        roles: Names of the R roles, the first one `all`.
+        episodes: (N,) episode of every inference.
+        groups: (N,) group of items of every episode.
+        categories: (N,) category of every episode.
+        sides: (N,) side of the correct picture; empty in a run without sides.
         calls: (N,) inference of the episode, counted from 0.
-        mass: (N, B, I, H, R) float32 shares; NaN where a block is not read in an iteration and of roles that no
-            token of an inference plays, such as a tile behind the arm.
+        mass: (N, B, I, H, R) float32 shares. They are NaN where a block is not read in an iteration, and for roles
+            without a token, such as a tile behind the arm.
     """
 
     roles: tuple[str, ...]
@@ -323,19 +345,22 @@ class AttentionShares:
 
     @classmethod
     def from_bytes(cls, content: bytes) -> Self:
-        """Load what `arrays_to_bytes` made of one."""
+        """Load one from the bytes of `arrays_to_bytes`."""
         return cls(**arrays_from_bytes(content))
 
     def only(self, selected: NDArray[np.bool_]) -> Self:
-        """Some of the inferences. selected: (N,)."""
+        """Return some of the inferences, those where `selected` (N,) is true."""
         return replace(self, **{name: value[selected] for name, value in vars(self).items() if name != "roles"})
 
     def by_category(self) -> list[tuple[str, Self]]:
-        """Every category with its inferences, in the order of the episodes."""
+        """Return every category with its inferences, in the order of the episodes."""
         return [(name, self.only(self.categories == name)) for name in dict.fromkeys(map(str, self.categories))]
 
     def shares(self) -> dict[str, Shares]:
-        """Return (N, B, I, H) by role: as stored, tiles also by the answer's side, and what is missing to 1."""
+        """Return the shares (N, B, I, H) by role.
+
+        These are the stored ones, tiles also by the answer's side, and the difference to 1.
+        """
         by_role = {role: self.mass[..., at].astype(np.float64) for at, role in enumerate(self.roles)}
         if set(TILE_ROLES) <= by_role.keys():
             left_tile, right_tile = (by_role[role] for role in TILE_ROLES)
@@ -347,7 +372,9 @@ class AttentionShares:
         return {**by_role, ACTION: 1 - by_role[ALL]} if ALL in by_role else by_role
 
     def rows(self, by: Sequence[Axis] = ("block", "iteration", "head")) -> "list[AttentionRow]":
-        """One per category, role and place along the axes `by`; means over the others, every episode alike.
+        """Return one row per category, role and place along the axes `by`.
+
+        Shares are means over the other axes, with equal weight for every episode.
 
         Raises:
             UsageError: For an axis that does not exist.
@@ -363,7 +390,7 @@ class AttentionShares:
         return rows
 
     def frame(self, by: Sequence[Axis] = ("block", "iteration", "head")) -> "pd.DataFrame":
-        """`rows` as a data frame, with the columns of the axes that are asked for."""
+        """Return `rows` as a data frame, with the columns of the requested axes."""
         import pandas as pd
 
         unused = [axis for axis in get_args(Axis) if axis not in by]
@@ -373,7 +400,8 @@ class AttentionShares:
     def correct_minus_other(self, seed_text: str) -> "dict[int, tuple[float, tuple[float, float]]]":
         """Return by block the share on the correct tile minus the other's, with its 95 % interval by groups.
 
-        Of one category; a mean over iterations, heads and calls. Empty without tiles.
+        The inferences must be of one category. The share is a mean over iterations, heads and calls. Empty without
+        tiles.
         """
         shares = self.shares()
         if CORRECT not in shares:
@@ -408,7 +436,7 @@ class AttentionShares:
         return rows
 
     def _episodes(self) -> tuple[NDArray[np.int64], NDArray[np.str_]]:
-        """(N,) which of the E episodes an inference is of, and the (E,) groups of these."""
+        """Return (N,) the number of every inference's episode among the E, and the (E,) groups of these."""
         _, first, which = np.unique(self.episodes, return_index=True, return_inverse=True)
         return which, self.groups[first]
 
@@ -418,10 +446,11 @@ class AttentionRow(Effect):
     """The share of the attention on one role's tokens, in one category.
 
     Attributes:
-        block: Of which; None for the mean over all.
-        iteration: As `block`.
-        head: As `block`.
-        call: As `block`.
+        block: Block of the backbone; None for the mean over all.
+        iteration: Iteration of the acting stream; None for the mean over all.
+        head: Head of the block; None for the mean over all.
+        call: Inference of the episode; None for the mean over all.
+        share: Share of the acting stream's attention.
     """
 
     role: str
@@ -433,7 +462,7 @@ class AttentionRow(Effect):
     n_episodes: int
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values, without the axes that it is a mean over."""
+        """Return plain values, without the axes that it is a mean over."""
         axes = get_args(Axis)
         return {name: value for name, value in asdict(self).items() if value is not None or name not in axes}
 
@@ -441,13 +470,14 @@ class AttentionRow(Effect):
 def stored_attention(run: RunReader) -> dict[str, AttentionShares]:
     """Return by category the shares of most episodes, and of these of most roles; empty if there is none.
 
-    Raises RunDamagedError.
+    Raises:
+        RunDamagedError: If a stored intervention was changed.
     """
     return {category: category_shares for category, (_, category_shares) in preferred_attention(run).items()}
 
 
 def preferred_attention(run: RunReader) -> dict[str, tuple[StoredResult, AttentionShares]]:
-    """`stored_attention`, and of which stored intervention each is."""
+    """Return `stored_attention`, and the stored intervention of each."""
     preferred: dict[str, tuple[StoredResult, AttentionShares]] = {}
     read: dict[str, AttentionShares] = {}
     for result in stored_results(run, ATTENTION):
@@ -461,7 +491,7 @@ def preferred_attention(run: RunReader) -> dict[str, tuple[StoredResult, Attenti
 
 
 def _per_episode(values: Shares, episodes: NDArray[np.int64]) -> Shares:
-    """(E, …) means over the inferences of every episode, of those that are not NaN."""
+    """Return the means (E, …) over the inferences of every episode, of values that are not NaN."""
     sums, counts = (np.zeros((episodes.max() + 1, *values.shape[1:])) for _ in range(2))
     has_share = ~np.isnan(values)
     np.add.at(sums, episodes, np.where(has_share, values, 0.0))
@@ -470,7 +500,7 @@ def _per_episode(values: Shares, episodes: NDArray[np.int64]) -> Shares:
 
 
 def _mean(values: Shares, axes: tuple[int, ...]) -> Shares:
-    """Mean over some axes of what is not NaN; NaN where nothing is."""
+    """Return the mean over some axes of values that are not NaN; NaN where there are none."""
     has_share = ~np.isnan(values)
     counts = has_share.sum(axis=axes)
     sums = np.where(has_share, values, 0.0).sum(axis=axes)

@@ -1,4 +1,4 @@
-"""Attribution patching: gradients order cells, exact patches check the order and anchor it. Enters no verdict."""
+"""Attribution patching: gradients order cells, exact patches check the order and anchor it; enters no verdict."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -49,9 +49,12 @@ if TYPE_CHECKING:
 NAME = "attribution"
 SITES = (f"{KV_STREAM}.*", "backbone.*")
 EXACT, ESTIMATE = "exact", "estimate"
-"""How the names of conditions begin: `exact|kv.02|image`."""
+"""Beginnings of the names of conditions, such as `exact|kv.02|image`."""
 TOP = 20
-"""Cells of each kind and category with the largest estimates, that are patched exactly; as many are drawn."""
+"""Number of cells of each kind and category with the largest estimates, which are patched exactly.
+
+As many are drawn from the others.
+"""
 _LEGEND = (
     "estimate: share of the image swap by gradients; exact: with these tokens patched; anchor: a complete cut, "
     f"patched exactly; a screen that misses an anchor by more than a factor of {AGREEMENT:.0f} is void and shows "
@@ -61,9 +64,10 @@ _LEGEND = (
 
 
 def _estimated(cell: Cell, by_row: Mapping[tuple[int, int], float]) -> Condition:
-    """Return no inference: the clean action, and by how much an estimate says that patching a cell moves it.
+    """Return a condition without an inference: the clean action, and the displacement estimated for a cell.
 
     Args:
+        cell: Cell whose patch is estimated.
         by_row: Displacement by row and step of the run.
     """
 
@@ -78,13 +82,15 @@ def _estimated(cell: Cell, by_row: Mapping[tuple[int, int], float]) -> Condition
 class AttributionPatching(Intervention):
     """An estimate for every cell, from one backward pass per episode, and exact patches of some of them.
 
+    The anchors are patched exactly too: all of `kv`, and all tokens of each layer of the backbone with a cell.
+
     Attributes:
-        sites: Of the cells.
-        roles: As `sites`.
-        ends: Where gradients are taken, see `Ends`.
-        top: Cells of each kind with the largest estimates that are patched exactly.
-        controls: So many more, drawn from the rest with `seed`. The anchors are patched exactly too: all of `kv`,
-            and all tokens of each layer of the backbone with a cell.
+        sites: Patterns of the cells' places.
+        roles: Roles of the cells' tokens.
+        ends: Inputs at which gradients are taken, see `Ends`.
+        top: Number of cells of each kind with the largest estimates that are patched exactly.
+        controls: Number of further cells of each kind that are patched exactly, drawn from the others with `seed`.
+        seed: Seed of the drawn cells.
     """
 
     kind: ClassVar[str] = NAME
@@ -118,7 +124,7 @@ class AttributionPatching(Intervention):
 
     @classmethod
     def from_options(cls, run: Run, **options: Any) -> Self:
-        """Return it without `kv` where the family has none and no sites are named."""
+        """Return the kind with its options, without `kv` where the family has none and no sites are named."""
         from probe_kit.hooks.registry import get_family
 
         family = get_family(run.model)
@@ -169,7 +175,7 @@ class AttributionPatching(Intervention):
         return rows, shares
 
     def _select(self, cells: Sequence[Cell], shares: Sequence[NDArray[np.float64]]) -> tuple[set[Cell], set[Cell]]:
-        """Return those with the largest estimates of any category, by kind, and those drawn from the rest."""
+        """Return the cells with the largest estimates of any category, by kind, and those drawn from the rest."""
         top: set[Cell] = set()
         drawn: set[Cell] = set()
         kinds = [kind_of_place(cell.site_group.name) for cell in cells]
@@ -210,7 +216,7 @@ class AttributionPatching(Intervention):
 
     @staticmethod
     def finding(rows: Sequence[AttributionEffect], context: Measurement) -> str:
-        """Return whether the screen holds, and what it puts first."""
+        """Return whether the screen holds, and which cell it ranks first."""
         del context
         worst = worst_anchor(rows)
         if worst is None:
@@ -235,7 +241,7 @@ _COLUMNS: Mapping[str, Any] = {
 
 
 def _rows(outcomes: ConditionOutcomes, drawn: Collection[str]) -> list[AttributionEffect]:
-    """Return the rows of one category. drawn: names of conditions."""
+    """Return the rows of one category; `drawn` has the names of conditions with drawn cells."""
     clean, exchange = outcomes.of(CLEAN), outcomes.exchange()
     assert exchange is not None
     moved: dict[str, dict[CellName, NDArray[np.float64]]] = {ESTIMATE: {}, EXACT: {}}

@@ -1,6 +1,6 @@
 """The parts that every kind of intervention shares: settings, names of conditions, effects, tests, tables.
 
-Loads neither torch nor a simulator, and neither do the kinds: tables read them without a model.
+It loads neither torch nor a simulator, and neither do the kinds: tables read them without a model.
 """
 
 from abc import ABC, abstractmethod
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 Values = NDArray[np.float64]
 CONTROL = "control-"
-"""The names of random directions begin with it, by which stored results tell them apart."""
+"""Beginning of the names of random directions, which distinguishes them in stored results."""
 OPTIONS = ("sites", "roles", "direction", "controls", "coefficients", "target_side", "seed")
 """Options of the command that a kind may take."""
 
@@ -53,23 +53,26 @@ OPTIONS = ("sites", "roles", "direction", "controls", "coefficients", "target_si
 class Intervention(Choice, ABC):
     """One kind of intervention: its settings as fields, its conditions, and how their numbers are read.
 
-    categories: of the run; None for all. items: so many of each category, the first ones; None for all. readout:
-    the part of the policy's answer that is read, see `Readout`. Of runs without sides: vary: the input that the
-    source has of its donor, empty for `usual_vary`. frames: of an episode, evenly spaced; None for 4. pairs: of
-    the user's own, episode and frame of the clean inference and of its donor.
-
-    Of the class. kind: its name on the command line.
+    Subclasses set the fields without a default as attributes of the class; `kind` is their name on the command
+    line. An option outside of `OPTIONS` raises UsageError.
 
     Attributes:
-        summary: A line of help.
-        position: In help.
-        options: Those of `OPTIONS` that it takes, and their meaning; another one raises UsageError. needs: the
-            interventions that a family must support, besides those of the fields `sites` and `roles`. fits_always:
-            whether items are inferred beforehand.
-        has_verdict: Whether `classify_use` classifies its rows. is_descriptive: whether it edits and tests
-            nothing.
+        summary: Line of help.
+        position: Position in help.
+        options: Options of `OPTIONS` that the kind takes, and their meaning.
+        needs: Interventions that a family must support, besides those of the fields `sites` and `roles`.
+        fits_always: Whether items are inferred beforehand.
+        has_verdict: Whether `classify_use` classifies its rows.
+        is_descriptive: Whether it edits and tests nothing.
         asks_where: Whether it edits places of the network, so that a line says which layer matters.
         needs_sides: Whether it applies to runs of the scene alone.
+        categories: Categories of the run; None for all.
+        items: Number of items of each category, the first ones; None for all.
+        readout: Part of the policy's answer that is read, see `Readout`.
+        vary: In runs without sides, the input that the source has of its donor; empty for `usual_vary`.
+        frames: In runs without sides, the number of frames of an episode, evenly spaced; None for 4.
+        pairs: In runs without sides, pairs of the user's own: episode and frame of the clean inference and of its
+            donor.
     """
 
     summary: ClassVar[str]
@@ -99,18 +102,22 @@ class Intervention(Choice, ABC):
 
     @classmethod
     def from_options(cls, run: Run, **options: Any) -> Self:
-        """Return it as the command builds it. options: those that are given. Raises UsageError."""
+        """Return the kind as the command builds it, from the options that the user gave.
+
+        Raises:
+            UsageError: For an option with a value that does not fit.
+        """
         del run
         return cls(**options)
 
     @property
     def patterns(self) -> tuple[tuple[str, tuple[str, ...]], ...]:
-        """Return the patterns of places that it edits, each with the roles of the tokens; none by default."""
+        """The patterns of places that it edits, each with the roles of the tokens; none by default."""
         return tuple((site, getattr(self, "roles", ())) for site in getattr(self, "sites", ()))
 
     @property
     def required_capabilities(self) -> tuple[InterventionKind, ...]:
-        """Return the interventions that a family must support for it, at its sites and roles."""
+        """The interventions that a family must support for it, at its sites and roles."""
         roles = {*getattr(self, "roles", ()), *(role for _, roles in self.patterns for role in roles)}
         reads_kv = any(site.partition(".")[0] == KV_STREAM for site, _ in self.patterns)
         needed: dict[InterventionKind, bool] = {"kv": reads_kv, "tiles": not TILES.keys().isdisjoint(roles)}
@@ -122,7 +129,12 @@ class Intervention(Choice, ABC):
         return self.fits_always or ":" in getattr(self, "direction", "")
 
     def check_run(self, run: Run) -> None:
-        """Raise UnknownCategoryError for a category that the run lacks, UsageError for a run that does not fit."""
+        """Refuse a run that the intervention does not fit.
+
+        Raises:
+            UnknownCategoryError: For a category that the run lacks.
+            UsageError: For a run that does not fit.
+        """
         categories_in(run, self.categories)
         if has_sides(run):
             if self.vary or self.frames or self.pairs:
@@ -138,7 +150,7 @@ class Intervention(Choice, ABC):
             )
 
     def eligible_items(self, session: "ReplaySession", items: Sequence[str]) -> list[str]:
-        """Return those of the items that it can be asked of; the others are passed over, and counted."""
+        """Return the items to which the kind applies; the others are passed over, and counted."""
         del session
         return list(items)
 
@@ -146,7 +158,7 @@ class Intervention(Choice, ABC):
     def conditions(self, session: "ReplaySession") -> Sequence[Condition]:
         """Return all conditions, in the order in which they are stored; the first one changes nothing.
 
-        What the certificate shall say of them is put in `session.certificate`.
+        Entries on them for the certificate are put in `session.certificate`.
         """
 
     def play(
@@ -178,7 +190,7 @@ class Intervention(Choice, ABC):
 
     @classmethod
     def sentences(cls, rows: Sequence[Any], context: Measurement) -> list[str]:
-        """Return what was found with its numbers, a sentence per category; none of a kind that only describes."""
+        """Return the findings with their numbers, a sentence per category; none of a kind that only describes."""
         parts = [(name, cls.sentence(part)) for name, part in edits_by_category(rows).items()]
         return [f"{category_of(name).title}: {context.in_words(text)}." for name, text in parts if text]
 
@@ -193,13 +205,13 @@ class Intervention(Choice, ABC):
 
     @staticmethod
     def sentence(rows: Sequence[Any]) -> str:
-        """Return what was found in one category with its numbers. rows: without controls."""
+        """Return the finding in one category with its numbers; `rows` are without controls."""
         del rows
         return ""
 
     @staticmethod
     def finding(rows: Sequence[Any], context: Measurement) -> str:
-        """Return a verdict, a colon and what was found, in few words without brackets. rows: as of `sentence`."""
+        """Return a verdict, a colon and the finding, in few words without brackets; `rows` have no controls."""
         del rows, context
         return ""
 
@@ -211,13 +223,13 @@ class Intervention(Choice, ABC):
 
     @staticmethod
     def keys_in_use(run: RunReader) -> set[str] | None:
-        """Return keys of the stored ones that tables and figures read; None if none is preferred."""
+        """Return keys of the stored interventions that tables and figures read; None if none is preferred."""
         del run
         return None
 
 
 NONE = "none"
-"""No direction: tokens are patched in full."""
+"""Name for no direction: tokens are patched in full."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -225,12 +237,14 @@ class AlongDirection(Intervention):
     """An intervention along a direction, with matched random ones as controls.
 
     Attributes:
-        takes_none: Of the class, whether tokens may be edited along no direction.
-        direction: `mean-difference` or `probe`, one vector per place found in means over tokens without the
-            episode it is used on; `mean-difference:K`, K directions found in the tokens themselves, see
-            `directions`; FILE#NAME, see `direction_files`; some kinds take `none`.
-        controls: So many random directions of the data's own covariance, orthogonal to it.
-        vector: Of a file; then `direction` is its name.
+        takes_none: Whether tokens may be edited along no direction; an attribute of the class.
+        direction: Name of the direction. `mean-difference` or `probe` is one vector per place, found in means over
+            tokens without the episode that it is used on. `mean-difference:K` is K directions found in the tokens
+            themselves, see `directions`. FILE#NAME is a direction of a file, see `direction_files`. Some kinds
+            take `none`.
+        controls: Number of random directions of the data's own covariance, orthogonal to it.
+        seed: Seed of controls and folds.
+        vector: Direction of a file, whose name `direction` then is; None for other directions.
     """
 
     takes_none: ClassVar[bool] = True
@@ -256,7 +270,7 @@ class AlongDirection(Intervention):
     def fit_directions(
         self, session: "ReplaySession", cells: Sequence[Cell], patterns: Sequence[str]
     ) -> "dict[Cell, Directions]":
-        """Return its direction and the random ones in every cell; see `directions.fit_directions_in_cells`."""
+        """Return the direction and the random ones in every cell; see `directions.fit_directions_in_cells`."""
         from probe_kit.intervene.directions import fit_directions_in_cells
 
         return fit_directions_in_cells(
@@ -271,7 +285,13 @@ class AlongDirection(Intervention):
         )
 
     def check_run(self, run: Run) -> None:
-        """Raise UsageError also for a direction of an answer in a run without sides."""
+        """Refuse a run that the intervention does not fit.
+
+        Raises as `Intervention.check_run` too.
+
+        Raises:
+            UsageError: For a direction of an answer in a run without sides.
+        """
         super().check_run(run)
         if not has_sides(run) and self.direction != NONE and self.vector is None:
             raise UsageError(
@@ -294,7 +314,7 @@ class ConditionName:
 
     @classmethod
     def parse(cls, condition: str) -> "ConditionName":
-        """Take a stored name apart."""
+        """Split a stored name into its parts."""
         return cls(*condition.split(SEPARATOR))
 
     def __str__(self) -> str:
@@ -320,17 +340,19 @@ class EffectRow(Effect):
     """The effect of one edit in one category, with the columns that all kinds of edits have.
 
     Attributes:
-        sites: That were edited.
-        role: Of the tokens.
-        direction: Empty if they were edited in full.
-        net: Share of episodes that do with the edit what the kind counts, such as a flip to the target side, minus
-            the share that do the reverse, with its 95 % interval by groups.
-        net_ci: As `net`.
-        max_action_change: Largest difference in any action of any episode; 0 is bit for bit.
-        fires: Of edited sites in all episodes, and those that changed nothing.
-        no_op_fires: As `fires`.
-        relative_change: How far tokens were moved, in their own norms.
-        key: Of the intervention.
+        sites: Name of the edited place.
+        role: Role of the edited tokens.
+        direction: Name of the direction; empty if tokens were edited in full.
+        is_control: Whether the direction is a random one.
+        net: Share of episodes with a change that the kind counts, such as a flip to the target side, minus the
+            share with the reverse.
+        net_ci: The 95 % interval of `net`, by groups.
+        max_action_change: Largest difference in any action of any episode; 0 means that all are bit for bit the
+            same.
+        fires: Number of edits of sites in all episodes.
+        no_op_fires: Number of those edits that changed nothing.
+        relative_change: Distance by which tokens were moved, in their own norms.
+        key: Key of the intervention.
     """
 
     sites: str
@@ -349,18 +371,18 @@ class EffectRow(Effect):
 
     @property
     def name(self) -> str:
-        """Return the edit in a few words."""
+        """The edit in a few words."""
         return " ".join(filter(None, (self.sites, self.role, self.direction)))
 
 
 def common_columns(outcomes: ConditionOutcomes, row: int, name: ConditionName, gains: Values) -> dict[str, Any]:
-    """Return the columns of `EffectRow` of one condition.
+    """Return the columns of `EffectRow` for one condition.
 
     Args:
-        outcomes: Of one category.
-        row: Of the condition in them.
-        gains: (E,) 1 where an episode does with the edit what the kind counts and did not without it, −1 for the
-            reverse.
+        outcomes: Outcomes of one category.
+        row: Row of the condition in them.
+        name: Name of the condition, in its parts.
+        gains: (E,) 1 where an episode has the change that the kind counts with the edit only, −1 for the reverse.
     """
     logged = dict(zip(LOG_FIELDS, outcomes.edit_log[row].T, strict=True))
     norm = float((logged["norm"] * logged["fires"]).sum())
@@ -388,13 +410,16 @@ def net_interval(gains: Values, outcomes: ConditionOutcomes) -> tuple[float, flo
 
 
 class ControlTest(NamedTuple):
-    """One condition against its controls. controls: their rows. beyond: (E,) its values less their mean.
+    """One condition compared with its controls.
+
+    The test is one-sided, by sign flips of whole groups. Its numbers are None for a condition that is not tested.
 
     Attributes:
-        t: One-sided, by sign flips of whole groups; p_fwe against the largest t of the category. All are None for
-            a condition that is not tested.
-        p: As `t`.
-        p_fwe: As `t`.
+        controls: Rows of its controls.
+        beyond: (E,) values of the condition minus the mean of its controls.
+        t: Statistic of the test.
+        p: The p-value of the condition alone.
+        p_fwe: Family-wise p-value, against the largest t of the category.
     """
 
     controls: list[int]
@@ -415,9 +440,9 @@ def compare_with_controls(
     """Compare every condition that is no control with its own controls, in the order of the conditions.
 
     Args:
-        values: (K, E) tested to be above zero.
-        names: Of the K conditions.
-        outcomes: Of one category.
+        values: (K, E) values that are tested to be above zero.
+        names: Names of the K conditions.
+        outcomes: Outcomes of one category.
         skipped: Rows that are not tested though they are no controls, such as an identity patch.
         broken_controls: Rows of controls that nothing is compared with, such as those that disrupt the task.
     """
@@ -441,7 +466,7 @@ def compare_with_controls(
 
 
 def mean_of(values: Values) -> float | None:
-    """Return the mean of some numbers, and None if there are none."""
+    """Return the mean of some numbers; None if there are none."""
     return float(values.mean()) if values.size else None
 
 
@@ -455,7 +480,7 @@ def edits_by_category[Row: Effect](rows: Iterable[Row]) -> dict[str, list[Row]]:
 
 
 def frame_of(rows: Sequence[Effect]) -> "pd.DataFrame":
-    """Return one line per row; intervals as two columns at the end."""
+    """Return one line per row; intervals are two columns at the end."""
     import pandas as pd
 
     flat = []
@@ -480,12 +505,15 @@ def effect_table[Row](
     parts: Mapping[str, Mapping[str, Callable[[Row], str]]],
     is_bold: Callable[[Row], bool] = lambda _: False,
 ) -> "Table":
-    """Return a table.
+    """Return rows of effects as a table.
 
     Args:
+        title: Title of the table.
+        caption: Note below the table.
         names: Headings of the columns that name a line.
-        lines: These names and the row of each.
-        parts: By title, the text of a row's cell by column.
+        lines: Names of each line, and its row.
+        parts: By title of a group of columns, the function that gives a row's text in each column.
+        is_bold: Function that returns whether a row's names are bold.
     """
     from probe_kit._tables.table import Cell, Heading, Table, grouped
 
@@ -506,12 +534,12 @@ def lines_of[Row: Effect](rows: Iterable[Row], name: Callable[[Row], str]) -> li
 
 
 def edit_of(row: EffectRow) -> str:
-    """Return the category and the name of a row, as a sentence begins with them."""
+    """Return the category and the name of a row, with which a sentence begins."""
     return f"{category_of(row.category).title}, {row.name}"
 
 
 def p_of(value: float | None) -> str:
-    """Return a p-value in two digits, and a dash for none."""
+    """Return a p-value in two digits; a dash for None."""
     if value is None:
         return "–"
     text = format(value, ".2g")
@@ -523,7 +551,7 @@ def interval_text(
     limits: tuple[float, float] | None,
     write: Callable[[float | None], str] = number,
 ) -> str:
-    """Return `value [low, high]`, and a dash without an interval."""
+    """Return `value [low, high]`; a dash without an interval."""
     if value is None or limits is None:
         return "–"
     return f"{write(value)} [{write(limits[0])}, {write(limits[1])}]"
@@ -535,7 +563,7 @@ def signed_interval(value: float | None, limits: tuple[float, float] | None) -> 
 
 
 def count_edits(names: Sequence[str], tried: int, most: int = 3) -> str:
-    """Return how many of the edits that were tried, and the first of them by name."""
+    """Return how many edits of those that were tried have an effect, and the first of them by name."""
     if not names:
         return f"none of {tried}"
     remaining = len(names) - most
@@ -545,6 +573,12 @@ def count_edits(names: Sequence[str], tried: int, most: int = 3) -> str:
 
 
 def share_of_edits(rows: Sequence[EffectRow], tried: int, subject: str = "edits") -> str:
-    """Return `2 of 3 edits, most at backbone.01 image`. rows: with the largest effect first, at least one."""
+    """Return a text such as `2 of 3 edits, most at backbone.01 image`.
+
+    Args:
+        rows: Edits with an effect, at least one, the largest effect first.
+        tried: Number of edits that were tried.
+        subject: Noun for the edits.
+    """
     first = f"{rows[0].sites} {rows[0].role}".rstrip()
     return f"{len(rows)} of {tried} {subject}, {'most ' * (len(rows) > 1)}at {first}"

@@ -1,9 +1,9 @@
 """Closed loop: the episode is played again, with the edit at every inference.
 
 The first inference's action is a forecast. Here the cube lands somewhere, and is compared with the run's own
-outcomes: the same scene, the same seeds, and an identity patch that must give every one of them again.
+outcomes. Scene and seeds are the same, and an identity patch must reproduce every outcome.
 
-Two things are kept apart: which picture the cube was brought to, and whether it was brought to any. An edit that
+Two effects are kept apart: which picture the cube was brought to, and whether it was brought to any. An edit that
 disrupts the task lowers a success rate as well as one that turns the choice, so that it enters no verdict.
 """
 
@@ -67,7 +67,7 @@ _LEGEND = (
 
 
 def identity_patch(sites: Sequence[Site]) -> Condition:
-    """Return the inference as the run made it, with every site that any condition changes written back."""
+    """Return the inference as the run made it, with every site that a condition changes written back as it is."""
 
     def play(context: ConditionContext) -> ConditionResult:
         policy = context.session.policy
@@ -87,11 +87,13 @@ def identity_patch(sites: Sequence[Site]) -> Condition:
 class ClosedLoop(AlongDirection):
     """Interchange at a few targets in closed loop: identity patch, image swap, every target and its controls.
 
+    Every target is patched in full. Where its place is one site and its role no tile, it is also patched within
+    the direction, and within the random ones.
+
     Attributes:
-        targets: `PLACE|ROLE`, such as `backbone.02|image`; see `best_patch_targets`.
-        direction: As of `Interchange`; a target is also patched within it, and within `controls` random ones of
-            the data's own covariance, where a place is one site and the role no tile; `none` for neither. Every
-            target is also patched in full.
+        targets: Names `PLACE|ROLE`, such as `backbone.02|image`; see `best_patch_targets`.
+        direction: Name of the direction, as for `Interchange`; `none` for no patches within a direction.
+        controls: Number of random directions of the data's own covariance.
     """
 
     kind: ClassVar[str] = "closed-loop"
@@ -119,7 +121,7 @@ class ClosedLoop(AlongDirection):
 
     @classmethod
     def from_options(cls, run: Run, **options: Any) -> Self:
-        """Return it at the named sites and roles, else at `best_patch_targets`.
+        """Return the kind at the named sites and roles, else at `best_patch_targets`.
 
         Raises:
             UsageError: For roles without sites.
@@ -137,16 +139,22 @@ class ClosedLoop(AlongDirection):
 
     @property
     def patterns(self) -> tuple[tuple[str, tuple[str, ...]], ...]:
-        """Return place and role of every target."""
+        """The place and role of every target."""
         names = map(ConditionName.parse, self.targets)
         return tuple((name.site, (name.role,)) for name in names)
 
     def parameters(self) -> dict[str, Any]:
-        """Return where and along what; it is read where the cube ends."""
+        """Return its own settings; the readout is where the cube ends."""
         return {**super().parameters(), "readout": "episode"}
 
     def check_run(self, run: Run) -> None:
-        """Raise UsageError for outcomes by another rule than they were recorded by."""
+        """Refuse a run that the intervention does not fit.
+
+        Raises as `Intervention.check_run` too.
+
+        Raises:
+            UsageError: For outcomes by another rule than they were recorded by.
+        """
         super().check_run(run)
         if run.rule != DEFAULT_RULE:
             raise UsageError(
@@ -155,7 +163,13 @@ class ClosedLoop(AlongDirection):
             )
 
     def conditions(self, session: "ReplaySession") -> Sequence[Condition]:
-        """Return the identity patch, the image swap and every target. Raises UnknownSiteError, NoProbesError."""
+        """Return the identity patch, the image swap and every target.
+
+        Raises:
+            NoProbesError: For a direction of probes in a run without them.
+            UnknownSiteError: For a place that does not exist.
+            NoDirectionError: For a named place without a direction.
+        """
         cells = [
             Cell(site_group, role)
             for site, (role,) in self.patterns
@@ -226,7 +240,7 @@ class ClosedLoop(AlongDirection):
 
     @staticmethod
     def notes(rows: "Sequence[ClosedLoopEffect]") -> list[str]:
-        """Return edits that disrupt the task."""
+        """Return notes on edits that disrupt the task."""
         return [
             f"{edit_of(row)}: the cube is in a zone in {100 * row.in_zone:.0f} % of episodes; the "
             "task is disrupted, and this enters no verdict."
@@ -242,23 +256,26 @@ KIND = ClosedLoop
 class ClosedLoopEffect(EffectRow):
     """The effect of one edit on whole episodes, in one category; see `EffectRow`.
 
+    Here `net` is the share of episodes that end wrong minus that without the edit. `max_action_change` is of any
+    number of any trajectory. The test is one-sided, by sign flips of whole groups; its numbers are None for rows
+    that enter no verdict.
+
     Attributes:
-        correct: Shares of episodes.
-        wrong: As `correct`.
-        in_zone: As `correct`.
-        wrong_in_zone: Share of wrong ones among those in a zone; None if there is none. net: share of episodes
-            that end wrong minus that without the edit.
-        net_left: By the side of the wrong picture.
-        net_right: As `net_left`.
-        control_net: Mean of its controls that do not disrupt the task. gained, lost: episodes that end wrong only
-            with the edit, and only without.
-        p_mcnemar: Exact and two-sided, episodes of an item taken as independent, so that it is no verdict.
-        t: Of net beyond the controls', one-sided, by sign flips of whole groups; p_fwe against the largest t of
-            the category; None for what enters no verdict.
-        p: As `t`.
-        p_fwe: As `t`.
-        disrupted: Whether the cube is in a zone less than half as often. max_action_change: of any number of any
-            trajectory.
+        correct: Share of episodes that end on the correct picture.
+        wrong: Share of episodes that end on the wrong picture.
+        in_zone: Share of episodes that end on either picture.
+        wrong_in_zone: Share of wrong ones among those in a zone; None if none is.
+        net_left: The same as `net`, of episodes with the wrong picture on the left; None if there are none.
+        net_right: The same as `net`, of episodes with the wrong picture on the right; None if there are none.
+        control_net: Mean `net` of its controls that do not disrupt the task; None without any.
+        gained: Number of episodes that end wrong only with the edit.
+        lost: Number of episodes that end wrong only without it.
+        p_mcnemar: Exact two-sided p-value with the episodes of an item taken as independent, so that it is no
+            verdict.
+        t: Statistic of `net` beyond the controls'.
+        p: The p-value of the same.
+        p_fwe: Family-wise p-value, against the largest t of the category.
+        disrupted: Whether the cube is in a zone less than half as often.
     """
 
     correct: float
@@ -278,7 +295,7 @@ class ClosedLoopEffect(EffectRow):
 
     @property
     def finding(self) -> Finding:
-        """Return `confirmed` if, beyond its controls and chance, enough episodes turn to the other picture."""
+        """The finding: `confirmed` if, beyond controls and chance, enough episodes turn to the other picture."""
         if self.sites == CLEAN:
             return "identity patch"
         if self.disrupted:
@@ -295,7 +312,7 @@ class ClosedLoopEffect(EffectRow):
 
 
 def closed_loop_effects(outcomes: ConditionOutcomes) -> list[ClosedLoopEffect]:
-    """Return one per condition of one category, the identity patch first."""
+    """Return one row per condition of one category, the identity patch first."""
     assert outcomes.episode_outcomes is not None
     names = [ConditionName.parse(condition) for condition in outcomes.conditions]
     wrong = (outcomes.episode_outcomes == WRONG).astype(float)
@@ -331,7 +348,7 @@ def closed_loop_effects(outcomes: ConditionOutcomes) -> list[ClosedLoopEffect]:
 
 
 def _of_edits(text: Callable[[ClosedLoopEffect], str]) -> Callable[[ClosedLoopEffect], str]:
-    """Return the text of a cell, but for the identity patch."""
+    """Return the function that gives a cell's text, with a dash for the identity patch."""
     return lambda row: "–" if row.sites == CLEAN else text(row)
 
 

@@ -1,10 +1,10 @@
 """Concept erasure: the linearly decodable answer is removed from each token, with random controls.
 
-Holds the intervention, its effects and their table. The fits are in `erasers`, which interchange and
-steer share with it (`--direction mean-difference:K`). Erasure is a supplement, and the weakest. A policy may read
-what is not linear. An answer that is erased at one place may pass at another, and what is removed along with it
-disrupts the task. Erasers that know only the mean over tokens blind a probe and leave the behaviour, so that there
-is one per position.
+This file has the intervention, its effects and their table. The fits are in `erasers`, which interchange and steer
+share with it (`--direction mean-difference:K`). Erasure is a supplement, and the weakest. A policy may read what
+is not linear. An answer that is erased at one place may pass at another, and information that is removed along
+with it disrupts the task. Erasers that know only the mean over tokens blind a probe and leave the behaviour, so
+that there is one per position.
 """
 
 from collections.abc import Mapping, Sequence
@@ -55,16 +55,16 @@ if TYPE_CHECKING:
 
 LEACE = "leace"
 PROBE_ACCURACY = "probe_accuracy"
-"""Entry of the certificate: what probes read behind each condition, by category."""
+"""Entry of the certificate: accuracies of probes behind each condition, by category."""
 Finding = Literal[
     "identity patch", "control", "no baseline effect", "controls also disrupt", "effect", "no effect"
 ]
 UNTOUCHED, ZERO = "none", "0"
 """Direction and coefficient of the condition in which tokens are written back as they are."""
 CHANCE_LIKE = 0.6
-"""Held-out accuracy below which a probe on two sides is said to be blind.
+"""Held-out accuracy below which a probe on two sides is called blind.
 
-Chance is 0.5; an accuracy of a few dozen episodes wavers by about 0.1.
+Chance is 0.5; an accuracy of a few dozen episodes varies by about 0.1.
 """
 _LEGEND = (
     "goes there: share of episodes whose action goes to the correct picture; kept: of how far, n/a where it does "
@@ -79,14 +79,19 @@ _LEGEND = (
 
 @dataclass(frozen=True, kw_only=True)
 class ConceptErasure(Intervention):
-    """Every place and role: written back as it was, erased, and with matched random subspaces taken away instead.
+    """Conditions at every place and role: unchanged, erased, and with matched random subspaces removed instead.
+
+    The eraser of an episode was fitted on the tokens of the other folds' episodes, of the items that are played.
 
     Attributes:
         sites: Patterns of places of one site each.
-        roles: Whose tokens.
-        method: See `erasers.Method`. controls: so many of the same rank. What erases an episode was fitted on the
-            tokens of the other folds' episodes, of the items that are played. Raises UsageError for a method that
-            does not exist.
+        roles: Roles of the erased tokens.
+        method: Name of the way to erase, see `erasers.Method`.
+        controls: Number of random subspaces of the same rank.
+        seed: Seed of controls and folds.
+
+    Raises:
+        UsageError: For a method that does not exist, or a role or readout that does not fit.
     """
 
     kind: ClassVar[str] = "erase"
@@ -121,16 +126,23 @@ class ConceptErasure(Intervention):
 
     @classmethod
     def from_options(cls, run: Run, **options: Any) -> Self:
-        """Return it with `direction` as its method. Raises UsageError without sites."""
+        """Return the kind with `direction` as its method.
+
+        Raises:
+            UsageError: Without sites.
+        """
         if "sites" not in options:
             raise UsageError("--kind erase needs --sites, such as --sites backbone.02")
         method = options.pop("direction", LEACE)
         return super().from_options(run, method=method, **options)
 
     def conditions(self, session: "ReplaySession") -> Sequence[Condition]:
-        """Return clean, then every cell untouched, erased and with its controls. Raises UnknownSiteError.
+        """Return clean, then every cell untouched, erased and with its controls.
 
         The certificate gets, by condition and category, how well a fresh probe reads the answer behind it.
+
+        Raises:
+            UnknownSiteError: For a place that does not exist or has several sites.
         """
         from probe_kit.intervene.directions import PassedOver, by_episode, collect_token_features, fit_by_fold
 
@@ -160,13 +172,13 @@ class ConceptErasure(Intervention):
 
     @staticmethod
     def effects(measurement: Measurement) -> "list[ErasureEffect]":
-        """Return one per category and condition."""
+        """Return one row per category and condition."""
         accuracies = measurement.certificate.get(PROBE_ACCURACY, {})
         return measurement.rows(lambda part: erasure_effects(part, accuracies))
 
     @staticmethod
     def table(rows: "Sequence[ErasureEffect]", context: Measurement) -> "Table":
-        """Return one line per category and place; controls are columns of what is compared with them."""
+        """Return one line per category and place; controls are columns of the edits compared with them."""
         edits = [row for row in rows if row.finding not in ("control", "identity patch")]
         return effect_table(
             f"What is lost without it? {context.subject}, erase",
@@ -201,7 +213,7 @@ class ConceptErasure(Intervention):
 
     @staticmethod
     def notes(rows: "Sequence[ErasureEffect]") -> list[str]:
-        """Return how weak the evidence is, probes at chance, and controls that disrupt."""
+        """Return notes on how weak the evidence is, probes at chance, and controls that disrupt."""
         blind = [row for row in rows if row.finding == "no effect" and (row.probe_accuracy or 1.0) < CHANCE_LIKE]
         broken = [row for row in rows if row.finding == "controls also disrupt"]
         return [
@@ -221,10 +233,12 @@ def _name_of(cell: Cell, name: str) -> str:
 
 
 def erased(cell: Cell, name: str, erasers: Mapping[str, Eraser]) -> Condition:
-    """Return the clean inference with the tokens of one cell without what an eraser takes away.
+    """Return the clean inference with the tokens of one cell erased.
 
     Args:
-        erasers: By episode, fitted without it; empty to write back what is there.
+        cell: Cell whose tokens are erased.
+        name: Name of the method or the control.
+        erasers: By episode, the eraser that was fitted without it; empty to write back the tokens unchanged.
     """
 
     def play(context: ConditionContext) -> ConditionResult:
@@ -239,12 +253,12 @@ def erased(cell: Cell, name: str, erasers: Mapping[str, Eraser]) -> Condition:
 
 @dataclass(frozen=True)
 class ApplyEraser:
-    """An edit that leaves what an eraser leaves; tokens beyond those it was fitted on stay as they are."""
+    """An edit that applies an eraser; tokens beyond those that it was fitted on stay as they are."""
 
     eraser: Eraser
 
     def __call__(self, site: Site, activation: "Tensor", where: TokenIndex) -> "Tensor":
-        """Computed in float64, as it was fitted."""
+        """Return the activation without the erased part, computed in float64, in which the eraser was fitted."""
         import torch
 
         del site, where
@@ -256,7 +270,10 @@ class ApplyEraser:
 
 
 def _probe_accuracy(features: "TokenFeatures", fits: Sequence[tuple[Fold, Eraser | None]]) -> float:
-    """Held-out accuracy of a probe on the mean over tokens, of each fold behind its eraser; chance is one half."""
+    """Return the held-out accuracy of a probe on the mean over tokens, of each fold behind its eraser.
+
+    Chance is one half.
+    """
     from sklearn.linear_model import LogisticRegression
     from sklearn.pipeline import make_pipeline
     from sklearn.preprocessing import StandardScaler
@@ -279,20 +296,24 @@ def _probe_accuracy(features: "TokenFeatures", fits: Sequence[tuple[Fold, Eraser
 class ErasureEffect(EffectRow):
     """The effect on the action of erasing an answer at one place, in one category; see `EffectRow`.
 
+    Here `net` is the share of episodes that no longer go to the correct side minus those that do now.
+
     Attributes:
-        right_before: Share of episodes whose action goes to the correct picture's side, without and with the edit.
-        right: As `right_before`.
-        share_left: Of how far actions go to the correct side; None if they do not go there, because a share of
-            noise is noise. net: share of episodes that no longer go there minus those that do now.
-            mean_displacement: metres away from the correct side.
-        control_share_left: Means of the controls.
-        control_net: As `control_share_left`.
-        control_displacement: As `control_share_left`.
-        p: Exact and one-sided, that an item's action moves away from the correct picture farther than under the
-            controls, by items and by groups, the larger one.
-        p_fwe: Of the same, by sign flips of whole groups against the largest t of the category.
-        probe_accuracy_before: Held-out accuracy of a fresh probe on the mean over tokens.
-        probe_accuracy: As `probe_accuracy_before`.
+        right_before: Share of episodes whose action goes to the correct picture's side, without the edit.
+        right: The same share with the edit.
+        share_left: Share that is left of how far actions go to the correct side. None if they do not go there,
+            because a share of noise is noise.
+        mean_displacement: Metres away from the correct side.
+        control_share_left: Mean `share_left` of the controls; None without any.
+        control_net: Mean `net` of the controls; None without any.
+        control_displacement: Mean `mean_displacement` of the controls; None without any.
+        p: Exact one-sided p-value that an item's action moves away from the correct picture farther than under the
+            controls. It is the larger one of by items and by groups; None for rows that are not tested.
+        p_fwe: Family-wise p-value of the same, by sign flips of whole groups against the largest t of the
+            category; None likewise.
+        probe_accuracy_before: Held-out accuracy of a fresh probe on the mean over tokens, without the edit; None
+            if not stored.
+        probe_accuracy: The same accuracy behind the edit; None if not stored.
     """
 
     right_before: float
@@ -309,7 +330,7 @@ class ErasureEffect(EffectRow):
 
     @property
     def finding(self) -> Finding:
-        """`effect` if, beyond its controls and chance, enough of the answer is gone from the action."""
+        """The finding: `effect` if, beyond controls and chance, enough of the answer is gone from the action."""
         if self.direction == UNTOUCHED:
             return "identity patch"
         if self.is_control:
@@ -325,19 +346,24 @@ class ErasureEffect(EffectRow):
 
     @property
     def name(self) -> str:
-        """Return the edit in a few words."""
+        """The edit in a few words."""
         what = "identity patch" if self.direction == UNTOUCHED else self.direction
         return " ".join((self.sites, self.role, what))
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values and the finding."""
+        """Return plain values and the finding."""
         return {**super().to_json(), "finding": self.finding}
 
 
 def erasure_effects(
     outcomes: ConditionOutcomes, probe_accuracy: Mapping[str, Mapping[str, float]]
 ) -> list[ErasureEffect]:
-    """Return one per condition of one category. probe_accuracy: by condition and category, of the certificate."""
+    """Return one row per condition of one category.
+
+    Args:
+        outcomes: Outcomes of one category.
+        probe_accuracy: Accuracy by condition and category, from the certificate.
+    """
     sign, category = outcomes.correct_sign, str(outcomes.categories[0])
     clean = sign * outcomes.of(CLEAN)
     conditions = [name for name in outcomes.conditions if name != CLEAN]
@@ -372,7 +398,7 @@ def erasure_effects(
 
 
 def _tried(rows: Sequence[ErasureEffect]) -> tuple[list[ErasureEffect], bool]:
-    """Return the erasures but for identity patches, and whether the unedited action has an answer to lose."""
+    """Return the erasures without identity patches, and whether the unedited action has an answer to lose."""
     tried = [row for row in rows if row.finding != "identity patch"]
     return tried, not tried or any(row.finding != "no baseline effect" for row in tried)
 

@@ -1,7 +1,7 @@
 """Image swap: with the two images swapped, and nothing else, does the action change sides?
 
-Two inferences per episode, same state and noise. Displacements are in units of the policy's own reach. Of runs
-without sides one input is exchanged for a donor's, and sizes are in spreads of clean actions.
+Two inferences per episode have the same state and noise. Displacements are in units of the policy's own reach. In
+runs without sides, one input is exchanged for a donor's, and sizes are in spreads of clean actions.
 """
 
 from abc import abstractmethod
@@ -50,11 +50,14 @@ NAME = "image-swap"
 FEWEST_TO_EITHER_SIDE = 8
 """Clean inferences that must go to either side before a reach is taken from them: a median of fewer jumps."""
 SMALLEST_REACH = 0.02
-"""Metres. Two sides that are nearer to each other are no choice between tiles, which are 0.31 m apart."""
+"""Least reach in metres. Two sides that are nearer are no choice between tiles, which are 0.31 m apart."""
 REACHED = 0.25
 """Share of the reach, from the middle, where a side counts as reached: half-way, as the side is at 0.5."""
 SMALLEST_SHARE_OF_INTEREST = 0.10
-"""Of the reach. A displacement below it is a trace. Chosen, as the bound within which *not used* must lie."""
+"""Share of the reach below which a displacement is a trace.
+
+It is chosen, as the bound within which *not used* must lie.
+"""
 FOLLOWS, REVERSES = 1, -1
 """Responses of an episode to a swap; 0 is neither."""
 _LEGEND = (
@@ -85,15 +88,16 @@ class InputEffect(Effect):
     Attributes:
         vary: The input that was exchanged for a donor's.
         changed: Share of pairs in which any number of the action changed; 0 means that the input does not arrive.
-        size: Mean size of the change by the donor's input, by its control and by all of the donor's inputs.
-        control_size: As `size`.
-        full_size: As `size`.
-        share: Displacement toward the donor's action by this input, as a share of the exchange of all inputs, with
-            its 95 % interval by groups; None where that changes nothing.
-        share_ci: As `share`.
-        p: Exact and one-sided, that the change is larger than the control's, by items and by groups, the larger
+        size: Mean size of the action's change by the donor's input.
+        control_size: Mean size of its change by the control of that input.
+        full_size: Mean size of its change by all of the donor's inputs.
+        share: Displacement toward the donor's action by this input, as a share of the exchange of all inputs. None
+            where that changes nothing.
+        share_ci: The 95 % interval of `share`, by groups; None likewise.
+        p: Exact one-sided p-value that the change is larger than the control's, by items and by groups, the larger
             one.
-        finding: `decides`, `moves`, `no effect` within the bound, or `open`.
+        finding: Verdict in a word: `decides`, `moves`, `no effect` within the bound, or `open`.
+        key: Key of the intervention.
     """
 
     vary: str
@@ -112,7 +116,13 @@ class InputEffect(Effect):
 
 
 def input_effect(outcomes: ConditionOutcomes, swapped: str, vary: str) -> InputEffect:
-    """Return that of one category. swapped: the condition in which the input is the donor's."""
+    """Return the effect of one input in one category.
+
+    Args:
+        outcomes: Outcomes of one category.
+        swapped: Name of the condition in which the input is the donor's.
+        vary: Name of the input.
+    """
     assert outcomes.size is not None
     at, control, full = (outcomes.conditions.index(name) for name in (swapped, CONTROL_INPUT, DONOR))
     size, control_size, full_size = outcomes.size[[at, control, full]]
@@ -136,7 +146,13 @@ def input_effect(outcomes: ConditionOutcomes, swapped: str, vary: str) -> InputE
 
 
 def _finding(share: SwapShare | None, p: float, ratio: float) -> Finding:
-    """Return the verdict of an input. ratio: of its change to that by all inputs."""
+    """Return the verdict of an input.
+
+    Args:
+        share: Share of the exchange of all inputs; None where that changes nothing.
+        p: The p-value that the change is larger than the control's.
+        ratio: Size of its change over that by all inputs.
+    """
     if share is None:
         return "open"
     beyond = p < SIGNIFICANCE
@@ -172,7 +188,7 @@ _INPUT_COLUMNS: Mapping[str, Any] = {
 
 
 def _find_input(row: InputEffect) -> str:
-    """Return a verdict and what the action does, without brackets."""
+    """Return a verdict and the action's response, without brackets."""
     if not row.changed:
         return f"does not arrive: another {row.vary} changes no number of any action"
     share = "" if row.share is None else f", by {row.share:z.2f} of what all inputs do"
@@ -185,7 +201,7 @@ def _find_input(row: InputEffect) -> str:
 
 
 def _describe_input(row: InputEffect) -> str:
-    """Return the same as the end of a sentence."""
+    """Return the verdict of an input as the end of a sentence."""
     if not row.changed:
         return f"the {row.vary} does not arrive: it changes no number of any action"
     share = "n/a" if row.share is None else f"{row.share:z.2f}"
@@ -199,9 +215,9 @@ class Reach(NamedTuple):
     """The lateral distance between a policy's own two choices.
 
     Attributes:
-        metres: More than zero.
-        source: `actions`, the clean inferences of all categories, or `tiles`, the distance between the tiles,
-            where too few inferences go to one of the sides.
+        metres: The distance; more than zero.
+        source: Origin of the distance. `actions` are the clean inferences of all categories. `tiles` is the
+            distance between the tiles, where too few inferences go to one of the sides.
     """
 
     metres: float
@@ -209,9 +225,9 @@ class Reach(NamedTuple):
 
     @classmethod
     def of(cls, clean: NDArray[np.float64], tiles_apart: float = TILES_APART) -> "Reach":
-        """Return that of (E,) clean displacements, metres, left positive, over all categories of an intervention.
+        """Return the reach of (E,) clean displacements in metres, left positive, over all categories.
 
-        Medians: a few categories in which the policy moves weakly do not shorten it.
+        The reach is a difference of medians: a few categories in which the policy moves weakly do not shorten it.
         """
         to_left, to_right = clean[clean > 0], clean[clean < 0]
         if min(to_left.size, to_right.size) >= FEWEST_TO_EITHER_SIDE:
@@ -228,22 +244,24 @@ class ImageSwapEffect(Effect):
     Attributes:
         follow_rate: Share of episodes in which the action goes to the correct picture, and to the other side once
             the two are swapped.
-        reversal_rate: In which it does the reverse.
-        net_follow_rate: Their difference, with its 95 % interval by groups.
-        follow_p: Exact, one-sided: an item's action moves toward (away from) the correct picture more often than
-            by chance; the larger of by items and by groups.
-        reversal_p: As `follow_p`.
-        median_displacement: Metres between the two actions.
-        reach: See `Reach`.
-        reach_source: As `reach`.
+        reversal_rate: Share of episodes in which it does the reverse.
+        net_follow_rate: Difference of the two rates.
+        net_follow_rate_ci: The 95 % interval of `net_follow_rate`, by groups.
+        follow_p: Exact one-sided p-value that an item's action moves toward the correct picture more often than by
+            chance, by items and by groups, the larger one.
+        reversal_p: The same p-value for moves away from the correct picture.
+        median_displacement: Median distance between the two actions, in metres.
+        reach: Metres of the policy's reach, see `Reach`.
+        reach_source: Origin of the reach, see `Reach`.
         reach_share: Mean displacement toward the correct picture in units of the reach, 1 for a whole change of
-            sides, with Student's 95 % interval by groups.
-        moved_share: The same whichever way the action moves.
-        left_reached: Of the episodes with the correct picture on that side, the share that reaches it (beyond a
-            quarter of the reach from the middle), minus that share with swapped images.
-        right_reached: As `left_reached`.
-        readout: `first-chunk` or `per-step`, of all displacements.
-        key: Of the stored intervention.
+            sides.
+        reach_share_ci: Student's 95 % interval of `reach_share`, by groups.
+        moved_share: Mean displacement in units of the reach, whichever way the action moves.
+        left_reached: Share of the episodes with the correct picture on the left that reach it, minus that share
+            with swapped images. Reached is what lies beyond a quarter of the reach from the middle.
+        right_reached: The same of the episodes with the correct picture on the right.
+        readout: Readout of all displacements, `first-chunk` or `per-step`.
+        key: Key of the stored intervention.
     """
 
     n_episodes: int
@@ -268,7 +286,7 @@ class ImageSwapEffect(Effect):
 
 
 def image_swap_effects(measurement: Measurement) -> list[ImageSwapEffect]:
-    """Return one per category, in the order of the episodes."""
+    """Return one row per category, in the order of the episodes."""
     reach = Reach.of(measurement.outcomes.of(CLEAN), measurement.tiles_apart)
     return measurement.rows(
         lambda part: [ImageSwapEffect(**swap_columns(part, IMAGE_SWAP, reach), readout=measurement.readout)]
@@ -276,7 +294,13 @@ def image_swap_effects(measurement: Measurement) -> list[ImageSwapEffect]:
 
 
 def swap_columns(outcomes: ConditionOutcomes, swapped: str, reach: Reach) -> dict[str, Any]:
-    """Return the columns of `ImageSwapEffect` of one category. swapped: compared with the clean condition."""
+    """Return the columns of `ImageSwapEffect` for one category.
+
+    Args:
+        outcomes: Outcomes of one category.
+        swapped: Name of the condition that is compared with the clean one.
+        reach: Reach of the policy.
+    """
     clean, other = (outcomes.correct_sign * outcomes.of(name) for name in (CLEAN, swapped))
     responses = swap_responses(outcomes, swapped)
     net = responses.astype(float)
@@ -317,7 +341,8 @@ def swap_responses(outcomes: ConditionOutcomes, swapped: str = IMAGE_SWAP) -> ND
 def swap_responses_by_episode(run: RunReader) -> dict[str, int]:
     """Return by episode id how its action responds in the image swap that tables read; empty without a stored one.
 
-    Raises RunDamagedError.
+    Raises:
+        RunDamagedError: If a stored intervention was changed.
     """
     stored = [result.outcomes for result in preferred_by_category(run, NAME).values()]
     return {
@@ -330,9 +355,11 @@ def swap_responses_by_episode(run: RunReader) -> dict[str, int]:
 def stored_image_swaps(run: RunReader, readout: str | None = None) -> dict[str, ImageSwapEffect]:
     """Return by category the effects of the image swaps that are stored for the episodes the run has now.
 
+    Of several image swaps it is the preferred one, see `stored`. Empty if there is none.
+
     Args:
-        readout: Of those alone; None for any. Of several the preferred one, see `outcomes`; empty if there is
-            none.
+        run: Run with the stored interventions.
+        readout: Readout of the image swaps, `first-chunk` or `per-step`; None for any.
 
     Raises:
         RunDamagedError: If any stored intervention was changed.
@@ -355,14 +382,14 @@ SWAP_COLUMNS: Mapping[str, Any] = {
     "median displacement cm": lambda row: f"{100 * row.median_displacement:.2f}",
     "n (items)": lambda row: f"{row.n_episodes} ({row.n_items})",
 }
-"""The columns that all swaps have."""
+"""The columns of all swaps."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Swap(Intervention):
-    """An exchange of one input, in the condition `swapped`; a kind says what it is in the scene.
+    """An exchange of one input, in the condition `swapped`; a kind defines it for the scene.
 
-    Without sides it is exchanged for that of a donor, and one row per category says what that does.
+    Without sides, the input is exchanged for that of a donor, and one row per category has the effect.
     """
 
     swapped: ClassVar[str]
@@ -384,7 +411,7 @@ class Swap(Intervention):
 
     @classmethod
     def sentences(cls, rows: Sequence[Any], context: Measurement) -> list[str]:
-        """Return one per category."""
+        """Return one sentence per category."""
         if context.lacks_sides:
             return [f"{row.n_episodes} frames of {row.n_items} episodes: {_describe_input(row)}." for row in rows]
         return [

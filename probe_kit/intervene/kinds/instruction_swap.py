@@ -1,7 +1,7 @@
 """Instruction swap: asked for the other picture before the same images, does the action change sides?
 
-Following the images shows that they are read; following the instruction shows that it is read. A policy may do one
-and not the other: it can have learnt what to look for, whatever is asked.
+If the action follows the images, they are read; if it follows the instruction, that is read. A policy may follow
+one and not the other: it can have learnt what to look for, whatever is asked.
 """
 
 from collections.abc import Mapping, Sequence
@@ -53,12 +53,12 @@ class InputSensitivity:
     """The changes of the first inferences of one category; one input is swapped, the others stay.
 
     Attributes:
-        instruction: Median lateral metres between where the two actions would bring the hand.
-        images: As `instruction`.
-        noise: As `instruction`.
-        instruction_changed: Share of episodes in which any number of the action changed at all; 0 means that the
-            policy ignores that input.
-        images_changed: As `instruction_changed`.
+        instruction: Median lateral metres between the two actions' ends of the hand, with the instruction swapped.
+        images: The same with the images swapped.
+        noise: The same with the noise drawn anew.
+        instruction_changed: Share of episodes in which any number of the action changed at all with the
+            instruction swapped; 0 means that the policy ignores it.
+        images_changed: The same share with the images swapped.
     """
 
     instruction: float
@@ -70,18 +70,22 @@ class InputSensitivity:
 
 @dataclass(frozen=True, kw_only=True)
 class InstructionSwapEffect(ImageSwapEffect):
-    """The columns of `ImageSwapEffect`, of the swapped instruction. sensitivity: of one step to each input."""
+    """The columns of `ImageSwapEffect`, for the swapped instruction.
+
+    Attributes:
+        sensitivity: Sensitivity of one step to each input.
+    """
 
     sensitivity: InputSensitivity
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain values, the sensitivity's among them."""
+        """Return plain values, with the sensitivity's among them."""
         plain = asdict(self)
         return {**{name: value for name, value in plain.items() if name != "sensitivity"}, **plain["sensitivity"]}
 
 
 def input_sensitivity(outcomes: ConditionOutcomes) -> InputSensitivity:
-    """Return that of the episodes of one category."""
+    """Return the sensitivity in the episodes of one category."""
     clean = outcomes.of(CLEAN)
     apart = {name: float(np.median(np.abs(outcomes.of(other) - clean))) for name, other in _CONDITIONS.items()}
     changed = {
@@ -94,7 +98,7 @@ def input_sensitivity(outcomes: ConditionOutcomes) -> InputSensitivity:
 
 
 def _ask_for_the_other(context: ConditionContext) -> ConditionResult:
-    """Infer with the same state, noise and pictures, asked for the other one of the two."""
+    """Infer with the same state, noise and pictures, asked for the other picture."""
     observation = context.session.with_other_instruction(context.pair)
     assert observation is not None, "items without a counterpart are skipped"
     return ConditionResult(context.session.act(observation, context.pair.seed))
@@ -110,7 +114,8 @@ class InstructionSwap(Swap):
     """Four inferences per episode: clean, other instruction, swapped images, other noise.
 
     A counterpart shows the same two pictures and asks for the other one; items without one are skipped and
-    counted. The last two are for comparison: the sensitivity of one step's action to images and to noise.
+    counted. The last two inferences are for comparison: the sensitivity of one step's action to images and to
+    noise.
     """
 
     kind: ClassVar[str] = "instruction-swap"
@@ -120,7 +125,11 @@ class InstructionSwap(Swap):
     swapped: ClassVar[str] = INSTRUCTION_SWAP
 
     def eligible_items(self, session: "ReplaySession", items: Sequence[str]) -> list[str]:
-        """Return those of `items` with a counterpart in the run's wording. Raises UsageError if there is none."""
+        """Return those of `items` with a counterpart in the run's wording.
+
+        Raises:
+            UsageError: If there is none.
+        """
         eligible = [item for item in items if session.has_other_instruction(item)]
         if not eligible:
             raise UsageError(
@@ -130,7 +139,10 @@ class InstructionSwap(Swap):
         return eligible
 
     def conditions(self, session: "ReplaySession") -> Sequence[Condition]:
-        """Return clean; asked for the other picture; the images swapped; the noise drawn anew."""
+        """Return clean, the other picture's instruction, swapped images, and noise drawn anew.
+
+        Without sides, the images are those of a donor, and a control is added.
+        """
         swapped, noise = Condition(INSTRUCTION_SWAP, _ask_for_the_other), Condition(NOISE, _resample_noise)
         if has_sides(session.run):
             return CLEAN_RUN, swapped, SOURCE_RUN, noise

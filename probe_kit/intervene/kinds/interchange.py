@@ -1,13 +1,13 @@
-"""Edits of places by interchange (activation patching), and what a run's stored edits found inside the network.
+"""Interchange (activation patching) at places, and what a run's stored edits found inside the network.
 
-Tokens are patched from the same inference with swapped images. What is patched in is what this policy computes
-there in this state, so it is on the policy's own distribution, has no strength to choose, and can do no more than
-the image swap: with all that differs patched, the effect is 1.
+Tokens are patched from the same inference with swapped images. The patch is what this policy computes there in
+this state, so it is on the policy's own distribution and has no strength to choose. It can do no more than the
+image swap: with all that differs patched, the effect is 1.
 
-Effects are signed: the *target side* is the one on which the correct picture lies once the two are swapped, or the
-side that is steered to. A flip rate alone says nothing: actions flip away from it as well. Maps, directions and
-steering are each read by themselves. Family-wise p-values are against everything that was tried in the same stream
-on the same episodes, in one intervention or in several.
+Effects are signed. The *target side* is the one on which the correct picture lies once the two are swapped, or the
+side that is steered to. A flip rate alone is no evidence: actions flip away from that side as well. Maps,
+directions and steering are each read by themselves. Family-wise p-values are against everything that was tried in
+the same stream on the same episodes, in one intervention or in several.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -67,19 +67,25 @@ _LEGEND = (
 class PatchEffect(EffectRow):
     """The effect of an edit at one place, in one category; see `EffectRow`.
 
-    net: share of episodes whose action flips to the target side, minus those that flip away from it; net_left,
+    Here `net` is the share of episodes whose action flips to the target side, minus those that flip away from it.
+    The test is one-sided, by sign flips of whole groups; for an interchange it is in the direction of the swap
+    itself.
 
     Attributes:
-        coefficient: Of steering, else empty.
-        effect: Share of what the whole image swap does to where the action goes, toward the target side, with its
-            95 % interval by groups; None if that does nothing, so that a share would be a ratio of noise.
-        net_right: The same by target side.
-        mean_displacement: Metres toward the target side, of the edit and of its matched controls.
-        control_displacement: As `mean_displacement`.
-        t: Of the displacement beyond the controls', one-sided, by sign flips of whole groups, of an interchange in
-            the direction of the swap itself; p_fwe against the largest t of all edits of the category.
-        p: As `t`.
-        p_fwe: As `t`.
+        coefficient: Coefficient of steering, as text; empty for other edits.
+        effect: Share of what the whole image swap does to where the action goes, toward the target side. None if
+            the swap does nothing, so that a share would be a ratio of noise.
+        effect_ci: The 95 % interval of `effect`, by groups; None likewise.
+        net_left: The same as `net`, of episodes with the target side left.
+        net_right: The same as `net`, of episodes with the target side right.
+        mean_displacement: Metres toward the target side.
+        control_displacement: Metres toward the target side of its matched controls, on average; None without any.
+        t: Statistic of the displacement beyond the controls'.
+        p: The p-value of the same; None for rows that are not tested.
+        p_fwe: Family-wise p-value, against the largest t of all edits of the category; None likewise.
+        action_share: Displacement toward the source's action as a share of the whole image swap's; None where that
+            changes nothing.
+        action_share_ci: The 95 % interval of `action_share`, by groups; None likewise.
     """
 
     coefficient: str
@@ -116,7 +122,7 @@ class PatchEffect(EffectRow):
     def is_by_construction(self) -> bool:
         """Whether its place carries the effect in every policy that acts on the images, and so locates nothing.
 
-        The first layer of the backbone holds the swapped images themselves, and the acting stream the action.
+        The first layer of the backbone contains the swapped images themselves, and the acting stream the action.
         """
         parsed = PlaceName.parse(self.sites)
         is_first = parsed.stream == BACKBONE and parsed.layer == 0 and parsed.quantity in ("", RESIDUAL)
@@ -124,12 +130,12 @@ class PatchEffect(EffectRow):
 
     @property
     def name(self) -> str:
-        """Return the edit in a few words."""
+        """The edit in a few words."""
         return " ".join(filter(None, (super().name, self.coefficient and f"coefficient {self.coefficient}")))
 
 
 def target_sign(outcomes: ConditionOutcomes, target_side: str) -> Values:
-    """Return (E,) the side that is pushed to, +1 for left."""
+    """Return (E,) the target side of every episode, +1 for left."""
     correct = outcomes.correct_sign
     sides = {"left": np.ones_like(correct), "right": -np.ones_like(correct), "correct": correct}
     # `wrong`, and the image swap, after which the correct picture lies on the other side.
@@ -137,7 +143,12 @@ def target_sign(outcomes: ConditionOutcomes, target_side: str) -> Values:
 
 
 def patch_effects(outcomes: ConditionOutcomes, target_side: str = IMAGE_SWAP) -> list[PatchEffect]:
-    """Return one per edit, of one category. target_side: `image_swap`, or the side that is steered to."""
+    """Return one row per edit, of one category.
+
+    Args:
+        outcomes: Outcomes of one category.
+        target_side: Name of the target: `image_swap`, or the side that is steered to.
+    """
     rows = [row for row, name in enumerate(outcomes.conditions) if name not in UNCHANGED]
     if not rows:
         return []
@@ -188,15 +199,16 @@ def patch_effects(outcomes: ConditionOutcomes, target_side: str = IMAGE_SWAP) ->
 
 BACKBONE = "backbone"
 USUAL, WRONG = "mean-difference", "wrong"
-"""Settings of steering if nothing is said: the direction of the class means, and the side."""
+"""Default settings of steering: the direction of the class means, and the side."""
 
 
 def stored_site_effects(run: RunReader) -> dict[str, list[PatchEffect]]:
     """Return the maps by category: the effects of tokens patched in full, a row for every place and role.
 
-    The backbone first and `kv` last, shallow before deep.
+    The backbone comes first and `kv` last, shallow before deep.
 
-    Raises RunDamagedError.
+    Raises:
+        RunDamagedError: If a stored intervention was changed.
     """
     return _by_category(_maps(run))
 
@@ -209,8 +221,8 @@ def stored_subspace_effects(run: RunReader) -> dict[str, list[PatchEffect]]:
 def stored_steering(run: RunReader) -> dict[str, dict[str, list[PatchEffect]]]:
     """Return by category and place (`backbone.02 image`) the effects of steering, all coefficients and controls.
 
-    Another direction than that of the class means, and another side than the wrong one, stand apart
-    (`backbone.02 image, probe, toward left`).
+    Steering along another direction than that of the class means, or to another side than the wrong one, has a key
+    of its own (`backbone.02 image, probe, toward left`).
     """
     steering: dict[str, dict[str, list[PatchEffect]]] = {}
     for selection, rows in _rows_of(_steering(run)):
@@ -223,10 +235,10 @@ def stored_steering(run: RunReader) -> dict[str, dict[str, list[PatchEffect]]]:
 
 
 def localised_sites(rows: Sequence[PatchEffect]) -> tuple[str, ...]:
-    """The places, each once, that carry half of the effect or more when their tokens are patched in full.
+    """Return the places, each once, that carry half of the effect or more when their tokens are patched in full.
 
-    Those of `kv` with the role of the tokens (`kv.01 language`), unless only all of a block together carry it.
-    Without those that carry it by construction.
+    Places of `kv` have the role of the tokens (`kv.01 language`), unless only all of a block together carry it.
+    Places that carry it by construction are left out.
     """
     localised = [row for row in rows if row.is_localised and not row.direction and not row.is_by_construction]
     read = KV_STREAM + "."
@@ -248,8 +260,8 @@ def is_backbone_layer(row: PatchEffect) -> bool:
 def localised_by_category(maps: Mapping[str, Sequence[PatchEffect]]) -> dict[str, tuple[str, ...]]:
     """Return by category `localised_sites` of `stored_site_effects`; without categories that were not searched.
 
-    Searched is one of which all tokens of some layer of the backbone were patched, or of which a place was found:
-    a null result for one role, iteration or block does not rule out the others.
+    A category counts as searched if all tokens of some layer of the backbone were patched, or if a place was
+    found. A null result for one role, iteration or block does not rule out the others.
     """
     localised = {category: localised_sites(rows) for category, rows in maps.items()}
     return {
@@ -262,8 +274,10 @@ def localised_by_category(maps: Mapping[str, Sequence[PatchEffect]]) -> dict[str
 def carrying_directions(along: Mapping[str, Sequence[PatchEffect]]) -> dict[str, tuple[str, ...]]:
     """Return by category the directions that carry half of the effect, beyond random ones.
 
+    A direction is spelt `mean-difference at backbone.02 image`.
+
     Args:
-        along: As `stored_subspace_effects` gives it. A direction is spelt `mean-difference at backbone.02 image`.
+        along: Effects by category, as `stored_subspace_effects` gives them.
     """
     return {
         category: tuple(
@@ -276,7 +290,11 @@ def carrying_directions(along: Mapping[str, Sequence[PatchEffect]]) -> dict[str,
 
 
 class _Selection(NamedTuple):
-    """The conditions that stand for a subject. merit: of several, the largest is chosen."""
+    """The conditions that stand for a subject.
+
+    Attributes:
+        merit: Key by which one of several selections is chosen, the largest one.
+    """
 
     group: PooledConditions
     conditions: tuple[str, ...]
@@ -301,7 +319,7 @@ def _steering(run: RunReader) -> list[_Selection]:
 
 
 def _selections(groups: Sequence[PooledConditions], setting: Sequence[str]) -> list[_Selection]:
-    """One per category, place, role and values of these settings, by depth within a category."""
+    """Return one selection per category, place, role and values of these settings, by depth within a category."""
     selected: dict[str, dict[tuple[str, ...], _Selection]] = {}
     for group in groups:
         values = [str(group.like.stored.settings.get(name)) for name in setting]
@@ -320,7 +338,7 @@ def _selections(groups: Sequence[PooledConditions], setting: Sequence[str]) -> l
 
 
 def _rows_of(selections: Sequence[_Selection]) -> Iterator[tuple[_Selection, list[PatchEffect]]]:
-    """The numbers of each, tested against everything that its group tried in the same stream."""
+    """Yield each selection with its effects, tested against all that its group tried in the same stream."""
     tested: dict[tuple[int, str], dict[str, PatchEffect]] = {}
     for selection in selections:
         group, stream = selection.group, selection.conditions[0].partition(".")[0]
@@ -344,7 +362,7 @@ def _by_category(selections: Sequence[_Selection]) -> dict[str, list[PatchEffect
 
 
 def _depth(subject: tuple[str, ...]) -> tuple[object, ...]:
-    """The backbone, then the acting stream, then `kv`; shallow before deep, all tokens before single roles."""
+    """Return a sort key: backbone, acting stream, then `kv`; shallow before deep, all tokens before roles."""
     site, role, *values = subject
     name = PlaceName.parse(site)
     part = {BACKBONE: 0, KV_STREAM: 2}.get(name.stream, 1)
@@ -352,11 +370,11 @@ def _depth(subject: tuple[str, ...]) -> tuple[object, ...]:
 
 
 def best_patch_targets(run: RunReader, categories: Sequence[str]) -> tuple[str, ...]:
-    """`PLACE|ROLE`, of each category the last place of the backbone that was located, in its narrowest role.
+    """Return `PLACE|ROLE`, of each category the last place of the backbone located, in its narrowest role.
 
-    The last one is behind everything else through which the answer passes; where none of the backbone was located,
-    the last of the acting stream or of `kv`. Of its roles the one with the largest effect, and all tokens only
-    where no single role carries half of it.
+    The last place lies behind all other places through which the answer passes. Where none of the backbone was
+    located, it is the last of the acting stream or of `kv`. Of its roles it has the one with the largest effect,
+    and all tokens only where no single role carries half of it.
 
     Raises:
         UsageError: If none was located.
@@ -373,7 +391,7 @@ def best_patch_targets(run: RunReader, categories: Sequence[str]) -> tuple[str, 
 
 
 def best_cell(rows: Sequence[PatchEffect]) -> PatchEffect | None:
-    """The patch behind which nothing of the answer passes, of one category; see `best_patch_targets`."""
+    """Return the patch behind which nothing of the answer passes, of one category; see `best_patch_targets`."""
     located = [row for row in rows if row.is_localised and not row.direction]
     if not located:
         return None
@@ -386,7 +404,7 @@ def best_cell(rows: Sequence[PatchEffect]) -> PatchEffect | None:
 
 
 def cells_at(session: "ReplaySession", places: Iterable[SiteGroup], roles: Sequence[str]) -> list[Cell]:
-    """Return the cells of these roles at places, as far as tokens play them."""
+    """Return the cells of these roles at places, for the roles that tokens there have."""
     return [
         Cell(site_group, role)
         for site_group in places
@@ -395,7 +413,13 @@ def cells_at(session: "ReplaySession", places: Iterable[SiteGroup], roles: Seque
 
 
 def patch_of(cell: Cell, source_sites: tuple[Site, ...], prefix: str = "") -> Condition:
-    """Return the patch of one cell in full. prefix: of its name."""
+    """Return the patch of one cell in full.
+
+    Args:
+        cell: Cell that is patched.
+        source_sites: Sites at which the source is captured.
+        prefix: Beginning of the condition's name.
+    """
     return patched_run(f"{prefix}{ConditionName(cell.site_group.name, cell.role)}", {"": (cell,)}, source_sites)
 
 
@@ -412,7 +436,11 @@ def patches_within(
 
 
 def check_roles_apart(roles: Sequence[str], kind: str) -> None:
-    """Raise UsageError for roles that share tokens: sets of such cells would patch tokens twice."""
+    """Refuse roles that share tokens: sets of such cells would patch tokens twice.
+
+    Raises:
+        UsageError: If the role `all` is among others.
+    """
     if ALL in roles:
         raise UsageError(f"--kind {kind} needs roles that share no token; leave all out")
 
@@ -430,7 +458,7 @@ class PatchKind(AlongDirection):
 
     @staticmethod
     def table(rows: Sequence[PatchEffect], context: Measurement) -> "Table":
-        """Return one line per category and edit; controls are columns of what is compared with them."""
+        """Return one line per category and edit; controls are columns of the edits that are compared with them."""
         unread = context.certificate.get("unread", ())
         edits = [row for row in rows if not row.is_control]
         return effect_table(
@@ -478,20 +506,21 @@ class PatchKind(AlongDirection):
 
     @staticmethod
     def keys_in_use(run: RunReader) -> set[str]:
-        """Return keys of the stored ones of which any number is in a map, a direction or a steering."""
+        """Return keys of the stored interventions with any number in a map, a direction or a steering."""
         every = [*_maps(run), *_along(run), *_steering(run)]
         return {selection.group.sources[name].stored.key for selection in every for name in selection.conditions}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Interchange(PatchKind):
-    """Every place is tried at every role, alone.
+    """An interchange that tries every place at every role, alone.
 
     Attributes:
-        sites: Patterns, see `resolve_sites`.
-        roles: Of the tokens that are patched; a stream is tried at those that it has. direction: patches tokens
-            within it alone; `none` in full. controls: so many times as many random directions, per place and role;
-            see `AlongDirection`.
+        sites: Patterns of places, see `resolve_sites`.
+        roles: Roles of the patched tokens; a stream is tried at those that it has.
+        direction: Name of the direction within which alone tokens are patched, see `AlongDirection`; `none` to
+            patch in full.
+        controls: Number of random subspaces of the same rank, per place and role.
     """
 
     kind: ClassVar[str] = "interchange"
@@ -518,12 +547,18 @@ class Interchange(PatchKind):
 
     @classmethod
     def from_options(cls, run: Run, **options: Any) -> Self:
-        """Return it with five controls where a direction is given and their number is not."""
+        """Return the kind with five controls where a direction is given and their number is not."""
         options.setdefault("controls", 5 if "direction" in options else 0)
         return super().from_options(run, **options)
 
     def conditions(self, session: "ReplaySession") -> Sequence[Condition]:
-        """Return clean, images swapped, and every place at every role. Raises UnknownSiteError, NoProbesError."""
+        """Return clean, images swapped, and every place at every role.
+
+        Raises:
+            NoProbesError: For a direction of probes in a run without them.
+            UnknownSiteError: For a place that does not exist.
+            NoDirectionError: For a named place without a direction.
+        """
         cells = cells_at(session, resolve_all(self.sites, session.policy).values(), self.roles)
         source_sites = sites_of_cells(cells)
         conditions = [CLEAN_RUN, SOURCE_RUN]
@@ -559,13 +594,13 @@ _WITHOUT_SIDES: Mapping[str, Any] = {
     "p": _COLUMNS["p"],
     "relative change": _COLUMNS["relative change"],
 }
-"""Displacements are in spreads of clean actions, toward the source's action."""
+"""Columns of a run without sides; displacements are in spreads of clean actions, toward the source's action."""
 
 
 def _carriers(rows: Sequence[PatchEffect]) -> tuple[list[PatchEffect], list[PatchEffect], int]:
     """Return edits, those with half of the effect, the largest first, and how many have it by construction.
 
-    What carries the swap in every policy locates nothing (`*` in the table), so that it counts apart.
+    A place that carries the swap in every policy locates nothing (`*` in the table), so that it counts separately.
     """
     edits = [row for row in rows if row.coefficient != "0"]
     by_construction = [row for row in edits if row.is_localised and row.is_by_construction]

@@ -36,14 +36,14 @@ if TYPE_CHECKING:
 
 NAME = "joint"
 SITES, ROLES = ("kv.*",), ("image", "language", "state")
-"""Searched if nothing is said: all that the acting stream reads."""
+"""Default places and roles of a search: all that the acting stream reads."""
 EVERY, ALONE, WITHOUT, MINIMAL, SECOND = "every-cell", "alone", "without", "minimal", "second"
-"""Conditions: all cells; one of them, and all but it; the smallest set, and one that is found without it."""
+"""Names of conditions: all cells; one of them, all but it; the smallest set, and one found without it."""
 WITHOUT_MINIMAL = f"{WITHOUT}|{MINIMAL}"
 WORTH_SEARCHING = 0.5
-"""Effect of all cells together from which a smallest set is searched: of less, hardly any carries half."""
+"""Effect of all cells together from which on a smallest set is searched: of less, hardly any carries half."""
 MOST_PLACES = 3
-"""Places that a short sentence names."""
+"""Number of places that a short sentence names."""
 _LEGEND = (
     "alone: share of the image swap with only these cells patched; needed: what all cells lose without them; "
     "read here: both at least 0.5; enough alone: another copy is read as well; needed, not enough: one part of "
@@ -61,11 +61,11 @@ class SearchedSets(NamedTuple):
     """The result of the search in one category; the sets may be empty.
 
     Attributes:
-        choosing: The groups that were searched.
-        cells: The smallest set.
-        second: Of the other cells, the smallest set that carries the effect as well.
-        effect: Of `cells`, in these groups.
-        tried: How many sets.
+        choosing: Groups in which the sets were searched.
+        cells: Cells of the smallest set.
+        second: Cells of the smallest set of the other cells that carries the effect as well.
+        effect: Effect of `cells` in these groups.
+        tried: Number of sets that were tried.
     """
 
     choosing: tuple[str, ...]
@@ -82,15 +82,16 @@ class SearchedSets(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class JointPlaces(Intervention):
-    """Every cell alone, all cells but it, all of them, and the smallest set that carries the effect.
+    """Conditions with every cell alone, all but it, all of them, and the smallest set that carries the effect.
 
-    A cell is the tokens of a role at a place.
+    A cell is the tokens of a role at a place. The smallest set is searched in one half of each category's groups,
+    drawn with `seed`, and scored in the other.
 
     Attributes:
-        sites: Patterns of places that are read in parallel, the blocks of `kv`, one layer, or the heads of one
-            block; of several layers the first decides.
-        roles: Of the cells' tokens. The smallest set is searched in one half of each category's groups, drawn with
-            `seed`, and scored in the other.
+        sites: Patterns of places that are read in parallel: the blocks of `kv`, one layer, or the heads of one
+            block. Of several layers, the first would decide.
+        roles: Roles of the cells' tokens.
+        seed: Seed of the halves of the groups.
     """
 
     kind: ClassVar[str] = NAME
@@ -113,7 +114,11 @@ class JointPlaces(Intervention):
         check_roles_apart(self.roles, self.kind)
 
     def conditions(self, session: "ReplaySession") -> Sequence[Condition]:
-        """Return clean, images swapped, the sets of cells. Raises UsageError for cells that are not parallel."""
+        """Return clean, images swapped, and the sets of cells.
+
+        Raises:
+            UsageError: For cells that are not parallel, or fewer than two.
+        """
         cells = self._cells(session)
         pairs: dict[str, list[Pair]] = {}
         for item in self.items_in(session.run):
@@ -152,7 +157,7 @@ class JointPlaces(Intervention):
         return cells
 
     def _search(self, session: "ReplaySession", cells: tuple[Cell, ...], pairs: Sequence[Pair]) -> SearchedSets:
-        """Return the smallest sets of one category, searched on the choosing half of its groups."""
+        """Search the smallest sets of one category, in the choosing half of its groups."""
         choosing = choosing_half([pair.group for pair in pairs], self.seed)
         searched_pairs = [pair for pair in pairs if pair.group in choosing]
         sites = sites_of_cells(cells)
@@ -210,7 +215,7 @@ class JointPlaces(Intervention):
 
     @staticmethod
     def notes(rows: "Sequence[JointEffect]") -> list[str]:
-        """Return categories in which the half of the groups that scores a smallest set cannot confirm any."""
+        """Return notes on categories whose scoring half of the groups is too small to confirm any smallest set."""
         counts = {row.category: row.n_groups for row in rows if row.part == MINIMAL}
         return [
             f"{name}: the smallest set is scored in {count} groups, in which no p can be below "
@@ -221,7 +226,11 @@ class JointPlaces(Intervention):
 
     @staticmethod
     def keys_in_use(run: RunReader) -> set[str]:
-        """Return keys of the stored searches that verdicts and tables read. Raises RunDamagedError."""
+        """Return keys of the stored searches that verdicts and tables read.
+
+        Raises:
+            RunDamagedError: If a stored intervention was changed.
+        """
         return {result.stored.key for result in _preferred(run).values()}
 
 
@@ -242,15 +251,22 @@ _COLUMNS: Mapping[str, Any] = {
 class JointEffect(Effect):
     """The effect of one set of cells in one category.
 
+    The smallest sets are scored on the groups in which they were not searched. Shares and their intervals are None
+    where the swap itself is not significant.
+
     Attributes:
-        cells: Its cells, joined by `+`; of all cells their places and roles, `kv` if nothing of it is missing.
-            part: `cell`, `every-cell`, `minimal` or `second`.
-        alone: Share of the swap with only these cells patched; needed: what all cells lose without them, of the
-            swap; both with 95 % intervals by groups, None where the swap itself is not significant.
-        p: That the set alone moves the action toward the target side. Of cells by sign flips of whole groups,
-            p_fwe against all cells; of the smallest sets exact. The smallest sets are scored on the groups in
-            which they were not searched.
-        p_fwe: As `p`.
+        part: Kind of the set: `cell`, `every-cell`, `minimal` or `second`.
+        cells: Cells of the set, joined by `+`; of all cells their places and roles, `kv` if nothing of it is
+            missing.
+        alone: Share of the swap with only these cells patched.
+        alone_ci: The 95 % interval of `alone`, by groups.
+        needed: Share of the swap that all cells lose without them.
+        needed_ci: The 95 % interval of `needed`, by groups.
+        p: The p-value that the set alone moves the action toward the target side. For cells it is by sign flips of
+            whole groups, for the smallest sets it is exact.
+        p_fwe: Family-wise p-value against all cells; None for sets of several.
+        finding: Finding in words.
+        key: Key of the intervention.
     """
 
     part: str
@@ -268,9 +284,12 @@ class JointEffect(Effect):
 
 
 def stored_joint_places(run: RunReader) -> dict[str, list[JointEffect]]:
-    """Return by category the rows of the preferred stored search: all of `kv` before a part, then the backbone.
+    """Return by category the rows of the preferred stored search.
 
-    Raises RunDamagedError.
+    All of `kv` is preferred to a part, and a part to the backbone.
+
+    Raises:
+        RunDamagedError: If a stored intervention was changed.
     """
     rows = {}
     for category, result in _preferred(run).items():
@@ -308,12 +327,14 @@ def is_read_jointly(rows: Sequence[JointEffect]) -> bool:
 
 @dataclass(frozen=True)
 class JointReading:
-    """The cells at which it is read, or passes in the backbone, and how. cells: none where that remains open.
+    """The cells at which the answer is read, or passes in the backbone, and how.
 
     Attributes:
-        alone: The shares that single cells carry, by cell.
-        is_jointly: Of a smallest set, whose cells are one text joined by `+`.
-        is_past: It reaches the action past all cells.
+        verb: Words for how, such as `read` or `passes jointly`.
+        cells: Names of the cells; empty where they remain open.
+        alone: Shares that single cells carry, by cell.
+        is_jointly: Whether it is a smallest set, whose cells are one text joined by `+`.
+        is_past: Whether the answer reaches the action past all cells.
     """
 
     verb: str
@@ -323,12 +344,12 @@ class JointReading:
     is_past: bool = False
 
     def list_cells(self, most: int | None = None) -> str:
-        """Return the cells in words. most: how many places are named, by default all."""
+        """Return the cells in words, at most so many places by name; None for all."""
         return self.cells[0] if self.is_jointly else list_places(self.cells, most)
 
 
 def joint_places(rows: Sequence[JointEffect]) -> JointReading:
-    """Return where it is read, or passes in the backbone.
+    """Return the cells at which the answer is read, or passes in the backbone.
 
     A smallest set is named if no cell alone comes near what all cells carry.
     """
@@ -357,7 +378,7 @@ def describe_joint_places(rows: Sequence[JointEffect]) -> str:
 
 
 def describe_remainder(rows: Sequence[JointEffect]) -> str:
-    """Return the part that places leave out: cells that oppose it, and a part that is past all cells."""
+    """Return the part that places leave out: cells that oppose it, and a part that passes outside of all cells."""
     (every,) = (row for row in rows if row.part == EVERY)
     opposing = [row.cells for row in rows if row.part == "cell" and row.finding == "opposes it"]
     parts = [f"opposed at {list_places(opposing)}"] * bool(opposing)
@@ -369,7 +390,13 @@ def describe_remainder(rows: Sequence[JointEffect]) -> str:
 def _rows(
     outcomes: ConditionOutcomes, settings: Mapping[str, Any], searches: Mapping[str, Any]
 ) -> list[JointEffect]:
-    """Return the rows of one category. searches: by category, as the certificate has them."""
+    """Return the rows of one category.
+
+    Args:
+        outcomes: Outcomes of one category.
+        settings: Settings of the intervention.
+        searches: Searched sets by category, as the certificate has them.
+    """
     clean, exchange = outcomes.of(CLEAN), outcomes.exchange()
     assert exchange is not None
     moved = {name: outcomes.of(name) - clean for name in outcomes.conditions}
@@ -432,7 +459,7 @@ def _all_cells(names: Sequence[str], settings: Mapping[str, Any]) -> str:
 
 
 def _of_all(every: SwapShare | None) -> str:
-    """Return what all cells together do."""
+    """Return the finding on all cells together."""
     if every is None:
         return "n/a"
     if carries_nothing(every.low, every.high):

@@ -1,12 +1,12 @@
 """Steering: a direction added to the tokens of one role, with matched controls of the same norm.
 
 One vector for all tokens cannot move an answer that lies in *which* tokens are marked: it marks all of them alike.
-`mean-difference:K` has a vector for each position, which takes the mark from one tile to the other.
+A direction `mean-difference:K` has a vector for each position, which moves the mark from one tile to the other.
 
-A supplement to the interchange, not a replacement. The sum may lie off the network's distribution, a coefficient
-has no natural size, and at a large one every direction disrupts the task. So coefficients count half class-mean
-differences (2 goes from one mean to the other), controls are orthogonal directions of the data's own covariance
-with the same norm, and both sides are reported.
+Steering is a supplement to the interchange, not a replacement. The sum may lie off the network's distribution, a
+coefficient has no natural size, and at a large one every direction disrupts the task. So coefficients count half
+class-mean differences (2 goes from one mean to the other). Controls are orthogonal directions of the data's own
+covariance with the same norm, and both sides are reported.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 TargetSide = Literal["wrong", "correct", "left", "right"]
 LARGE_CHANGE = 2.0
-"""Token norms beyond which a steering is said to be large."""
+"""Change in token norms beyond which a steering is called large."""
 
 
 def steered(cell: Cell, name: str, coefficient: float, target_side: TargetSide, bases: "Directions") -> Condition:
@@ -51,17 +51,20 @@ def steered(cell: Cell, name: str, coefficient: float, target_side: TargetSide, 
 
 @dataclass(frozen=True, kw_only=True)
 class Steering(PatchKind):
-    """Every place and coefficient, toward one side, and the same for the controls; 0 is always played as well.
+    """Conditions at every place and coefficient, toward one side, with controls; 0 is always played as well.
 
     Attributes:
         sites: Patterns of places.
-        role: Whose tokens are moved.
-        direction: `mean-difference` or `probe`, one vector found in the mean of these tokens and added to each; or
-            `mean-difference:K`, at each position the difference of the class means there, within the K directions
-            that positions share.
-        coefficients: In half class-mean differences along the direction.
-        target_side: `wrong` and `correct` are those of the clean images.
-        controls: So many orthogonal directions. Raises UsageError for a coefficient or side that does not exist.
+        role: Role of the moved tokens.
+        direction: Name of the direction. `mean-difference` or `probe` is one vector found in the mean of these
+            tokens and added to each. `mean-difference:K` is at each position the difference of the class means
+            there, within the K directions that positions share.
+        coefficients: Sizes of the step, in half class-mean differences along the direction.
+        target_side: Side to steer to; `wrong` and `correct` are those of the clean images.
+        controls: Number of orthogonal directions.
+
+    Raises:
+        UsageError: For a role, coefficient or side that does not fit.
     """
 
     kind: ClassVar[str] = "steer"
@@ -103,12 +106,16 @@ class Steering(PatchKind):
 
     @property
     def patterns(self) -> tuple[tuple[str, tuple[str, ...]], ...]:
-        """Return the patterns of places with the role."""
+        """The patterns of places with the role."""
         return tuple((site, (self.role,)) for site in self.sites)
 
     @classmethod
     def from_options(cls, run: Run, **options: Any) -> Self:
-        """Return it as the command builds it. Raises UsageError without sites or with other than one role."""
+        """Return the kind as the command builds it.
+
+        Raises:
+            UsageError: Without sites, or with other than one role.
+        """
         roles = options.pop("roles", ())
         if "sites" not in options or len(roles) != 1:
             raise UsageError(
@@ -119,10 +126,10 @@ class Steering(PatchKind):
     def conditions(self, session: "ReplaySession") -> Sequence[Condition]:
         """Return clean, images swapped, then every place at every coefficient, with its controls.
 
-        The swap is the unit of the effect: a steering is a share of what it does.
+        The swap is the unit of the effect: a steering is a share of it.
 
         Raises:
-            UnknownSiteError: For a named place without a direction.
+            UnknownSiteError: For a place that does not exist, or has several sites.
             NoDirectionError: For a named place without a direction.
         """
         cells = [Cell(site_group, self.role) for site_group in resolve_all(self.sites, session.policy).values()]
@@ -137,7 +144,7 @@ class Steering(PatchKind):
 
     @staticmethod
     def notes(rows: Sequence[PatchEffect]) -> list[str]:
-        """Return notes about too large a change, and about a vector that cannot move the answer."""
+        """Return notes on too large a change, and on a vector that cannot move the answer."""
         large = [
             f"{name} moves tokens by {ratio:.1f} times their own norm; what that does is little evidence."
             for name, ratio in {row.name: row.relative_change for row in rows if row.coefficient}.items()

@@ -1,11 +1,10 @@
 """Activation patching as plain functions: capture, patch and compare, for one observation or for many pairs.
 
-    from probe_kit import patching as pt
-
-    pair = pt.Pair(clean, source, seed=0)
-    cells = pt.find_cells(policy, "backbone.*|all,image", "kv.*|image", "backbone.02.heads.*|image")
-    chunk = pt.patch_cells(policy, pair, cells[3])
-    swept = pt.sweep_cells(policy, pairs, cells, metric)
+  from probe_kit import patching as pt
+  pair = pt.Pair(clean, source, seed=0)
+  cells = pt.find_cells(policy, "backbone.*|all,image", "kv.*|image", "backbone.02.heads.*|image")
+  chunk = pt.patch_cells(policy, pair, cells[3])
+  swept = pt.sweep_cells(policy, pairs, cells, metric)
 
 Nothing is stored; `run_intervention` makes the same patches, stores them, and gives verdicts.
 """

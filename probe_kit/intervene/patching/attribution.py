@@ -1,6 +1,6 @@
 """A screen by gradients over pairs: estimates for all cells, and exact patches of the anchors that test them.
 
-One backward pass gives the estimates of all cells of a pair. As in attribution patching (Syed et al. 2023,
+One backward pass gives the estimates of all cells of a pair. This is attribution patching (Syed et al. 2023,
 https://arxiv.org/abs/2310.10348).
 """
 
@@ -34,34 +34,42 @@ if TYPE_CHECKING:
 CellName = tuple[str, str]
 """Place and role."""
 Ends = Literal["clean", "both"]
-"""Where gradients are taken: at the clean input, or as the mean of that and of the source."""
+"""Inputs at which gradients are taken: the clean input, or the mean of that and of the source."""
 Slope = Callable[["Tensor"], "Tensor"]
-"""From actions (chunk, D) to a number with a graph, such as metres to the left."""
+"""Function from actions (chunk, D) to a number with a graph, such as metres to the left."""
 EVERY_BLOCK = f"{KV_STREAM}.*"
-"""The anchor that is all of `kv`."""
+"""Name of the anchor that is all of `kv`."""
 AGREEMENT = 3.0
-"""Factor within which an anchor's estimate must lie of its exact effect. A choice: orders survive it."""
+"""Factor within which an anchor's estimate must lie of its exact effect.
+
+It is a choice: orders survive it.
+"""
 LOCALISATION_SHARE = 0.5
-"""Share of the whole effect from which a place is called localised; as `exchange.CARRIES` of sets."""
+"""Share of the whole effect from which on a place is called localised; for sets it is `exchange.CARRIES`."""
 FIRST = 3
-"""Cells that a sentence names."""
+"""Number of cells that a sentence names."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class AttributionEffect(Effect):
     """One cell in one category.
 
+    Shares and their intervals are None where the swap itself is not significant.
+
     Attributes:
-        sites: Of its tokens.
-        role: As `sites`.
-        is_anchor: A complete cut, patched exactly to test the screen.
-        is_drawn: Patched exactly although its estimate was not among the largest.
-        estimate: Shares of the image swap with 95 % intervals by groups, None where the swap itself is not
-            significant or no exact patch was made.
-        exact: As `estimate`.
-        p_fwe: Of the exact patch, one-sided, max-T over those of the category.
-        rank: By estimate among the cells of its kind, 1 for the largest; None in a void screen.
-        finding: Of the category's screen: `anchored`, `void`, or `n/a` where no anchor carries the effect.
+        sites: Name of the place.
+        role: Role of the tokens.
+        is_anchor: Whether it is a complete cut, patched exactly to test the screen.
+        is_drawn: Whether it was patched exactly although its estimate was not among the largest.
+        estimate: Share of the image swap by gradients.
+        estimate_ci: The 95 % interval of `estimate`, by groups.
+        exact: Share of the image swap with these tokens patched; None too where no exact patch was made.
+        exact_ci: The 95 % interval of `exact`, by groups.
+        p_fwe: Family-wise p-value of the exact patch, one-sided, max-T over those of the category; None without an
+            exact patch.
+        rank: Rank by estimate among the cells of its kind, 1 for the largest; None in a void screen.
+        finding: Finding on the category's screen: `anchored`, `void`, or `n/a` where no anchor carries the effect.
+        key: Key of the intervention.
     """
 
     sites: str
@@ -81,12 +89,12 @@ class AttributionEffect(Effect):
 
     @property
     def name(self) -> str:
-        """Return sites and role."""
+        """The place and role in words."""
         return f"{self.sites} {self.role}"
 
     @property
     def kind(self) -> str:
-        """Return the kind of cells that it is ordered among; empty for an anchor."""
+        """The kind of cells among which it is ranked; empty for an anchor."""
         return "" if self.is_anchor else kind_of_place(self.sites)
 
 
@@ -103,11 +111,16 @@ def estimate_patches(
 ) -> tuple[Any, Any, NDArray[np.float64]]:
     """Return the outputs of the clean and the source's inference, and (C,) the estimate of every cell's patch.
 
-    Σ (source − clean) · ∂ slope / ∂ activation, over the tokens and features of the cell.
+    The estimate is Σ (source − clean) · ∂ slope / ∂ activation, over the tokens and features of the cell. It takes
+    two inferences, and one with a backward pass; two of these for both ends.
 
     Args:
-        act: How an inference is made; by default `infer`. Two inferences, and one with a backward pass; two of
-            these for both ends.
+        model: Policy with gradients.
+        pair: Pair of observations.
+        cells: The C cells.
+        slope: Function from actions to a number with a graph.
+        ends: Inputs at which gradients are taken.
+        act: Function that makes an inference; None for `infer`.
     """
     from probe_kit.hooks import capture, gradients_at
 
@@ -138,8 +151,11 @@ def sum_over_cells(
     """Return (C,) Σ (source − clean) · slope over the tokens and features of every cell, in one inference.
 
     Args:
-        slopes: The gradients at the same sites, of which the mean is taken.
-        masks: (T,) the tokens of every cell.
+        clean: Activations of the clean inference, at the sites of the cells.
+        source: Activations of the source's inference, at the same sites.
+        slopes: Gradients at the same sites, of which the mean is taken.
+        cells: The C cells.
+        masks: (T,) tokens of every cell.
     """
     products = {
         site: (source[site].float() - clean[site].float())[0]
@@ -156,7 +172,7 @@ def sum_over_cells(
 
 
 def _of_head(product: "Tensor", site_group: SiteGroup) -> NDArray[np.float64]:
-    """Return (T, D) of all features, or of those of the place's head."""
+    """Return the product (T, D) of all features, or of those of the place's head."""
     if site_group.head is not None:
         width = product.shape[-1] // site_group.heads
         product = product[:, site_group.head * width : (site_group.head + 1) * width]
@@ -185,7 +201,7 @@ def complete_cuts(model: "Model", places: Sequence[SiteGroup]) -> list[Cell]:
 
 
 def worst_anchor(rows: Sequence[AttributionEffect]) -> AttributionEffect | None:
-    """Return, of the anchors that carry half of the effect, the one that its estimate misses most, if any."""
+    """Return the anchor with the worst estimate, of those that carry half of the effect; None if none does."""
     carrying = [row for row in rows if row.is_anchor and (row.exact or 0.0) >= LOCALISATION_SHARE]
     return min(carrying, key=_agreement, default=None)
 
@@ -222,9 +238,12 @@ def screen_rows(
     """Return the effects of cells of one category, in the order of `order_cells`.
 
     Args:
-        estimates: By cell, (E,) how far its patch moves the output by gradients, and moved it. anchors, drawn:
-            cells that are a complete cut, and that were chosen at random.
-        exact: As `estimates`.
+        exchange: Effect of the source.
+        estimates: By cell, (E,) how far its patch moves the output by gradients.
+        exact: By cell that was patched exactly, (E,) how far the patch moved the output.
+        anchors: Cells that are a complete cut.
+        drawn: Cells that were chosen at random.
+        category: Name of the category; empty outside of runs.
     """
     _, _, p_fwe = exchange.test(np.array(list(exact.values())))
     p_of = dict(zip(exact, map(float, p_fwe), strict=True))
@@ -247,14 +266,20 @@ def screen_rows(
 
 
 def kind_of_place(name: str) -> str:
-    """Return what a place can be compared with: `kv`, `backbone`, `backbone heads`, `expert iterations`."""
+    """Return the kind of a place, of places that can be compared with each other.
+
+    Examples are `kv`, `backbone`, `backbone heads`, `expert iterations`.
+    """
     parsed = PlaceName.parse(name)
     qualifiers = [parsed.quantity * (parsed.quantity != RESIDUAL), "iterations" * (parsed.iterations is not None)]
     return " ".join(filter(None, (parsed.stream, *qualifiers)))
 
 
 def describe_screen(rows: Sequence[AttributionEffect]) -> str:
-    """Return the test on the anchors, and the first cells of each kind unless the screen is void; one category."""
+    """Return the test on the anchors, and the first cells of each kind unless the screen is void.
+
+    The rows are of one category.
+    """
     worst = worst_anchor(rows)
     if worst is None:
         return "no anchor carries the effect, so that there is no order"
@@ -293,12 +318,12 @@ def _compared(anchor: AttributionEffect) -> str:
 
 @dataclass(frozen=True)
 class Screen:
-    """Estimates by gradients of each cell, and whether they can be believed.
+    """Estimates by gradients of each cell, and whether they can be trusted.
 
     Attributes:
         rows: The anchors, then the cells of each kind by rank; in a void screen in the order in which they were
             given.
-        cells: By name.
+        cells: Cells by name.
     """
 
     rows: tuple[AttributionEffect, ...]
@@ -306,19 +331,19 @@ class Screen:
 
     @property
     def finding(self) -> str:
-        """Return `anchored`, `void`, or `n/a` where no anchor carries the effect of the source."""
+        """The finding: `anchored`, `void`, or `n/a` where no anchor carries the effect of the source."""
         return self.rows[0].finding
 
     @property
     def anchor(self) -> AttributionEffect | None:
-        """Return the complete cut that carries the effect and that its estimate misses most; None without one."""
+        """The complete cut with the worst estimate, of those that carry the effect; None without one."""
         return worst_anchor(self.rows)
 
     @cached_property
     def table(self) -> "pd.DataFrame":
-        """Return one row per anchor and cell.
+        """The screen as one row per anchor and cell.
 
-        Columns: cells; kind, empty for an anchor; rank within the kind, NaN unless the screen is anchored;
+        Columns are cells; kind, empty for an anchor; rank within the kind, NaN unless the screen is anchored;
         estimate with estimate_low, estimate_high; exact with exact_low, exact_high, of anchors alone. Shares are
         NaN where the source itself is not significant.
         """
@@ -340,7 +365,7 @@ class Screen:
     def choose(self, top: int = 20, drawn: int = 20, seed: int = 0) -> tuple[tuple[Cell, ...], tuple[Cell, ...]]:
         """Return cells for exact patches: of each kind the `top` largest estimates, and `drawn` of all others.
 
-        The largest exact effect of the drawn ones bounds what the screen missed.
+        The largest exact effect of the drawn ones bounds the effects that the screen missed.
 
         Raises:
             UsageError: For a screen that is not anchored: it has no order.
@@ -363,15 +388,18 @@ def attribute_cells(model: "Policy", pairs: Sequence[Pair], cells: Sequence[Cell
     """Estimate the effect of a patch of every cell, by attribution patching, and test the estimates on anchors.
 
     Anchors are patched exactly: all of `kv`, and all tokens of each layer of the backbone with a cell. If one that
-    carries the effect is missed by more than a factor of 3, the screen is void.
+    carries the effect is missed by more than a factor of 3, the screen is void. The cost per pair is two
+    inferences, one with a backward pass, and one per anchor.
 
     Args:
-        metric: Of actions (chunk, D), with a graph, such as `session.lateral_motion`. Cost per pair: two
-            inferences, one with a backward pass, and one per anchor.
+        model: Policy with gradients.
+        pairs: Pairs of observations.
+        cells: Cells to estimate.
+        metric: Function from actions (chunk, D) to a number with a graph, such as `session.lateral_motion`.
 
     Raises:
         UnsupportedInterventionError: Before any inference, for a family without gradients.
-        UsageError: Without pairs or cells, and for pairs of questions.
+        UsageError: Without pairs or cells, or for pairs of questions.
     """
     import torch
 

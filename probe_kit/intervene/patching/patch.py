@@ -32,28 +32,37 @@ if TYPE_CHECKING:
 
 
 Output = Union[NDArray[np.float32], "Reading"]
-"""(chunk, 7) actions of a policy, or what a model that answers read."""
+"""Actions (chunk, 7) of a policy, or the reading of a model that answers."""
 
 
 @dataclass(frozen=True)
 class HookPoint:
-    """The place of a hook's call. roles: of the site's tokens; None for a stream without roles, such as vision."""
+    """The place of a hook's call.
+
+    Attributes:
+        site: Site of the activation.
+        roles: Roles of the site's tokens; None for a stream without roles, such as vision.
+    """
 
     site: Site
     roles: "Roles | None"
 
     @property
     def iteration(self) -> int | None:
-        """Return the site's flow-matching step or action token; None where the stream runs once."""
+        """The site's flow-matching step or action token; None where the stream runs once."""
         return self.site.iteration
 
 
 HookFunction = Callable[["Tensor", HookPoint], "Tensor"]
-"""From an activation (1, T, D) and its place to the activation that passes instead, of the same shape."""
+"""Function from an activation (1, T, D) and its place to the activation that passes instead, of the same shape."""
 
 
 def infer(model: "Model", model_input: Given, seed: int = 0) -> Output:
-    """One inference. Raises UsageError for an observation of a model that does not act, and the reverse."""
+    """Make one inference.
+
+    Raises:
+        UsageError: For an observation of a model that does not act, or a question to one that does not answer.
+    """
     from probe_kit.hooks import AnswerModel, Policy
 
     if isinstance(model_input, Observation):
@@ -68,7 +77,7 @@ def infer(model: "Model", model_input: Given, seed: int = 0) -> Output:
 
 
 def sites_of(model: "Model", patterns: Sequence[str]) -> list[Site]:
-    """The sites of all places that patterns name, each once; see `resolve_sites`."""
+    """Return the sites of all places that patterns name, each once; see `resolve_sites`."""
     sites = [
         site for pattern in patterns for site_group in resolve_sites(pattern, model) for site in site_group.sites
     ]
@@ -78,14 +87,19 @@ def sites_of(model: "Model", patterns: Sequence[str]) -> list[Site]:
 def run_with_cache(
     model: "Model", model_input: Given, seed: int = 0, places: Sequence[str] | None = None
 ) -> "tuple[Output, ActivationCache]":
-    """The output of one inference, and the activations (1, T, D) of it.
+    """Return the output of one inference, and its activations (1, T, D).
+
+    Raises as `capture` too.
 
     Args:
+        model: Policy, or model that answers.
+        model_input: Observation for a policy, question for a model that answers.
+        seed: Seed of the inference.
         places: Patterns such as `backbone.*`, `kv.*`, `expert.03@0-4` or `backbone.*.heads`; None for the residual
             streams that an extraction stores.
 
     Raises:
-        UnknownSiteError: And what `capture` raises.
+        UnknownSiteError: For a pattern that names no place.
     """
     from probe_kit.hooks import capture
 
@@ -95,14 +109,19 @@ def run_with_cache(
 
 
 def run_with_hooks(model: "Model", model_input: Given, hooks: Mapping[str, HookFunction], seed: int = 0) -> Output:
-    """The output of one inference in which functions change activations.
+    """Return the output of one inference in which functions change activations.
+
+    Raises as `edit` too.
 
     Args:
-        hooks: By pattern of places a function of (activation, `HookPoint`), called at each of their sites; the
-            activation may be changed in place, but must be returned.
+        model: Policy, or model that answers.
+        model_input: Observation for a policy, question for a model that answers.
+        hooks: By pattern of places, a function of (activation, `HookPoint`), called at each of their sites. It may
+            change the activation in place, but must return it.
+        seed: Seed of the inference.
 
     Raises:
-        UsageError: For a site that two patterns name, and what `edit` raises.
+        UsageError: For a site that two patterns name.
     """
     from probe_kit.hooks import edit
 
@@ -135,7 +154,7 @@ class Cell:
 Cells = Cell | Sequence[Cell]
 """One cell, or several that are patched together in one inference."""
 Basis = NDArray[np.floating]
-"""(K, D), orthonormal rows."""
+"""Orthonormal rows (K, D)."""
 
 
 def all_but(cells: tuple[Cell, ...], left_out: tuple[Cell, ...]) -> tuple[Cell, ...]:
@@ -151,13 +170,13 @@ def sites_of_cells(cells: Sequence[Cell]) -> tuple[Site, ...]:
 def find_cells(model: "Model", *patterns: str) -> tuple[Cell, ...]:
     """Return the cells that patterns of the form `PLACES|ROLES` name, in their order, each once.
 
-    PLACES as for `--sites`: `backbone.*`, `kv.02`, `expert.03@0-4`, `backbone.*.heads.*`. ROLES, separated by
-    commas: `all`, roles of the stream's tokens such as `image`, or positions such as `7` or `7-11`; without, all
-    tokens.
+    PLACES have the form of `--sites`: `backbone.*`, `kv.02`, `expert.03@0-4`, `backbone.*.heads.*`. ROLES are
+    separated by commas: `all`, roles of the stream's tokens such as `image`, or positions such as `7` or `7-11`.
+    Without roles, all tokens are meant.
 
     Raises:
-        UnknownSiteError: For a place that is not there.
-        UsageError: For a role that no token can have.
+        UnknownSiteError: For a place that does not exist.
+        UsageError: For a role that no token can have, or without a pattern.
     """
     cells = []
     for pattern in patterns:
@@ -189,9 +208,15 @@ def patch_cells(
 ) -> Output:
     """Return the output of the clean inference with the cells' activations from the source.
 
+    It takes two inferences.
+
     Args:
-        along: Patch only the component within the span of its rows (K, D), at every cell.
-        complement: Patch all but that component. Two inferences.
+        model: Policy, or model that answers.
+        pair: Pair of inputs.
+        cells: Cell, or several that are patched together.
+        along: (K, D) orthonormal rows; only the component within their span is patched, at every cell. None to
+            patch in full.
+        complement: Whether to patch all but that component.
 
     Raises:
         EmptyRoleError: For a role that no token has now.
@@ -215,9 +240,14 @@ def patched(
     """Patch cells while the model of `tokens` infers once; every patch of the package is made here.
 
     Args:
+        tokens: Tokens of the pair's clean inference.
+        cells: Cells that are patched together.
         source: Activations of the pair's source, at the sites of the cells.
-        along: See `patch_cells`. Gives the log of the edits.
-        complement: As `along`.
+        along: (K, D) orthonormal rows, see `patch_cells`; None to patch in full.
+        complement: Whether to patch all but the component within `along`.
+
+    Yields:
+        The log of the edits.
     """
     changes: dict[Site, list[tuple[TokenSelection, TokenEdit]]] = {}
     for cell in cells:
@@ -231,7 +261,11 @@ def patched(
 
 
 def as_tuple(cells: Cells) -> tuple[Cell, ...]:
-    """Return one cell or several as a tuple. Raises UsageError for none."""
+    """Return one cell or several as a tuple.
+
+    Raises:
+        UsageError: For none.
+    """
     together = (cells,) if isinstance(cells, Cell) else tuple(cells)
     if not together:
         raise UsageError("no cell is given; name at least one with find_cells(model, 'backbone.02|image')")
@@ -261,9 +295,9 @@ class AttentionPattern:
 
     Attributes:
         weights: (H, S, T) float32, rows sum to 1.
-        queries: Roles of the S tokens that attend.
-        keys: Of the T attended ones. Both are None for a stream whose tokens have no roles, such as a vision
+        queries: Roles of the S tokens that attend; None for a stream whose tokens have no roles, such as a vision
             tower.
+        keys: Roles of the T attended tokens; None likewise.
     """
 
     weights: NDArray[np.float32]
@@ -271,7 +305,7 @@ class AttentionPattern:
     keys: "Roles | None"
 
     def mean_share(self, role: str, asking: str = "") -> NDArray[np.float64]:
-        """(H,) the share on tokens of `role`, a mean over tokens of the role `asking`, or over all real tokens.
+        """Return (H,) the share on tokens of `role`, a mean over tokens of the role `asking`, or over real ones.
 
         Raises:
             EmptyRoleError: If no token attends, or the stream has no roles.
@@ -288,11 +322,15 @@ class AttentionPattern:
 def attention_patterns(
     model: "Model", model_input: Given, places: Sequence[str], seed: int = 0
 ) -> dict[Site, AttentionPattern]:
-    """The model's own attention patterns in one inference, by site.
+    """Return the model's own attention patterns in one inference, by site.
+
+    Raises as `capture_patterns`.
 
     Args:
-        places: Patterns of heads, such as `backbone.*.heads` or `expert.02.heads@9`. Raises what
-            `capture_patterns` raises.
+        model: Policy, or model that answers.
+        model_input: Observation for a policy, question for a model that answers.
+        places: Patterns of heads, such as `backbone.*.heads` or `expert.02.heads@9`.
+        seed: Seed of the inference.
     """
     from probe_kit.hooks import attended_roles, capture_patterns
 

@@ -33,9 +33,9 @@ if TYPE_CHECKING:
 
 
 Metric = Callable[[Any, Given], float]
-"""From the output of an inference and what was given to it to a number, such as metres to the left."""
+"""Function from the output of an inference and its input to a number, such as metres to the left."""
 SEED_TEXT = "patching"
-"""Text that all random draws over pairs are seeded with: of a run it is the run's `seed_text`."""
+"""Text that seeds all random draws over pairs: for a run it is the run's `seed_text`."""
 
 
 @dataclass(frozen=True)
@@ -43,13 +43,13 @@ class Sweep:
     """The effects of K sets of cells in E pairs.
 
     Attributes:
-        cells: The sets.
-        groups: (E,) of the pairs.
-        items: As `groups`.
+        cells: The K sets of cells.
+        groups: (E,) group of every pair.
+        items: (E,) item of every pair.
         toward: (E,) ±1, see `Pair`.
-        clean: (E,) the metric of both inferences.
-        source: As `clean`.
-        patched: (K, E) of those with a set of cells patched.
+        clean: (E,) metric of the clean inferences.
+        source: (E,) metric of the sources' inferences.
+        patched: (K, E) metric of the clean inferences with a set of cells patched.
     """
 
     cells: tuple[tuple[Cell, ...], ...]
@@ -62,7 +62,7 @@ class Sweep:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Return the cells of every set, joined by +."""
+        """The names of the cells of every set, joined by +."""
         return tuple(" + ".join(map(str, cells)) for cells in self.cells)
 
     @cached_property
@@ -73,27 +73,31 @@ class Sweep:
 
     @property
     def full_effect(self) -> NDArray[np.float64]:
-        """(E,) by how much the source differs from the clean inference."""
+        """The difference (E,) of the source from the clean inference."""
         return self.exchange.full
 
     @property
     def source_p(self) -> float:
-        """Return p that the source moves the metric, in the better direction: exact sign test, as of the swap."""
+        """The p-value that the source moves the metric, in the better direction, by an exact sign test."""
         return min(self.exchange.p_values)
 
     @cached_property
     def shares(self) -> tuple[SwapShare | None, ...]:
-        """Per set its share of the source's effect with a 95 % interval by groups; see `table`."""
+        """The share of the source's effect of each set, with a 95 % interval by groups; see `table`."""
         return tuple(self.exchange.share(values - self.clean) for values in self.patched)
 
     @cached_property
     def table(self) -> "pd.DataFrame":
-        """One row per set of cells.
+        """The sweep as one row per set of cells.
 
         share, low, high: Σ moved · whole / Σ whole² over pairs, 1 for all that the source does, with its 95 %
-        interval by groups; NaN where the source itself is not significant, as with four groups or fewer: it
-        would be a ratio of noise. moved: mean of the metric toward `Pair.toward`, in its unit. p, p_fwe:
-        that it moves where the source does, by sign flips of whole groups; p_fwe against all sets (max-T).
+        interval by groups. NaN where the source itself is not significant, as with four groups or fewer: it would
+        be a ratio of noise.
+
+        moved: mean of the metric toward `Pair.toward`, in its unit.
+
+        p, p_fwe: that it moves where the source does, by sign flips of whole groups; p_fwe against all sets
+        (max-T).
         """
         import pandas as pd
 
@@ -113,7 +117,7 @@ class Sweep:
         )
 
     def heatmap(self, column: str = "share") -> "Figure":
-        """Cells by layer and role, coloured by a column of the table.
+        """Draw cells by layer and role, coloured by a column of the table.
 
         Raises:
             UsageError: For sets of several cells, or without any number in the column.
@@ -154,14 +158,19 @@ def sweep_cells(
 ) -> Sweep:
     """Patch every cell, or every set of cells, of `cells` in every pair; one inference each, and two per pair.
 
+    Raises as `patch_cells` too.
+
     Args:
-        metric: Of an output and what was given, such as `session.lateral_displacement`; of the same inference as
-            the patch.
-        along: See `patch_cells`.
-        complement: As `along`.
+        model: Policy, or model that answers.
+        pairs: Pairs of inputs.
+        cells: Cells, or sets of cells that are patched together.
+        metric: Function of an output and its input, such as `session.lateral_displacement`. It is measured in the
+            inference that is patched.
+        along: (K, D) orthonormal rows, see `patch_cells`; None to patch in full.
+        complement: Whether to patch all but the component within `along`.
 
     Raises:
-        UsageError: Without pairs, and what `patch_cells` raises.
+        UsageError: Without pairs or cells.
     """
     sets = tuple(as_tuple(together) for together in cells)
     if not pairs or not sets:
@@ -188,9 +197,10 @@ def _order(name: PlaceName) -> tuple[object, ...]:
 
 
 MOST_SINGLY = 30
-"""Cells up to which each is left out in turn; of more, halves are, then quarters and so on (delta debugging).
+"""Number of cells up to which each is left out in turn.
 
-Singly takes up to n (n + 1) / 2 sets, each an inference per pair: 465 for 30 cells, 2,485 for 70.
+Of more, halves are left out, then quarters and so on (delta debugging). Singly takes up to n (n + 1) / 2 sets,
+each an inference per pair: 465 for 30 cells, 2,485 for 70.
 """
 KEEP = 0.9
 """Share of the whole set's effect that the smaller one must keep; the rest is `exchange.NOTHING`."""
@@ -201,12 +211,16 @@ def find_minimal_set[C](
 ) -> tuple[tuple[C, ...], float, int]:
     """Leave out cells while `keep` of the effect of all of them stays; of equal ones the first is left out.
 
-    Return a set of which no cell can be left out, its effect, and how many sets were tried.
+    At most n (n + 1) / 2 sets of up to `MOST_SINGLY` cells are tried. Adding cells one by one would stop at once
+    where a majority decides: no first cell has an effect.
 
     Args:
-        effects: The effect of each of some sets. At most n (n + 1) / 2 sets of up to `MOST_SINGLY` cells are
-            tried. Adding cells one by one would stop at once where a majority decides: no first cell has an
-            effect.
+        cells: All cells.
+        effects: Function that returns the effect of each of some sets.
+        keep: Share of the effect of all cells that a set must keep.
+
+    Returns:
+        A set of which no cell can be left out, its effect, and the number of sets that were tried.
     """
     have = tuple(cells)
     (full,) = effects([have])
@@ -240,13 +254,15 @@ def choosing_half(groups: Sequence[str], seed: int) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class MinimalCells:
-    """The smallest set of cells that keeps an effect, and what it does in pairs in which it was not searched.
+    """The smallest set of cells that keeps an effect, and its effect in pairs in which it was not searched.
 
     Attributes:
-        cells: Of them none can be left out.
-        chosen_effect: Their share in the pairs of the search, of `tried` sets.
-        share: In the other half of the groups, with its interval; None where the source is not significant there.
-        p: That the set moves the metric toward the source there.
+        cells: Cells of the set, of which none can be left out.
+        chosen_effect: Share of the source's effect in the pairs of the search.
+        tried: Number of sets that were tried.
+        share: Share in the other half of the groups, with its interval; None where the source is not significant
+            there.
+        p: The p-value that the set moves the metric toward the source there.
         choosing: Groups of the search.
     """
 
@@ -261,9 +277,9 @@ class MinimalCells:
 def compare_alone_and_without(
     model: "Model", pairs: Sequence[Pair], cells: Sequence[Cell], metric: Metric
 ) -> "pd.DataFrame":
-    """One row per cell: what it carries alone, and what all cells lose without it.
+    """Return one row per cell: its effect alone, and what all cells lose without it.
 
-    Columns: cells; alone with alone_low, alone_high: share of the source's effect; needed with needed_low,
+    Columns are cells; alone with alone_low, alone_high: share of the source's effect; needed with needed_low,
     needed_high: (all cells) − (all but it), as a share; p_fwe of the cell alone; finding as of `--kind joint`,
     "n/a" where the source is not significant. The cells must be parallel: blocks of `kv`, roles or heads of one
     layer.
@@ -302,7 +318,7 @@ def find_minimal_cells(
     keep: float = KEEP,
     seed: int = 0,
 ) -> MinimalCells:
-    """The smallest set of cells that keeps the share `keep` of what all of them carry.
+    """Search the smallest set of cells that keeps the share `keep` of what all of them carry.
 
     It is searched in one half of the groups, drawn with `seed`, and scored in the other; see `find_minimal_set`.
     The cells must be parallel.

@@ -1,7 +1,7 @@
 """Converter of sets in Act2Answer's format: `pairs.json`, `model_db.json` and a GLB per tile.
 
-A tile is the texture of its upper face, as the camera sees it. The converter refuses what the release would
-misread.
+A tile is the texture of its upper face, as the camera sees it. The converter refuses everything that the release
+would misread.
 """
 
 import re
@@ -31,7 +31,7 @@ from probe_kit.suite.pictures import rgb_of
 from probe_kit.suite.suite import Picture, Suite, make_item, new_suite, squared_picture
 
 RELEASE_YAW = 90
-"""Degrees by which Act2Answer turns its tiles: mesh +x lies to the viewer's right, mesh +y away from him."""
+"""Degrees by which Act2Answer turns its tiles: mesh +x lies to the viewer's right, mesh +y away from them."""
 YAWS = (0, 90, 180, 270)
 _UP = 0.99  # of a unit normal
 _LEVEL = 0.05  # of the tile's thickness: what counts as its top
@@ -44,23 +44,32 @@ _UNREADABLE = (
 
 @dataclass(frozen=True)
 class Tile:
-    """picture: RGB on white, as seen from in front of the tile. size: its x, y and z extent in metres."""
+    """A tile of a set in Act2Answer's format.
+
+    Attributes:
+        picture: RGB on white, as seen from in front of the tile.
+        size: Extent along x, y and z in metres.
+    """
 
     picture: Image.Image
     size: tuple[float, float, float]
 
 
 Top = tuple[NDArray[np.float64], NDArray[np.float64], Any]
-"""Corners of what faces up: (N, 2) metres, (N, 2) of the texture with v downwards; and their material."""
+"""Corners of the upper face: (N, 2) in metres, (N, 2) in the texture with v downwards; and their material."""
 
 
 def read_tile(path: Path, yaw: int = RELEASE_YAW) -> Tile:
-    """The tile in a binary glTF. yaw: degrees by which the scene turns it about z, of `YAWS`.
+    """Read the tile in a binary glTF.
+
+    Args:
+        path: The GLB file.
+        yaw: Degrees by which the scene turns the tile about z, one of `YAWS`.
 
     Raises:
-        SuiteError: If it cannot be read, if nothing faces up, and if what does has no picture, more than one, or
-            one that is tinted, repeated or askew.
         MissingExtraError: Without trimesh.
+        SuiteError: If the file cannot be read, or nothing faces up. Also if the upper face has no picture, more
+            than one, or one that is tinted, repeated or askew.
     """
     trimesh = require("trimesh", "act2answer")
     if not path.is_file():
@@ -80,7 +89,7 @@ def read_tile(path: Path, yaw: int = RELEASE_YAW) -> Tile:
 
 
 def _meshes(scene: Any) -> Iterator[tuple[NDArray[np.float64], Any]]:
-    """Corners in the scene's frame, with scale and turn of their node, and the mesh."""
+    """Yield the corners in the scene's frame, with the scale and turn of their node, and the mesh."""
     for node in scene.graph.nodes_geometry:
         transform, name = scene.graph[node]
         mesh = scene.geometry[name]
@@ -139,7 +148,7 @@ def _texture(material: Any, path: Path) -> Image.Image:
 
 
 def _slope(xy: NDArray[np.float64], uv: NDArray[np.float64], path: Path) -> NDArray[np.float64]:
-    """(2, 2): how much of the picture's width and height (u, v) passes along the tile's x and y."""
+    """Return (2, 2) how much of the picture's width and height (u, v) passes along the tile's x and y."""
     design = np.column_stack([xy, np.ones(len(xy))])
     fitted, _, rank, _ = np.linalg.lstsq(design, uv, rcond=None)
     off = float(np.abs(design @ fitted - uv).max())
@@ -179,7 +188,14 @@ _SIDES: dict[str, Side] = {"left": "left", "right": "right"}
 
 @dataclass(frozen=True)
 class Pair:
-    """One question. left, right: names of its tiles. concepts: what their pictures are called, left and right."""
+    """One question of a set.
+
+    Attributes:
+        index: Position of the question in its set.
+        left: Name of the left tile.
+        right: Name of the right tile.
+        concepts: Names of the left and the right picture's content.
+    """
 
     index: int
     left: str
@@ -190,11 +206,12 @@ class Pair:
 
 
 def read_pairs(root: Path) -> list[Pair]:
-    """Every question in the order of its index.
+    """Read every question in the order of its index.
 
     Raises:
-        SuiteError: For an answer that is no side (the release takes it for left), for one tile on both sides (it
-            has one body per name), and for indices that are not 0, 1, 2 … (it asks for them one by one).
+        SuiteError: For an answer that is no side (the release takes it for left), or for one tile on both sides
+            (the release has one body per name). Also for indices that are not 0, 1, 2 … (the release asks for them
+            one by one).
     """
     path = root / PAIRS
     records = read_annotations(path, SOURCE, REMEDY, list)
@@ -236,7 +253,7 @@ def _pair(record: Any, position: int, path: Path) -> Pair:
 
 
 def object_of(question: str) -> tuple[str, str]:
-    """Return the object of a question and its article: the words behind "on"; all words where there is no "on"."""
+    """Return the object of a question and its article: the words behind "on", or all words without an "on"."""
     _, preposition, behind = question.partition(" on ")
     phrase = (behind if preposition else question).strip().rstrip(".").strip()
     article, space, noun = phrase.partition(" ")
@@ -254,21 +271,26 @@ _SAME_SIZE = 0.001
 
 
 class BoundingBoxWarning(UserWarning):
-    """A set scores its tiles as smaller or larger than they are drawn."""
+    """A warning that a set scores its tiles as smaller or larger than they are drawn."""
 
 
 def convert_set(
     root: Path, out: Path, categories: Sequence[str] | None, n: int, values: Mapping[str, Any]
 ) -> Suite:
-    """The first `n` questions of the set in `root` as a suite in `out`; sides, words and pictures stay.
+    """Write the first `n` questions of the set in `root` as a suite in `out`; sides, words and pictures stay.
 
     Args:
-        categories: The one that its questions are counted under; None for the one that the folder's name tells.
+        root: Folder of one set, with `pairs.json`, `model_db.json` and the tiles.
+        out: Folder to write; new or empty, or with this very suite.
+        categories: The one category under which the questions are counted; None for the one in the folder's name.
+        n: Most questions.
+        values: Fields of Act2AnswerOptions by name.
 
     Raises:
-        UsageError: Naming file and record.
-        SuiteError: Naming file and record.
         MissingExtraError: Without trimesh.
+        UsageError: For an unknown option or turn of the tiles, a folder that does not exist, or other than one
+            category.
+        SuiteError: For a set that cannot be converted; the message names the file and the record.
     """
     options = options_from(Act2AnswerOptions, dict(values))
     if options.tile_yaw not in YAWS:
@@ -292,7 +314,7 @@ def convert_set(
 
 
 def _category(root: Path, categories: Sequence[str] | None) -> str:
-    """The category asked for, or the only one that the folder's name tells."""
+    """Return the requested category, or the only one that the folder's name contains."""
     if categories is not None:
         if len(categories) != 1:
             raise UsageError(f"{SOURCE}: a set has one category; {', '.join(categories) or 'none'} given.")
@@ -309,7 +331,10 @@ def _category(root: Path, categories: Sequence[str] | None) -> str:
 
 
 class _Assets:
-    """The tiles of a set, each read once. files: what the suite stores of them. notes: for its statistics."""
+    """The tiles of a set, each read once.
+
+    `files` are the pictures that the suite stores, by file name; `notes` are for its statistics.
+    """
 
     def __init__(self, root: Path, options: Act2AnswerOptions) -> None:
         self._root, self._options = root, options
@@ -323,7 +348,11 @@ class _Assets:
         return records
 
     def item(self, category: str, pair: Pair) -> Item:
-        """One question. Raises SuiteError for a tile that is not described, unreadable, or equal to the other."""
+        """Make the item of one question.
+
+        Raises:
+            SuiteError: For a tile that is not described, cannot be read, or is equal to the other one.
+        """
         left, right = (self._stored(name, pair) for name in (pair.left, pair.right))
         if left.pixels_sha256 == right.pixels_sha256:
             raise SuiteError(
@@ -391,7 +420,7 @@ class _Assets:
         return self._tiles[name][1]
 
     def compare_sizes(self) -> None:
-        """Warn, and note in the statistics, where the box that is scored is not the tile that is drawn."""
+        """Warn, and note in the statistics, where the scored box differs from the drawn tile."""
         differing = []
         for name, (tile, _) in self._tiles.items():
             where = f"tile {name} of {self._root / TILES}"

@@ -19,12 +19,14 @@ from probe_kit.suite.pictures import WHITE, decode_picture
 
 @dataclass(frozen=True)
 class SourcePicture:
-    """A picture of the source. `load` gives it upright and RGB; two equal ids are one picture.
+    """A picture of the source; two equal ids are one picture.
 
     Attributes:
-        original: Path or key it is read from.
-        operation: What `load` did to it.
-        least_side: What the shorter side must have in pixels, None for the usual limit.
+        load: Function that returns the picture upright and in RGB.
+        original: Path or key that the picture is read from.
+        operation: Description of how `load` changes the picture.
+        least_side: Least length of the shorter side in pixels; None for the limit of the options.
+        real_face: Whether it shows a real person.
     """
 
     image_id: str
@@ -37,7 +39,12 @@ class SourcePicture:
 
 @dataclass(frozen=True)
 class Wording:
-    """The wording of an item: its phrase, and the opposite phrase if the question has one."""
+    """The wording of an item: its phrase, and the opposite phrase if the question has one.
+
+    Attributes:
+        rule_id: Name of the rewriting rule.
+        proposed_by: Model, hash of the prompt and raw reply of a wording that a model proposed; None for a rule's.
+    """
 
     phrase: str
     rule_id: str
@@ -48,15 +55,17 @@ class Wording:
 
 @dataclass(frozen=True)
 class Candidate:
-    """One question of the source with the picture that answers it, and with the one that does not if it has one.
+    """One question of the source with the picture that answers it, and with the wrong picture if it has one.
 
     Attributes:
+        distractor: The picture that does not answer the question; None where pairing has to find one.
         answer: Short answer in words, where the pictures are the answer to a question in words.
-        wording: Given where the source says what the picture shows; else the rewriting rules have to find one.
-        family: Pictures are paired inside one family first.
-        shows: Names it is known to show.
-        forbids: Names that must not be in the other picture.
-        needs_person: Only a person can accept it.
+        wording: Given where the source says what the picture shows; None where the rewriting rules have to find
+            one.
+        family: Name of a family; pictures are paired inside one family first.
+        shows: Names of what the picture is known to show.
+        forbids: Names of what must not be in the other picture.
+        needs_person: Whether only a person can accept the candidate.
     """
 
     source_id: str
@@ -76,7 +85,7 @@ class Candidate:
 
     @property
     def question_sha256(self) -> str:
-        """Changes with the question, so that a stale review is noticed."""
+        """The hash of question and answer: it changes with the question, so that a stale review is noticed."""
         return sha256_text(f"{self.question}\n{self.answer}")
 
 
@@ -84,8 +93,12 @@ class Candidate:
 class Reading:
     """The content of a source: candidates, the number of records per category, and why others were left out.
 
+    `license`, `attribution`, `url` and `revision` are those of the source.
+
     Attributes:
-        files: Annotation files read. license, attribution, url and revision are those of the source.
+        pool: Number of records by category.
+        reasons: Number of records that were left out, by reason.
+        files: Annotation files that were read.
     """
 
     license: str
@@ -106,20 +119,21 @@ class Reading:
 
 @dataclass(frozen=True)
 class ConvertOptions:
-    """Settings every source shares.
+    """The settings that every source shares.
 
     Attributes:
-        min_side: Pixels of the shorter side.
-        max_aspect: Longer over shorter side.
-        min_spread: Standard deviation of the grey levels.
-        legible_at: Tile side in pixels at which edges must survive, None for no such check.
-        paper_polarity: Keep every comparison as the source asks it, which lets pictures alone give the answer.
-        image_root: Where pictures lie if not below the root.
-        llm_base: An OpenAI-compatible service that proposes wordings no rule finds; its key is read from the
-            environment variable PROBE_KIT_LLM_KEY.
-        llm_model: As `llm_base`.
-        llm_cache: As `llm_base`.
-        trust_llm: Emit them without a person.
+        min_side: Least length of a picture's shorter side, in pixels.
+        max_aspect: Largest ratio of the longer to the shorter side.
+        min_spread: Least standard deviation of the grey levels.
+        legible_at: Tile side in pixels at which edges must survive; None for no such check.
+        paper_polarity: Whether to keep every comparison as the source asks it, so that pictures alone can give the
+            answer.
+        image_root: Folder of the pictures; None if they lie below the root.
+        llm_base: Address of an OpenAI-compatible service that proposes wordings where no rule matches; None for no
+            service. Its key is read from the environment variable PROBE_KIT_LLM_KEY.
+        llm_model: Name of the model at this service; None without a service.
+        llm_cache: Folder of the service's replies; None without a service.
+        trust_llm: Whether wordings of the model are emitted without a person's review.
     """
 
     min_side: int = 100
@@ -138,13 +152,18 @@ class ConvertOptions:
     trust_llm: bool = False
 
     def pictures_below(self, root: Path) -> Path:
-        """Return the folder below which pictures are looked for."""
+        """Return the folder that contains the pictures."""
         return Path(self.image_root) if self.image_root else root
 
 
 @dataclass(frozen=True)
 class CompBenchOptions(ConvertOptions):
-    """fer: whether to use FER-2013, whose faces are 48 px; fer_min_side is their own limit."""
+    """The options of MLLM-CompBench.
+
+    Attributes:
+        fer: Whether to use FER-2013, whose faces are 48 px.
+        fer_min_side: Least side of FER-2013's faces in pixels, in place of `min_side`.
+    """
 
     fer: bool = True
     fer_min_side: int = 48
@@ -152,7 +171,12 @@ class CompBenchOptions(ConvertOptions):
 
 @dataclass(frozen=True)
 class IconQaOptions(ConvertOptions):
-    """all_distractors: an item per wrong choice, not one per problem. cross_items: pair "how many" stems."""
+    """The options of IconQA.
+
+    Attributes:
+        all_distractors: Whether to make an item per wrong choice, not one per problem.
+        cross_items: Whether to pair the pictures of "how many" questions.
+    """
 
     min_side: int = 48
     min_spread: float = 4.0
@@ -162,18 +186,24 @@ class IconQaOptions(ConvertOptions):
 
 @dataclass(frozen=True)
 class MmbenchOptions(ConvertOptions):
-    """include_real_faces: Celebrity shows real people, and is made only on request."""
+    """The options of MMBench.
+
+    Attributes:
+        include_real_faces: Whether to make Celebrity, which shows real people.
+    """
 
     include_real_faces: bool = False
 
 
 @dataclass(frozen=True)
 class OkVqaOptions(ConvertOptions):
-    """instances: folder with COCO's `instances_<split>.json`, which can show that an animal is absent.
+    """The options of OK-VQA.
 
     Attributes:
+        instances: Folder with COCO's `instances_<split>.json`, which can show that an animal is absent; None for
+            none.
         min_agreement: Share of the ten answers that must agree.
-        min_object_share: Of the picture's area.
+        min_object_share: Least share of the picture's area that the object's box covers.
     """
 
     instances: str | None = None
@@ -183,7 +213,12 @@ class OkVqaOptions(ConvertOptions):
 
 @dataclass(frozen=True)
 class VlThinkOptions(ConvertOptions):
-    """recolor: add pink, white and gray by repainting. extra_boards: of laundry, weather and arrows."""
+    """The options of VL-Think.
+
+    Attributes:
+        recolor: Whether to add pink, white and gray by repainting.
+        extra_boards: Further sets of boards to use, of `laundry`, `weather` and `arrows`.
+    """
 
     recolor: bool = False
     extra_boards: tuple[str, ...] = ()
@@ -194,9 +229,9 @@ class Act2AnswerOptions:
     """The options of a set in Act2Answer's own format, for what the format does not say.
 
     Attributes:
-        tile_yaw: Degrees by which its scene turns the tiles; 90 as released, 0 as VL-Think does.
-        contains_real_face: Whether its pictures show real people.
-        license: An SPDX name, if you know it.
+        tile_yaw: Degrees by which the set's scene turns the tiles; 90 as released, 0 as in VL-Think.
+        contains_real_face: Whether the pictures show real people.
+        license: SPDX name of the pictures' licence, if it is known.
     """
 
     tile_yaw: int = 90
@@ -207,7 +242,15 @@ class Act2AnswerOptions:
 def options_from[Options: (ConvertOptions, Act2AnswerOptions)](
     kind: type[Options], values: dict[str, Any]
 ) -> Options:
-    """The options of one source. Raises UsageError for a name it does not have, with the nearest one."""
+    """Make the options of one source.
+
+    Args:
+        kind: Class of the source's options.
+        values: Values of options by name.
+
+    Raises:
+        UsageError: For a name that the source does not have; the message has the nearest one.
+    """
     names = [field.name for field in fields(kind)]
     for name in values:
         if name not in names:
@@ -224,17 +267,25 @@ def options_from[Options: (ConvertOptions, Act2AnswerOptions)](
 
 MARGIN = 0.08  # of the longer side, around trimmed art
 MOST_BYTES = 1 << 30
-"""Of annotations; the instances of COCO have 350 MB."""
+"""Largest size of an annotation file; the instances of COCO have 350 MB."""
 _TRIM_STEP = 12  # levels that ink differs from white
 
 
 def read_annotations(path: Path, source: str, remedy: str, kind: type = dict) -> Any:
-    """The JSON value of `kind` in a file. Raises SuiteError naming source, file and remedy."""
+    """Read the JSON value of `kind` in an annotation file.
+
+    Raises:
+        SuiteError: If the file cannot be read; the message names source, file and remedy.
+    """
     return read_json(path, SuiteError, f"{remedy} It is needed to convert {source}.", MOST_BYTES, kind)
 
 
 def first_existing(tried: Sequence[Path], source: str, record: str, remedy: str) -> Path:
-    """The first path that is a file. Raises SuiteError naming the record, what was tried, and the remedy."""
+    """Return the first path that is a file.
+
+    Raises:
+        SuiteError: If none is; the message names the record, all tried paths, and the remedy.
+    """
     for path in tried:
         if path.is_file():
             return path
@@ -243,7 +294,11 @@ def first_existing(tried: Sequence[Path], source: str, record: str, remedy: str)
 
 
 def field_of(record: Any, name: str, kind: type, source: str, where: str) -> Any:
-    """A field of a record. Raises SuiteError if it is missing or of another type."""
+    """Return a field of a record.
+
+    Raises:
+        SuiteError: If the field is missing or of another type.
+    """
     value = record.get(name) if isinstance(record, dict) else None
     if not isinstance(value, kind):
         raise SuiteError(
@@ -254,10 +309,15 @@ def field_of(record: Any, name: str, kind: type, source: str, where: str) -> Any
 
 
 def by_key[Key, Value](entries: Iterable[tuple[Key, Value, str]], source: str, key: str) -> dict[Key, Value]:
-    """The values of (key, value, where) by their key. key: its name, for messages.
+    """Return the values of (key, value, where) by their key.
+
+    Args:
+        entries: Key, value, and a description of the record for messages.
+        source: Name of the source, for messages.
+        key: Name of the key, for messages.
 
     Raises:
-        SuiteError: Naming both records of a key that occurs twice.
+        SuiteError: For a key that occurs twice; the message names both records.
     """
     values: dict[Key, Value] = {}
     places: dict[Key, str] = {}
@@ -272,17 +332,17 @@ def by_key[Key, Value](entries: Iterable[tuple[Key, Value, str]], source: str, k
 
 
 def photo(path: Path) -> partial[Image.Image]:
-    """Loads a photograph as it is."""
+    """Return a function that loads a photograph as it is."""
     return partial(decode_picture, path)
 
 
 def trimmed_art(path: Path) -> Image.Image:
-    """Line art on white without its own margins, square, with one margin for all."""
+    """Load line art on white without its own margins, as a square, with one margin for all pictures."""
     return trimmed(decode_picture(path))
 
 
 def trimmed(image: Image.Image) -> Image.Image:
-    """The picture cut to its ink and padded to a white square with a margin of 8 %."""
+    """Return the picture cut to its ink and padded to a white square with a margin of 8 %."""
     ink = (255 - np.asarray(image.convert("RGB"), np.int64)).max(axis=2) > _TRIM_STEP
     rows, columns = np.flatnonzero(ink.any(axis=1)), np.flatnonzero(ink.any(axis=0))
     if not len(rows):

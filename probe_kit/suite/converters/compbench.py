@@ -35,7 +35,11 @@ _REMEDY = "pass image_root (--image-root) or check that the processed archive is
 
 
 def read(root: Path, categories: Sequence[str], options: CompBenchOptions) -> Reading:
-    """Every comparison of the sets that are present. Raises SuiteError if none is, or for a broken one."""
+    """Read every comparison of the sets that are present.
+
+    Raises:
+        SuiteError: If no set is present, or if one is broken.
+    """
     reading = Reading(
         license="LicenseRef-MLLM-CompBench-pictures",
         attribution="MLLM-CompBench (questions CC-BY-4.0; pictures under the terms of their own sets)",
@@ -63,7 +67,7 @@ def read(root: Path, categories: Sequence[str], options: CompBenchOptions) -> Re
 
 
 def _annotation_files(folder: Path, stem: str) -> list[Path]:
-    """The whole file if present, else its parts; never both, they hold the same records."""
+    """Return the whole file if present, else its parts; never both, as they have the same records."""
     if (folder / f"{stem}.json").is_file():
         return [folder / f"{stem}.json"]
     parts = [folder / f"{stem}{part}.json" for part in ("_test", "_val")]

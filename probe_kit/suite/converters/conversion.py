@@ -1,4 +1,4 @@
-"""`convert`: from a benchmark's folder to a suite, in five counted stages."""
+"""Conversion (`convert`) from a benchmark's folder to a suite, in five counted stages."""
 
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -75,7 +75,7 @@ _ALL = (
 )
 SOURCES: dict[str, _Source] = {source.name: source for source in _ALL}
 EVERY_SOURCE = (*SOURCES, ACT2ANSWER)
-"""What `convert` takes as a source."""
+"""The names that `convert` takes as a source."""
 
 
 def convert(
@@ -90,20 +90,28 @@ def convert(
     emit_curation: Path | str | None = None,
     **options: Any,
 ) -> Suite:
-    """A suite made from the benchmark in `root`, written to `out` and loaded.
+    """Make a suite from the benchmark in `root`, write it to `out` and load it.
+
+    The same arguments give the same bytes. `stats.json` lists the counts of every stage next to the paper's. Sets
+    in Act2Answer's own format (`act2answer`) are converted question by question, whatever `seed` is.
 
     Args:
+        source: Name of the benchmark, one of EVERY_SOURCE.
+        root: Folder of the unpacked benchmark.
+        out: Folder to write; new or empty, or with this very suite.
+        categories: Names of categories, None for all of the source.
         n: Most items per category.
-        curation: A reviewed file; only what it accepts is emitted.
-        emit_curation: Where to write a file to review.
-        **options: Fields of the source's options, such as `min_side` (see `SOURCES`). The same arguments give the
-            same bytes. `stats.json` counts every stage beside the paper. Sets in Act2Answer's own format
-            (`act2answer`) are converted question by question, whatever `seed` is.
+        seed: Seed of the pairs and sides.
+        curation: A reviewed file, of which only accepted pairs are emitted; None to use all pairs that need no
+            review.
+        emit_curation: File to write for a review; None for none.
+        **options: Fields of the source's options, such as `min_side` (see `SOURCES`).
 
     Raises:
-        UsageError: For arguments.
-        SuiteError: Naming file, record and remedy for a tree that is not what it should be; `out` is then left as
-            it was.
+        UsageError: For an unknown source, category or option, a number of items below 1, or a root that does not
+            exist.
+        SuiteError: For a tree that is not as expected, naming file, record and remedy; `out` is then left as it
+            was.
     """
     if source not in EVERY_SOURCE:
         raise UsageError(f"unknown source {source!r}; available: {', '.join(EVERY_SOURCE)}.")
@@ -133,7 +141,7 @@ def convert(
 
 @dataclass
 class _Conversion:
-    """One run: what was read, and how many candidates every stage left."""
+    """One conversion: the content of the source, and how many candidates every stage left."""
 
     kind: _Source
     options: ConvertOptions
@@ -196,7 +204,10 @@ class _Conversion:
         return self.looks[picture.image_id]
 
     def _text_problem(self, candidate: Candidate) -> str | None:
-        """A question without a wording passes: a person may still write one."""
+        """Return what is wrong with a candidate's words; None if nothing is.
+
+        A question without a wording passes: a person may still write one.
+        """
         wording = candidate.wording
         if wording is None:
             self.reading.reasons["no rewriting rule matches (needs_edit)"] += 1
@@ -210,7 +221,7 @@ class _Conversion:
         return None
 
     def without_review(self, bundles: list[Bundle]) -> list[Bundle]:
-        """Bundles that need no review: worded by a rule, or by a trusted model."""
+        """Return the bundles that need no review: worded by a rule, or by a trusted model."""
         accepted = {}
         for proposal in (proposal for bundle in bundles for proposal in bundle):
             if proposal.wording is None or proposal.needs_person:

@@ -25,7 +25,7 @@ COLUMNS = (
     *("reason", "reviewer", "date", "llm"),
 )
 _DECIDED = ("question_sha256", "status", "instruction", "object_phrase", "polarity", "recognisable")
-"""Columns that decide what becomes of a candidate."""
+"""Columns that decide whether and how a candidate is used."""
 _TABLES = (".csv", ".tsv")
 _PREVIEW_PIXELS = 160
 
@@ -34,10 +34,12 @@ Render = Callable[[SourcePicture], Image.Image]
 
 
 def write_curation(path: Path, proposals: Sequence[Proposal], render: Render) -> None:
-    """The file at `path`, and previews in a folder beside it.
+    """Write the curation file to `path`, and previews to a folder next to it.
 
-    In the previews the picture asked for lies left. `.csv` and `.tsv` give CSV, anything else JSON lines. Raises
-    SuiteError if the file is there and a person has reviewed any row of it, or if it cannot be read.
+    In the previews, the correct picture lies left. `.csv` and `.tsv` give CSV, anything else JSON lines.
+
+    Raises:
+        SuiteError: If the file exists and a person has reviewed any row of it, or if it cannot be read.
     """
     if path.exists():
         try:
@@ -63,9 +65,12 @@ def write_curation(path: Path, proposals: Sequence[Proposal], render: Render) ->
 
 
 def read_curation(path: Path) -> list[dict[str, Any]]:
-    """The rows of a curation file, one per candidate. Raises SuiteError naming the line that cannot be used.
+    """Read the rows of a curation file, one per candidate.
 
     Cells are texts without white space around them; `status` and `recognisable` are in lower case.
+
+    Raises:
+        SuiteError: For a line that cannot be used; the message names it.
     """
     if not path.is_file():
         raise SuiteError(f"curation file {path} not found. Make one with emit_curation (--emit-curation).")
@@ -87,7 +92,7 @@ def read_curation(path: Path) -> list[dict[str, Any]]:
 
 
 def _text(cell: Any) -> Any:
-    """A cell as the reader of tables has it: an empty text for a missing one."""
+    """Return a cell as the reader of tables gives it: an empty text for a missing one."""
     if not isinstance(cell, str):
         return "" if cell is None else cell
     text = plain_cell(cell)
@@ -95,7 +100,11 @@ def _text(cell: Any) -> Any:
 
 
 def _decided(row: dict[str, Any], where: str) -> dict[str, Any]:
-    """The row with its decisions in lower case. Raises SuiteError."""
+    """Return the row with its decisions in lower case.
+
+    Raises:
+        SuiteError: For a row without an id, hash or status, or with an unknown decision.
+    """
     missing = [name for name in ("candidate_id", "question_sha256", "status") if not row.get(name)]
     if missing:
         raise SuiteError(f"{where} has no {missing[0]}; expected the columns {', '.join(COLUMNS)}.")
@@ -110,10 +119,10 @@ def _decided(row: dict[str, Any], where: str) -> dict[str, Any]:
 
 
 def apply_curation(proposals: Sequence[Proposal], rows: Sequence[Row], path: Path) -> dict[str, Proposal]:
-    """The accepted proposals by candidate id, reworded where a person did so.
+    """Return the accepted proposals by candidate id, reworded where a person did so.
 
     Raises:
-        SuiteError: For ids this conversion does not have, and for rows whose question has changed since.
+        SuiteError: For ids that this conversion does not have, or for rows whose question has changed since.
     """
     by_id = {proposal.candidate_id: proposal for proposal in proposals}
     unknown = [row["candidate_id"] for row in rows if row["candidate_id"] not in by_id]

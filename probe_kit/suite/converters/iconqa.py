@@ -1,4 +1,4 @@
-"""IconQA: pictures to choose from, and stems to count in, for Shape, Symmetry, Counting and Time."""
+"""IconQA: pictures to choose from, and pictures to count in, for Shape, Symmetry, Counting and Time."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -45,7 +45,11 @@ _HOW_MANY = re.compile(
 
 
 def read(root: Path, categories: Sequence[str], options: IconQaOptions) -> Reading:
-    """Every self-contained problem of the wanted categories. Raises SuiteError for a tree that is not IconQA's."""
+    """Read every self-contained problem of the requested categories.
+
+    Raises:
+        SuiteError: For a tree that is not IconQA's.
+    """
     base = root / "iconqa_data" if (root / "iconqa_data").is_dir() else root
     reading = Reading(
         license="LicenseRef-CC-BY-NC-SA-4.0",
@@ -165,7 +169,7 @@ def _candidates(
 
 
 def _stem_is_idle(stem: Path, pictures: Sequence[SourcePicture]) -> bool:
-    """Whether nothing is lost without the stem: it is absent, blank, or one of the choices."""
+    """Whether nothing is lost without the question's own picture: it is absent, blank, or one of the choices."""
     if not stem.is_file():
         return True
     image = decode_picture(stem)
@@ -178,7 +182,7 @@ def _stem_is_idle(stem: Path, pictures: Sequence[SourcePicture]) -> bool:
 def _counted_stem(
     problem: Any, pid: str, folder: Path, where: str, options: IconQaOptions, reading: Reading
 ) -> Iterator[Candidate]:
-    """A stem that shows a known number of known things; pairs are made of two such stems."""
+    """Yield the candidate of a picture that shows a known number of known things; pairs are made of two such."""
     match = _HOW_MANY.search(_plain(problem["question"]))
     count = _count_of(problem, where)
     if match is None or not options.cross_items or count is None:

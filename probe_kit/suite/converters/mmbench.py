@@ -31,7 +31,12 @@ Row = Mapping[str, str]
 
 
 def read(root: Path, categories: Sequence[str], options: MmbenchOptions) -> Reading:
-    """Every identity question. Raises UsageError unless real faces are asked for, SuiteError for a broken file."""
+    """Read every identity question.
+
+    Raises:
+        UsageError: Unless real faces are requested.
+        SuiteError: For a broken file.
+    """
     del categories  # there is only one
     if not options.include_real_faces:
         raise UsageError(
@@ -79,7 +84,11 @@ def _file(root: Path) -> Path:
 
 
 def _read_rows(path: Path) -> dict[int, Row]:
-    """The rows by their index. Raises SuiteError naming the line of a row that is cut off or has no own index."""
+    """Read the rows by their index.
+
+    Raises:
+        SuiteError: For a row that is cut off or has no index of its own; the message names its line.
+    """
     table = open_table(path, _COLUMNS, SuiteError, most_characters=_MOST_CHARACTERS)
     missing = [name for name in _COLUMNS if name not in table.names]
     if missing:
@@ -138,7 +147,7 @@ def _candidate(index: int, row: Row, rows: Mapping[int, Row], path: Path, readin
 
 
 def _picture_cell(index: int, rows: Mapping[int, Row], where: str) -> tuple[int, str]:
-    """The row that holds the picture, and the picture as base64; references may point to references."""
+    """Return the row that contains the picture, and the picture as base64; references may point to references."""
     holder, visited = index, set()
     while len(rows[holder]["image"].strip()) <= _LONGEST_REFERENCE:
         visited.add(holder)

@@ -55,7 +55,7 @@ COCO_CLASS: dict[str, str] = {
 
 
 def singular(answer: str) -> str:
-    """The listed noun that an answer such as "horses" or "butterflies" is the plural of, else the answer."""
+    """Return the listed noun whose plural an answer is, such as "horses" or "butterflies"; else the answer."""
     for plural, ending in (("ies", "y"), ("ches", "ch"), ("es", ""), ("s", "")):
         if answer not in KIND_OF and answer.endswith(plural) and answer.removesuffix(plural) + ending in KIND_OF:
             return answer.removesuffix(plural) + ending
@@ -78,11 +78,15 @@ _OTHER_MATTER = re.compile(
 
 
 Boxes = Mapping[int, Mapping[str, float]]
-"""Per picture, the share of its area that the largest box of each COCO class covers."""
+"""The share of a picture's area that the largest box of each COCO class covers, by picture."""
 
 
 def read(root: Path, categories: Sequence[str], options: OkVqaOptions) -> Reading:
-    """Every question of the two splits that are present. Raises SuiteError if neither is, or for a broken one."""
+    """Read every question of those of the two splits that are present.
+
+    Raises:
+        SuiteError: If no split is present, or if one is broken.
+    """
     del categories  # there is only one
     reading = Reading(
         license="LicenseRef-COCO-Flickr",
@@ -131,7 +135,11 @@ def _read_split(root: Path, split: str, questions: Path, options: OkVqaOptions, 
 
 
 def _by_question(path: Path, key: str, name: str) -> dict[int, Any]:
-    """The records of a file by their question, in its order. Raises SuiteError for a question with two."""
+    """Return the records of a file by their question, in the file's order.
+
+    Raises:
+        SuiteError: For a question with two records.
+    """
     value = read_annotations(path, SOURCE, "Unpack the questions and the annotations of the same release.")
     records = enumerate(field_of(value, key, list, SOURCE, path.name))
     places = ((f"{name} {number} of {path.name}", record) for number, record in records)
@@ -140,7 +148,7 @@ def _by_question(path: Path, key: str, name: str) -> dict[int, Any]:
 
 
 def _answer(record: Any, question: str, options: OkVqaOptions, where: str) -> tuple[str, str | None]:
-    """The answer people agree on, or why there is none to ask for."""
+    """Return the answer that people agree on, or why there is none."""
     plain = question.lower()
     if not _NAMES_A_KIND.search(plain) or _OTHER_MATTER.search(plain):
         return "", "question asks for something else than a kind"

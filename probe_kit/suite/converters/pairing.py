@@ -16,9 +16,9 @@ from probe_kit.suite.suite import Picture, make_item, squared_picture
 
 @dataclass(frozen=True)
 class Proposal:
-    """One would-be item that asks the question of `candidate`.
+    """One possible item that asks the question of `candidate`.
 
-    `wording` is None if a person has to write it; `curation_status` is how it stands in review.
+    `wording` is None if a person has to write it; `curation_status` is its status in the review.
     """
 
     candidate: Candidate
@@ -37,7 +37,7 @@ class Proposal:
 
     @property
     def instruction(self) -> str:
-        """The imperative, empty without a wording."""
+        """The imperative; empty without a wording."""
         return instruction_for(self.wording.phrase, self.wording.article) if self.wording else ""
 
 
@@ -51,14 +51,17 @@ def pair_candidates(
     alike: Callable[[SourcePicture, SourcePicture], bool],
     rng: np.random.Generator,
 ) -> list[Bundle]:
-    """Proposals in bundles that stay together, in random order.
+    """Pair candidates to proposals, in bundles that stay together, in random order.
 
-    Questions that bring both pictures keep them, and half of those with an opposite ask for it, so that the
-    pictures alone do not give the answer. Others are paired two by two and asked both ways.
+    Questions that bring both pictures keep them. Half of those with an opposite ask for it, so that the pictures
+    alone do not give the answer. The others are paired two by two and asked both ways.
 
     Args:
-        reuse: Every two of those, instead of every picture once.
-        alike: Whether two pictures are too much the same.
+        candidates: Candidates of one category.
+        reuse: Whether to make every pair of candidates with one picture, instead of using every picture once.
+        paper_polarity: Whether to keep every comparison as the source asks it.
+        alike: Function that returns whether two pictures are too much the same.
+        rng: Generator of the order, the couples and the opposites.
     """
     native = [candidate for candidate in candidates if candidate.distractor is not None]
     single = [candidate for candidate in candidates if candidate.distractor is None]
@@ -81,7 +84,7 @@ def pair_candidates(
 
 
 def _native(candidate: Candidate, negated: bool) -> Proposal:
-    """The question of a candidate with both pictures. negated: asked for by its opposite, if it has one."""
+    """Make the proposal of a candidate with both pictures; `negated` asks for the opposite, if there is one."""
     assert candidate.distractor is not None
     wording = candidate.wording
     phrase, opposite = (wording.phrase, wording.opposite) if wording else (candidate.question, None)
@@ -107,7 +110,7 @@ def _native(candidate: Candidate, negated: bool) -> Proposal:
 
 
 def _ask(candidate: Candidate, other: Candidate) -> Proposal:
-    """One of two candidates asked for, with the other's picture as the wrong one."""
+    """Make the proposal that asks for one of two candidates, with the other's picture as the wrong one."""
     recolored = "recolored" in (candidate.construction, other.construction)
     return Proposal(
         candidate,
@@ -140,7 +143,7 @@ def _may_meet(first: Candidate, second: Candidate) -> bool:
 def _disjoint_couples(
     candidates: Sequence[Candidate], rng: np.random.Generator
 ) -> list[tuple[Candidate, Candidate]]:
-    """Couples inside one family; every picture is in at most one, paired with the next free one that fits."""
+    """Pair candidates inside one family; every picture is in at most one pair, with the next free fitting one."""
     waiting: dict[str, list[Candidate]] = {}
     used: set[str] = set()
     couples = []
@@ -160,7 +163,7 @@ def _disjoint_couples(
 
 
 def sample(bundles: Sequence[Bundle], count: int) -> list[Bundle]:
-    """The first bundles with at most `count` proposals in all."""
+    """Return the first bundles with at most `count` proposals in all."""
     sampled: list[Bundle] = []
     capacity = count
     for bundle in bundles:
@@ -174,9 +177,9 @@ def emit(
     source: str, bundles: Sequence[Bundle], reading: Reading, render: Callable[[SourcePicture], Image.Image],
     rng: np.random.Generator,
 ) -> tuple[list[Item], dict[str, bytes]]:  # fmt: skip
-    """The items of the bundles without groups, and their pictures by file name.
+    """Make the items of the bundles, without groups, and their pictures by file name.
 
-    Twins keep their two pictures where they are; all sides balance.
+    Twins keep the places of their two pictures; all sides balance.
     """
     store: dict[str, Picture] = {}
 
@@ -193,7 +196,7 @@ def emit(
 
 
 def _with_sides(bundles: Sequence[Bundle], rng: np.random.Generator) -> Iterator[tuple[Proposal, Side]]:
-    """Each proposal with the side of its target: phrases alternate, and their remainders balance each other."""
+    """Yield each proposal with the side of its target; phrases alternate, and their remainders balance."""
     lean: Counter[str] = Counter()
     side_of_first: dict[str, Side] = {}
     for bundle in sorted(bundles, key=lambda bundle: bundle[0].instruction):
@@ -210,7 +213,10 @@ def _with_sides(bundles: Sequence[Bundle], rng: np.random.Generator) -> Iterator
 
 
 def _side(proposal: Proposal, first: Proposal, side_of_first: Side) -> Side:
-    """Twins keep their pictures in place, so the one that asks for the other picture asks for the other side."""
+    """Return the side of a proposal's target, given that of the first in its bundle.
+
+    Twins keep their pictures in place, so the one that asks for the other picture asks for the other side.
+    """
     return side_of_first if proposal.target == first.target else other_side(side_of_first)
 
 

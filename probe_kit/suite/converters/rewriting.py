@@ -1,6 +1,6 @@
-"""Words of converted questions: an ordered rule table names the correct picture; and filters.
+"""Words of converted questions: an ordered table of rules that name the correct picture, and filters.
 
-Optionally a language model proposes a wording where no rule matches. A person must accept it.
+Optionally, a language model proposes a wording where no rule matches. A person must accept it.
 """
 
 import json
@@ -63,7 +63,12 @@ _ER = r"(?:[a-z]+er|worse|more|less|fewer)"
 
 @dataclass(frozen=True)
 class _Rule:
-    """`build` makes the phrase and its opposite from the match, or None if the match means something else."""
+    """A rule that rewrites a question.
+
+    Attributes:
+        build: Function that makes the phrase and its opposite from the match. It returns None if the match means
+            something else.
+    """
 
     rule_id: str
     pattern: re.Pattern[str]
@@ -71,10 +76,12 @@ class _Rule:
 
 
 def rewrite(question: str, answer: str = "", options_are_names: bool = False) -> Wording | None:
-    """The wording of the first rule that matches, None (rule R0) if a person has to write it.
+    """Return the wording of the first rule that matches; None (rule R0) if a person has to write it.
 
     Args:
-        answer: The right option's text, for questions whose options are words.
+        question: Text of the source's question.
+        answer: The right option's text, for questions whose options are words; empty for others.
+        options_are_names: Whether the options are names of people.
     """
     text = clean(question)
     if options_are_names and _IDENTITY.match(text):
@@ -91,14 +98,14 @@ def rewrite(question: str, answer: str = "", options_are_names: bool = False) ->
 
 
 def clean(question: str) -> str:
-    """The question without what every question has: prefixes, question mark, double spaces."""
+    """Return the question without prefixes, question mark and double spaces."""
     text = re.sub(r"\s+", " ", question).strip().rstrip("?.! ").strip()
     text = _TAIL.sub("", _PREFIX.sub("", text))
     return text[:1].lower() + text[1:]
 
 
 def opposite_of(comparative: str, noun_follows: str = "") -> str:
-    """The other way round: "shorter" for "longer", "less dry" for "drier", "fewer" or "less" for "more"."""
+    """Return the opposite: "shorter" for "longer", "less dry" for "drier", "fewer" or "less" for "more"."""
     word = comparative.lower()
     if word == "more" and noun_follows:
         return "fewer" if noun_follows.endswith("s") and not noun_follows.endswith("ss") else "less"
@@ -108,7 +115,7 @@ def opposite_of(comparative: str, noun_follows: str = "") -> str:
 
 
 def base_of(comparative: str) -> str:
-    """ "happy" for "happier", "big" for "bigger", "large" for "larger"."""
+    """Return the base form: "happy" for "happier", "big" for "bigger", "large" for "larger"."""
     if comparative in _BASES:
         return _BASES[comparative]
     stem = comparative.removesuffix("er")
@@ -124,7 +131,7 @@ def _bare(text: str) -> str:
 
 
 def _noun_of(text: str) -> str:
-    """The noun of a question; "picture" for a mere "image"."""
+    """Return the noun of a question; "picture" for a mere "image"."""
     noun = _bare(text)
     return "picture" if noun.lower() in _GENERIC or noun.startswith("of ") else noun
 
@@ -134,13 +141,13 @@ def _is_comparative(word: str) -> bool:
 
 
 def _graded(match: re.Match[str]) -> tuple[str, str] | None:
-    """ "more ADJ X" and "less ADJ X" (R1, R3, R6)."""
+    """Build "more ADJ X" and "less ADJ X" (R1, R3, R6)."""
     noun, degree, adjective = _noun_of(match["x"]), match["degree"], _bare(match["adj"])
     return f"{degree} {adjective} {noun}", f"{opposite_of(degree)} {adjective} {noun}"
 
 
 def _comparative(match: re.Match[str]) -> tuple[str, str] | None:
-    """ "ADJ-er X" and its opposite (R2, R3, R6)."""
+    """Build "ADJ-er X" and its opposite (R2, R3, R6)."""
     word = match["er"].lower()
     if not _is_comparative(word) or word in ("more", "less", "fewer"):
         return None
@@ -156,7 +163,7 @@ def _doing(match: re.Match[str]) -> tuple[str, str]:
 
 
 def _having(match: re.Match[str]) -> tuple[str, str] | None:
-    """ "X with more Y" (R5, R7)."""
+    """Build "X with more Y" and its opposite (R5, R7)."""
     word = match["er"].lower()
     if not _is_comparative(word):
         return None
@@ -211,7 +218,7 @@ _LEAST_EDGE_ENERGY = 0.25  # of the original, after a picture was as small as on
 
 
 def picture_problem(image: Image.Image, options: ConvertOptions, least_side: int | None = None) -> str | None:
-    """Why the picture cannot be used, None if it can."""
+    """Return why the picture cannot be used; None if it can."""
     if min(image.size) < (options.min_side if least_side is None else least_side):
         return "picture too small"
     if max(image.size) > options.max_aspect * min(image.size):
@@ -235,7 +242,7 @@ def _edge_energy(image: Image.Image) -> float:
 
 
 def text_problem(instruction: str, phrase: str, options: ConvertOptions) -> str | None:
-    """Why the instruction cannot be used, None if it can."""
+    """Return why the instruction cannot be used; None if it can."""
     text = unicodedata.normalize("NFKC", instruction)
     checks: dict[str, Callable[[], bool]] = {
         "instruction has too many words": lambda: len(text.split()) > options.max_words,
@@ -263,13 +270,13 @@ a leading article), polarity (pos, neg or none), keep (false if choosing one of 
 
 
 def propose_wording(candidate: Candidate, options: ConvertOptions) -> Wording | None:
-    """Return the wording that the service proposes, None if it proposes nothing usable.
+    """Return the wording that the service proposes; None if it proposes nothing usable.
 
     Replies are kept in `llm_cache`, so that the same conversion needs no network again.
 
     Raises:
-        UsageError: For incomplete options.
         SuiteError: If the service does not answer.
+        UsageError: For a service without a model or a folder for replies.
     """
     if options.llm_base is None:
         return None

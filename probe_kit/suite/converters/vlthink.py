@@ -41,7 +41,11 @@ ALIASES = {"stop give way": "stop", "do not dryclean": "do not dry clean", "dryc
 
 
 def read(root: Path, categories: Sequence[str], options: VlThinkOptions) -> Reading:
-    """Every board of the wanted categories. Raises SuiteError if a set is missing or a board is broken."""
+    """Read every board of the requested categories.
+
+    Raises:
+        SuiteError: If there is no board for them, or for an unknown set or a broken board.
+    """
     base = root / _BOARDS if (root / _BOARDS).is_dir() else root
     reading = Reading(
         license="MIT",
@@ -124,7 +128,7 @@ def _label(record: Any, field: str, where: str) -> str:
 
 
 def _repaint(board: Path, color: str) -> Image.Image:
-    """The black board with its ink in another colour; white ink lies on gray."""
+    """Return the black board with its ink in another colour; white ink lies on gray."""
     opacity = 255 - np.asarray(upright_board(board).convert("L"), np.float64)[..., None]
     paper = np.array(_BEHIND_WHITE if color == "white" else WHITE, np.float64)
     mixed = (opacity * np.array(_RECOLORS[color]) + (255 - opacity) * paper) / 255
@@ -132,7 +136,9 @@ def _repaint(board: Path, color: str) -> Image.Image:
 
 
 def upright_board(path: Path) -> Image.Image:
-    """The art of one board. Textures are stored with rows and columns exchanged: as such, STOP reads backwards.
+    """Return the art of one board.
+
+    Textures are stored with rows and columns exchanged: without a transposition, STOP reads backwards.
 
     Raises:
         SuiteError: If the file is not a binary glTF with one embedded picture.
@@ -151,7 +157,7 @@ _UNREADABLE = (
 
 
 def _texture(path: Path) -> Image.Image:
-    """The first embedded picture of a GLB: a JSON chunk says which bytes of the binary chunk it is."""
+    """Return the first embedded picture of a GLB: a JSON chunk says which bytes of the binary chunk it is."""
     try:
         chunks = dict(_chunks(read_regular(path)))
         scene = parse_json(chunks[_JSON_CHUNK])

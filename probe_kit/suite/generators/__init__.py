@@ -22,11 +22,11 @@ _ALL = (
     *(COUNTING, TIME, PUBLIC_INFO, TRAFFIC, LIVING_WORLD),
 )
 GENERATORS: dict[str, Generator[Any]] = {generator.category: generator for generator in _ALL}
-"""By category."""
+"""The generator of each category, by name."""
 
 
 def vocabulary() -> list[str]:
-    """Every lower-case word that an instruction of the embedded suite can hold, sorted."""
+    """Return every lower-case word that an instruction of the embedded suite can contain, sorted."""
     concepts = [concept for generator in GENERATORS.values() for pair in generator.pairs for concept in pair]
     sentences = {instruction_for(concept.phrase, "the") for concept in concepts}
     return sorted({word for sentence in sentences for word in sentence.lower().split()})

@@ -36,11 +36,13 @@ Draw = Callable[[Pen, float, RGB], None]
 
 @dataclass(frozen=True)
 class Gradable:
-    """A thing asked for by more or by less of one property. Its colour is free, unless `shaded`: then its shade
-
-    is the level.
+    """A thing that is asked for by more or by less of one property.
 
     Attributes:
+        more: Phrase for the thing with more of the property.
+        less: Phrase for the thing with less of it.
+        draw: Function that draws the thing with a pen, a level from 0 to 1, and a colour.
+        shaded: Whether the shade of its colour is the level; else its colour is free.
         upright: Whether it must not be turned, because a turn would change the property.
     """
 
@@ -193,7 +195,7 @@ def _distant_dots(pen: Pen, level: float, color: RGB) -> None:
 
 
 def _window(pen: Pen, level: float, color: RGB) -> None:
-    """A veil of `color` before a checkerboard; the more transparent, the more of the board shows."""
+    """Draw a veil of `color` in front of a checkerboard; the more transparent, the more of the board shows."""
     for row in range(4):
         for column in range(4):
             behind = _WHITE if (row + column) % 2 else _DARK
@@ -250,7 +252,7 @@ _BY_NAME = {name: gradable for gradable in GRADABLES for name in (gradable.more,
 
 @dataclass(frozen=True)
 class Sample(Tile):
-    """Everything the picture is drawn from: a gradable, by its word for more, with this much of its property."""
+    """Everything that the picture is drawn from: a gradable, by its word for more, with this much of it."""
 
     more: str
     level: float
@@ -272,14 +274,14 @@ def _sample(gradable: Gradable, level: float, rng: np.random.Generator) -> Sampl
 
 
 def _shade(level: float, rng: np.random.Generator) -> RGB:
-    """Any hue, as dark as the level says."""
+    """Return a colour of any hue, as dark as the level says."""
     value = _LIGHTEST + level * (_DARKEST - _LIGHTEST)
     red, green, blue = colorsys.hsv_to_rgb(rng.uniform(), 0.35, value)
     return round(255 * red), round(255 * green), round(255 * blue)
 
 
 def _tiles(left: Concept, right: Concept, rng: np.random.Generator) -> tuple[Sample, Sample]:
-    """Two levels a good way apart, wherever in the range."""
+    """Draw two tiles whose levels are a good way apart, anywhere in the range."""
     gap = rng.uniform(*_GAP)
     low = rng.uniform(0, 1 - gap)
     levels = {"neg": low, "pos": low + gap}

@@ -29,7 +29,7 @@ _WHITE = (250, 250, 250)
 
 @dataclass(frozen=True)
 class Glyph:
-    """A thing with its names, the basic colours it comes in, and how to draw it in the unit disk."""
+    """A thing with its names, its possible basic colours, and a function that draws it in the unit disk."""
 
     singular: str
     plural: str
@@ -170,7 +170,7 @@ class Count(Concept):
 
 @dataclass(frozen=True)
 class Scatter(Tile):
-    """Everything the picture is drawn from: equal glyphs, spread without overlap."""
+    """Everything that the picture is drawn from: equal glyphs, spread without overlap."""
 
     glyph: str
     color: str
@@ -182,9 +182,10 @@ class Scatter(Tile):
 
 
 def _radius(number: int, rng: np.random.Generator) -> float:
-    """Radius of each glyph in tile units; in half of the tiles all ink together is fixed, in half each glyph.
+    """Draw the radius of each glyph in tile units.
 
-    With only one of the two rules, the number could be read off the ink or off the size of a single glyph.
+    In half of the tiles all ink together is fixed, in half each glyph. With only one of the two rules, the number
+    could be read off the ink or off the size of a single glyph.
     """
     if rng.integers(2):
         return float(rng.uniform(*_FIXED_RADIUS))
@@ -192,7 +193,7 @@ def _radius(number: int, rng: np.random.Generator) -> float:
 
 
 def _centres(number: int, radius: float, rng: np.random.Generator) -> list[tuple[float, float]]:
-    """Centres of disks that neither overlap nor leave the tile; starts over when a disk finds no room."""
+    """Draw centres of disks that neither overlap nor leave the tile; start over when a disk finds no room."""
     reach = _MARGIN - radius
     while True:
         centres: list[tuple[float, float]] = []

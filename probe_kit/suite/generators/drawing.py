@@ -1,16 +1,16 @@
 """Drawing of tiles: colours and backgrounds, a canvas in plain coordinates, and icons.
 
 Drawings use *drawing units*: x to the right, y down, and everything inside the disk of radius 1. A `Placement`
-maps them to *tile units*: the tile spans -1 to 1 on both axes. A tile is drawn at three times the size and
-reduced once.
+maps them to *tile units*: the tile spans -1 to 1 on both axes. A tile is drawn at three times the size and reduced
+once.
 
 Concepts recur in other pictures, so a probe can learn by itself which pixels answer which word (see the control
-`random-features`). What recurs should be the concept and little else: the background has any hue, and where size
-means nothing, drawings have other sizes anywhere on their tile.
+`random-features`). The concept should recur, and little else. So the background has any hue, and where size means
+nothing, drawings have different sizes anywhere on their tile.
 
-Icons are rendered once by `scripts/build_suite_art.py` and shipped with their licences. `suite/art/` holds two
-sheets of 128 px cells, `fluent.png` in colour and `material.png` as grey masks, and `index.json` with the icon
-names in the order of the cells. `suite/art/NOTICE.md` says where they come from.
+Icons are rendered once by `scripts/build_suite_art.py` and shipped with their licences. The folder `suite/art/`
+contains two sheets of 128 px cells, `fluent.png` in colour and `material.png` as grey masks. The file `index.json`
+has the icon names in the order of the cells. The notice `suite/art/NOTICE.md` names their origin.
 """
 
 import colorsys
@@ -50,7 +50,7 @@ _TINT = 12
 
 
 def jittered(color: RGB, rng: np.random.Generator) -> RGB:
-    """A shade that still has the same name: up to 14 levels off, and 5 degrees in hue.
+    """Draw a shade that still has the same name: up to 14 levels off, and 5 degrees in hue.
 
     Moving the channels one by one would turn gray into olive; in HSV an achromatic colour stays achromatic.
     """
@@ -64,19 +64,19 @@ def jittered(color: RGB, rng: np.random.Generator) -> RGB:
 
 
 def darker(color: RGB) -> RGB:
-    """The same hue with 60 % of the light."""
+    """Return the same hue with 60 % of the light."""
     red, green, blue = color
     return red * 6 // 10, green * 6 // 10, blue * 6 // 10
 
 
 def lightness(color: RGB) -> float:
-    """Perceived lightness (Rec. 601 luma), 0 to 255."""
+    """Return the perceived lightness (Rec. 601 luma), 0 to 255."""
     red, green, blue = color
     return 0.299 * red + 0.587 * green + 0.114 * blue
 
 
 def background_for(ink: RGB, rng: np.random.Generator, contrast: float = INK_CONTRAST) -> RGB:
-    """A pale, faintly tinted background at least `contrast` levels lighter or darker than `ink`."""
+    """Draw a pale, faintly tinted background at least `contrast` levels lighter or darker than `ink`."""
     while True:
         tinted = rng.uniform(*_BACKGROUND_LIGHTNESS) + rng.uniform(-_TINT, _TINT, size=3)
         red, green, blue = (int(channel) for channel in np.clip(np.rint(tinted), 0, 255))
@@ -85,11 +85,11 @@ def background_for(ink: RGB, rng: np.random.Generator, contrast: float = INK_CON
 
 
 _LEAST_LIGHTNESS = 110
-"""Of a background: dark edges must stand out from it."""
+"""Least lightness of a background: dark edges must stand out from it."""
 
 
 def hued_background(ink: RGB, rng: np.random.Generator, contrast: float = INK_CONTRAST) -> RGB:
-    """A background of any hue, from pale to vivid, at least `contrast` levels lighter or darker than `ink`."""
+    """Draw a background of any hue, pale to vivid, at least `contrast` levels lighter or darker than `ink`."""
     while True:
         shade = colorsys.hsv_to_rgb(rng.uniform(), rng.uniform(0, 0.9), rng.uniform(0.5, 1))
         red, green, blue = (round(255 * channel) for channel in shade)
@@ -99,9 +99,10 @@ def hued_background(ink: RGB, rng: np.random.Generator, contrast: float = INK_CO
 
 
 def on_hues[T: Any](first: T, second: T, rng: np.random.Generator) -> tuple[T, T]:
-    """The two tiles on backgrounds of any hue, from which each tile's `ink` stands out.
+    """Return the two tiles on backgrounds of any hue, from which each tile's `ink` stands out.
 
-    Drawn after both tiles, whose pale backgrounds stay in the stream of `rng`: suite 2.0.0 is drawn in this order.
+    The backgrounds are drawn after both tiles, whose pale backgrounds stay in the stream of `rng`: suite 2.0.0 is
+    drawn in this order.
     """
     return (
         replace(first, background=hued_background(first.ink, rng)),
@@ -124,9 +125,14 @@ Points = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Placement:
-    """The place of a drawing on its tile; none of it means anything.
+    """The place of a drawing on its tile; it carries no meaning.
 
-    scale is the radius of the drawing and x, y its centre, in tile units; rotation is in degrees.
+    Attributes:
+        scale: Radius of the drawing, in tile units.
+        x: Centre of the drawing to the right, in tile units.
+        y: Centre of the drawing downwards, in tile units.
+        rotation: Turn in degrees.
+        mirror: Whether left and right are exchanged.
     """
 
     scale: float
@@ -136,7 +142,7 @@ class Placement:
     mirror: bool
 
     def apply(self, points: Points) -> Points:
-        """Drawing units (N, 2) to tile units (N, 2)."""
+        """Return points in drawing units (N, 2) as tile units (N, 2)."""
         angle = np.deg2rad(self.rotation)
         turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
         flip = np.array([-1.0 if self.mirror else 1.0, 1.0])
@@ -150,11 +156,15 @@ def random_placement(
     turn: float = 17,
     mirrored: bool = True,
 ) -> Placement:
-    """A placement for a drawing that has the tile to itself: up to 5 % off centre, up to `turn` degrees turned.
+    """Draw a placement for a drawing that is alone on its tile, up to 5 % off centre.
 
     Args:
-        scales: The range of its radius; a drawing that fills the unit disk leaves the tile above FULL_DISK.
-        mirrored: Whether it may also be mirrored; not where that would change what is shown, as with lettering.
+        rng: Generator of the placement.
+        scales: Range of the radius, in tile units; a drawing that fills the unit disk leaves the tile above
+            FULL_DISK.
+        turn: Largest turn in degrees.
+        mirrored: Whether the drawing may also be mirrored; not where that would change what it shows, as with
+            lettering.
     """
     return Placement(
         scale=round(rng.uniform(*scales), 4),
@@ -166,12 +176,12 @@ def random_placement(
 
 
 def polygon(*corners: tuple[float, float]) -> Points:
-    """Points (N, 2) with these coordinates."""
+    """Return points (N, 2) with these coordinates."""
     return np.array(corners, dtype=np.float64)
 
 
 def rectangle(left: float, top: float, right: float, bottom: float) -> Points:
-    """The four corners (4, 2) of an upright rectangle."""
+    """Return the four corners (4, 2) of an upright rectangle."""
     return polygon((left, top), (right, top), (right, bottom), (left, bottom))
 
 
@@ -180,13 +190,13 @@ SHIRT = polygon(*_HALF_SHIRT, *((-x, y) for x, y in reversed(_HALF_SHIRT)))
 
 
 def ellipse(x: float, y: float, rx: float, ry: float, start: float = 0, end: float = 360) -> Points:
-    """Points (49, 2) along an ellipse from angle `start` to `end` in degrees, 0 to the right, 90 down."""
+    """Return points (49, 2) along an ellipse from angle `start` to `end` in degrees, 0 to the right, 90 down."""
     angles = np.deg2rad(np.linspace(start, end, 49))
     return np.stack([x + rx * np.cos(angles), y + ry * np.sin(angles)], axis=1)
 
 
 def tinted(mask: Image.Image, color: RGB) -> Image.Image:
-    """RGBA art of one colour with the grey picture `mask` as its opacity."""
+    """Return RGBA art of one colour with the grey picture `mask` as its opacity."""
     art = Image.new("RGBA", mask.size, color)
     art.putalpha(mask)
     return art
@@ -194,7 +204,7 @@ def tinted(mask: Image.Image, color: RGB) -> Image.Image:
 
 @cache
 def _lettering(text: str) -> Image.Image:
-    """Text in Pillow's own font, as a grey picture cut to its ink."""
+    """Return a text in Pillow's own font, as a grey picture cut to its ink."""
     font = ImageFont.load_default(size=_FONT_PIXELS)
     left, top, right, bottom = font.getbbox(text, stroke_width=_BOLDNESS)
     mask = Image.new("L", (round(right - left), round(bottom - top)))
@@ -203,33 +213,33 @@ def _lettering(text: str) -> Image.Image:
 
 
 class Canvas:
-    """One tile in the making."""
+    """One tile that is being drawn."""
 
     def __init__(self, background: RGB) -> None:
         self._image = Image.new("RGB", (_DRAWN_PIXELS, _DRAWN_PIXELS), background)
 
     def pen(self, placement: Placement) -> "Pen":
-        """A pen that draws at `placement`."""
+        """Return a pen that draws at `placement`."""
         return Pen(self._image, placement)
 
     def picture(self) -> Image.Image:
-        """The finished tile, RGB, 256 by 256 pixels."""
+        """Return the finished tile, RGB, 256 by 256 pixels."""
         return self._image.resize((TILE_PIXELS, TILE_PIXELS), Image.Resampling.LANCZOS)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Tile:
-    """Everything one picture is drawn from: plain values, and so a record of it.
+    """Everything that one picture is drawn from: plain values, and so a record of it.
 
     Attributes:
-        ink: A colour from which the background stands apart.
+        ink: Colour that stands out from the background.
     """
 
     ink: RGB
     background: RGB
 
     def draw(self) -> Image.Image:
-        """The picture, RGB; equal tiles give equal pixels."""
+        """Draw the picture, RGB; equal tiles give equal pixels."""
         canvas = Canvas(self.background)
         self._paint(canvas)
         return canvas.picture()
@@ -243,7 +253,7 @@ class Tile:
 
 
 class Pen:
-    """Draws in drawing units at one placement."""
+    """A pen that draws in drawing units at one placement."""
 
     def __init__(self, image: Image.Image, placement: Placement) -> None:
         self._image = image
@@ -251,11 +261,11 @@ class Pen:
         self._placement = placement
 
     def fill(self, points: Points, color: RGB) -> None:
-        """A filled polygon with corners `points` (N, 2)."""
+        """Draw a filled polygon with corners `points` (N, 2)."""
         self._draw.polygon(self._pixels(points), fill=color)
 
     def line(self, points: Points, color: RGB, width: float) -> None:
-        """An open line through `points` (N, 2) with round ends; `width` in drawing units."""
+        """Draw an open line through `points` (N, 2) with round ends; `width` in drawing units."""
         pixels = self._pixels(points)
         stroke = width * self._placement.scale * _DRAWN_PIXELS / 2
         self._draw.line(pixels, fill=color, width=round(stroke), joint="curve")
@@ -263,11 +273,11 @@ class Pen:
             self._draw.circle((x, y), stroke / 2, fill=color)
 
     def outline(self, points: Points, color: RGB, width: float) -> None:
-        """A closed line around the polygon `points` (N, 2); `width` in drawing units."""
+        """Draw a closed line around the polygon `points` (N, 2); `width` in drawing units."""
         self.line(np.vstack([points, points[:1]]), color, width)
 
     def stamp(self, art: Image.Image, x: float, y: float, height: float) -> None:
-        """Ready-made RGBA art with its centre at (x, y); `height` in drawing units, the width follows."""
+        """Paste ready-made RGBA art with its centre at (x, y); `height` in drawing units, the width follows."""
         pixels_high = height * self._placement.scale * _DRAWN_PIXELS / 2
         size = (round(pixels_high * art.width / art.height), round(pixels_high))
         placed = art.resize(size, Image.Resampling.BICUBIC)
@@ -279,7 +289,7 @@ class Pen:
         self._image.paste(placed, corner, placed)
 
     def text(self, text: str, x: float, y: float, height: float, color: RGB) -> None:
-        """Bold lettering with its centre at (x, y); `height` of a capital letter in drawing units."""
+        """Draw bold lettering with its centre at (x, y); `height` of a capital letter in drawing units."""
         self.stamp(tinted(_lettering(text), color), x, y, height)
 
     def _pixels(self, points: Points) -> list[tuple[float, float]]:
@@ -296,18 +306,18 @@ COLUMNS = 12
 
 
 def color_icon(name: str) -> Image.Image:
-    """A Fluent icon, RGBA, 128 px square."""
+    """Return a Fluent icon, RGBA, 128 px square."""
     return _cell("fluent", name)
 
 
 def mask_icon(name: str) -> Image.Image:
-    """A Material icon as opacity, grey, 128 px square."""
+    """Return a Material icon as opacity, grey, 128 px square."""
     return _cell("material", name)
 
 
 @cache
 def mean_color(name: str) -> RGB:
-    """Average colour of the opaque part of a Fluent icon."""
+    """Return the average colour of the opaque part of a Fluent icon."""
     pixels = np.asarray(color_icon(name), np.float64).reshape(-1, 4)
     red, green, blue = np.average(pixels[:, :3], axis=0, weights=pixels[:, 3])
     return round(red), round(green), round(blue)

@@ -57,7 +57,7 @@ class Expression:
     eyes: float = 0
 
     def at(self, strength: float) -> "Expression":
-        """The same feeling, this much of it."""
+        """Return the same feeling with this strength."""
         return Expression(*(strength * part for part in vars(self).values()))
 
 
@@ -73,7 +73,7 @@ EXPRESSIONS: dict[str, Expression] = {
 
 
 def draw_head(pen: Pen, skin: RGB, hair: RGB, long_hair: bool) -> None:
-    """Hair, ears and an empty face in the unit disk."""
+    """Draw hair, ears and an empty face in the unit disk."""
     if long_hair:
         pen.fill(ellipse(0, -0.12, 0.88, 0.82, 180, 360), hair)
         for side in (-1, 1):
@@ -86,7 +86,7 @@ def draw_head(pen: Pen, skin: RGB, hair: RGB, long_hair: bool) -> None:
 
 
 def draw_glasses(pen: Pen, skin: RGB) -> None:
-    """Round frames around the eyes."""
+    """Draw round frames around the eyes."""
     color = _standing_out(skin)
     for side in (-1, 1):
         pen.outline(ellipse(side * 0.32, -0.02, 0.27, 0.27), color, 0.045)
@@ -94,7 +94,7 @@ def draw_glasses(pen: Pen, skin: RGB) -> None:
 
 
 def draw_expression(pen: Pen, set_as: Expression, skin: RGB) -> None:
-    """Eyes, brows and mouth."""
+    """Draw eyes, brows and mouth."""
     color = _standing_out(skin)
     for side in (-1, 1):
         _draw_eye(pen, side, set_as.eyes, color)
@@ -141,7 +141,7 @@ def _draw_mouth(pen: Pen, set_as: Expression, color: RGB) -> None:
 
 
 def _standing_out(skin: RGB) -> RGB:
-    """Dark brows vanish on dark skin, light ones on light skin."""
+    """Return a colour that is visible on the skin: dark brows vanish on dark skin, light ones on light skin."""
     return _DARK if lightness(skin) > _MIDDLE_LIGHTNESS else _LIGHT
 
 
@@ -160,7 +160,7 @@ _DEGREES = {
 
 @dataclass(frozen=True)
 class Feeling(Concept):
-    """One emotion, 0 for none of it to 1 for all of it."""
+    """One emotion, with a strength from 0 for none of it to 1 for all of it."""
 
     emotion: str = "neutral"
     strength: float = _STRONG
@@ -168,7 +168,7 @@ class Feeling(Concept):
 
 @dataclass(frozen=True)
 class Face(Tile):
-    """Everything the picture is drawn from; `ink` is the skin."""
+    """Everything that the picture is drawn from; `ink` is the skin."""
 
     emotion: str
     strength: float

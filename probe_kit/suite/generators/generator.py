@@ -1,4 +1,4 @@
-"""A category of the embedded suite: its concepts, which of them meet, and the couples of tiles that are drawn."""
+"""A category of the embedded suite: its concepts, the pairs of them, and the couples of tiles that are drawn."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -24,11 +24,13 @@ class Concept:
 class Generator[C: Concept]:
     """One category of the embedded suite.
 
-    pairs: every two concepts that may lie side by side, each couple once.
-    tiles: draws the two tiles of a couple. Whatever does not show the concepts must be drawn for both from
-        the same distribution, because which of the two is asked for is decided elsewhere.
-    name_of: the words for what a tile literally shows, which need no knowledge, for the wording `named`. They are
-        empty where they say no more than the concept does; None if the category has no such words.
+    Attributes:
+        pairs: Every two concepts that may lie side by side, each couple once.
+        tiles: Function that draws the two tiles of a couple. All that does not show the concepts must be drawn for
+            both from the same distribution. Another function decides which of the two is asked for.
+        name_of: Function that returns the words for what a tile literally shows, which need no knowledge, for the
+            wording `named`. They are empty where they say no more than the concept does. None if the category has
+            no such words.
     """
 
     category: str
@@ -40,7 +42,7 @@ class Generator[C: Concept]:
 def spread_pairs[C: Concept](
     concepts: Sequence[C], allowed: Callable[[C, C], bool], most: int | None = None
 ) -> tuple[tuple[C, C], ...]:
-    """Allowed pairs, at most `most`, that use every concept about equally often.
+    """Return allowed pairs, at most `most`, that use every concept about equally often.
 
     The concepts stand in a circle, in an order that follows no family; neighbours are paired first, then those
     two places apart, and so on.
@@ -58,9 +60,9 @@ def spread_pairs[C: Concept](
 def half_within[C: Concept](
     concepts: Sequence[C], family: Callable[[C], object], allowed: Callable[[C, C], bool]
 ) -> tuple[tuple[C, C], ...]:
-    """All allowed pairs inside one family, and as many across families.
+    """Return all allowed pairs inside one family, and as many across families.
 
-    Were most pairs mixed, what a family has in common, such as a red ring, would already tell them apart.
+    If most pairs were mixed, a common feature of a family, such as a red ring, would already tell them apart.
     """
     within = spread_pairs(concepts, lambda a, b: family(a) == family(b) and allowed(a, b))
     across = spread_pairs(concepts, lambda a, b: family(a) != family(b) and allowed(a, b), most=len(within))
@@ -70,19 +72,22 @@ def half_within[C: Concept](
 def each[C: Concept, T: Tile](
     draw: Callable[[C, np.random.Generator], T],
 ) -> Callable[[C, C, np.random.Generator], tuple[T, T]]:
-    """The drawing of two tiles, one after the other, from the drawing of one."""
+    """Return a function that draws two tiles, one after the other, from the function that draws one."""
     return lambda left, right, rng: (draw(left, rng), draw(right, rng))
 
 
 def each_on_hues[C: Concept, T: Tile](
     draw: Callable[[C, np.random.Generator], T],
 ) -> Callable[[C, C, np.random.Generator], tuple[T, T]]:
-    """The same, then with backgrounds of any hue, as `on_hues` has them."""
+    """Return a function that draws two tiles, and then backgrounds of any hue, see `on_hues`."""
     return lambda left, right, rng: on_hues(draw(left, rng), draw(right, rng), rng)
 
 
 def none_alike[C: Concept](families: Sequence[set[str]]) -> Callable[[C, C], bool]:
-    """A rule that allows two concepts unless their names are together in one of `families` of look-alikes."""
+    """Return a rule that allows two concepts unless their names are together in one of `families`.
+
+    A family contains names of look-alikes.
+    """
     return lambda first, second: not any({first.name, second.name} <= family for family in families)
 
 
@@ -103,7 +108,7 @@ class Couple:
 
 
 def draw_couples(generator: Generator[Any], seed: int) -> Iterator[Couple]:
-    """Endless couples of one category; the first ones are the same however many are taken."""
+    """Yield endless couples of one category; the first ones are the same, however many are taken."""
     order = _random("order", generator.category, seed)
     for number, (left, right) in enumerate(visiting_order(generator.pairs, order)):
         rng = _random(number, generator.category, seed)
@@ -113,9 +118,9 @@ def draw_couples(generator: Generator[Any], seed: int) -> Iterator[Couple]:
 
 
 def visiting_order[C: Concept](pairs: Sequence[tuple[C, C]], rng: np.random.Generator) -> Iterator[tuple[C, C]]:
-    """Endless (left, right) pairs: all of them shuffled, then all of them shuffled again.
+    """Yield endless (left, right) pairs: all of them shuffled, then all of them shuffled again.
 
-    The concept that has lain left more often goes right, so that no phrase leans to one side.
+    The concept that has been left more often goes right, so that no phrase leans to one side.
     """
     lean: Counter[str] = Counter()
     while True:

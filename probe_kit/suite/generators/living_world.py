@@ -19,7 +19,7 @@ from probe_kit.suite.generators.generator import Concept, Generator, each, half_
 
 @dataclass(frozen=True)
 class Creature:
-    """An animal or plant; `view` is how much of it the icon shows."""
+    """An animal or plant; `view` says how much of it the icon shows."""
 
     name: str
     icon: str
@@ -28,7 +28,7 @@ class Creature:
 
 
 def _family(family: str, names: str, view: Literal["whole", "face"] = "whole") -> list[Creature]:
-    """Creatures of one family from words like `fox` or, where the icon has another name, `bee=honeybee`."""
+    """Make creatures of one family from words like `fox` or, where the icon has another name, `bee=honeybee`."""
     creatures = []
     for word in names.split():
         name, _, icon = word.partition("=")
@@ -109,7 +109,7 @@ class Depicted(Concept):
 
 @dataclass(frozen=True)
 class Portrait(Tile):
-    """Everything the picture is drawn from: one icon; `ink` is its average colour."""
+    """Everything that the picture is drawn from: one icon; `ink` is its average colour."""
 
     icon: str
     placement: Placement
@@ -125,7 +125,7 @@ def _portrait(concept: Depicted, rng: np.random.Generator) -> Portrait:
 
 
 def _animal_pairs() -> tuple[tuple[Depicted, Depicted], ...]:
-    """Half of the pairs inside one family; never a whole animal beside a mere face."""
+    """Return the pairs of creatures, half of them inside one family; never a whole animal next to a mere face."""
     creature_of = {creature.name: creature for creature in CREATURES}
     unlike = none_alike(LOOK_ALIKES)
 
@@ -140,7 +140,7 @@ def _animal_pairs() -> tuple[tuple[Depicted, Depicted], ...]:
 
 
 def _alive_or_not(count: int) -> tuple[tuple[Depicted, Depicted], ...]:
-    """A living thing beside one that is not; every creature and every thing about equally often."""
+    """Return pairs of a living thing and one that is not; every creature and every thing about equally often."""
     living = [Depicted("living thing", "living thing", icon=c.icon) for c in CREATURES]
     dead = [Depicted("thing that is not alive", "thing that is not alive", icon=icon) for icon in THINGS]
     return spread_pairs(living + dead, lambda a, b: a.name != b.name, most=count)

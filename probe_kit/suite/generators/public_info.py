@@ -26,7 +26,7 @@ class Pictogram:
     """A public sign; a forbidden one is drawn under a red ring and bar.
 
     Attributes:
-        shows: What is drawn, where the name says what it stands for instead.
+        shows: Description of the drawing, where the name says what it means instead; else empty.
     """
 
     name: str
@@ -108,7 +108,7 @@ _SHOWS = {pictogram.icon: pictogram.shows for pictogram in PICTOGRAMS}
 
 @dataclass(frozen=True)
 class Board(Tile):
-    """Everything the picture is drawn from: a pictogram and the field it lies on."""
+    """Everything that the picture is drawn from: a pictogram and the field it lies on."""
 
     icon: str
     style: Style
@@ -163,7 +163,7 @@ def _concepts(forbidden: bool) -> list[Concept]:
 
 
 def _pairs() -> tuple[tuple[Concept, Concept], ...]:
-    """Services among themselves; forbidden things among themselves, and as often beside a service."""
+    """Return pairs of services, pairs of forbidden things, and as many pairs of one of each."""
     services, forbidden = _concepts(False), _concepts(True)
 
     def kind(concept: Concept) -> bool:

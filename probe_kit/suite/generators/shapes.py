@@ -1,13 +1,15 @@
 """Color, Shape and Symmetry: pictures of one outline.
 
 Color asks for "red shape" against a shape of another basic colour, of the same outline in half of the pairs.
-Backgrounds have a basic colour too, none of the two that meet, and shapes are small and anywhere on their tile.
-An untrained conjunction of pixels and words so decodes less. Shape asks for "triangle" against another outline.
-The fifteen outlines are polygons of equal area, so that the area of ink does not identify the outline.
+Backgrounds have a basic colour too, none of the two that meet, and shapes are small and anywhere on their tile. An
+untrained conjunction of pixels and words so decodes less.
+
+Shape asks for "triangle" against another outline. The fifteen outlines are polygons of equal area, so that the
+area of ink does not identify the outline.
 
 Symmetry asks for "symmetric shape" against an asymmetric one of the same kind, and vice versa. Both are polygons
-around an axis, with as many corners and as much area on either side of it; in the asymmetric one the half widths
-of one side have changed places. Measured on its pixels, each is clearly what it is called.
+around an axis, with as many corners and as much area on either side of it. In the asymmetric one, the half widths
+of one side have changed places. Measured on its pixels, each clearly matches its name.
 """
 
 from collections.abc import Sequence
@@ -66,7 +68,7 @@ def _cross(arm: float = 0.38) -> Points:
 
 
 def _matched(points: Points) -> Points:
-    """The same outline with the shared area and its bounding box centred on the origin."""
+    """Return the same outline with the shared area and its bounding box centred on the origin."""
     x, y = points.T
     area = abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))) / 2
     centred = points - (points.min(axis=0) + points.max(axis=0)) / 2
@@ -108,7 +110,7 @@ _HOLLOW_WIDTH = 0.15
 
 @dataclass(frozen=True)
 class Figure(Tile):
-    """Everything the picture is drawn from."""
+    """Everything that the picture is drawn from."""
 
     color: str
     outline: str
@@ -128,12 +130,12 @@ class Figure(Tile):
 
 
 def colored_outline(figure: Figure) -> str:
-    """The figure in words, such as "red circle"."""
+    """Return the figure in words, such as "red circle"."""
     return f"{figure.color} {figure.outline}"
 
 
 def random_figure(color: str, outline: str, style: Style, rng: np.random.Generator) -> Figure:
-    """A figure of this colour and outline with everything else drawn from `rng`."""
+    """Draw a figure of this colour and outline with everything else from `rng`."""
     ink = jittered(COLORS[color], rng)
     background = background_for(ink, rng)
     return Figure(color, outline, style, random_placement(rng), ink=ink, background=background)
@@ -143,7 +145,7 @@ def random_figure(color: str, outline: str, style: Style, rng: np.random.Generat
 
 
 _SHRUNK = (0.5, 0.75)
-"""Of the size of a drawing; half a tile is legible for a plain outline."""
+"""Range of the factor by which a drawing is made smaller; half a tile is legible for a plain outline."""
 _REACH = 0.97
 
 
@@ -168,7 +170,7 @@ def _colored_tiles(left: Concept, right: Concept, rng: np.random.Generator) -> t
 
 
 def other_color(concepts: Sequence[Concept], ink: RGB, rng: np.random.Generator) -> RGB:
-    """A background of a basic colour that is none of the two that meet, and apart from the `ink`."""
+    """Draw a background of a basic colour that is none of the two that meet, and apart from the `ink`."""
     names = [name for name in COLORS if name not in {concept.name for concept in concepts}]
     while True:
         color = jittered(COLORS[str(rng.choice(names))], rng)
@@ -177,7 +179,7 @@ def other_color(concepts: Sequence[Concept], ink: RGB, rng: np.random.Generator)
 
 
 def moved(placement: Placement, rng: np.random.Generator) -> Placement:
-    """Smaller, and anywhere on the tile."""
+    """Return a smaller placement, anywhere on the tile."""
     scale = round(placement.scale * rng.uniform(*_SHRUNK), 4)
     reach = _REACH - scale
     x, y = rng.uniform(-reach, reach, size=2).round(4).tolist()
@@ -237,7 +239,7 @@ _MASK_PIXELS = 128
 
 @dataclass(frozen=True)
 class Outline(Tile):
-    """Everything the picture is drawn from; the widths run along the axis, one list for each of its sides."""
+    """Everything that the picture is drawn from; the widths run along the axis, one list for each of its sides."""
 
     color: str
     one_side: tuple[float, ...]
@@ -255,7 +257,7 @@ class Outline(Tile):
 
 
 def _corners(one_side: tuple[float, ...], other_side: tuple[float, ...]) -> Points:
-    """The polygon (2 N, 2) around an upright axis, scaled into the unit disk."""
+    """Return the polygon (2 N, 2) around an upright axis, scaled into the unit disk."""
     heights = np.linspace(-1, 1, len(one_side))
     points = np.vstack(
         [np.stack([one_side, heights], axis=1), np.stack([np.negative(other_side), heights], axis=1)[::-1]]
@@ -265,9 +267,10 @@ def _corners(one_side: tuple[float, ...], other_side: tuple[float, ...]) -> Poin
 
 
 def mirror_overlap(one_side: tuple[float, ...], other_side: tuple[float, ...]) -> float:
-    """Shared area over joint area of the shape and its best mirror image, over all axes through its centre.
+    """Return the shared area over the joint area of the shape and its best mirror image.
 
-    Turned by half a turn counts as well: a shape like the letter S would be called symmetric by many.
+    All axes through its centre are tried. A half turn counts as well: many would call a shape like the letter S
+    symmetric.
     """
     mask = Image.new("L", (_MASK_PIXELS, _MASK_PIXELS))
     corners = _corners(one_side, other_side)
@@ -285,7 +288,7 @@ def _overlap(first: Image.Image, second: Image.Image) -> float:
 
 
 def _sides(symmetric: bool, rng: np.random.Generator) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Half widths of both sides; drawn again until the pixels agree with the name."""
+    """Draw the half widths of both sides; again until the pixels agree with the name."""
     while True:
         count = int(rng.integers(*_CORNERS))
         widths = tuple(rng.uniform(*_WIDTHS, size=count).round(3).tolist())

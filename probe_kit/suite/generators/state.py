@@ -37,10 +37,13 @@ _VIVID = ("red", "green", "blue", "orange", "purple")
 
 @dataclass(frozen=True)
 class TwoStates:
-    """A thing asked for in the one state or in the other; `draw` takes whether it is in the first.
+    """A thing that is asked for in one state or in the other.
 
     Attributes:
-        colors: The basic colours it comes in.
+        first: Phrase for the thing in the first state.
+        second: Phrase for the thing in the second state.
+        draw: Function that draws the thing; it takes whether the thing is in the first state.
+        colors: Its possible basic colours.
     """
 
     first: str
@@ -163,7 +166,7 @@ def _book(pen: Pen, is_open: bool, color: RGB) -> None:
 
 
 def _switch(pen: Pen, is_on: bool, color: RGB) -> None:
-    """A toggle in the manner of a phone's: a bright track with its knob at the end, or a gray one."""
+    """Draw a toggle in the manner of a phone's: a bright track with its knob at the end, or a gray one."""
     track = COLORS["green"] if is_on else _METAL
     pen.fill(rectangle(-0.86, -0.62, 0.86, 0.62), color)
     pen.line(polygon((-0.36, 0), (0.36, 0)), track, 0.72)
@@ -282,7 +285,7 @@ _THINGS = {name: states for states in TWO_STATES for name in (states.first, stat
 
 @dataclass(frozen=True)
 class Condition(Tile):
-    """Everything the picture is drawn from: a thing in the state it is asked for by."""
+    """Everything that the picture is drawn from: a thing in the state in which it is asked for."""
 
     state: str
     placement: Placement

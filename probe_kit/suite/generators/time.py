@@ -42,18 +42,18 @@ class Reading(Concept):
 
     @property
     def hour_angle(self) -> float:
-        """Degrees clockwise from twelve."""
+        """The hour hand in degrees clockwise from twelve."""
         return 30 * (self.hour % 12) + self.minute / 2
 
     @property
     def minute_angle(self) -> float:
-        """Degrees clockwise from twelve."""
+        """The minute hand in degrees clockwise from twelve."""
         return 6.0 * self.minute
 
 
 @dataclass(frozen=True)
 class Clock(Tile):
-    """Everything the picture is drawn from; `ink` is the colour of the rim."""
+    """Everything that the picture is drawn from; `ink` is the colour of the rim."""
 
     hour: int
     minute: int
@@ -113,7 +113,7 @@ def _confusable(first: Reading, second: Reading) -> bool:
 
 
 def _tiles(left: Reading, right: Reading, rng: np.random.Generator) -> tuple[Clock, Clock]:
-    """Two clocks, of one make in half of the pairs."""
+    """Draw two clocks, of one make in half of the pairs."""
     makes = rng.integers((3, len(_RIMS), 3), size=(2, 3)).tolist()
     if rng.integers(2):
         makes[1] = makes[0]

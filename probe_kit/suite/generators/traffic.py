@@ -1,6 +1,6 @@
 """Traffic: "no entry sign" against another road sign, of the same family in half of the pairs.
 
-The names hold no side words: signs that turn left or right are not in this suite.
+No name contains a side word: signs that turn left or right are not in this suite.
 """
 
 from collections.abc import Callable
@@ -43,7 +43,7 @@ Draw = Callable[[Pen], None]
 
 @dataclass(frozen=True)
 class RoadSign:
-    """A sign with its family, which is also its shape, and how to draw it in the unit disk."""
+    """A sign with its family, which is also its shape, and a function that draws it in the unit disk."""
 
     name: str
     family: str
@@ -52,7 +52,7 @@ class RoadSign:
 
 
 def _layers(*layers: Draw) -> Draw:
-    """Return the drawing of one over the other."""
+    """Return a function that draws one layer over the other."""
 
     def draw(pen: Pen) -> None:
         for layer in layers:
@@ -202,7 +202,7 @@ LOOK_ALIKES: tuple[set[str], ...] = (
 
 @dataclass(frozen=True)
 class SignPost(Tile):
-    """Everything the picture is drawn from; `ink` is the colour of the sign's edge."""
+    """Everything that the picture is drawn from; `ink` is the colour of the sign's edge."""
 
     sign: str
     placement: Placement
