@@ -207,7 +207,7 @@ def intervene(
     \b
     probe-kit intervene runs/mine
     probe-kit intervene runs/mine --kind interchange --sites "backbone.*"
-    """
+    """  # noqa: D301 - click reads the \b
     from probe_kit.intervene import ReplaySource
     from probe_kit.intervene.pairs import read_pairs
     from probe_kit.runs import open_run

@@ -74,7 +74,7 @@ def from_csv(
 
     Rows of one group, or with a common picture, are never split between training and test. Every row is played
     with the answer on the left and on the right.
-    """
+    """  # noqa: D301 - click reads the \b
     from probe_kit.suite import Terms, suite_from_csv
 
     if license_name is None:
