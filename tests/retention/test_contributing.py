@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 
 from probe_kit.train import ArrayRun
-from tests.test_names import fillers, first_words
+from tests.test_names import fillers, first_words, parameters_in_prose
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
@@ -159,4 +159,4 @@ def test_an_example_follows_the_rules_of_the_house(example: str) -> None:
         )  # fmt: skip
         assert ruff.returncode == 0, ruff.stdout + ruff.stderr
     tree = ast.parse(example)
-    assert not [*fillers(tree), *first_words(tree)]
+    assert not [*fillers(tree), *first_words(tree), *parameters_in_prose(tree)]
