@@ -245,7 +245,7 @@ HEAT = (
 )
 """The upper bound of retention, color name and RGB, from lost (pale yellow) to kept (blue).
 
-Lightness alone orders them, so that they differ in gray and for every kind of color vision.
+Lightness alone orders them, so that they differ in grey and for every kind of color vision.
 """
 
 

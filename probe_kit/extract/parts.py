@@ -263,7 +263,7 @@ class AskTask(Part):
         protocol: A published protocol, whose scene takes the place of the default one; it decides nothing else of
             a question.
         prompt: A template, or its name or file.
-        picture: `frame` shows the first frame of the episode, `side-by-side` its two pictures on gray, `none`
+        picture: `frame` shows the first frame of the episode, `side-by-side` its two pictures on grey, `none`
             nothing.
         query: The object that is asked for, see `QUERIES`.
 

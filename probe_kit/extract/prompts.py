@@ -28,7 +28,7 @@ from probe_kit.suite.items import other_side
 
 Query = Literal["target", "distractor", "absent"]
 Picture = Literal["frame", "side-by-side", "none"]
-"""The picture of a question: the first frame, the two pictures on gray, or nothing."""
+"""The picture of a question: the first frame, the two pictures on grey, or nothing."""
 QUERIES: Mapping[Query, str] = {
     "target": "the object of the instruction",
     "distractor": "the other picture's: right is the other side",
@@ -257,7 +257,7 @@ MARGIN = 0.05
 
 
 def side_by_side(episode: Episode, shape: tuple[int, int]) -> NDArray[np.uint8]:
-    """Return left and right picture of the episode on gray, (H, W, 3) uint8 of `shape`.
+    """Return left and right picture of the episode on grey, (H, W, 3) uint8 of `shape`.
 
     Both are equally large, as large as fits.
 

@@ -1,4 +1,4 @@
-"""Trajectories in a run, and the outcomes and behavior that are computed from them.
+"""Trajectories in a run, and the outcomes and behaviour that are computed from them.
 
     data.zarr/trajectory   float32 (episode, frame, channel); frames behind the end of an episode are not numbers
 

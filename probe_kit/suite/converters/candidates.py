@@ -216,7 +216,7 @@ class VlThinkOptions(ConvertOptions):
     """The options of VL-Think.
 
     Attributes:
-        recolor: Whether to add pink, white and gray by repainting.
+        recolor: Whether to add pink, white and grey by repainting.
         extra_boards: Further sets of boards to use, of `laundry`, `weather` and `arrows`.
     """
 

@@ -128,7 +128,7 @@ def _label(record: Any, field: str, where: str) -> str:
 
 
 def _repaint(board: Path, color: str) -> Image.Image:
-    """Return the black board with its ink in another colour; white ink lies on gray."""
+    """Return the black board with its ink in another colour; white ink lies on grey."""
     opacity = 255 - np.asarray(upright_board(board).convert("L"), np.float64)[..., None]
     paper = np.array(_BEHIND_WHITE if color == "white" else WHITE, np.float64)
     mixed = (opacity * np.array(_RECOLORS[color]) + (255 - opacity) * paper) / 255

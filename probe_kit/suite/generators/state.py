@@ -166,7 +166,7 @@ def _book(pen: Pen, is_open: bool, color: RGB) -> None:
 
 
 def _switch(pen: Pen, is_on: bool, color: RGB) -> None:
-    """Draw a toggle in the manner of a phone's: a bright track with its knob at the end, or a gray one."""
+    """Draw a toggle in the manner of a phone's: a bright track with its knob at the end, or a grey one."""
     track = COLORS["green"] if is_on else _METAL
     pen.fill(rectangle(-0.86, -0.62, 0.86, 0.62), color)
     pen.line(polygon((-0.36, 0), (0.36, 0)), track, 0.72)
