@@ -120,8 +120,10 @@ def test_views_and_categories_that_were_not_probed_are_errors(probed_run: Probed
         layer_curve(results, "last")
     with pytest.raises(UnknownCategoryError, match="probed: color"):
         LayerCurveDisplay.from_results(results, "shape")
-    with pytest.raises(UnknownSiteError, match="probed in stream 'vision'"):
+    with pytest.raises(UnknownSiteError, match="'vision' was not probed in mean; its probed views: none"):
         RoleCurvesDisplay.from_results(results, "color", "vision")
+    with pytest.raises(UnknownSiteError, match="was not probed in tokens; its probed views: mean"):
+        RoleCurvesDisplay.from_results(results, "color", "expert", views=("mean", "tokens"))
     with pytest.raises(UnknownSiteError, match="no iterations"):
         IterationMapDisplay.from_results(results, "color", stream="backbone")
 

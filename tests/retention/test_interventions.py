@@ -7,7 +7,7 @@ import matplotlib as mpl
 import numpy as np
 import pytest
 
-from probe_kit.errors import NoInterventionsError
+from probe_kit.errors import NoInterventionsError, UnknownCategoryError, UnknownSiteError
 from probe_kit.intervene import AttentionShares, UseVerdict
 from probe_kit.intervene.kinds.attention import ATTENTION_FILE, PATCHES_FILE, PatchAttention
 from probe_kit.intervene.outcomes import ConditionOutcomes, arrays_to_bytes
@@ -87,6 +87,15 @@ def test_it_shows_accuracies_and_turned_episodes_by_layer(run: ArrayRun) -> None
     assert "passes: all" in labels
     names = [exhibit.name for exhibit in collect_figures([run], retention_table([run]))]
     assert any("causes" in name for name in names)
+
+
+def test_a_view_or_a_category_without_probes_is_refused_by_name(run: ArrayRun) -> None:
+    answers = {name: follower(48) for name in ("color", "state")}
+    store(run, "interchange", inside(outcomes_of(answers), backbone__00=1.0, backbone__01=0.0))
+    with pytest.raises(UnknownSiteError, match="'tokens' was not probed; probed: mean"):
+        site_effect_curve(run, load_results(run), "tokens")
+    with pytest.raises(UnknownCategoryError, match="'state' was not probed; probed: color, shape"):
+        SiteEffectDisplay.from_run(run, load_results(run), "state")
 
 
 def test_without_an_interchange_there_is_no_such_figure(run: ArrayRun) -> None:

@@ -314,7 +314,7 @@ class Ask(_Task):
         model = load_of(load_model, settings)
         if not isinstance(model, AnswerModel):
             raise UsageError(
-                f"{settings.model.family} returned a {type(model).__name__}, not a AnswerModel; fix the loader"
+                f"{settings.model.family} returned a {type(model).__name__}, not an AnswerModel; fix the loader"
             )
         return model
 

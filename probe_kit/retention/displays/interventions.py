@@ -31,6 +31,7 @@ from probe_kit.retention.displays.display import (
     in_panels,
     layer_axis,
     panels,
+    probed_curve,
     scores_of,
     series,
 )
@@ -97,6 +98,8 @@ class SiteEffectDisplay(Display):
             stored: Result of `shown_passing`; None reads it from the run.
 
         Raises:
+            UnknownSiteError: For a view that was not probed.
+            UnknownCategoryError: For a category that was not probed.
             NoInterventionsError: If no interchange is stored of the category.
         """
         rows = (shown_passing(run) if stored is None else stored).get(category, [])
@@ -105,6 +108,7 @@ class SiteEffectDisplay(Display):
                 f"{run.location} has no stored interchange of {category!r} in a layer of the backbone or of the "
                 f"keys and values. Run `probe-kit intervene {run.location} --kind interchange`"
             )
+        probed_curve(results, view, category)
         scores = scores_of(results, category, view, BACKBONE).sort_values("layer")
         by_role: dict[str, list[PatchEffect]] = {}
         for row in rows:

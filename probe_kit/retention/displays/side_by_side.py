@@ -124,14 +124,19 @@ class RoleCurvesDisplay(CurvesDisplay):
             iterations: Iterations that take part.
 
         Raises:
-            UnknownSiteError: If none of the views was probed in the stream.
+            UnknownSiteError: For a view that was not probed in the stream.
             UnknownCategoryError: For a category that was not probed.
         """
         candidates = tuple(views or results.settings.views)
         curve_of(results, category, results.settings.views[0])
         curves = _curves({view: scores_of(results, category, view, stream) for view in candidates}, iterations)
-        if not curves:
-            raise UnknownSiteError(f"none of the views {', '.join(candidates)} was probed in stream {stream!r}")
+        # By default a view that other streams have alone is left out; one that is named is not.
+        if not curves or (views and len(curves) < len(candidates)):
+            missing = ", ".join(view for view in candidates if view not in curves)
+            probed = dict.fromkeys(results.scores.loc[results.scores["stream"] == stream, "view"])
+            raise UnknownSiteError(
+                f"stream {stream!r} was not probed in {missing}; its probed views: {', '.join(probed) or 'none'}"
+            )
         certificate = ProvenanceLine.of_results(results, next(iter(curves)))
         title = f"{title_of(category)}: {label_of(stream)}"
         return cls(title=title, curves=curves, looks=tuple(curves), certificates=(certificate,))
@@ -152,7 +157,7 @@ def role_curves(
         iterations: Iterations that take part.
 
     Raises:
-        UnknownSiteError: If none of the views was probed in the stream.
+        UnknownSiteError: For a view that was not probed in the stream.
     """
     categories = results.settings.categories
     return in_panels(
