@@ -255,7 +255,9 @@ def shares_of(episodes: "pd.DataFrame", outcome: str) -> "NDArray[np.float64]":
 
 
 def _correct(episodes: "pd.DataFrame") -> "pd.Series[float]":
-    return episodes[[]].assign(correct=shares_of(episodes, "correct"))["correct"]
+    import pandas as pd
+
+    return pd.Series(shares_of(episodes, "correct"), index=episodes.index)
 
 
 def success_share(episodes: "pd.DataFrame", seed_text: str = "") -> Share:
@@ -373,21 +375,27 @@ def paired_items(episodes: "pd.DataFrame") -> PairedItems:
     """Return the items that ran in both layouts, by outcome; others are left out.
 
     Raises:
-        UsageError: If the model did not act.
+        UsageError: If the model did not act, and for an item that occurs twice in one layout.
     """
     _check_acted(episodes)
-    outcomes = episodes.pivot(index="item_id", columns="layout", values="outcome")
-    outcomes = outcomes.reindex(columns=["original", "swapped"]).dropna()
-    right, wrong = (outcomes == "correct").sum(axis=1), (outcomes == "wrong").sum(axis=1)
     group_of = dict(zip(episodes["item_id"], units_of(episodes), strict=True))
-    lead = ((right == 2).astype(int) - (wrong == 2)).groupby(outcomes.index.map(group_of)).sum()
-    both, both_wrong = int((right == 2).sum()), int((wrong == 2).sum())
+    trials = zip(episodes["item_id"], episodes["layout"], strict=True)
+    outcome_of = dict(zip(trials, episodes["outcome"], strict=True))
+    if len(outcome_of) < len(episodes):
+        raise UsageError("an item occurs twice in one layout; expected one episode each. Select one of them")
+    by_item = {item: [outcome_of.get((item, layout)) for layout in ("original", "swapped")] for item in group_of}
+    pairs = {item: pair for item, pair in by_item.items() if all(isinstance(outcome, str) for outcome in pair)}
+    right = Counter(pair.count("correct") for pair in pairs.values())
+    lead: Counter[str] = Counter()
+    for item, pair in pairs.items():
+        lead[group_of[item]] += (pair.count("correct") == 2) - (pair.count("wrong") == 2)
+    favoured = [votes for votes in lead.values() if votes]  # groups that favour neither are no tosses
     return PairedItems(
-        both=both,
-        exactly_one=int((right == 1).sum()),
-        none=int((right == 0).sum()),
-        both_wrong=both_wrong,
-        p=heads_p(int((lead > 0).sum()), int((lead != 0).sum())),  # groups that favour neither are no tosses
+        both=right[2],
+        exactly_one=right[1],
+        none=right[0],
+        both_wrong=sum(pair.count("wrong") == 2 for pair in pairs.values()),
+        p=heads_p(sum(votes > 0 for votes in favoured), len(favoured)),
     )
 
 

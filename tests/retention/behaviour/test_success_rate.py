@@ -121,6 +121,12 @@ def test_items_that_ran_in_one_layout_are_not_paired(outcome_table: Outcomes) ->
     assert paired_items(outcome_table(correct=3, wrong=0, oob=0)).both == 1
 
 
+def test_an_item_that_occurs_twice_in_one_layout_is_refused(outcome_table: Outcomes) -> None:
+    episodes = outcome_table(correct=2, wrong=2, oob=0)
+    with pytest.raises(UsageError, match="twice in one layout"):
+        paired_items(pd.concat([episodes, episodes]))
+
+
 def test_a_layout_that_did_not_run_has_no_rate(outcome_table: Outcomes) -> None:
     episodes = outcome_table(correct=10, wrong=0, oob=0)
     success = success_rate(episodes[episodes["layout"] == "original"])
