@@ -47,7 +47,13 @@ WORLDS = {
 Found = tuple[str, float, float, float]
 
 
-@pytest.fixture(scope="module", params=WORLDS)
+IN_DEFAULT = ("perfect and good", "hopeless", "mixed")
+
+
+@pytest.fixture(
+    scope="module",
+    params=[pytest.param(name, marks=() if name in IN_DEFAULT else pytest.mark.slow) for name in WORLDS],
+)
 def table(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> RetentionTable:
     """A run of the world against an equal one, and a group of two good ones."""
     world, probed_run = WORLDS[request.param], runs_in(tmp_path_factory.mktemp("world"))

@@ -76,6 +76,7 @@ def test_the_margin_of_guessing_is_the_papers(rows: dict[str, RetentionTable], d
     assert 100 * half == pytest.approx(8.002, abs=0.001)
 
 
+@pytest.mark.slow
 def test_the_main_table_has_a_row_per_system_and_the_printed_numbers(
     runs: dict[str, SaidRun], tables: dict[str, Any], derived: dict[str, Any]
 ) -> None:
