@@ -35,9 +35,9 @@ _BARE = re.compile(
 """A path of two parts or more in a sentence."""
 
 
-def without_places(text: str, places: tuple[str, ...] = ()) -> str:
-    """Return `text` with only the last part of every absolute path, and of `places`, which may hold spaces."""
-    for path in sorted(filter(None, places), key=len, reverse=True):
+def without_folders(text: str, paths: tuple[str, ...] = ()) -> str:
+    """Return `text` with only the last part of every absolute path, and of `paths`, which may hold spaces."""
+    for path in sorted(filter(None, paths), key=len, reverse=True):
         text = text.replace(path, _last(path))
     text = _QUOTED.sub(lambda match: f"{match[1]}{_last(match[2])}{match[1]}", text)
     return _BARE.sub(lambda match: _last(match[0]), text)

@@ -7,7 +7,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from probe_kit._system.escaping import without_places
+from probe_kit._system.escaping import without_folders
 from probe_kit._tables.content import Cell, Content, heat_colour
 from probe_kit._tables.numbers import NONE
 
@@ -24,10 +24,10 @@ _NOTEBOOK = (
 """Rules of a table in a notebook, which has no page of ours around it."""
 
 
-def environment(*folders: Path, places: tuple[str, ...] = ()) -> "Environment":
+def environment(*folders: Path, paths: tuple[str, ...] = ()) -> "Environment":
     """Return the environment of templates in `folders`, which may import `table.html.jinja`.
 
-    No text that it renders holds one of `places` or another absolute path: pages and notebooks are sent to others.
+    No text that it renders holds one of `paths` or another absolute path: pages and notebooks are sent to others.
     """
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup
@@ -35,7 +35,7 @@ def environment(*folders: Path, places: tuple[str, ...] = ()) -> "Environment":
     def escaped(value: Any) -> Any:
         if not isinstance(value, str) or isinstance(value, Markup) or value.startswith("data:"):
             return value
-        return without_places(value, places)
+        return without_folders(value, paths)
 
     templates = Environment(
         loader=FileSystemLoader([*folders, _FOLDER]), autoescape=True, undefined=StrictUndefined, trim_blocks=True,

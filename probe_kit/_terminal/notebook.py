@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from html import escape
 from typing import Any
 
-from probe_kit._system.escaping import without_places
+from probe_kit._system.escaping import without_folders
 
 PROGRESS_MARK = "probe-kit-progress"
 """The CSS class of a progress bar, so that a tool that stores notebooks can remove the bars."""
@@ -38,7 +38,7 @@ def rows_html(title: str, columns: Sequence[str], rows: Iterable[Sequence[object
 
 def _safe(text: str) -> str:
     """Escape for HTML, and leave out the folders of this machine: notebooks are sent to others."""
-    return escape(without_places(text))
+    return escape(without_folders(text))
 
 
 def notebook_progress(label: str) -> Callable[..., None] | None:

@@ -96,7 +96,7 @@ def _or_nan(value: float | None) -> float:
 # -- the passage of an input ---------------------------------------------------------------------------------
 
 
-def places_of(model: "Model") -> list[SiteGroup]:
+def sites_of(model: "Model") -> list[SiteGroup]:
     """Return every layer of every stored stream and the keys and values of the backbone, in network order."""
     streams = list(model.streams)
     if model.prompt_kv is not None:
@@ -116,16 +116,16 @@ def measure_passage(
         pairs: Clean and donor observations of equally many tokens.
         scale: The spread of the session's actions.
     """
-    model, places = session.policy, places_of(session.policy)
-    differences = np.zeros((len(pairs), len(places)))
-    moved, squares = np.zeros((len(pairs), len(places))), np.zeros(len(pairs))
+    model, groups = session.policy, sites_of(session.policy)
+    differences = np.zeros((len(pairs), len(groups)))
+    moved, squares = np.zeros((len(pairs), len(groups))), np.zeros(len(pairs))
     for row, pair in enumerate(pairs):
-        clean, before = _captured(session, pair.clean, pair.seed, places)
-        donated, donor = _captured(session, pair.source, pair.seed, places)
+        clean, before = _captured(session, pair.clean, pair.seed, groups)
+        donated, donor = _captured(session, pair.source, pair.seed, groups)
         change = scale.changes(donated[None], clean[None])[0]
         squares[row] = change @ change
         tokens = PairTokens(model, pair)
-        for column, group in enumerate(places):
+        for column, group in enumerate(groups):
             differences[row, column] = _relative_difference(group, before, donor)
             # Elsewhere the patch would put in what is there already: an inference saved, and a share of 0.
             if squares[row] and differences[row, column] > LIKE_NONE:
@@ -134,15 +134,15 @@ def measure_passage(
                 moved[row, column] = scale.changes(edited[None], clean[None])[0] @ change
     # Least squares through 0, of the patch's change on the donor's over all pairs. As a ratio of sums it gives
     # pairs whose action hardly changes little weight, where a mean of ratios would divide by almost 0.
-    shares = moved.sum(axis=0) / squares.sum() if squares.any() else np.full(len(places), np.nan)
+    shares = moved.sum(axis=0) / squares.sum() if squares.any() else np.full(len(groups), np.nan)
     return tuple(
         SitePassage(group.name, float(difference), float(share))
-        for group, difference, share in zip(places, differences.mean(axis=0), shares, strict=True)
+        for group, difference, share in zip(groups, differences.mean(axis=0), shares, strict=True)
     )
 
 
 def _captured(
-    session: "ReplaySession", observation: Given, seed: int, places: Sequence[SiteGroup]
+    session: "ReplaySession", observation: Given, seed: int, groups: Sequence[SiteGroup]
 ) -> "tuple[Chunk, ActivationCache]":
     """Return the actions and the activations of one inference.
 
@@ -150,7 +150,7 @@ def _captured(
     """
     from probe_kit.hooks import capture
 
-    with capture(session.policy, [site for group in places for site in group.sites]) as cache:
+    with capture(session.policy, [site for group in groups for site in group.sites]) as cache:
         chunk = session.act(observation, seed)
     return chunk, cache
 

@@ -25,23 +25,23 @@ def draw_passage(diagnosis: "Diagnosis") -> "Figure":
     Below them the curve of a target is drawn: its score above chance.
     """
     curves = [diagnosed for diagnosed in diagnosis.inputs if diagnosed.passage]
-    places = list(dict.fromkeys(site.name for diagnosed in curves for site in diagnosed.passage))
+    names = list(dict.fromkeys(site.name for diagnosed in curves for site in diagnosed.passage))
     knowledge = diagnosis.knowledge
     labels = ["relative difference", "share carried"]
     labels += [f"{knowledge.metric} of {knowledge.target}\nabove chance"] if knowledge else []
-    width = max(4.2, 0.28 * len(places))
+    width = max(4.2, 0.28 * len(names))
     figure, axes = panels(len(labels), width=width, height=2.6, columns=1, share=False)
     for at, diagnosed in enumerate(curves):
-        x = [places.index(site.name) for site in diagnosed.passage]
+        x = [names.index(site.name) for site in diagnosed.passage]
         axes[0].plot(x, [site.difference for site in diagnosed.passage], label=diagnosed.name, **_look(at))
         axes[1].plot(x, [site.carried for site in diagnosed.passage], label=diagnosed.name, **_look(at))
     if knowledge:
-        sites = [site for site in knowledge.sites if site.name in places]
+        sites = [site for site in knowledge.sites if site.name in names]
         heights = [site.score - site.chance for site in sites]
-        axes[2].plot([places.index(site.name) for site in sites], heights, "o", color="0.25")
+        axes[2].plot([names.index(site.name) for site in sites], heights, "o", color="0.25")
     for panel, label in zip(axes, labels, strict=True):
         plain(panel)
-        panel.set_xticks(range(len(places)), places, rotation=90, fontsize=7)
+        panel.set_xticks(range(len(names)), names, rotation=90, fontsize=7)
         panel.set_ylabel(label, fontsize=8.5)
     axes[1].axhline(1.0, color="0.45", lw=0.8, ls="--", zorder=0)
     legend_above(figure, axes[0].get_legend_handles_labels()[0])

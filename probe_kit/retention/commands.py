@@ -469,20 +469,20 @@ def _groups(texts: Sequence[str]) -> dict[str, tuple[str, ...]]:
     return groups
 
 
-def save_all(exhibits: "Sequence[ReportFigure]", folder: Path, details: bool = False) -> None:
+def save_all(figures: "Sequence[ReportFigure]", folder: Path, details: bool = False) -> None:
     """Draw the main figures into a folder, and print where each is and how many are left out.
 
     Args:
-        exhibits: All figures of a table.
+        figures: All figures of a table.
         folder: Folder of the figures.
         details: Whether every figure is drawn.
     """
     from probe_kit.retention.displays import save_figures
 
-    drawn = [exhibit for exhibit in exhibits if details or not exhibit.is_detail]
+    drawn = [report_figure for report_figure in figures if details or not report_figure.is_detail]
     for path in save_figures(drawn, folder):
         say(f"figure: {path}")
-    if left_out := len(exhibits) - len(drawn):
+    if left_out := len(figures) - len(drawn):
         say(f"{counted(left_out, 'further figure')}: add --details all")
 
 

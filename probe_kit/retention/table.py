@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal, Self, get_args
 
 from probe_kit._system.counting import counted
-from probe_kit._system.escaping import csv_of_frame, without_places
+from probe_kit._system.escaping import csv_of_frame, without_folders
 from probe_kit._tables.formats import render
 from probe_kit._tables.table import Table
 from probe_kit.env.scoring import DEFAULT_RULE, SENSITIVITY_RADII, check_rule
@@ -98,7 +98,7 @@ class RetentionTable:
         rows = [category for run in self.summary for category in run.categories]
         item = Markup("<li><b>{}</b> {}</li>")
         sentences = Markup("").join(
-            item.format(category.name, without_places(category.finding)) for category in rows
+            item.format(category.name, without_folders(category.finding)) for category in rows
         )
         tables = [table for title, table in self.tables().items() if title != "Controls"]
         pages = "".join(part._repr_html_() for table in tables if (part := table.details(False)) is not None)

@@ -175,20 +175,20 @@ def study_report(study: LoadedStudy, partial: bool = False) -> StudyReport:
     missing |= {f"figure {name}": why for name, why in no_figure.items()}
     runs = stored_runs(study, lambda cell: cell.selection, str(study.file), partial=True)
     plan = plan_study(study)
-    places = tuple(name for stored in runs.runs for name in (stored.run.location.address, stored.location))
+    paths = tuple(name for stored in runs.runs for name in (stored.run.location.address, stored.location))
     rows = [
         (run.cell.model, run.run_text, ", ".join(run.cell.selections), str(run.cell.episodes), run.words)
         for run in plan.cells
     ]
     state = Table.of("Runs", ("model", "run", "blocks", "episodes", "state"), rows, names=2)
     drawn = {
-        name: [Picture(each.title, "", each.reading, *data_uri(each, places), extra=False) for each in of_name]
+        name: [Picture(each.title, "", each.reading, *data_uri(each, paths), extra=False) for each in of_name]
         for name, of_name in figures.items()
     }
     sentence, bibtex = citation([stored.run for stored in runs.runs])
     html = render(
         "study.html.jinja",
-        places,
+        paths,
         title=file.name,
         version=__version__,
         several=False,

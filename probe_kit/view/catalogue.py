@@ -97,7 +97,7 @@ class Catalogue:
 
     @property
     def _places(self) -> tuple[str, ...]:
-        return tuple(location for viewed in self.runs.values() for location in viewed.places)
+        return tuple(location for viewed in self.runs.values() for location in viewed.paths)
 
     def stamp(self, name: str) -> str:
         """Return a hash that changes with the commits and probes that a payload is made of.

@@ -14,7 +14,7 @@ from probe_kit.retention.behaviour import SCORES
 from probe_kit.runs.layout import FIRST_FRAME, FRAME_COLUMNS
 from probe_kit.runs.thumbnails import EpisodeFrames, episode_frames
 from probe_kit.suite.pictures import picture_size
-from probe_kit.view.run_payloads import Packed, best_places, code_words, pack_floats, pack_log_odds, rounded
+from probe_kit.view.run_payloads import Packed, best_sites, code_words, pack_floats, pack_log_odds, rounded
 from probe_kit.view.viewed_run import ViewedRun, toward
 
 _STILL = 1e-4
@@ -94,10 +94,10 @@ def _refitted(viewed: ViewedRun, row: dict[str, Any], calls: int) -> Any:
     log_odds = np.full((calls, len(viewed.sites)), np.nan)
     for call, results in viewed.refitted.items():
         curve = results.curves.get((category, str(view)))
-        places = [] if curve is None else np.flatnonzero(curve.episodes == row["episode_id"]).tolist()
-        if curve is not None and places and call < calls:
+        positions = [] if curve is None else np.flatnonzero(curve.episodes == row["episode_id"]).tolist()
+        if curve is not None and positions and call < calls:
             sign = toward(str(row["side_correct"]))
-            log_odds[call] = curve.decisions[:, places[0]] * sign
+            log_odds[call] = curve.decisions[:, positions[0]] * sign
     return pack_log_odds(log_odds)
 
 
@@ -193,9 +193,9 @@ def _trajectory(trajectory: Trajectory) -> dict[str, Any]:
     }
 
 
-def _moved(places: NDArray[np.float32]) -> NDArray[np.float32]:
+def _moved(positions: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the middles of a tile (T + 1, 2), or its first one alone where it stays."""
-    return places if np.abs(places - places[0]).max() > _STILL else places[:1]
+    return positions if np.abs(positions - positions[0]).max() > _STILL else positions[:1]
 
 
 def _events(trajectory: Trajectory) -> dict[str, int | None]:
@@ -275,12 +275,12 @@ def _word(value: Any) -> str | None:
 
 def _best_log_odds(viewed: ViewedRun, part: str) -> Packed | None:
     """Return the packed log-odds (E,) of the best sites; None without probes of that part."""
-    places = {name: best_places(viewed, name)[part] for name in viewed.probed_categories}
-    if all(best is None for best in places.values()):
+    best_of_category = {name: best_sites(viewed, name)[part] for name in viewed.probed_categories}
+    if all(best is None for best in best_of_category.values()):
         return None
     log_odds = np.full(len(viewed.run.episodes), np.nan)
     for position, category in enumerate(viewed.run.episodes["category"]):
-        best = places.get(category)
+        best = best_of_category.get(category)
         if best is not None:
             log_odds[position] = viewed.probes[category].first(position)[best["site"]]
     return pack_log_odds(log_odds)

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
-from probe_kit._system.escaping import terminal_safe, without_places
+from probe_kit._system.escaping import terminal_safe, without_folders
 from probe_kit._tables.numbers import p_text, percent, with_limits
 from probe_kit._tables.table import Row, Table
 from probe_kit.diagnose.diagnosis import load_diagnosis
@@ -93,19 +93,19 @@ def rounded(value: Any, digits: int = 4) -> float | None:
     return None if value is None or value != value else round(float(value), digits)
 
 
-def payload_script(name: str, value: Any, places: tuple[str, ...] = ()) -> bytes:
+def payload_script(name: str, value: Any, paths: tuple[str, ...] = ()) -> bytes:
     """Return the script `put(name, value)` in ASCII.
 
     A page that is opened as a file may load scripts, and fetch nothing. Text of `value` has visible signs in place
-    of control and direction characters, and the last part alone of `places` and other absolute paths. No `<` is
+    of control and direction characters, and the last part alone of `paths` and other absolute paths. No `<` is
     left, so that no text can end the script.
     """
-    return _script("put", name, _encode(value, places))
+    return _script("put", name, _encode(value, paths))
 
 
-def failure_script(name: str, words: str, places: tuple[str, ...] = ()) -> bytes:
+def failure_script(name: str, words: str, paths: tuple[str, ...] = ()) -> bytes:
     """Return the script `refuse(name, words)`: the reason why there is no such payload, for the page to show."""
-    return _script("refuse", name, _encode(words, places))
+    return _script("refuse", name, _encode(words, paths))
 
 
 def _script(function: str, name: str, value: Any) -> bytes:
@@ -113,15 +113,15 @@ def _script(function: str, name: str, value: Any) -> bytes:
     return f"{function}({json.dumps(name)},{text})\n".replace("<", "\\u003c").encode("ascii")
 
 
-def _encode(value: Any, places: tuple[str, ...]) -> Any:
+def _encode(value: Any, paths: tuple[str, ...]) -> Any:
     if isinstance(value, Packed):  # before text, which it is too: base64 has nothing to escape, and is long
         return value
     if isinstance(value, str):
-        return without_places(terminal_safe(value), places)
+        return without_folders(terminal_safe(value), paths)
     if isinstance(value, dict):
-        return {_encode(key, places): _encode(entry, places) for key, entry in value.items()}
+        return {_encode(key, paths): _encode(entry, paths) for key, entry in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_encode(entry, places) for entry in value]
+        return [_encode(entry, paths) for entry in value]
     return value
 
 
@@ -173,7 +173,7 @@ def run_payload(viewed: ViewedRun, page_runs: Sequence[ViewedRun] = ()) -> dict[
         ],
         "sites": _site_entries(viewed.sites),
         "categories": [
-            {"name": name, "title": category_of(name).title, "best": best_places(viewed, name)}
+            {"name": name, "title": category_of(name).title, "best": best_sites(viewed, name)}
             for name in viewed.categories
         ],
         "scene": _scene(run.settings.get("scene")),
@@ -196,7 +196,7 @@ def _site_entries(sites: Sequence[Site]) -> list[dict[str, Any]]:
     ]
 
 
-def best_places(viewed: ViewedRun, category: str) -> dict[str, Any]:
+def best_sites(viewed: ViewedRun, category: str) -> dict[str, Any]:
     """Return by part the index of the best site among all, and whether it has signal; None without probes."""
     row = viewed.probed_rows.get(category) if viewed.has_sides else None
     if row is None or viewed.curve(category) is None:

@@ -34,12 +34,12 @@ class _StreamProbes:
     """The probes of one stream, at S sites with F folds.
 
     Attributes:
-        places: Positions of its sites among all.
+        positions: Positions of its sites among all.
         weights: (S, F, D).
         intercepts: (S, F).
     """
 
-    places: list[int]
+    positions: list[int]
     at: tuple[list[int], ...]
     view: int
     weights: Values
@@ -119,7 +119,7 @@ class FrozenProbes:
                 values = (np.einsum("ksd,sfd->ksf", features, probes.weights) + probes.intercepts).mean(axis=-1)
             else:
                 values = np.einsum("ksd,sd->ks", features, probes.weights[:, fold]) + probes.intercepts[:, fold]
-            log_odds[:, probes.places] = values * toward(side)
+            log_odds[:, probes.positions] = values * toward(side)
         return log_odds, fold is not None
 
     def _features(self, stream: str, probes: _StreamProbes, position: int, calls: int) -> Values:
@@ -154,11 +154,11 @@ class FrozenProbes:
         streams = {}
         for stream in dict.fromkeys(site.stream for site in self.sites):
             stored = self.run.stored(stream)
-            places = [index for index, site in enumerate(self.sites) if site.stream == stream]
-            indices = [stored.at(self.sites[index]) for index in places]
-            probes = [directions[names[index]] for index in places]
+            positions = [index for index, site in enumerate(self.sites) if site.stream == stream]
+            indices = [stored.at(self.sites[index]) for index in positions]
+            probes = [directions[names[index]] for index in positions]
             streams[stream] = _StreamProbes(
-                places,
+                positions,
                 tuple(list(axis) for axis in zip(*indices, strict=True)),
                 stored.views.index(resolve_view(self._view, stored.views)),
                 np.stack([probe.weights.astype(np.float64) for probe in probes]),
@@ -172,15 +172,15 @@ def toward(side_correct: str) -> float:
     return 1.0 if side_correct == "left" else -1.0
 
 
-def decisions_toward_correct(curve: ProbeCurve, places: Sequence[int], sides: Sequence[str]) -> Values:
+def decisions_toward_correct(curve: ProbeCurve, positions: Sequence[int], sides: Sequence[str]) -> Values:
     """Return the held-out log-odds (S, E) of some episodes of the curve, the correct side up.
 
     Args:
         curve: Probes of one category in one view.
-        places: Positions of the E episodes in the curve.
+        positions: Positions of the E episodes in the curve.
         sides: (E,) the correct sides.
     """
-    return np.asarray(curve.decisions[:, places] * np.array([toward(side) for side in sides]))
+    return np.asarray(curve.decisions[:, positions] * np.array([toward(side) for side in sides]))
 
 
 # -- the run -----------------------------------------------------------------------------------------------------
@@ -216,7 +216,7 @@ class ViewedRun:
         return retention_table([self.run], with_behaviour=False)
 
     @property
-    def places(self) -> tuple[str, str]:
+    def paths(self) -> tuple[str, str]:
         """The run's names on this machine, which no page shows."""
         return self.run.location.address, str(self.run.location)
 
@@ -351,8 +351,8 @@ def view_runs(runs: Sequence[Run], probes_of: Run | None = None) -> list[ViewedR
     """
     if not runs:
         raise UsageError("the viewer needs at least one run")
-    places = [run.location.address for run in runs]
-    if doubles := [address for at, address in enumerate(places) if address in places[:at]]:
+    paths = [run.location.address for run in runs]
+    if doubles := [address for at, address in enumerate(paths) if address in paths[:at]]:
         raise UsageError(f"{doubles[0]} is given twice. Leave one out")
     keys: list[str] = []
     for run in runs:

@@ -23,7 +23,7 @@ from probe_kit._system.escaping import (
     markdown_safe,
     terminal_safe,
     unescaped,
-    without_places,
+    without_folders,
 )
 from probe_kit._system.table_cells import plain_cell
 from probe_kit._system.text_tables import open_table
@@ -291,7 +291,7 @@ def test_no_path_of_this_machine_stands_in_what_notebooks_show_of_runs_and_model
     ],
 )
 def test_of_a_path_the_last_part_is_kept(text: str, expected: str) -> None:
-    assert without_places(text) == expected
+    assert without_folders(text) == expected
 
 
 @pytest.mark.parametrize(
@@ -308,4 +308,4 @@ def test_of_a_path_the_last_part_is_kept(text: str, expected: str) -> None:
     ],
 )
 def test_what_is_no_path_of_a_machine_stays(text: str) -> None:
-    assert without_places(text) == text
+    assert without_folders(text) == text

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from markdown_it import MarkdownIt
 from rich.console import Console
 
-from probe_kit._system.escaping import without_places
+from probe_kit._system.escaping import without_folders
 from probe_kit._tables.formats import names, render
 from probe_kit._tables.formats.latex import _SPECIAL, MOST_COLUMNS
 from probe_kit._tables.table import Cell, Heading, Row, Table, grouped
@@ -139,7 +139,7 @@ def test_html_holds_the_cells_as_text_and_no_element_of_theirs(table: Table) -> 
     cells = [words(text).replace("\u00a0", "") for text in reader.cells[len(table.headings) :]]
     assert sorted("".join(sorted(cell)) for cell in cells) == sorted(
         # A page names no folder of this machine: of a path, it has the last part.
-        "".join(sorted(words(without_places(cell.text))))
+        "".join(sorted(words(without_folders(cell.text))))
         for row in ordered
         for cell in row.cells
     )

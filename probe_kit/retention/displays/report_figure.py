@@ -283,14 +283,16 @@ def _makers(of_sides: bool) -> list[Maker]:
     return sorted(makers, key=makers.__getitem__)
 
 
-def save_figures(exhibits: Sequence[ReportFigure], folder: Path) -> Iterator[Path]:
-    """Draw exhibits into `folder` as PNG and PDF, one after the other; yield the path of every PNG."""
+def save_figures(figures: Sequence[ReportFigure], folder: Path) -> Iterator[Path]:
+    """Draw figures into `folder` as PNG and PDF, one after the other; yield the path of every PNG."""
     folder.mkdir(parents=True, exist_ok=True)
-    for exhibit in exhibits:
-        path = folder / f"{exhibit.name}{SUFFIXES[0]}"
-        with exhibit.drawn() as figure:
+    for report_figure in figures:
+        path = folder / f"{report_figure.name}{SUFFIXES[0]}"
+        with report_figure.drawn() as figure:
             for suffix in SUFFIXES:
-                figure.savefig(path.with_suffix(suffix), metadata=_metadata(suffix, exhibit, caption_of(figure)))
+                figure.savefig(
+                    path.with_suffix(suffix), metadata=_metadata(suffix, report_figure, caption_of(figure))
+                )
         yield path
 
 
@@ -299,9 +301,13 @@ def caption_of(figure: "Figure") -> str:
     return str(getattr(figure, "caption", ""))
 
 
-def _metadata(suffix: str, exhibit: ReportFigure, caption: str) -> dict[str, str | None]:
+def _metadata(suffix: str, report_figure: ReportFigure, caption: str) -> dict[str, str | None]:
     """Return the caption as metadata of the file, under the keys that readers of its format show."""
     if suffix == ".pdf":
         # Without its date a figure of the same numbers has the same bytes.
-        return {"Title": exhibit.title, "Subject": f"{caption}. {exhibit.reading}", "CreationDate": None}
-    return {"Title": exhibit.title, "Description": f"{caption}. {exhibit.reading}"}
+        return {
+            "Title": report_figure.title,
+            "Subject": f"{caption}. {report_figure.reading}",
+            "CreationDate": None,
+        }
+    return {"Title": report_figure.title, "Description": f"{caption}. {report_figure.reading}"}

@@ -79,9 +79,9 @@ def episode_grid(
     with_picture = _with_pictures(listed, stride)
     picture_of = _without_repeats(with_picture)
     distinct = list(dict.fromkeys(picture for picture, _ in picture_of.values()))
-    places = {picture: at for at, picture in enumerate(distinct)}
+    positions = {picture: at for at, picture in enumerate(distinct)}
     cards = tuple(
-        {**episode.card, "picture": places[picture_of[episode.key][0]], "half": picture_of[episode.key][1]}
+        {**episode.card, "picture": positions[picture_of[episode.key][0]], "half": picture_of[episode.key][1]}
         if episode.key in picture_of
         else {**episode.card, "picture": None}
         for episode in listed

@@ -14,7 +14,7 @@ from xml.etree import ElementTree
 
 from probe_kit._system.counting import enumerated
 from probe_kit._system.drafts import write_whole
-from probe_kit._system.escaping import without_places
+from probe_kit._system.escaping import without_folders
 from probe_kit._tables.content import heat_key
 from probe_kit._tables.html import environment
 from probe_kit._tables.table import Table
@@ -132,10 +132,10 @@ def report_html(
         raise UsageError("a report needs at least one run")
     table = retention_table(runs) if table is None else table
     source = FigureSource.of(runs, table)
-    places = tuple(path for run in runs for path in (run.location.address, str(run.location)))
-    names = [without_places(run.name, places) for run in source.table_runs]
+    paths = tuple(path for run in runs for path in (run.location.address, str(run.location)))
+    names = [without_folders(run.name, paths) for run in source.table_runs]
     opening = opening_row(source) if table.is_of_sides else None
-    pictures_of = arranged([*source.figures(), *_opening_curves(opening, table.iterations)], names, places)
+    pictures_of = arranged([*source.figures(), *_opening_curves(opening, table.iterations)], names, paths)
     sides: dict[str, Any] = {}
     tables = [table.summary_table]
     if table.is_of_sides:
@@ -144,14 +144,14 @@ def report_html(
         sides = {"grid": grid, "question": question, **_sides(source, pictures_of)}
         tables += [*(part for of_subject in sides["tables"].values() for part in of_subject)]
         tables += [*sides["further"], *sides["joined"]]
-        labels = _stored_labels(runs, names, places)
+        labels = _stored_labels(runs, names, paths)
     else:
         labels = _labels(table, runs, names, pictures_of)
     tables += [part for label in labels for part in (label["retention"], *label["probes"])]
     sentence, bibtex = citation([run.run for run in source.table_runs])
     return render(
         "page.html.jinja",
-        places,
+        paths,
         is_of_sides=table.is_of_sides,
         title=enumerated(names if table.is_of_sides else table.targets),
         suites=list(dict.fromkeys(run.suite for run in runs)),
@@ -180,15 +180,15 @@ def _sides(source: FigureSource, pictures_of: PicturesBySubject) -> dict[str, An
     """Return the parts of the page that only sides have, such as success, episodes and answers."""
     table = source.table
     modes = modes_of(table.all_rows)
-    warnings: dict[tuple[str | None, str], list[tuple[str, str]]] = {}
+    warnings_of_run: dict[tuple[str | None, str], list[tuple[str, str]]] = {}
     further_views = []
     for mean in table.means:
         rows = [row for row in table.rows if (*row.key, row.view) == (*mean.key, mean.view)]
-        if mean.key in warnings:  # its run was met before, by another view; the summary is of the first
+        if mean.key in warnings_of_run:  # another view of the same run came first; the summary is of that one
             sentences = [f"{title_of(row.category)}: {conclusion(row)}" for row in rows]
             further_views.append((f"{model_name(mean)}, view {mean.view}", sentences))
         else:
-            warnings[mean.key] = [(model_name(mean), sentence) for sentence in warnings_of(mean, rows)]
+            warnings_of_run[mean.key] = [(model_name(mean), sentence) for sentence in warnings_of(mean, rows)]
     tables: dict[str, list[Table]] = {subject: [] for subject in SUBJECTS.values()}
     for title, part in table.tables().items():
         tables[SUBJECTS[title]].append(part)
@@ -200,7 +200,7 @@ def _sides(source: FigureSource, pictures_of: PicturesBySubject) -> dict[str, An
         "reached": "What reaches the answer" if modes == "answers" else "What reaches the action",
         "curve": next((pictures[0] for pictures in pictures_of.get(_OPENING, ())), None),
         "further_views": further_views,
-        "warnings": [warning for of_run in warnings.values() for warning in of_run],
+        "warnings": [warning for of_run in warnings_of_run.values() for warning in of_run],
         "tables": tables,
         "wordings": table.wording_tables,
         "further": table.further_tables,
@@ -320,14 +320,14 @@ def _labels(
 
 
 def _stored_labels(
-    runs: Sequence[RunReader], names: Sequence[str], places: tuple[str, ...]
+    runs: Sequence[RunReader], names: Sequence[str], paths: tuple[str, ...]
 ) -> list[dict[str, Any]]:
     """Return a section per run and label column of which the run has probes; none for other runs."""
     sections = []
     for run, name in zip(runs, names, strict=True):
         if targets := list(stored_targets(run)):
             table = retention_table([run], target=targets)
-            pictures_of = arranged(FigureSource.of([run], table).figures(), [name], places)
+            pictures_of = arranged(FigureSource.of([run], table).figures(), [name], paths)
             sections += _labels(table, [run], [name], pictures_of, name if len(runs) > 1 else "")
     return sections
 
@@ -345,12 +345,12 @@ _HERE = Path(__file__).parent
 _ASSETS = {"css": "page.css", "js": "page.js", "episodes_js": "episodes.js"}
 
 
-def render(template: str, places: tuple[str, ...], **content: Any) -> str:
-    """Return the page; no text in it holds `places` or another absolute path of this machine."""
+def render(template: str, paths: tuple[str, ...], **content: Any) -> str:
+    """Return the page; no text in it holds `paths` or another absolute path of this machine."""
     from markupsafe import Markup
 
     assets = {name: Markup((_HERE / file).read_text(encoding="utf-8")) for name, file in _ASSETS.items()}
-    return environment(_HERE, places=places).get_template(template).render(**assets, **content)
+    return environment(_HERE, paths=paths).get_template(template).render(**assets, **content)
 
 
 SVG_LIMIT = 150_000
@@ -367,7 +367,7 @@ _IN_URI = " !$'()*+,-./:;=?@[]_`{|}~"
 
 
 def arranged(
-    figures: Sequence[ReportFigure], names: Sequence[str], places: tuple[str, ...] = ()
+    figures: Sequence[ReportFigure], names: Sequence[str], paths: tuple[str, ...] = ()
 ) -> PicturesBySubject:
     """Draw figures, by subject and kind.
 
@@ -377,7 +377,7 @@ def arranged(
     Args:
         figures: Figures of all runs.
         names: The name of each run.
-        places: Paths that are shortened in texts, see `data_uri`.
+        paths: Paths that are shortened in texts, see `data_uri`.
     """
     subjects: dict[str, dict[str, list[Picture]]] = {}
     together = {
@@ -392,7 +392,7 @@ def arranged(
         before = [other for pictures in by_title.values() for other in pictures]
         extra = any(other.run == run and other.title.partition(",")[0] == kind for other in before)
         extra |= figure.run is not None and (figure.subject, f"{kind} side by side") in together
-        picture = Picture(figure.title, run, figure.reading, *data_uri(figure, places), extra)
+        picture = Picture(figure.title, run, figure.reading, *data_uri(figure, paths), extra)
         by_title.setdefault(figure.title, []).append(picture)
     return {subject: list(by_title.values()) for subject, by_title in subjects.items()}
 
@@ -402,25 +402,25 @@ def _kind(figure: ReportFigure) -> str:
     return figure.title.partition(",")[0]
 
 
-def data_uri(exhibit: ReportFigure, places: tuple[str, ...] = ()) -> tuple[str, str]:
+def data_uri(report_figure: ReportFigure, paths: tuple[str, ...] = ()) -> tuple[str, str]:
     """Return the drawn figure as SVG, or WebP if that would be large, with its caption.
 
     A figure gives the same bytes every time. Its ground is transparent, so that the page's colour shows through.
-    Of `places` and other absolute paths in its words the last part is left.
+    Of `paths` and other absolute paths in its words the last part is left.
 
     Args:
-        exhibit: The figure that is drawn.
-        places: Absolute paths of runs.
+        report_figure: The figure that is drawn.
+        paths: Absolute paths of runs.
     """
     import matplotlib as mpl
     from matplotlib.text import Text
 
     with (
-        exhibit.drawn() as figure,
+        report_figure.drawn() as figure,
         mpl.rc_context({"svg.hashsalt": "probe_kit", "svg.fonttype": "none", "savefig.transparent": True}),
     ):
         for words in figure.findobj(Text):
-            words.set_text(without_places(words.get_text(), places))
+            words.set_text(without_folders(words.get_text(), paths))
         file = BytesIO()
         figure.savefig(file, format="svg", metadata={"Date": None})
         svg = compact_svg(file.getvalue())
@@ -593,16 +593,16 @@ def words_of(tables: Sequence[Table]) -> Words:
     words = {_word(cell) for cell in cells}
     groups["Verdicts"] = {(name, text): None for name, text in VERDICT_HELP.items() if name in words}
     groups["Further terms"] = {word: None for word in TERMS.items() if word not in _all(groups)}
-    places = {word: f"word-{number}" for number, word in enumerate(_all(groups))}
+    anchors = {word: f"word-{number}" for number, word in enumerate(_all(groups))}
     entries = {
-        title: tuple((*word, places[word]) for word in entries_of)
+        title: tuple((*word, anchors[word]) for word in entries_of)
         for title, entries_of in groups.items()
         if entries_of
     }
     of_values = {
-        name: anchor for (name, text), anchor in places.items() if (VERDICT_HELP | TERMS).get(name) == text
+        name: anchor for (name, text), anchor in anchors.items() if (VERDICT_HELP | TERMS).get(name) == text
     }
-    return Words(entries, places, {cell: of_values[_word(cell)] for cell in cells if _word(cell) in of_values})
+    return Words(entries, anchors, {cell: of_values[_word(cell)] for cell in cells if _word(cell) in of_values})
 
 
 def _word(cell: str) -> str:
