@@ -415,7 +415,7 @@ class AskSettings(Settings):
         """Raise UsageError for a question about objects or sides if the source has none."""
         super().model_post_init(context)
         source = self.source
-        if not source.command:
+        if source.is_scene:
             return
         if not self.task.prompt.is_instruction:
             raise UsageError(

@@ -31,7 +31,7 @@ from probe_kit.hooks.contract.observation import Observation
 from probe_kit.intervene.outcomes import directions_of, spread_of
 from probe_kit.intervene.pairs import Chunk, Given, Pair, PairRow
 from probe_kit.intervene.settings import Choice
-from probe_kit.runs.layout import stored_inputs_of
+from probe_kit.runs.layout import source_settings_of
 from probe_kit.runs.run import Run
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ class Frames:
         from probe_kit.extract.config_files import source_again
         from probe_kit.extract.sources.source import Played
 
-        self.run, inputs = run, stored_inputs_of(run.settings)
+        self.run, inputs = run, source_settings_of(run.settings)
         opened = source_again(run, source.moved).open()
         opened.check_same(run.settings)
         opened.columns = tuple(inputs["columns"])

@@ -9,11 +9,11 @@ from zarr.core.buffer import Buffer, BufferPrototype
 
 from probe_kit.errors import RunDamagedError
 from probe_kit.runs.arrays import chunk_slices, index_bytes, inner_chunks
-from probe_kit.runs.records import BLOCK_BYTES, Sum, block_digest, digest
+from probe_kit.runs.records import BLOCK_BYTES, Checksum, block_digest, digest
 from probe_kit.runs.store import Location
 
 _BLOCK = 2 * BLOCK_BYTES
-"""The hex digits of the hash of one inner chunk, of which `Sum.blocks` is a row."""
+"""The hex digits of the hash of one inner chunk, of which `Checksum.blocks` is a row."""
 
 _SPARE = 1 << 20
 """The bytes that an object may have too many and is still read: an enlarged file never takes all memory."""
@@ -43,13 +43,13 @@ class ArrayStore(Store):
         self,
         location: Location,
         folder: str,
-        sums: Mapping[str, Sum],
+        sums: Mapping[str, Checksum],
         advice: Callable[[str], str] = lambda _key: "",
         read_only: bool = False,
     ) -> None:
         super().__init__(read_only=read_only)
         self._location, self._folder, self._advice = location, folder, advice
-        self.sums, self.written, self.shards = dict(sums), dict[str, Sum](), dict[str, int]()
+        self.sums, self.written, self.shards = dict(sums), dict[str, Checksum](), dict[str, int]()
         self._indexes: dict[str, dict[tuple[int, int], str]] = {}
 
     def __eq__(self, other: object) -> bool:
@@ -151,7 +151,7 @@ class ArrayStore(Store):
         count = self.shards.get(key.partition("/c/")[0], 0) if "/c/" in key else 0
         blocks = "".join(block_digest(content[part]) for part in inner_chunks(content, count)) if count else ""
         await asyncio.to_thread(self._location.write, self._key(key), content, durable=False)
-        self.sums[key] = self.written[key] = Sum(len(content), digest(content), blocks)
+        self.sums[key] = self.written[key] = Checksum(len(content), digest(content), blocks)
 
     async def delete(self, key: str) -> None:
         """Remove one object."""

@@ -27,7 +27,7 @@ from probe_kit.runs.array_store import ArrayStore
 from probe_kit.runs.arrays import bounded_codecs, open_array
 from probe_kit.runs.commits import Commit, commit_key, stamp_of
 from probe_kit.runs.layout import COLUMNS, LATER, SEALED
-from probe_kit.runs.records import NAME_DIGITS, Record, Sum, Sums, named_by_hash
+from probe_kit.runs.records import NAME_DIGITS, Checksum, Record, Sums, named_by_hash
 from probe_kit.runs.root import Root
 from probe_kit.runs.store import Location
 
@@ -62,7 +62,7 @@ class Columns:
         sums: The sums of every object in the folder, by key.
     """
 
-    def __init__(self, location: Location, folder: str, sums: Mapping[str, Sum]) -> None:
+    def __init__(self, location: Location, folder: str, sums: Mapping[str, Checksum]) -> None:
         self.folder, self.sums = folder, sums
         self._location = location
         self.advice = (
@@ -131,7 +131,7 @@ def seal_key(stamp: str) -> str:
     return f"{SEALED}/{stamp[:NAME_DIGITS]}.json"
 
 
-def write_seal(root: Root, commits: Mapping[int, Commit], sums: Mapping[str, Sum]) -> None:
+def write_seal(root: Root, commits: Mapping[int, Commit], sums: Mapping[str, Checksum]) -> None:
     """Store the hashes of the columns, and the episodes they are made of, from which on the columns count."""
     seal = Seal(run=root.identity, stamp=stamp_of(commits), episodes=sorted(commits), objects=dict(sums))
     # `write`: the same commits are sealed once more after their columns were deleted.

@@ -27,7 +27,7 @@ from probe_kit.runs.layout import (
 )
 from probe_kit.runs.plan import plan_key
 from probe_kit.runs.provenance import certificate_keys
-from probe_kit.runs.records import RESTORE, Sum
+from probe_kit.runs.records import RESTORE, Checksum
 from probe_kit.runs.results import BUNDLES, HEAD, PARTIAL, TIMES, advice_for, bundle_keys, read_bundle
 from probe_kit.runs.root import LeftOut, Root, is_left_out
 from probe_kit.runs.run import Run, open_run
@@ -46,7 +46,7 @@ class StoredObject:
     """
 
     key: str
-    stored_sum: Sum
+    stored_sum: Checksum
     advice: str
     owner: str = ""
     optional: bool = False

@@ -320,7 +320,7 @@ def write_sae(
 ) -> None:
     """Write `<stream>/<site>.npy` (N, D) in one drawn order per stream, `<stream>/index.parquet`, `scales.json`.
 
-    In `scales.json`, `scale` is the factor by which the mean squared norm of the rows of a site becomes D. Stored
+    In `scales.json`, `scale` is a factor of the rows of a site: times it, their mean squared norm is D. The stored
     rows are not multiplied by it.
 
     Args:
@@ -413,7 +413,7 @@ def _as_stored(values: NDArray[np.float32], dtype: np.dtype[Any], site: Site, ru
 
 
 def _scale(file: Path) -> dict[str, float]:
-    """Return the mean squared norm of stored rows, and the factor by which it becomes D."""
+    """Return the mean squared norm of stored rows, and the factor of rows with which it becomes D."""
     stored = np.load(file, mmap_mode="r")
     total = 0.0
     for start in range(0, len(stored), _READ_AT_ONCE):

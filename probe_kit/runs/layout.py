@@ -9,8 +9,10 @@ RUN/
   times/<n>.json     seconds that an episode took, which no other hash covers, see `commits`
   failed/<n>.json    why an episode was given up; removed when it is tried again
   certificate.json   what was really loaded, and what was checked
+  certificates/      the same of every further process that played
+  provenance/        versions and machine of every process that played
   data.zarr/         <stream>/pooled; with --tokens all <stream>/tokens; with --later-views mean <stream>/later
-                     of recordings also inputs/<kind>
+                     of all sources but the scene also inputs/<kind>
   columns.zarr/      the pooled rows again, by site and view; derived, see `columns`
   sealed/<stamp>.json  hashes of the columns, and of which commits they were made
   probes/            results of `probe-kit train`
@@ -52,7 +54,7 @@ TRUTHS = "truth"
 CLASSES = "classes."
 """A prefix of a column's name among the names of inputs: the entry has the texts that the column indexes."""
 INPUTS = "inputs"
-"""The group of arrays that hold what a run on recordings showed: state, actions, small pictures."""
+"""The group of arrays that hold what a source without a scene showed: state, actions, small pictures."""
 ILLUSTRATIONS = (FRAMES, VIDEOS)
 """Pictures for people, which a run can do without."""
 Codec = Literal["zstd", "fast", "none"]
@@ -85,7 +87,10 @@ ONCE, AT_END = "success_once", "success_at_end"
 CAPTURE_ONLY = "capture_only"
 """The outcome of an episode whose model was captured and did not act: there is no success rate."""
 DATASET = "dataset"
-"""The part of a run's settings that says which recordings it was made of; scene runs have `suite` and `scene`."""
+"""The part of a run's settings that names the recordings, pictures or other stored observations it shows.
+
+Runs of the scene have `suite` and `scene` instead.
+"""
 
 ENVIRONMENT = "environment"
 """The part of a run's settings that says in which environment of the user's own it was played."""
@@ -98,7 +103,7 @@ It is None where they are compared.
 """
 
 
-def stored_inputs_of(settings: Mapping[str, Any]) -> Mapping[str, Any]:
+def source_settings_of(settings: Mapping[str, Any]) -> Mapping[str, Any]:
     """Return the settings of recordings or environment, with shapes and names of `inputs`; empty for scenes."""
     described: Mapping[str, Any] = settings.get(DATASET) or settings.get(ENVIRONMENT) or {}
     return described

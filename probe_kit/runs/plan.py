@@ -341,9 +341,9 @@ def _check_equal(was: RowColumns, now: RowColumns, location: Location) -> None:
         if was.get(part) != now.get(part):
             if part == _CONTENT:
                 raise SettingsMismatchError(
-                    f"the files of the data set that hold {was['episode_id']} have changed since {location} "
-                    f"began: their {part} is stored as {was.get(part)!r}, here {now.get(part)!r}. Give the data "
-                    "set as it was, or choose another --out"
+                    f"the files that {was['episode_id']} shows have changed since {location} "
+                    f"began: their {part} is stored as {was.get(part)!r}, here {now.get(part)!r}. Give them "
+                    "as they were, or choose another --out"
                 )
             raise SettingsMismatchError(
                 f"{location} plans {was['episode_id']} otherwise: its {part} is stored as {was.get(part)!r}, here "

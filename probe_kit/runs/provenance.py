@@ -4,8 +4,8 @@
     certificate.json              the first process's record, with its provenance
     certificates/<digits>.json    a record per process, named by the sha256 of its content
 
-Settings say what was asked for; provenance says what answered. Numbers made on another kind of device or by other
-libraries are not the same numbers. So a run is not continued there unless that is asked for, and then says so.
+Settings say what was requested; provenance says which machine and libraries computed it. Numbers of another kind
+of device or of other libraries are not the same numbers. So a run is continued there only on request, and says so.
 """
 
 import json

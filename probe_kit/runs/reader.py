@@ -58,7 +58,7 @@ def check_several_wordings(episodes: "pd.DataFrame") -> None:
 
 
 def check_call(run: RunReader, call: int) -> None:
-    """Raise UsageError if no such inference was captured, and for a run that does not store them separately."""
+    """Raise UsageError if no such inference was captured."""
     captured = run.captured_calls
     if call and not 0 < call < captured:
         raise UsageError(

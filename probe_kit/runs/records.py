@@ -38,7 +38,7 @@ _HASH_NAME = re.compile(rf"[0-9a-f]{{{NAME_DIGITS}}}\.json")
 RESTORE = "Restore it from a copy, or extract the run again"
 
 
-class Sum(NamedTuple):
+class Checksum(NamedTuple):
     """The length of an object in bytes, and the blake2b of these bytes as 64 hex digits.
 
     Attributes:
@@ -51,7 +51,7 @@ class Sum(NamedTuple):
     blocks: str = ""
 
     @classmethod
-    def of(cls, content: bytes) -> "Sum":
+    def of(cls, content: bytes) -> "Checksum":
         """Return the sum of an object that is always read at once."""
         return cls(len(content), digest(content))
 
@@ -72,18 +72,18 @@ class Sum(NamedTuple):
         return None if digest(content) == self.digest else "has other bytes than were written"
 
 
-def parse_sum(values: Any) -> Sum:
-    """Return the sum that `Sum.to_json` stored. Raises ValueError for anything else."""
+def parse_sum(values: Any) -> Checksum:
+    """Return the sum that `Checksum.to_json` stored. Raises ValueError for anything else."""
     match values:
         case [int(length), str(known)] | [int(length), str(known), str()] if type(length) is int and length >= 0:
             blocks = "".join(values[2:])
             digits = _HEXADECIMAL.issuperset(known + blocks)
             if digits and len(known) == _HEX and len(blocks) % _BLOCK_HEX == 0:
-                return Sum(length, known, blocks)
+                return Checksum(length, known, blocks)
     raise ValueError(f"expected a number of bytes and {_HEX} hex digits")
 
 
-Sums = dict[str, Annotated[Sum, BeforeValidator(parse_sum), PlainSerializer(Sum.to_json)]]
+Sums = dict[str, Annotated[Checksum, BeforeValidator(parse_sum), PlainSerializer(Checksum.to_json)]]
 """The lengths and hashes of objects by key, as a record holds them."""
 
 

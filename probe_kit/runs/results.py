@@ -24,7 +24,7 @@ from pydantic import BeforeValidator, ConfigDict, PlainSerializer
 from probe_kit._system.bounded_files import open_arrays, parse_json
 from probe_kit.errors import RunDamagedError, UsageError
 from probe_kit.runs.layout import DIAGNOSES, INTERVENTIONS, PROBES
-from probe_kit.runs.records import DIGEST_BYTES, Record, Sum, digest, digest_of, parse_sum
+from probe_kit.runs.records import DIGEST_BYTES, Checksum, Record, digest, digest_of, parse_sum
 from probe_kit.runs.root import find_root
 from probe_kit.runs.store import Location
 
@@ -38,7 +38,7 @@ _SHORT = 8
 """The digits of its hash in the name of a file that replaces another."""
 
 
-def _parse_file(values: Any) -> tuple[str, Sum]:
+def _parse_file(values: Any) -> tuple[str, Checksum]:
     """Return the actual name and the sum of a file, as a head stores them. Raises ValueError for anything else."""
     match values:
         case [str(actual), *known]:
@@ -46,7 +46,7 @@ def _parse_file(values: Any) -> tuple[str, Sum]:
     raise ValueError("expected name, length and hash of a file")
 
 
-def _file_json(file: tuple[str, Sum]) -> list[str | int]:
+def _file_json(file: tuple[str, Checksum]) -> list[str | int]:
     return [file[0], *file[1].to_json()]
 
 
@@ -62,7 +62,7 @@ class Head(Record):
     key: str
     run: str | None
     settings: dict[str, Any]
-    files: dict[str, Annotated[tuple[str, Sum], BeforeValidator(_parse_file), PlainSerializer(_file_json)]]
+    files: dict[str, Annotated[tuple[str, Checksum], BeforeValidator(_parse_file), PlainSerializer(_file_json)]]
 
 
 class Times(Record):
@@ -90,7 +90,7 @@ class Bundle:
     key: str
     head: Mapping[str, Any]
     times: Mapping[str, str]
-    files: Mapping[str, tuple[str, Sum]]
+    files: Mapping[str, tuple[str, Checksum]]
 
     @property
     def folder(self) -> str:
@@ -182,7 +182,7 @@ def write_bundle(
         former = dict(before.files) if before else {}
         files_now = dict(former)
         for name, content in files.items():
-            content_sum = Sum.of(content)
+            content_sum = Checksum.of(content)
             if name not in former or former[name][1] != content_sum:
                 actual = name if before is None else _renamed(name, content_sum)
                 location.write(f"{folder}/{actual}", content)
@@ -205,7 +205,7 @@ def tidy_bundle(location: Location, home: str, key: str) -> None:
         location.remove(f"{home}/.{key}{PARTIAL}")
 
 
-def _renamed(name: str, content_sum: Sum) -> str:
+def _renamed(name: str, content_sum: Checksum) -> str:
     path = PurePosixPath(name)
     return f"{path.stem}-{content_sum.digest[:_SHORT]}{path.suffix}"
 

@@ -32,10 +32,10 @@ from probe_kit.runs.layout import (
     StoredStream,
     VectorKind,
     check_distinct,
-    stored_inputs_of,
+    source_settings_of,
 )
 from probe_kit.runs.plan import RowColumns, StoredPlan, plan_key, read_plans
-from probe_kit.runs.records import RESTORE, Record, Sum, Sums, read_plain
+from probe_kit.runs.records import RESTORE, Checksum, Record, Sums, read_plain
 from probe_kit.runs.run_folders import what_to_open
 from probe_kit.runs.store import Location, locate
 
@@ -133,7 +133,12 @@ def is_left_out(key: str, arrays: Iterable[str]) -> bool:
 
 @dataclass(frozen=True)
 class Root:
-    """The record `run.json`, checked, and the plan that goes with it."""
+    """The record `run.json` of a run, with its plan.
+
+    Attributes:
+        location: The folder or URL of the run.
+        card: The record itself: settings, streams, and the hashes of the arrays' metadata.
+    """
 
     location: Location
     card: Card
@@ -149,7 +154,7 @@ class Root:
         return {stream.name: stream for stream in self.card.streams}
 
     @cached_property
-    def metadata(self) -> dict[str, Sum]:
+    def metadata(self) -> dict[str, Checksum]:
         """The length and hash of the metadata of all arrays, by key in `data.zarr`."""
         return {key.removeprefix(f"{DATA}/"): stored for key, stored in self.card.objects.items()}
 
@@ -247,7 +252,7 @@ class Root:
         arrays = {
             name: axes for stream in streams for name, axes in stream.arrays(with_tokens, self.later_views).items()
         }
-        shapes = stored_inputs_of(self.own_settings).get("inputs", {})
+        shapes = source_settings_of(self.own_settings).get("inputs", {})
         return {**arrays, **{f"{INPUTS}/{name}": 2 + len(shape) for name, shape in shapes.items()}}
 
     @property
@@ -273,7 +278,7 @@ def new_card(settings: Mapping[str, Any], streams: Iterable[StoredStream], objec
         settings=cast("_Settings", dict(settings)),
         settings_sha256=sha256_json(settings),
         streams=list(streams),
-        objects={key: Sum.of(content) for key, content in objects.items()},
+        objects={key: Checksum.of(content) for key, content in objects.items()},
     )
 
 

@@ -53,7 +53,7 @@ from probe_kit.runs.layout import (
     ArrayKind,
     StoredStream,
     VectorKind,
-    stored_inputs_of,
+    source_settings_of,
 )
 from probe_kit.runs.plan import RowColumns, while_growing
 from probe_kit.runs.provenance import (
@@ -63,7 +63,7 @@ from probe_kit.runs.provenance import (
     read_certificate,
     read_provenances,
 )
-from probe_kit.runs.records import RESTORE, Sum
+from probe_kit.runs.records import RESTORE, Checksum
 from probe_kit.runs.root import read_label, read_root
 from probe_kit.runs.run_source import Origin, RunSource, select_items
 from probe_kit.runs.store import Location, locate
@@ -129,6 +129,9 @@ class Run:
         last_steps: The number of control steps at the end that the rule judges.
         wording: The only wording whose episodes are shown, None for all; see `in_wording`.
         item_ids: The only items whose episodes are shown, None for all; see `only`.
+        score: The score by which a run of questions is read: `text`, as stored.
+        control_features: Features of a control by its name that the run brings along; none for a stored run, see
+            `ArrayRun`.
     """
 
     rule: str = DEFAULT_RULE
@@ -240,7 +243,7 @@ class Run:
 
     @property
     def recorded(self) -> bool:
-        """Whether the run was made of recordings: there are no sides, no outcomes and no scene."""
+        """Whether the run shows stored pictures, as recordings do: no sides, no outcomes and no scene."""
         return DATASET in self.settings
 
     @property
@@ -271,7 +274,7 @@ class Run:
         Raises:
             ActivationsLeftOutError: In a copy without activations.
         """
-        source = stored_inputs_of(self.settings)
+        source = source_settings_of(self.settings)
         if not source:
             return None
         if any(name.startswith(f"{INPUTS}/") for name in self.root.left_out):
@@ -731,7 +734,7 @@ class Run:
         return ArrayStore(self.location, DATA, self._sums, self._advice, read_only=True)
 
     @cached_property
-    def _sums(self) -> dict[str, Sum]:
+    def _sums(self) -> dict[str, Checksum]:
         """The sums of all objects of `data.zarr`, by key: metadata, and those that commits name."""
         sums = dict(self.root.metadata)
         for commit in self._commits.values():

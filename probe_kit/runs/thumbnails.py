@@ -16,7 +16,7 @@ from PIL import Image
 
 from probe_kit.errors import RunDamagedError
 from probe_kit.runs.commits import Commit, commit_key, redo, redo_picture
-from probe_kit.runs.layout import CAPTURE_ONLY, FRAME_COLUMNS, FRAMES, FrameChoice, stored_inputs_of
+from probe_kit.runs.layout import CAPTURE_ONLY, FRAME_COLUMNS, FRAMES, FrameChoice, source_settings_of
 from probe_kit.runs.reader import RunReader
 from probe_kit.runs.small_frames import SmallFrames, shrink
 from probe_kit.runs.store import Location, locate
@@ -80,7 +80,7 @@ def episode_frames(run: RunReader, position: int) -> EpisodeFrames | None:
     sheet = read_sheet(run.location, int(row.get("episode", position)))
     if sheet is not None and sheet.count is not None:
         return EpisodeFrames(sheet.content, sheet.count, "all")
-    cameras = len(stored_inputs_of(run.settings).get("cameras", ())) or 1
+    cameras = len(source_settings_of(run.settings).get("cameras", ())) or 1
     if sheet is not None:
         return EpisodeFrames(sheet.content, count_ends(row), "ends", cameras)
     if inputs is None or "pixels" not in inputs.kinds:

@@ -78,7 +78,18 @@ class Trajectories:
 def judged(
     trajectories: Iterable[Trajectory], sides: Iterable[Side], scene: Mapping[str, Any], rule: str, last_steps: int
 ) -> pd.DataFrame:
-    """Return a row per episode with the fields of `Judgement`, from `SceneSpec.to_json()`. Raises UsageError."""
+    """Return a row per episode with the fields of `Judgement`.
+
+    Args:
+        trajectories: One of each episode.
+        sides: Side of the correct picture of each episode.
+        scene: The scene's settings as JSON, see `SceneSpec.to_json`.
+        rule: Name of an outcome rule.
+        last_steps: Number of control steps at the end that the rule judges.
+
+    Raises:
+        UsageError: For an unknown rule, or steps that it cannot judge.
+    """
     by = rule_of(rule, scene)
     rows = [
         judge(trajectory, by, side, last_steps, scene["max_steps"])

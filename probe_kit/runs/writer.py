@@ -37,7 +37,7 @@ from probe_kit.runs.layout import (
     RUN_FILE,
     TRAJECTORY,
     StoredStream,
-    stored_inputs_of,
+    source_settings_of,
 )
 from probe_kit.runs.plan import Plan, PlanRecord, Row, StoredRow, further_rows, plan_key, while_growing
 from probe_kit.runs.provenance import (
@@ -49,7 +49,7 @@ from probe_kit.runs.provenance import (
     read_provenances,
     write_certificate,
 )
-from probe_kit.runs.records import Sum
+from probe_kit.runs.records import Checksum
 from probe_kit.runs.results import BUNDLES, bundle_keys
 from probe_kit.runs.root import Label, Root, find_continuable, new_card, read_root
 from probe_kit.runs.store import Location, begin
@@ -186,10 +186,10 @@ class RunWriter:
             self.settings["codec"], self.settings.get("later_views", "all"),
         )  # fmt: skip
         still = "ask" in self.settings or bool(self.settings.get("capture_only"))
-        if "scene" in self.settings and not still:  # who is asked or captured does not move
+        if "scene" in self.settings and not still:  # a model that is asked or only captured moves no arm
             frames = self.settings["scene"]["max_steps"] + 1
             create_trajectories(store, frames, self.settings["codec"])
-        if source := stored_inputs_of(self.settings):
+        if source := source_settings_of(self.settings):
             create_inputs(store, self.settings["captured_calls"], source["inputs"], self.settings["codec"])
         objects = {f"{DATA}/{key}": value.to_bytes() for key, value in arrays.items()}
         card = new_card(self.settings, self.plan.streams, objects)
@@ -345,7 +345,7 @@ class RunWriter:
             "provenance": name_of(self.provenance),
             "control_steps": [int(step) for step in episode.control_steps],
             "objects": store.written,
-            "pictures": {key: Sum.of(content) for key, content in episode.pictures.items()},
+            "pictures": {key: Checksum.of(content) for key, content in episode.pictures.items()},
         }
         optional = {
             "instruction_ids": None if episode.instruction_ids is None else list(episode.instruction_ids),

@@ -17,7 +17,7 @@ from probe_kit.errors import RunDamagedError, RunIncompleteError
 from probe_kit.runs import open_run, seal, verify_run
 from probe_kit.runs.commits import write_failure
 from probe_kit.runs.contents import stored_objects, stray_keys
-from probe_kit.runs.records import Sum, as_record
+from probe_kit.runs.records import Checksum, as_record
 from probe_kit.runs.run import Run
 from probe_kit.runs.store import locate
 from probe_kit.runs.thumbnails import read_thumbnail, thumbnail_key
@@ -351,7 +351,7 @@ def test_what_a_commit_names_outside_of_its_run_is_not_there(run: Path, tmp_path
     key = str(outside) if absolute else "../../outside"
     path = run / "commits" / "00000003.json"
     commit = json.loads(path.read_text(encoding="utf-8"))
-    commit["objects"][key] = Sum.of(outside.read_bytes()).to_json()
+    commit["objects"][key] = Checksum.of(outside.read_bytes()).to_json()
     write_record(path, commit)
     found = verify_run(run, deep=True)
     assert any("outside" in problem and "no object of this episode" in problem for problem in found.problems)

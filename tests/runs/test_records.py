@@ -23,7 +23,7 @@ from probe_kit.errors import DiskSpaceError, RunDamagedError
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.runs import Run, open_run, root, seal
 from probe_kit.runs.layout import INTERVENTIONS
-from probe_kit.runs.records import HASH, Record, Sum, Sums, as_record, read_record
+from probe_kit.runs.records import HASH, Checksum, Record, Sums, as_record, read_record
 from probe_kit.runs.results import PARTIAL, bundle_keys, read_bundles, write_bundle
 from probe_kit.runs.root import read_root
 from probe_kit.runs.run import NotSealedWarning
@@ -115,16 +115,16 @@ def test_a_record_of_other_parts_or_of_another_run_is_damage_by_name(content: di
 
 
 def test_a_record_reads_as_it_was_made() -> None:
-    note = Note(run="x", count=2, objects={"k": Sum.of(b"content"), "s": Sum(3, "0" * 64, "1" * 32)})
+    note = Note(run="x", count=2, objects={"k": Checksum.of(b"content"), "s": Checksum(3, "0" * 64, "1" * 32)})
     read = Note.parse(note.to_bytes(), "it", "do", run="x")
     assert (read.objects, read.hash, read.to_bytes()) == (note.objects, note.hash, note.to_bytes())
 
 
 def test_a_sum_finds_other_content_though_its_checksum_is_the_same() -> None:
     """A chunk ends in its own crc32c, so the crc32c of every chunk is one number."""
-    assert Sum.of(b"one" + b"crc1") != Sum.of(b"two" + b"crc2")
-    assert "other bytes" in str(Sum.of(b"one").problem(b"two"))
-    assert "3 were written" in str(Sum.of(b"one").problem(b"four"))
+    assert Checksum.of(b"one" + b"crc1") != Checksum.of(b"two" + b"crc2")
+    assert "other bytes" in str(Checksum.of(b"one").problem(b"two"))
+    assert "3 were written" in str(Checksum.of(b"one").problem(b"four"))
 
 
 @pytest.mark.parametrize("schema", [1, 5, 7, "x", None])

@@ -10,7 +10,7 @@ from typing import Any
 
 from probe_kit.hashing import sha256_json
 from probe_kit.runs.arrays import inner_chunks
-from probe_kit.runs.records import BLOCK_BYTES, HASH, Sum, as_record, block_digest
+from probe_kit.runs.records import BLOCK_BYTES, HASH, Checksum, as_record, block_digest
 
 
 def rehash(run: Path) -> None:
@@ -58,10 +58,10 @@ def _write(path: Path, content: dict[str, Any]) -> str:
     return str(json.loads(path.read_text(encoding="utf-8"))[HASH])
 
 
-def _sum(path: Path, blocks: str = "") -> Sum:
+def _sum(path: Path, blocks: str = "") -> Checksum:
     content = path.read_bytes()
     if not blocks:
-        return Sum.of(content)
+        return Checksum.of(content)
     count = len(blocks) // (2 * BLOCK_BYTES) - 1
     parts = "".join(block_digest(content[part]) for part in inner_chunks(content, count))
-    return Sum.of(content)._replace(blocks=parts)
+    return Checksum.of(content)._replace(blocks=parts)

@@ -1,1 +1,1 @@
-"""Playing episodes: environments (stages), controllers, and the worker that commits episodes."""
+"""Playing episodes: players of sources, controllers, and the worker that commits episodes."""

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 class EpisodeBuffers:
     """Everything captured in one episode, shaped like its rows in the store.
 
+    S counts captured inferences. `lead` is (iterations, layers) of a stream with iterations, else (layers,).
+
     Attributes:
         pooled: (S, *lead, V, D) float32 per stream, NaN where nothing was captured.
         tokens: (S, *lead, T, D) uint16 bits of bfloat16 per stream, zero where there is no token; empty if only
@@ -180,7 +182,7 @@ RolesByStream = Mapping[str, "Sequence[Roles]"]
 
 
 class Capturer:
-    """A capturer that hands the activations of an inference to the buffers of its episodes.
+    """The capture of one inference of several episodes, whose activations go into the buffers of each.
 
     Attributes:
         fires: The counts of the last capture.

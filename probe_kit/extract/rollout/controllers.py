@@ -40,7 +40,11 @@ if TYPE_CHECKING:
 
 
 Reach = Literal["output", "last layer", "nothing", "not the output", "not tested"]
-"""The last thing on the way to the output that changed with an input; "not the output" where no layer was read."""
+"""The last thing on the way to the output that changed with an input.
+
+`nothing`: neither the last layer nor the output changed. `not the output`: the output did not change, and no layer
+was read. `not tested`: there was no other value of the input to show.
+"""
 MOST_TEXTS = 32
 """The most other instructions that are searched for one with as many tokens; each of them is tokenized."""
 Ids = Callable[[str], tuple[int, ...] | None]
@@ -156,7 +160,8 @@ def _length(text: str, ids: Ids) -> int | None:
 def check_not_ignored(reaches: Mapping[str, Reach], model: str) -> None:
     """Raise IgnoredInputsError if inputs were tested and none of them changes anything that was read."""
     tested = [name for name, reach in reaches.items() if reach != "not tested"]
-    # One dead input is a finding, which the certificate keeps; only where none arrives a run would be void.
+    # One dead input is a finding, which the certificate keeps; only where none arrives a run would be void. Where
+    # a single input could be tested, the model may be one that is not made to read it.
     if len(tested) > 1 and all(reaches[name] in ("nothing", "not the output") for name in tested):
         layer = ", nor of its last layer" if "nothing" in reaches.values() else ""
         raise IgnoredInputsError(
@@ -218,10 +223,14 @@ def ensemble(chunks: Sequence[NDArray[np.float32]], exponent: float) -> NDArray[
 
 
 def count_lost_words(pack: Callable[[str], Sequence[int] | None], instruction: str) -> int:
-    """Count the words at the end of an instruction that do not reach the network, because its prompt is cut.
+    """Count the words at the end of an instruction that do not reach the network, and warn if there are any.
 
-    A word is lost if the ids stay the same without it. The function `pack` returns the ids that the network
-    receives, None if they are unknown.
+    The prompt of a model may be cut. A word is lost if the ids stay the same without it.
+
+    Args:
+        pack: A function of the instruction that returns the ids that the network receives; None where they are
+            unknown.
+        instruction: The words as the source has them.
     """
     ids, words = pack(instruction), instruction.split()
     lost = 0
@@ -401,7 +410,7 @@ class PolicyController(ModelController["Policy", Observation]):
     outputs = "actions"
 
     def __init__(self, policy: "Policy", source: Source[Any], settings: ExtractSettings) -> None:
-        """Prepare a policy for a source as it is shown it. Raises UsageError for more actions than a chunk."""
+        """Prepare a policy for a source as it is shown it."""
         task, card, self._source = settings.task, policy.card, source
         with while_acting(settings.model.family, card.checkpoint):
             # Of all instructions: the store makes room for the longest prompt.

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 Fitted = tuple[Settings, Source[Any], Controller, Calibration | None]
-"""The settings and source as the model is shown them, the controller, and the calibration of a batch left open."""
+"""The settings and source as the model is shown them, the controller, and the calibration of `--batch auto`."""
 
 
 def task_of(settings: Settings) -> Any:
@@ -80,7 +80,11 @@ _CAPTURE_REFUSES = ("captured_calls", "execute", "rotation", "video")
 
 
 class _Task:
-    """The defaults of methods that only one of the tasks implements.
+    """The steps of an extraction that depend on the task, with defaults for those that one task alone has.
+
+    In order: `check_meaningless` of settings, `declared_cameras` and `early_checks` of a family not yet loaded,
+    `planned` for settings that sizes decide, `check_loaded` of the loaded model, `view_of` the source as the model
+    is shown it, and its `rows`. Every check raises UsageError.
 
     Attributes:
         names_all_items: Whether it needs the whole suite besides the chosen items, for the names of other objects.
@@ -113,9 +117,9 @@ class Act(_Task):
     def check_meaningless(self, settings: ExtractSettings) -> None:
         """Raise UsageError for settings that a script, or a policy that does not act, has no use for."""
         name, source = settings.model.family, settings.source
-        if name in SCRIPTED and source.command:
+        if name in SCRIPTED and not source.is_scene:
             raise UsageError(f"{name} is scripted and looks at nothing; choose a model with weights")
-        if settings.task.capture_only and not source.command:
+        if settings.task.capture_only and source.is_scene:
             why = "which captures one inference per episode and executes no action; remove it"
             settings.refuse(_CAPTURE_REFUSES, f"does not apply with --no-act, {why}")
         if name in SCRIPTED:
@@ -128,12 +132,12 @@ class Act(_Task):
             return
         if not family.acts:
             raise UsageError(f"{family.name} answers and does not act; use `probe-kit ask`, or a model that acts")
-        if not settings.source.command and not settings.task.capture_only:
+        if settings.source.is_scene and not settings.task.capture_only:
             family.check_acting(settings.model.checkpoint, settings.model.options)
 
     def texts(self, settings: ExtractSettings, source: Source[Any]) -> Iterable[str]:
         """Return the instructions of a scene; those of other sources are checked with cameras and state."""
-        return () if settings.source.command else source.instructions
+        return () if not settings.source.is_scene else source.instructions
 
     def early_checks(
         self, settings: ExtractSettings, source: Source[Any], fetch: bool
@@ -146,7 +150,7 @@ class Act(_Task):
             return []
 
         def check_instructions() -> None:
-            if settings.source.command:
+            if not settings.source.is_scene:
                 family.check_words(source.instructions, model.checkpoint)
             family.whose_units(model.checkpoint, model.options, fetch)
             family.check_instructions(model.checkpoint, source.instructions, model.options, fetch)
@@ -170,7 +174,7 @@ class Act(_Task):
     def planned(self, settings: ExtractSettings, sizes: PlannedSizes) -> ExtractSettings:
         """Return the settings with the inferences of an episode counted."""
         # Only a scene has an arm that actions could misfit.
-        if not settings.source.command and sizes.outline is not None:
+        if settings.source.is_scene and sizes.outline is not None:
             check_misfit(settings, sizes.outline.misfit(), sizes.outline.checkpoint)
         return settings.with_every_call(settings.task.execute or sizes.execute)
 

@@ -48,12 +48,16 @@ class Playing:
     """An episode on its player.
 
     Attributes:
+        planned: The row of the plan.
+        buffers: Everything captured in it.
         ahead: Whether the player began it by itself, when the one before it ended.
         observation: The observation that waits for an inference, None while the player simulates.
         control_steps: The number of actions before each inference so far.
         steps: The number of actions so far.
         seconds: The seconds of inference so far.
         flagged: The number of inferences without a valid action, None where the policy cannot tell.
+        instruction_ids: Ids of the instruction as the network gets it; None if they are unknown.
+        lost_words: Words at the end of the instruction that do not reach the network.
         past: The chunks so far, for policies that average them.
         columns: Columns of the outcome.
     """

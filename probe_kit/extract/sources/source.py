@@ -88,6 +88,11 @@ class SourceSettings(Part):
         """Count the actions that an episode can have; 0 where nothing acts."""
         return 0
 
+    @property
+    def is_scene(self) -> bool:
+        """Whether the scene of Act2Answer is played, which no option of a command has to name."""
+        return not self.command
+
     @classmethod
     def command_options(cls) -> dict[str, FieldOption]:
         """Return the options of a command by the field that they give; a field of a scene is `scene.NAME`."""

@@ -110,7 +110,7 @@ def capture_attention(policy: Policy) -> Iterator[AttentionMass]:
     with policy.record_attention(note):
         yield mass
     if not mass.by_head:
-        raise CaptureError(f"{policy.card.family} paid no attention in this context; act once inside of it")
+        raise CaptureError(f"{policy.card.family} computed no attention in this context; act once inside of it")
 
 
 MOST_BYTES = 2_000_000_000

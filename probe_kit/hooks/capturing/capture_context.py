@@ -1,4 +1,4 @@
-"""Capture of activations and gradients while a model runs once, and proof that it changes no output.
+"""Capture of activations and gradients while a model runs once.
 
 value, slopes = gradients_at(policy, [observation], [seed], policy.sites(), lambda actions: actions[0, :, 1].sum())
 slopes["backbone.02.residual"]  # (B, T, D)
@@ -105,7 +105,8 @@ class ActivationCache(Mapping[Site, Tensor]):
     """The captured activations of one inference, a mapping from sites in the order in which they fired.
 
     `activations[site]` is what `capture` kept of it, (B, T, D) on the model's device unless it was reduced. The
-    name of a site does as well as the site. The attribute `fires` says how often each tapped module was called.
+    name of a site does as well as the site. The attribute `fires` has, per tap, the number of calls that it
+    promises; all of them came.
     """
 
     def __init__(self) -> None:
@@ -213,9 +214,10 @@ class ActivationCache(Mapping[Site, Tensor]):
 Reduce = Callable[[Site, Tensor], Tensor]
 EditFunction = Callable[[Tensor], Tensor]
 Handle = Callable[[Site, Tap, Tensor], Tensor | None]
-"""A function that receives what passes at a site.
+"""A function of a site, its tap and the tensor that passes there.
 
-What it returns, unless None or of a keyword, passes on in its place.
+A tensor that it returns passes on in place of the input, and None leaves the input. Where the tap reads a keyword
+of the call, the tensor is only read.
 """
 _captured_now: WeakSet[Model] = WeakSet()
 
@@ -433,8 +435,9 @@ def flowing_tensors(model: Model, sites: Iterable[Site]) -> Iterator[FlowingTens
     """Keep what passes at `sites` while the model runs once with a graph.
 
     An input is kept as the very tensor that flows, so that the norm and the path around the block both count. Of
-    an output, and of `kv`, a copy passes on. What read the tensor before does not count, and what is added to it
-    in place does not reach it. The first tensor of all becomes a leaf: nothing above it is kept.
+    an output, and of `kv`, a copy passes on: a later layer that adds to the copy in place does not change the kept
+    tensor. A module that read the tensor before the hook has no part in its gradient. The first tensor of all
+    becomes a leaf: nothing above it is kept.
     """
     flowing = FlowingTensors()
 

@@ -126,7 +126,12 @@ class TokenEdit(Protocol):
 
 @dataclass(frozen=True)
 class ReplaceWith:
-    """Replace tokens with the same tokens of another inference."""
+    """Replace tokens with the same tokens of another inference.
+
+    Attributes:
+        source: The activations of that inference.
+        tokens: Number of tokens of the inference that is edited, which must be that of the source.
+    """
 
     source: "ActivationCache"
     tokens: int
@@ -234,6 +239,7 @@ class DeclaredEdit:
     """The change that an `Edit` declares.
 
     Attributes:
+        edit: The declaration.
         vector: The direction (D,) or source (T, D); None for `zero`.
         tokens: The number T of tokens of every row.
     """
@@ -285,7 +291,15 @@ LOG_FIELDS = ("fires", "no_op_fires", "norm", "change", "largest_change")
 
 @dataclass(frozen=True)
 class LogEntry:
-    """A firing of an edit: tokens edited, their mean norm before, and how far they moved (mean, largest)."""
+    """A firing of an edit.
+
+    Attributes:
+        site: Name of the edited site.
+        tokens: Number of edited tokens.
+        norm: Mean norm of these tokens before the edit.
+        moved: Mean distance by which they moved; the column `change` of `LOG_FIELDS`.
+        largest: Largest distance; the column `largest_change`.
+    """
 
     site: str
     tokens: int
@@ -302,7 +316,7 @@ class EditLog:
 
     @classmethod
     def sum(cls, logs: Iterable["EditLog"]) -> "EditLog":
-        """The log of several inferences, or of several streams of one."""
+        """Return one log of the entries of several: of inferences, or of streams of one."""
         return cls([entry for log in logs for entry in log.entries])
 
     @property
@@ -409,7 +423,7 @@ class _ActiveEdits:
     """Edits of one inference.
 
     They are measured after the inference, all at once. An inference drives everything else out of the processor's
-    caches, so that every single call here costs ten times what it costs in a loop. Therefore they are few.
+    caches, so that a call here costs ten times what it costs in a loop. Therefore a firing only stores tensors.
 
     Attributes:
         fired: By firing the site and the tokens (1, T', D) before and after it.

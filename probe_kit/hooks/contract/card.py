@@ -77,8 +77,11 @@ class ModelCard:
     """The identity of a loaded model: weights, settings and shape.
 
     Attributes:
+        embodiment: The robot whose actions it makes, as people read it; "" where none is known.
         chunk: Actions per inference; 0 for a model that does not act.
         execute: Actions of a chunk that are executed before the next inference; 0 for a model that does not act.
+        notes: Sentences for people about what differs from the authors' code or cannot be checked.
+        audit: The comparison of the network's tensors with the weights' file, see `WeightsAudit`.
         settings: Everything outside the weights that actions, answers or activations depend on, such as the prompt
             and the contents of every file a loader reads. They are part of a run's identity.
         exact: False if the weights that ran are only near those of the file, as after quantisation.

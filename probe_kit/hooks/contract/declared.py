@@ -204,11 +204,13 @@ def as_text(value: Any) -> str:
 ProtocolName = Literal["act2answer"]
 ACT2ANSWER: ProtocolName = "act2answer"
 OWN_SEEDS = "draws come from the episode's seed; the release seeds once per process"
+"""A difference from the release that every sampling family has, see `ProtocolRow.unmatched`."""
 
 
 # -- streams --------------------------------------------------------------------------------------------------
 
 TEXT = ("language", "special")
+"""The roles that every stream with a prompt has."""
 
 
 @dataclass(frozen=True)
@@ -294,7 +296,7 @@ _UNDECLARED = {
 class Interventions:
     """The interventions that a family supports, to test whether a stream is used.
 
-    Following, the comparison of actions on swapped images or words, every policy supports: it is two inferences.
+    Swaps of images or words are not declared: every policy supports them, as two inferences.
 
     Attributes:
         edits: Per stored stream the quantities that can be rewritten; None for all that its streams have.

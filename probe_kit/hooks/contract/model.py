@@ -100,6 +100,7 @@ class Tap:
     the residual stream itself, so writing into that tensor writes the stream.
 
     Attributes:
+        end: The end of `module` at which it is read: what goes in, or what comes out.
         tokens: The positions of that (B, T, D) tensor which belong to the site, where one call serves two streams.
         rows: The block of the batch which belongs to the site, where one call serves several.
         first: Number of calls of `module` in an inference that come before those of this stream and are passed
@@ -526,15 +527,19 @@ class AnswerModel(Model):
     A call of `read` is one inference, as `capture` counts it.
 
     Attributes:
-        whole_prompt: Whether the backbone's stream has the last position of the prompt, where the answer begins.
+        whole_prompt: Whether the backbone's stream holds the prompt to its last position, where the answer begins.
+            Where it is False, the last position is the stream `answer`.
     """
 
     whole_prompt: bool = False
 
     def match_policies(self, matched: bool) -> None:
-        """Give the backbone's stream the positions that it has in policies grown from this model, or its own.
+        """Choose the positions of the backbone's stream, so that a VLM and policies grown from it are compared.
 
-        Both are the same where such policies too begin their output at the last position of the prompt.
+        By default this does nothing: policies too begin their output at the last position of the prompt.
+
+        Args:
+            matched: True gives the positions that the stream has in such policies, False those of this model.
         """
 
     @property

@@ -1,4 +1,4 @@
-"""The observation of a model, from the stage to the network, and layouts of its state. Imports no torch."""
+"""The observation of a model, from the source to the network, and layouts of its state. Imports no torch."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -18,6 +18,7 @@ class Observation:
         image: (H, W, 3) uint8, the third-person camera.
         state: (8,) float32: TCP x, y, z in metres in the robot base frame; roll, pitch, yaw in radians relative to
             the gripper pointing down; 0; gripper openness in [0, 1].
+        instruction: The words of the task as the source has them; the family makes its prompt of them.
         intrinsics: (3, 3) float32 pinhole matrix in pixels of `image`, x to the right and y down; None if unknown.
         cameras: Further pictures (H, W, 3) uint8 by the name of their camera.
     """
@@ -54,6 +55,7 @@ def checked_picture(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 ARM_NUMBERS = 8
 """The count of numbers of `Observation.state`."""
 OPENNESS = ("measured", "release")
+"""The ways in which the gripper's openness is given to a policy, see `laid_out`."""
 CLOSED, OPENED = 0.015, 0.037
 """The finger joints of the WidowX in metres, closed and open."""
 _EMPTY, _GRIPPER = 6, 7

@@ -86,14 +86,14 @@ class Stream:
     """The shape and meaning of one residual stream.
 
     Attributes:
-        layers: Number of residual sites, one more than the number of blocks.
+        layers: One more than the number of blocks, which is the number of residual sites where there are any.
         width: Features per token.
         iterations: Flow-matching steps or action tokens per inference, or None where the stream runs once.
         part: The part of the model it belongs to: `backbone` (VLM), `action`, `vision`, or `bridge` between them.
             The action is made in `action`: an expert, or the positions that choose action tokens. None takes the
             part that the name tells.
         label: The name that people read; "" takes the name in plain words.
-        quantities: The quantities that can be captured of it; `residual` always.
+        quantities: The quantities that can be captured of it: with `residual`, but for the stream `kv`.
         probed: Whether peaks, retention and default probes use it; False for the unconditional half of guidance.
         sums: Whether residual + attention + mlp make the next residual; False where something else enters between
             blocks, such as DeepStack's pictures.
