@@ -27,21 +27,20 @@ Chunk = NDArray[np.float32]
 class Pair:
     """Two inferences with the same seed.
 
-    Pairs of a run have values in all fields that apply to it.
-
     Attributes:
         clean: Input of the inference that is patched into.
         source: Input of the inference that activations are patched from; it must have as many tokens.
         seed: Seed of both inferences.
-        toward: +1 or −1, the direction of the metric in which the source should move the output.
-        group: Name of the unit that is resampled and flipped, such as a couple of items; empty for a pair that is
-            independent of all others.
-        item: Name of the unit that is averaged before; empty likewise.
+        toward: +1 or −1, the direction in which the source should move the number that is measured, such as +1 for
+            a displacement to the left.
+        group: Name of the unit that is resampled and flipped, such as an item with its counterpart; empty for a
+            pair that is independent of all others.
+        item: Name of the unit whose pairs are averaged before groups are; empty for one pair alone.
         row: Row of the episode in the run.
         episode: Id of the episode.
         category: Category of the episode.
         side: Side of the correct picture; None without sides.
-        donor: In runs without sides, the other frame of which the source has one input; None in the scene.
+        donor: In runs without sides, another frame: `source` is `clean` with one input of it. None in the scene.
         donor_name: Name of that frame.
         control: The clean input after a meaningless change of the varied input; None in the scene.
         tiles: (H, W) mask of each tile in the clean picture, by side.
@@ -72,8 +71,6 @@ def groups_and_items(pairs: Sequence[Pair]) -> tuple[list[str], list[str]]:
     groups = [pair.group or f"pair {at}" for at, pair in enumerate(pairs)]
     return groups, [pair.item or f"{groups[at]}, pair {at}" for at, pair in enumerate(pairs)]
 
-
-# -- tables of the user's own --------------------------------------------------------------------------------
 
 # -- tables of the user's own --------------------------------------------------------------------------------
 

@@ -24,7 +24,11 @@ if TYPE_CHECKING:
 ENOUGH = 0.1
 """Share of the largest change of any patch by which a patch of the tile changes; less is the filter's blur."""
 HALF, NEARLY = 0.5, 0.9
-"""Shares of a token's largest change from which on a band is its own, and of the largest share in that band."""
+"""Two limits by which the bands of a token are found.
+
+A band counts for a token if it changes it by HALF of what the token's strongest band does, and by NEARLY as much
+as, in such shares, the token that it changes most. So the blur of a resizing filter does not widen a token's box.
+"""
 BANDS = 32
 """Number of bands of rows, and of columns, in which a token is searched."""
 ANSWERS_NOTHING = "{} answers no questions: give it an observation"
@@ -73,8 +77,8 @@ def token_mask(model: "Model", model_input: Given, stream: str, role: str) -> ND
 class PairTokens:
     """The tokens of a pair's clean inference by role, tiles among the roles.
 
-    All patches of a pair share one of these. So the model determines only once the role of every token, and the
-    patches that see each tile.
+    All conditions of a pair share one of these. So the model determines only once the role of every token, and the
+    patches of the picture that see each tile.
     """
 
     def __init__(self, model: "Model", pair: Pair) -> None:
@@ -189,7 +193,7 @@ def token_boxes(policy: "Policy", observation: Observation, camera: str) -> NDAr
     """Return (tokens of a camera's picture, 4) the box that each sees: left, top, right, bottom, as shares of it.
 
     Boxes are measured by changing a band of rows, then of columns, at a time. So crops, padding and turns of the
-    policy's own preprocessing are included. NaN for a token that no pixel moves. It takes 2 × `BANDS` + 2
+    policy's own preprocessing are included. NaN for a token that no pixel moves. It takes 2 × `BANDS` + 1
     inferences.
     """
     before, ends = patch_embeddings(policy, observation, camera), []

@@ -276,7 +276,8 @@ def success_rate(episodes: "pd.DataFrame") -> SuccessRate:
     Args:
         episodes: Columns `item_id`, `layout`, `side_correct`, `outcome` (`correct`, `wrong`, `oob`),
             `side_placed`, and `group_id` where items share pictures. Where the last steps of an episode were
-            averaged also `share_correct` and so on, which the pairs of items take no notice of.
+            averaged also `share_correct` and so on, which the pairs of items take no notice of. Optional are
+            `never_moved`, `flagged_steps` with `inferences`, and `parse` of answers.
 
     Raises:
         UsageError: For a table that is empty or of several wordings, and for episodes in which the model did not

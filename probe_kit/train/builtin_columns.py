@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 
 SIM, ITEM, RECORDED, PLAYED = "sim.", "item.", "dataset.", "env."
+"""The prefixes of built-in columns: of the simulation, of items, of recordings and of environments."""
 ACTION_ERROR = "action_error"
 """Column of a shown frame: root mean square of predicted minus recorded first action, in recorded deviations."""
 OUTCOME = "env.outcome"

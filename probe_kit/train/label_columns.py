@@ -40,7 +40,7 @@ def read_table(table: "Path | str | pd.DataFrame", requested: Sequence[str]) -> 
         requested: Names of columns; those that the table lacks are left out.
 
     Raises:
-        UsageError: For a file that is no such table, or has no column `episode_id`.
+        UsageError: For a file that is no such table, or has no column `episode_id` or `source_episode`.
         MissingExtraError: For Parquet without pyarrow.
     """
     if not isinstance(table, str | Path):

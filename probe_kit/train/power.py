@@ -27,8 +27,8 @@ SEEDS = 5
 """Parts of a simulation, each with a limit of chance of its own; their spread is the error of the whole."""
 NULL_DRAWS, POOL = 4000, 40_000
 """Experiments without signal per seed, and the groups that they are made of."""
-_NUMBERS = 200_000
-"""Numbers in memory at once."""
+_NUMBERS_IN_MEMORY = 200_000
+"""The most random numbers that are held at once."""
 
 
 @dataclass(frozen=True)
@@ -192,7 +192,7 @@ def _limit(groups: int, sites: int, seed: int) -> float:
     """
     generator = np.random.default_rng([seed, groups, sites, 1])
     pool = _pool(sites, seed)
-    at_once = max(1, _NUMBERS // (groups * sites))
+    at_once = max(1, _NUMBERS_IN_MEMORY // (groups * sites))
     best = [
         pool[generator.integers(len(pool), size=(min(at_once, NULL_DRAWS - start), groups))]
         .sum(axis=1, dtype=np.int64)

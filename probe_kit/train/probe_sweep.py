@@ -141,8 +141,8 @@ def train_probes(
     """Probe every site of every stream for `target`, per category and view, and store the results in the run.
 
     With the same settings and episodes the stored results are returned, whatever jobs and device. An interrupted
-    sweep continues after the last finished site. Controls are added to what is stored. Nothing is stored before
-    all of it is fitted: where this raises, `load_results` still returns the earlier results.
+    sweep continues after the last finished site. Controls are added to what is stored. No results are stored
+    before all sites are fitted: where this raises, `load_results` still returns the earlier results.
 
     Args:
         run: Run whose activations are probed.
@@ -196,7 +196,7 @@ def train_probes(
         "views": views, "permutations": permutations, "token_permutations": token_permutations, "folds": folds,
         "incomplete": incomplete, "seed": seed, "call": call, "window": window, "align_to": align_to,
     }  # fmt: skip
-    crew: dict[str, Any] = {"jobs": jobs, "device": device, "ray": ray, "progress": progress}
+    workers: dict[str, Any] = {"jobs": jobs, "device": device, "ray": ray, "progress": progress}
     check_run(run, categories)
     if untrained is not None:
         check_run(untrained, categories)
@@ -219,9 +219,9 @@ def train_probes(
         untrained_sweep = Sweep.of(untrained, same, settings.categories, **options)
         check_untrained(run, untrained, sweep.samples, untrained_sweep.samples, settings.is_side, call)
         untrained_sweep.check()
-    results = add_controls(sweep.results(**crew), sweep.problems, sweep.widths, prepared)
+    results = add_controls(sweep.results(**workers), sweep.problems, sweep.widths, prepared)
     if untrained_sweep is not None:
-        untrained_results = untrained_sweep.results(**crew)
+        untrained_results = untrained_sweep.results(**workers)
         results = add_untrained(results, untrained_results)
         untrained_sweep.keep(untrained_results, requested=False)
     return sweep.keep(results, requested=True)
@@ -283,7 +283,14 @@ def probe_settings(
 
 @dataclass(frozen=True)
 class Sweep:
-    """The probes of a target in one run that are to be fitted, or are stored."""
+    """The probes of a target in one run that are to be fitted, or are stored.
+
+    Attributes:
+        run: The run whose activations are probed.
+        target: The target with its labels.
+        samples: The labelled episodes or inferences of the run.
+        settings: The settings that identify the results.
+    """
 
     run: RunReader
     target: Target
@@ -389,16 +396,16 @@ class Sweep:
         if self.stored is None:
             _ = self.keys, self.problems
 
-    def results(self, *, progress: Progress | None, **crew: Any) -> ProbeResults:
+    def results(self, *, progress: Progress | None, **workers: Any) -> ProbeResults:
         """Return the stored results, or new ones that are not stored yet.
 
         Args:
             progress: Called after every site; None for a bar in a notebook and nothing elsewhere.
-            **crew: The options `jobs`, `device` and `ray` of `probe_columns`.
+            **workers: The options `jobs`, `device` and `ray` of `probe_columns`.
         """
         if self.stored is not None:
             return self.stored
-        probes = self._probe_all(progress or notebook_progress("sites probed"), crew)
+        probes = self._probe_all(progress or notebook_progress("sites probed"), workers)
         curves = {}
         for category, problem in self.problems.items():
             for view in self.settings.views:
@@ -414,13 +421,13 @@ class Sweep:
         run, left_out = self.run, self.samples.left_out
         return ProbeResults(self.settings, curves, directions, stamp=run.stamp, label=run.label, left_out=left_out)
 
-    def _probe_all(self, progress: Progress | None, crew: Mapping[str, Any]) -> dict[Key, Probed]:
+    def _probe_all(self, progress: Progress | None, workers: Mapping[str, Any]) -> dict[Key, Probed]:
         """Return every view and site, in order, for every category; columns of an interrupted sweep are loaded."""
         unfinished = SweepCheckpoint.of(self.run.location, self.settings.key, self.run.stamp)
         probes = {key: stored for key in self.keys if (stored := unfinished.read(*key)) is not None}
         rows, inferences = self.samples.rows, self.samples.inferences
         columns = ((key, read_samples(self.run, *key, rows, inferences)) for key in self.keys if key not in probes)
-        for key, of_site in probe_columns(columns, self.problems, **crew):
+        for key, of_site in probe_columns(columns, self.problems, **workers):
             unfinished.keep(*key, of_site)
             probes[key] = of_site
             if progress is not None:
@@ -428,7 +435,7 @@ class Sweep:
         return {key: probes[key] for key in self.keys}  # workers finish in any order
 
     def keep(self, results: ProbeResults, *, requested: bool) -> ProbeResults:
-        """Store `results` and return them as loaded from the store."""
+        """Store `results` and return them as loaded from the store; for `requested` see `save_results`."""
         save_results(results, self.run.location, requested=requested)
         SweepCheckpoint.of(self.run.location, self.settings.key).discard()
         return load_results(self.run, self.settings.key)

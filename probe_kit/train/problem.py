@@ -44,9 +44,15 @@ LEAST_MOVABLE = 0.5
 class Problem:
     """The samples, labels, folds and label permutations that all sites of a category share.
 
+    E counts the samples: episodes, or inferences where each has a label.
+
     Attributes:
         classes: Names of the classes, empty for a quantity.
         positions: (E,) places of the category's samples among those of the target.
+        samples: The samples of the category.
+        episodes: (E,) episode of every sample.
+        items: (E,) item of every sample.
+        folds: Nested folds that all sites share.
         labels: (E,) bool of a side (true: left), else coded.
         permuted_labels: (E, P) labels under P permutations.
         token_permutations: Number of permutations that are fitted where every token is a sample.
@@ -159,7 +165,7 @@ def make_problem(
 
 
 def smallest_p_of_labels(labels: NDArray[Any], permuted_labels: NDArray[Any]) -> float:
-    """Return the share of (E, P) labellings, the real one (E,) included, that equal it: no p can be lower."""
+    """Return the share of labellings, permuted (E, P) or real (E,), that equal the real one: no p is lower."""
     same = (permuted_labels == labels[:, None]).all(axis=0)
     return float((1 + same.sum()) / (1 + same.size))
 
@@ -266,8 +272,8 @@ def _block_folds_and_permutations(
 ) -> Drawn:  # fmt: skip
     """Return the folds, and the labels of groups that exchange them as blocks.
 
-    Folds know strata and sizes of groups, not labels: only so is every exchange of labels as likely as the real
-    ones.
+    Folds are drawn from strata and sizes of groups, not from labels: only so is every exchange of labels as likely
+    as the real ones.
 
     Raises:
         TooFewGroupsError: For fewer than five groups, a class in fewer than five, and a fold that is trained on

@@ -1,4 +1,4 @@
-"""The samples of a probe: one per episode (pooled views), or one per token."""
+"""The samples of a probe: one per episode or inference (pooled views), or one per token."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -21,7 +21,7 @@ TOKENS = "tokens"
 
 @dataclass(frozen=True)
 class Samples:
-    """The features of M samples that belong to E episodes.
+    """The features of M samples that belong to E episodes, or to E inferences where each has a label.
 
     Attributes:
         features: (M, D), the samples of an episode in consecutive rows; tokens are not copied when some are

@@ -101,7 +101,7 @@ class TransferResults:
 
     @cached_property
     def scores(self) -> "pd.DataFrame":
-        """Return one row per view and site.
+        """One row per view and site.
 
         `score`, `ci_low`, `ci_high`, `chance`, `p`, `p_fwe`: as in `ProbeResults.scores`, on the other run.
         `recentred`, `recentred_chance`, `recentred_p_fwe`: the same on features moved to the first run's mean.

@@ -169,9 +169,9 @@ class StreamPart:
         ties: Number of other sites that are as accurate.
         p_fwe: Family-wise p of that site.
         exceeds: Whether it is better than `chance` and each control; None for one that was not run.
-        selectivity: Its accuracy above that of the same probe on random labels of items.
+        selectivity: Its accuracy above that of the same probe on random labels of whole groups.
         minus_untrained: Its accuracy minus that of the untrained network's best site.
-        remedy: The remedy where no p can be below 0.05; empty where one can.
+        remedy: What to do where no p can be below 0.05, such as more permutations or groups; empty where one can.
     """
 
     stream: str | None = None
@@ -221,7 +221,8 @@ class BackbonePart(StreamPart):
 class ActionPart(StreamPart):
     """The scores of probes where the action is made; see `StreamPart`.
 
-    The attributes are None where the stream runs once.
+    The three attributes are None where the stream runs once; `first_peak` and `first_layer` also for a target that
+    is no side.
 
     Attributes:
         iteration: The flow-matching step or action token of the site.
@@ -288,10 +289,12 @@ MEAN = "mean"
 class RetentionRow:
     """One row of the retention table: its parts. A part without values holds defaults.
 
-    In a row of category `mean`, numbers are averages over `categories` and retention leaves out `left_out`.
+    In a row of category `mean`, numbers are averages over `categories`. The published definition of retention,
+    which divides by each category's own backbone, leaves out `left_out`.
 
     Attributes:
-        view: The way in which tokens became one vector, None without probes.
+        view: The vectors that were probed: how tokens became one, or `tokens` for each by itself. None without
+            probes.
         target: The target that the probes decode.
         task: Kind of the target.
         group: Of several groups of runs, this run's.

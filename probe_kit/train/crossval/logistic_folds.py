@@ -28,8 +28,8 @@ from probe_kit.train.solver.logistic import LogisticSolver, check_single_class
 def cross_validate(samples: Samples, labels: NDArray[np.bool_], folds: list[NestedFold]) -> list[FittedFold]:
     """Return the probes of every outer fold, each column of (E, K) labels on its own.
 
-    Wide tokens with few columns are solved for all training sets together, where these have the same features.
-    Small problems are also solved together.
+    Problems that `can_be_joint` names, such as wide tokens with few columns, are solved for all training sets
+    together where these have the same features. Small problems are also solved together.
 
     Raises:
         ProbeNotConvergedError: If a probe stops before its optimum.
@@ -275,7 +275,8 @@ def labels_at_once(site: JointSite, folds: Sequence[NestedFold]) -> int:
 def _times_at_once(site: JointSite, folds: Sequence[NestedFold]) -> int:
     """Return how often the problems of all inner folds fit into COLUMN_MEMORY; at least once.
 
-    A problem takes three curvatures of every sample in float32 while a step is found, and some 16 rows of weights.
+    A problem takes 12 bytes per sample: three float32 vectors of its curvatures while a step is found. It takes
+    128 bytes per weight: the solver's rows of weights, directions and products, counted generously as 16 float64.
     """
     count, width = site.features.shape
     problems = sum(len(fold.inner) for fold in folds)

@@ -1,4 +1,7 @@
-"""Nested, grouped cross-validation: the folds, the grid of C, and the probes of an outer fold."""
+"""Nested, grouped cross-validation: the folds, the grid of C, and the probes of an outer fold.
+
+Ridge probes choose λ from a grid of their own on the same folds.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -23,7 +26,7 @@ end it is hardly penalised.
 
 @dataclass(frozen=True)
 class NestedFold:
-    """An outer fold, and the inner folds that divide its training side to choose C."""
+    """An outer fold, and the inner folds that divide its training set to choose C or λ."""
 
     outer: Fold
     inner: list[Fold]

@@ -1,5 +1,6 @@
 """The probe of one site: nested, grouped cross-validation for the labels and all their permutations at once.
 
+Sides and binary labels are decoded by logistic regression, see `logistic_folds`; classes and quantities by ridge.
 Ridge solves many targets and penalties by one factorisation of the training samples. For standardised training
 samples Z, test samples T and centred targets Y the predictions at penalty λ are
 

@@ -112,7 +112,7 @@ class Controls:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The controls that were run."""
+        """The controls that have scores; the untrained network of a side is in `untrained` alone."""
         return tuple(dict.fromkeys(score.name for score in self.scores))
 
     def exceeds(self, category: str, view: str, site: Site | str, p_fwe: float) -> Exceeds:

@@ -98,7 +98,7 @@ class ProbeCurve:
     def control_accuracy(self) -> Matrix:
         """The mean accuracy on the control task, (S,); NaN without label permutations.
 
-        The control task has random labels that are consistent within an item.
+        The control task has random labels that are consistent within a group.
         """
         return self.null_mean
 
