@@ -13,6 +13,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from probe_kit.errors import UsageError, WeightsError
+from probe_kit.hooks.family import Family
 from probe_kit.hooks.outputs import Outputs
 from probe_kit.hooks.registry import own_families
 from probe_kit.hooks.verify import Verification, compare, verify_keys, verify_reference
@@ -105,8 +106,15 @@ def test_a_wrong_number_in_any_quantity_is_noticed(folder: str, tmp_path: Path) 
     assert status["something_else"] == "not compared"
 
 
+built_once, function = cache(cache), Family.function
+"""`built_once(build)` builds every size once: each list is compared with all sizes of its family."""
+
+
 @pytest.mark.parametrize(("family", "file"), KEYS)
-def test_the_network_of_a_released_size_has_the_recorded_tensors(family: str, file: Path) -> None:
+def test_the_network_of_a_released_size_has_the_recorded_tensors(
+    family: str, file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Family, "function", lambda declared, use: built_once(function(declared, use)))
     verification = verify_keys(family, file)
     assert verification.passed, verification.comparisons
     size = file.name.split(".")[1]
@@ -131,7 +139,7 @@ def test_the_tensors_take_as_many_bytes_as_the_published_file(
     assert share * sum(held) / 1e9 == pytest.approx(published, abs=0.06 if published > 10 else 0.006)
 
 
-@pytest.fixture(params=["pi0", "smolvla"])
+@pytest.fixture(params=["pi0", pytest.param("smolvla", marks=pytest.mark.slow)])
 def reference(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[str, Path]:
     """A golden reference a test may damage, as (family, folder)."""
     return request.param, Path(shutil.copytree(GOLDEN / request.param, tmp_path / request.param))
