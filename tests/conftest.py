@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -55,6 +56,17 @@ def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 def _temporary_working_folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Relative paths of commands, such as the default `runs/`, never lead into the checkout."""
     with contextlib.chdir(tmp_path_factory.mktemp("working")):
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _commands_are_built_once() -> Iterator[None]:
+    """Typer builds all commands of the package for every line that is typed, half of a refusal's time."""
+    from typer.main import get_command
+
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("typer.main.get_command", "typer.testing._get_command"):
+            patch.setattr(name, cache(get_command))
         yield
 
 

@@ -175,7 +175,7 @@ def test_help_groups_all_commands_by_what_one_wants_to_do() -> None:
     group = typer.main.get_command(app)
     names = [name for panel in PANELS.values() for name in panel]
     assert group.list_commands(None) == names  # type: ignore[attr-defined,arg-type]
-    shown = probe_kit("--help").stdout
+    shown = in_process("--help").stdout
     headings = [*(f"─ {panel} ─" for panel in PANELS), *(f"│ {name} " for name in names)]
     places = {heading: shown.index(heading) for heading in headings}
     for panel, commands in PANELS.items():

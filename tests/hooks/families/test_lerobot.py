@@ -231,7 +231,7 @@ def seen() -> list[Observation]:
     ("mode", "dtype"),
     [
         ("QUANTILES", "bfloat16"),
-        ("QUANTILES", "float32"),
+        pytest.param("QUANTILES", "float32", marks=pytest.mark.slow),
         ("QUANTILE10", "float32"),
         ("MEAN_STD", "float32"),
         ("MIN_MAX", "float32"),
