@@ -216,8 +216,8 @@ def test_a_folder_of_runs_lists_the_runs_inside_and_a_near_name_is_suggested(
     small_suite: Suite, tmp_path: Path
 ) -> None:
     made = in_process(
-        "extract", "--model", "expert", "--suite", small_suite.folder, "--items", 2, "--max-steps", 1,
-        "--env-workers", 0, "--out", tmp_path / "runs" / "mine",
+        "extract", "--model", "expert", "--suite", small_suite.folder, "--categories", "color", "--items", 2,
+        "--max-steps", 1, "--env-workers", 0, "--out", tmp_path / "runs" / "mine",
     )  # fmt: skip
     assert made.returncode == 0, made.stderr
     shutil.copytree(tmp_path / "runs" / "mine", tmp_path / "runs" / "yours")

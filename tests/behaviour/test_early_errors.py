@@ -99,8 +99,9 @@ def folder(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Path
     from probe_kit.extract import ExtractSettings, extract_run
 
     settings = ExtractSettings(
-        "expert", suite=small_suite.folder, items=2, seed=7, scene=SceneSpec(max_steps=2), env_workers=0
-    )
+        "expert", suite=small_suite.folder, categories=("color",), items=2, seed=7, scene=SceneSpec(max_steps=2),
+        env_workers=0,
+    )  # fmt: skip
     extract_run(settings, folder / "a-run")
     return folder
 
