@@ -9,10 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
-from safetensors.torch import load_file, save_file
 
-from probe_kit.errors import UsageError, WeightsError
+from probe_kit.errors import UsageError
 from probe_kit.hooks.family import Family
 from probe_kit.hooks.outputs import Outputs
 from probe_kit.hooks.registry import own_families
@@ -139,29 +137,10 @@ def test_the_tensors_take_as_many_bytes_as_the_published_file(
     assert share * sum(held) / 1e9 == pytest.approx(published, abs=0.06 if published > 10 else 0.006)
 
 
-@pytest.fixture(params=["pi0", pytest.param("smolvla", marks=pytest.mark.slow)])
+@pytest.fixture(params=["pi0", "smolvla"])
 def reference(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[str, Path]:
     """A golden reference a test may damage, as (family, folder)."""
     return request.param, Path(shutil.copytree(GOLDEN / request.param, tmp_path / request.param))
-
-
-@pytest.mark.parametrize("damage", ["deleted", "renamed", "mis-shaped", "nan"])
-def test_a_damaged_checkpoint_is_refused_by_tensor_name(reference: tuple[str, Path], damage: str) -> None:
-    family, folder = reference
-    file = folder / "checkpoint" / "model.safetensors"
-    tensors = load_file(file)
-    name = "model.action_out_proj.weight"
-    original = tensors.pop(name)
-    if damage == "renamed":
-        tensors["model.action_out_porj.weight"] = original
-    elif damage == "mis-shaped":
-        tensors[name] = original[:-1].clone()
-    elif damage == "nan":
-        tensors[name] = torch.full_like(original, torch.nan)
-    save_file(tensors, file)
-    with pytest.raises(WeightsError, match=r"action_out_proj\.weight") as caught:
-        verify_reference(family, folder)
-    assert caught.value.exit_code == 3
 
 
 @pytest.mark.slow
