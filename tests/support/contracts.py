@@ -214,7 +214,6 @@ NATIVE = {
         "openvla", openvla_of_two_data_sets, {"unnorm_key": "bridge_orig"},
         lambda folder: {"unnorm_key": "other", "prompt": "openvla-v01", "tokenizer": words_beside(folder),
                         "temperature": 0.6, "top_k": "7"},
-        typical=True,
     ),
     "openvla of one tower, Mistral and a tokenizer file": Case(
         "openvla", single_tower_mistral, slow=True,

@@ -192,7 +192,7 @@ def seen() -> list[Observation]:
         pytest.param("QUANTILES", "float32", marks=pytest.mark.slow),
         ("QUANTILE10", "float32"),
         ("MEAN_STD", "float32"),
-        ("MIN_MAX", "float32"),
+        pytest.param("MIN_MAX", "float32", marks=pytest.mark.slow),
     ],
 )
 def test_pi05_acts_as_lerobots_own_loading_processors_and_policy_bit_for_bit(

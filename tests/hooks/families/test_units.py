@@ -18,7 +18,7 @@ from tests.support.every_checkpoint import WRITERS
 from tests.support.groot_checkpoints import write_nvidias
 
 UNITS = {"action": {"q01": [-0.5] * 7, "q99": [0.5] * 7, "mask": [True] * 6 + [False]}}
-FAMILIES = ("openvla", "spatialvla", "magma", "internvla-m1")
+FAMILIES = ("openvla", "magma", "internvla-m1", pytest.param("spatialvla", marks=pytest.mark.slow))
 DEFAULTS = {
     "openvla": {"unnorm_key": "bridge_orig"},
     "spatialvla": {"unnorm_key": "bridge_orig/1.0.0"},
