@@ -7,6 +7,8 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import cache
+from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -58,17 +60,28 @@ def _temporary_working_folder(tmp_path_factory: pytest.TempPathFactory) -> Itera
         yield
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _commands_are_built_once() -> Iterator[None]:
+    """Typer builds all commands of the package for every line that is typed, half of a refusal's time."""
+    from typer.main import get_command
+
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("typer.main.get_command", "typer.testing._get_command"):
+            patch.setattr(name, cache(get_command))
+        yield
+
+
 @pytest.fixture(autouse=True)
 def _modules_of_a_test_end_with_it(request: pytest.FixtureRequest) -> Iterator[None]:
     """A later test never imports a module, or finds a path, that lies in the folder of this one."""
     if "tmp_path" not in request.fixturenames:
         yield
         return
-    before = set(sys.modules)
+    last = next(reversed(sys.modules))  # what is imported later stands behind it; a set of all takes a millisecond
     yield
     if (folder := request.node.funcargs.get("tmp_path")) is None:  # a fixture skipped the test before it was made
         return
-    for name in sys.modules.keys() - before:
+    for name in list(takewhile(lambda name: name != last, reversed(sys.modules))):
         if str(getattr(sys.modules[name], "__file__", "")).startswith(str(folder)):
             del sys.modules[name]
     sys.path[:] = [path for path in sys.path if not path.startswith(str(folder))]

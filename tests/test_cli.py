@@ -175,7 +175,7 @@ def test_help_groups_all_commands_by_what_one_wants_to_do() -> None:
     group = typer.main.get_command(app)
     names = [name for panel in PANELS.values() for name in panel]
     assert group.list_commands(None) == names  # type: ignore[attr-defined,arg-type]
-    shown = probe_kit("--help").stdout
+    shown = in_process("--help").stdout
     headings = [*(f"─ {panel} ─" for panel in PANELS), *(f"│ {name} " for name in names)]
     places = {heading: shown.index(heading) for heading in headings}
     for panel, commands in PANELS.items():
@@ -216,8 +216,8 @@ def test_a_folder_of_runs_lists_the_runs_inside_and_a_near_name_is_suggested(
     small_suite: Suite, tmp_path: Path
 ) -> None:
     made = in_process(
-        "extract", "--model", "expert", "--suite", small_suite.folder, "--items", 2, "--max-steps", 1,
-        "--env-workers", 0, "--out", tmp_path / "runs" / "mine",
+        "extract", "--model", "expert", "--suite", small_suite.folder, "--categories", "color", "--items", 2,
+        "--max-steps", 1, "--env-workers", 0, "--out", tmp_path / "runs" / "mine",
     )  # fmt: skip
     assert made.returncode == 0, made.stderr
     shutil.copytree(tmp_path / "runs" / "mine", tmp_path / "runs" / "yours")

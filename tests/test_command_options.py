@@ -172,7 +172,7 @@ def test_help_is_short_plain_sentences(command: str) -> None:
             assert len(sentence.split()) <= 25, sentence
 
 
-@pytest.mark.parametrize("command", [(), ("extract",)])
+@pytest.mark.parametrize("command", [pytest.param((), marks=pytest.mark.slow), ("extract",)])
 def test_help_is_quick_and_loads_nothing_heavy(command: tuple[str, ...]) -> None:
     heavy = ("torch", "lerobot", "transformers", "pybullet", "sklearn", "pandas", "xarray", "zarr", "matplotlib")
     code = (

@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from datetime import timedelta
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -126,6 +127,7 @@ def test_a_command_is_accepted_as_it_is_typed(
     leaf.make_context(leaf.name, list(rest))
     if leaf.name in ("demo", "doctor", "models"):
         return
+    monkeypatch.setattr("probe_kit.runs.store._QUICK", timedelta(0))  # without keys a store never answers
     monkeypatch.setattr("probe_kit.extract.prepare", _stop_with, raising=False)
     monkeypatch.setattr("probe_kit.extract.extraction.prepare_asks", lambda wanted, _, **__: _stop_with(*wanted))
     with contextlib.chdir(tmp_path):

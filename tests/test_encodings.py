@@ -15,7 +15,7 @@ import pytest
 from probe_kit.suite import Suite
 
 ROOT = Path(__file__).parents[1]
-OPENS = re.compile(r"_text\b|open\b|NamedTemporaryFile|text=|universal_newlines")
+OPENS = re.compile(r"(_text|open|NamedTemporaryFile)\(|text=|universal_newlines")
 OURS = ("probe_kit", "tests", "scripts", "benchmarks", "docs")
 COMMANDS = r"""
 import io, json, locale, sys

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from tests.support.parsed import PACKAGE, package_trees
+from tests.support.parsed import PACKAGE, nodes, package_trees
 
 FILLERS = frozenset(
     [
@@ -59,7 +59,7 @@ FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 
 def fillers(tree: ast.Module) -> Iterator[tuple[int, str]]:
     """Lines and names of assigned variables, parameters, fields and definitions that are fillers."""
-    for node in ast.walk(tree):
+    for node in nodes(tree):
         match node:
             case ast.Name(id=name, ctx=ast.Store()) | ast.arg(arg=name) | ast.ExceptHandler(name=str(name)):
                 pass
@@ -76,7 +76,7 @@ def first_words(tree: ast.Module) -> Iterator[tuple[int, str]]:
 
     The docstring of a function that returns a Boolean may begin with "Whether".
     """
-    for node in ast.walk(tree):
+    for node in nodes(tree):
         if not isinstance(node, (ast.Module, ast.ClassDef, *FUNCTIONS)):
             continue
         docstring = (ast.get_docstring(node) or "").strip()
@@ -90,7 +90,7 @@ def first_words(tree: ast.Module) -> Iterator[tuple[int, str]]:
 
 def parameters_in_prose(tree: ast.Module) -> Iterator[tuple[int, str]]:
     """Lines and names of parameters and fields that a docstring explains outside of `Args:` or `Attributes:`."""
-    for node in ast.walk(tree):
+    for node in nodes(tree):
         if isinstance(node, FUNCTIONS):
             arguments = node.args
             every = [

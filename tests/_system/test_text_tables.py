@@ -88,7 +88,9 @@ def refusal(reader: str, content: bytes, folder: Path) -> str:
     return str(refused.value)
 
 
-@every_reader
+@pytest.mark.parametrize(
+    "reader", [pytest.param(name, marks=[pytest.mark.slow] * (name != "labels")) for name in READERS]
+)  # all read by one function, see below
 @pytest.mark.parametrize("separator", [",", ";", "\t"])
 @pytest.mark.parametrize(
     "encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le with mark", "utf-16-be with mark"]

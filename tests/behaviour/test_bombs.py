@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import google_crc32c
@@ -50,6 +51,7 @@ def memory() -> Iterator[None]:
     assert peak < MOST_MEMORY
 
 
+@cache
 def deflated(size: int) -> bytes:
     """So many zeros, as zlib packs them, made piece by piece."""
     packer, piece = zlib.compressobj(9), bytes(1 << 20)

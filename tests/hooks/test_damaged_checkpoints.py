@@ -136,7 +136,9 @@ def test_every_family_of_ours_is_looked_at() -> None:
     assert acting - {"pi0-tiny-early", "pi0-tiny-state"} == FAMILIES.keys()
 
 
-@pytest.mark.parametrize("kind", [torch.int8, torch.float8_e4m3fn, torch.complex64], ids=str)
+@pytest.mark.parametrize(
+    "kind", [torch.int8, torch.float8_e4m3fn, pytest.param(torch.complex64, marks=pytest.mark.slow)], ids=str
+)
 def test_weights_of_a_kind_that_nobody_declared_are_refused(
     family: str, checkpoint: Path, kind: torch.dtype
 ) -> None:

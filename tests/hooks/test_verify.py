@@ -9,10 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
-from safetensors.torch import load_file, save_file
 
-from probe_kit.errors import UsageError, WeightsError
+from probe_kit.errors import UsageError
+from probe_kit.hooks.family import Family
 from probe_kit.hooks.outputs import Outputs
 from probe_kit.hooks.registry import own_families
 from probe_kit.hooks.verify import Verification, compare, verify_keys, verify_reference
@@ -105,8 +104,15 @@ def test_a_wrong_number_in_any_quantity_is_noticed(folder: str, tmp_path: Path) 
     assert status["something_else"] == "not compared"
 
 
+built_once, function = cache(cache), Family.function
+"""`built_once(build)` builds every size once: each list is compared with all sizes of its family."""
+
+
 @pytest.mark.parametrize(("family", "file"), KEYS)
-def test_the_network_of_a_released_size_has_the_recorded_tensors(family: str, file: Path) -> None:
+def test_the_network_of_a_released_size_has_the_recorded_tensors(
+    family: str, file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Family, "function", lambda declared, use: built_once(function(declared, use)))
     verification = verify_keys(family, file)
     assert verification.passed, verification.comparisons
     size = file.name.split(".")[1]
@@ -135,25 +141,6 @@ def test_the_tensors_take_as_many_bytes_as_the_published_file(
 def reference(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[str, Path]:
     """A golden reference a test may damage, as (family, folder)."""
     return request.param, Path(shutil.copytree(GOLDEN / request.param, tmp_path / request.param))
-
-
-@pytest.mark.parametrize("damage", ["deleted", "renamed", "mis-shaped", "nan"])
-def test_a_damaged_checkpoint_is_refused_by_tensor_name(reference: tuple[str, Path], damage: str) -> None:
-    family, folder = reference
-    file = folder / "checkpoint" / "model.safetensors"
-    tensors = load_file(file)
-    name = "model.action_out_proj.weight"
-    original = tensors.pop(name)
-    if damage == "renamed":
-        tensors["model.action_out_porj.weight"] = original
-    elif damage == "mis-shaped":
-        tensors[name] = original[:-1].clone()
-    elif damage == "nan":
-        tensors[name] = torch.full_like(original, torch.nan)
-    save_file(tensors, file)
-    with pytest.raises(WeightsError, match=r"action_out_proj\.weight") as caught:
-        verify_reference(family, folder)
-    assert caught.value.exit_code == 3
 
 
 @pytest.mark.slow

@@ -1,6 +1,6 @@
 """The checkpoints on which every family is held to the contract of adapters, with their options."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from probe_kit.hooks import Observation, Prompt
+from probe_kit.hooks.conformance.check import Check
 from probe_kit.hooks.conformance.subject import INSTRUCTIONS, AnswerSubject, PolicySubject, Subject
 from probe_kit.hooks.families.internvla.checkpoint import convert
 from probe_kit.hooks.family import SIZE
@@ -30,6 +31,21 @@ GOLDEN = Path(__file__).parents[1] / "golden"
 UNTRIED = {"pi0": {"unread"}, "magma": {"unnorm_key", "statistics"}, "internvla-m1": {"weights"}}
 """Options of which another value needs a file of its own; tests of the family have them."""
 _BRIDGE = "bridge_orig/1.0.0"
+MECHANISMS = {
+    "every_option_reaches_the_card",
+    "hooks_are_gone_after_an_exception",
+    "nested_captures_are_refused",
+    "an_edit_is_what_a_capture_inside_it_reads",
+    "attention_patterns_are_the_models_own",
+    "what_is_rewritten_in_a_block_is_read_behind_it",
+    "rewriting_every_site_with_itself_changes_no_action_bit_for_bit",
+    "values_of_one_role_are_replaced_in_that_role_only",
+    "actions_with_a_graph_are_the_actions",
+    "gradients_at_sites_are_central_differences",
+}
+"""Checks of code that all families share."""
+LOADING = {"every_file_that_is_read_reaches_the_card", "random_twins_differ_by_their_seed_and_repeat_by_it"}
+"""Checks of code that families with the same loader share."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +54,8 @@ class Case:
 
     write: where its files lie, from an empty folder; None for the writer of `WRITERS`. options: besides those of
     `WRITERS`, None to leave one of them out. others: of options, values that are not in use; from the folder that
-    was written. If it is given, every option but the `UNTRIED` has one. kind: as what it is checked.
+    was written. If it is given, every option but the `UNTRIED` has one. kind: as what it is checked. typical:
+    whether checks of shared code are not slow.
     """
 
     family: str
@@ -49,6 +66,7 @@ class Case:
     instructions: Sequence[str] = INSTRUCTIONS
     dtype: str | None = None
     slow: bool = False
+    typical: bool = False
 
     def subject(self, folder: Path) -> Subject:
         write, options = WRITERS.get(self.family, (lambda _: folder, {}))
@@ -69,10 +87,17 @@ class Case:
         return subject
 
 
-def pairs(cases: Mapping[str, Case]) -> list[Any]:
-    """Every case with every check of its kind, as parameters of a test; `subject` is made in a fixture."""
+def pairs(cases: Mapping[str, Case], shared: Collection[str]) -> list[Any]:
+    """Every case with every check of its kind, as parameters of a test; `subject` is made in a fixture.
+
+    shared: checks of code that these families share; they are slow for all but the typical ones.
+    """
+
+    def is_slow(case: Case, check: Check) -> bool:
+        return case.slow or (check.name in shared and not case.typical)
+
     return [
-        pytest.param(case, check, id=f"{name}-{check.name}", marks=[pytest.mark.slow] * case.slow)
+        pytest.param(case, check, id=f"{name}-{check.name}", marks=[pytest.mark.slow] * is_slow(case, check))
         for name, case in cases.items()
         for check in next(checks for kind, checks in CONTRACTS.items() if issubclass(case.kind, kind))
     ]
@@ -165,7 +190,7 @@ LEROBOTS = {
     ),
     "pi05": Case("pi05"),
     "pi0-fast": Case(
-        "pi0-fast", golden("pi0_fast"), others=lambda _: {"captured_tokens": 3, "temperature": 0.5}
+        "pi0-fast", golden("pi0_fast"), others=lambda _: {"captured_tokens": 3, "temperature": 0.5}, typical=True
     ),
     "molmoact2": Case("molmoact2"),
     "groot": Case(
@@ -174,7 +199,7 @@ LEROBOTS = {
     ),
     "xvla": Case("xvla", others=lambda _: {"domain": 1}),
     "eo1": Case("eo1"),
-    "smolvla": Case("smolvla"),
+    "smolvla": Case("smolvla", typical=True),
     "smolvla, golden": Case("smolvla", golden("smolvla"), instructions=_GOLDEN_WORDS, slow=True),
     "smolvla with marked pictures, masked cameras and a fixed prefix": Case(
         "smolvla",
@@ -211,7 +236,7 @@ NATIVE = {
         ),
         instructions=_LETTERS,
     ),
-    "magma": Case("magma", others=lambda folder: {**_MAGMA, "tokenizer": str(folder)}),
+    "magma": Case("magma", others=lambda folder: {**_MAGMA, "tokenizer": str(folder)}, typical=True),
     "magma with whole pictures": Case("magma", options={"shrink": 0}, kind=OfWholePictures, slow=True),
     "magma that draws": Case("magma", options={"temperature": 0.7}, slow=True),
     "xiaomi-r0": Case(
@@ -234,6 +259,7 @@ ANSWERING = {
         lambda folder: prismatic_checkpoints.write_checkpoint(folder, model_type="prismatic"),
         others=lambda folder: {"steps": 2, "tokenizer": words_beside(folder)},
         kind=AnswerSubject,
+        typical=True,
     ),
     "magma": Case(
         "magma",
@@ -243,7 +269,12 @@ ANSWERING = {
         slow=True,
     ),
     **{
-        name: Case(name, others=lambda folder: {"tokenizer": str(folder)}, kind=AnswerSubject)
+        name: Case(
+            name,
+            others=lambda folder: {"tokenizer": str(folder)},
+            kind=AnswerSubject,
+            typical=name == "qwen2.5-vl",
+        )
         for name in ("paligemma", "qwen2.5-vl", "qwen3-vl", "internvl", "ovis2.5")
     },
 }

@@ -9,8 +9,10 @@ import torch
 from tests.support.groot_checkpoints import write_processor_files
 from tests.support.pi05_checkpoints import HIGH, LEAST, LOW, MOST
 from tests.support.vlm_checkpoints import write_qwen2_5_vl
+from tests.support.written_once import written_once
 
 
+@written_once
 def write_eo1(folder: Path, seed: int = 0, cameras: Sequence[str] = ("image",), **fields: Any) -> Path:
     """Three layers of a Qwen2.5-VL that denoise four actions in three steps. fields: of the configuration."""
     from lerobot.configs.types import FeatureType, NormalizationMode, PolicyFeature

@@ -10,6 +10,7 @@ import torch
 
 from tests.support.pi05_checkpoints import HIGH, LEAST, LOW, MOST
 from tests.support.vlm_checkpoints import write_qwen3_vl
+from tests.support.written_once import written_once
 
 TAG, HORIZON, CHUNK = "libero_sim", 6, 4
 """HORIZON: actions that the network puts out; CHUNK: those that have a meaning."""
@@ -37,6 +38,7 @@ NETWORK: dict[str, Any] = {
 }  # fmt: skip
 
 
+@written_once
 def write_nvidias(
     folder: Path, seed: int = 22, cameras: Sequence[str] = ("image",), relative: bool = False, **network: Any
 ) -> Path:
@@ -59,6 +61,7 @@ def write_nvidias(
     return folder
 
 
+@written_once
 def write_groot(folder: Path, seed: int = 22, cameras: Sequence[str] = ("image",), **fields: Any) -> Path:
     """What lerobot saves of a policy that grew from `base`; `fields` go into its configuration."""
     from probe_kit.hooks.families.groot.adapter import Groot

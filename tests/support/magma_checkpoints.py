@@ -27,6 +27,7 @@ from probe_kit.models.magma import (
     MagmaNetwork,
     build_magma,
 )
+from tests.support.written_once import written_once
 
 BINS, STEPS = 256, 7
 VOCABULARY = 2 * BINS
@@ -133,6 +134,7 @@ def weights(network: MagmaNetwork, head: bool = True) -> dict[str, Tensor]:
     return tensors
 
 
+@written_once
 def write_checkpoint(
     folder: Path,
     steered: bool = True,

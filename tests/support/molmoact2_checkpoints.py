@@ -14,6 +14,7 @@ from tokenizers.pre_tokenizers import ByteLevel
 
 from tests.support.lerobot_units import write_units
 from tests.support.pi05_checkpoints import HIGH, LEAST, LOW, MOST
+from tests.support.written_once import written_once
 
 STATE_TOKENS = 16
 ADDED = [
@@ -26,6 +27,7 @@ MASK = np.array([True] * 6 + [False])
 """The gripper stays as it is."""
 
 
+@written_once
 def write_molmoact2(folder: Path, seed: int = 0, cameras: Sequence[str] = ("image",), **fields: Any) -> Path:
     """Two blocks of width 32 that look at crops of 16 pixels; `fields` go into lerobot's configuration."""
     from lerobot.configs.types import FeatureType, PolicyFeature

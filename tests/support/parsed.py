@@ -15,6 +15,12 @@ def parsed(path: Path) -> ast.Module:
 
 
 @cache
+def nodes(tree: ast.Module) -> list[ast.AST]:
+    """Return every node of a tree."""
+    return list(ast.walk(tree))
+
+
+@cache
 def package_trees() -> dict[Path, ast.Module]:
     """Return the tree of every file of the package, by path and sorted."""
     trees = {path: parsed(path) for path in sorted(PACKAGE.rglob("*.py"))}
@@ -26,5 +32,5 @@ def package_trees() -> dict[Path, ast.Module]:
 def package_nodes[Node: ast.AST](kind: type[Node]) -> list[tuple[Path, Node]]:
     """Return every node of a kind, such as `ast.Call`, with its file."""
     return [
-        (path, node) for path, tree in package_trees().items() for node in ast.walk(tree) if isinstance(node, kind)
+        (path, node) for path, tree in package_trees().items() for node in nodes(tree) if isinstance(node, kind)
     ]

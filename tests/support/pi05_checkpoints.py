@@ -15,6 +15,7 @@ from tokenizers.processors import TemplateProcessing
 
 from probe_kit.models.embedded.words import WORDS
 from tests.support.lerobot_units import write_units
+from tests.support.written_once import written_once
 
 STATES, ACTIONS = 8, 7
 LOW = np.array([0.1, -0.3, -0.1, -1.0, -1.0, -1.0, -1.0, 0.0], np.float32)
@@ -23,6 +24,7 @@ MOST = np.array([0.02, 0.05, 0.04, 0.06, 0.07, 0.25, 1.0], np.float32)
 HIGH = np.array([0.6, 0.3, 0.5, 1.0, 1.0, 1.0, 1.0, 1.0], np.float32)
 
 
+@written_once
 def write_pi05(
     folder: Path,
     seed: int = 0,

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from tests.support.written_once import written_once
+
 VLM = "model.paligemma_with_expert.paligemma"
 # lerobot 0.6 on the left, lerobot of early 2025 (with transformers 4.48) on the right.
 OLDER = (
@@ -89,6 +91,7 @@ def old_golden(golden: Path, target: Path) -> Path:
     return target
 
 
+@written_once
 def write_intact(folder: Path, seed: int = 0) -> Path:
     """A tiny pi0 as INT-ACT fine-tuned it: 7-D state and action, chunk of 4, units left to its evaluation."""
     from lerobot.configs.types import FeatureType, NormalizationMode, PolicyFeature

@@ -16,6 +16,7 @@ from tokenizers.normalizers import Sequence as Normalizers
 
 from tests.support.lerobot_units import write_units
 from tests.support.pi05_checkpoints import HIGH, LEAST, LOW, MOST, write_tokenizer
+from tests.support.written_once import written_once
 
 CHUNK, ACTIONS = 4, 7
 GOLDEN = Path(__file__).parents[1] / "golden"
@@ -25,6 +26,7 @@ STEPS = 24
 HEAD = "model.paligemma_with_expert.paligemma.lm_head.weight"
 
 
+@written_once
 def write_pi0_fast(
     folder: Path,
     seed: int = 0,

@@ -14,6 +14,7 @@ from tokenizers.pre_tokenizers import Sequence, Split
 
 from probe_kit.models.building import initialise
 from probe_kit.models.prismatic import PrismaticConfig, build_prismatic
+from tests.support.written_once import written_once
 
 FUSED, SINGLE = "dinosiglip-vit-so-224px", "siglip-vit-so400m"
 TOWER = {"depth": 3, "embed_dim": 16, "num_heads": 2}
@@ -49,6 +50,7 @@ def config_values(vision: str = FUSED, language: str = "llama2-7b-pure", **field
     }
 
 
+@written_once
 def write_checkpoint(folder: Path, shards: int = 1, seed: int = 1, **fields: Any) -> Path:
     """Write config, tokenizer and weights; with more than one shard also the index that names them."""
     write_letters(folder)

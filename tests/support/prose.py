@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-from tests.support.parsed import parsed
+from tests.support.parsed import nodes, parsed
 
 type Kind = Literal["docstring", "summary", "help", "string", "page", "table", "comment"]
 
@@ -27,15 +27,14 @@ def prose_of_module(path: Path, name: str) -> Iterator[Prose]:
     tree = parsed(path)
     docstrings: dict[ast.Constant, bool] = {}
     _collect_docstrings(tree, docstrings, public=True)
-    nodes = list(ast.walk(tree))
     helps = {
         keyword.value
-        for node in nodes
+        for node in nodes(tree)
         if isinstance(node, ast.Call)
         for keyword in node.keywords
         if keyword.arg == "help"
     }
-    for node in nodes:
+    for node in nodes(tree):
         if not isinstance(node, ast.Constant) or not isinstance(node.value, str):
             continue
         place = f"{name}:{node.lineno}"

@@ -14,6 +14,7 @@ from tokenizers.pre_tokenizers import Sequence, Split
 from probe_kit.hooks.families.smolvla.adapter import build_smolvla
 from probe_kit.models.building import initialise
 from tests.support.lerobot_units import write_units
+from tests.support.written_once import written_once
 
 SPECIAL = [
     "<pad>", "<eos>", "<bos>", "<unk>", "<fake_token_around_image>", "<image>", "<end_of_utterance>",
@@ -23,6 +24,7 @@ WORDS = ["put", "the", "cube", "on", "star", "red", "blue", "shape", "\n"]
 IMAGES = "observation.images."
 
 
+@written_once
 def write_smolvla(folder: Path, cameras: tuple[str, ...] = ("top",), seed: int = 1, **fields: Any) -> Path:
     """A policy of two blocks of width 32; `fields` go into its configuration."""
     from lerobot.configs.policies import PreTrainedConfig

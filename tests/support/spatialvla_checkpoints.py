@@ -16,6 +16,7 @@ from tokenizers.normalizers import Replace
 
 from probe_kit.models.building import initialise
 from probe_kit.models.spatialvla import SpatialVLAConfig, SpatialVLANetwork, build_spatialvla
+from tests.support.written_once import written_once
 
 SIDE = 42
 BINS: dict[str, Any] = {
@@ -189,6 +190,7 @@ def network(seed: int = 1, **fields: Any) -> SpatialVLANetwork:
     return built
 
 
+@written_once
 def write_checkpoint(
     folder: Path,
     shards: int = 2,

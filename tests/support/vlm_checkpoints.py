@@ -14,6 +14,7 @@ from probe_kit.models.ovis2_5 import OvisConfig, build_ovis2_5
 from probe_kit.models.paligemma import build_paligemma
 from probe_kit.models.qwen import build_qwen2_5_vl, build_qwen3_vl
 from tests.support.qwen_checkpoints import ID, SPECIAL, picture_settings, save_sharded, token_ids, write_tokenizer
+from tests.support.written_once import written_once
 
 INTERNVL_SPECIAL = (*SPECIAL, "<img>", "</img>", "<IMG_CONTEXT>")
 PALIGEMMA_SPECIAL = ("<pad>", "<eos>", "<bos>", "<image>")
@@ -38,6 +39,7 @@ _SQUARE = {
 }
 
 
+@written_once
 def write_qwen2_5_vl(folder: Path, seed: int = 1, tied: bool = False, **fields: Any) -> Path:
     """The old flat configuration and the names of released files."""
     vision = {
@@ -56,6 +58,7 @@ def write_qwen2_5_vl(folder: Path, seed: int = 1, tied: bool = False, **fields: 
     return _write(folder, values, network, seed, names, picture_settings(14, 784, 50176), ID["<|im_end|>"])
 
 
+@written_once
 def write_qwen3_vl(folder: Path, seed: int = 1, tied: bool = True, **fields: Any) -> Path:
     """As Qwen3-VL-4B: output weights tied, DeepStack behind two blocks of the tower."""
     vision = {
@@ -75,6 +78,7 @@ def write_qwen3_vl(folder: Path, seed: int = 1, tied: bool = True, **fields: Any
     return _write(folder, values, network, seed, (), picture_settings(16, 4096, 65536), ID["<|im_end|>"])
 
 
+@written_once
 def write_internvl(folder: Path, seed: int = 1, large: bool = False, **fields: Any) -> Path:
     """Tiles of 28 pixels, of four patches each, one position per tile. large: the kind of tower that 38B has."""
     vision = {
@@ -96,6 +100,7 @@ def write_internvl(folder: Path, seed: int = 1, large: bool = False, **fields: A
     return _write(folder, values, network, seed, _LANGUAGE_LAST, settings, None, INTERNVL_SPECIAL)
 
 
+@written_once
 def write_paligemma(folder: Path, seed: int = 1, **fields: Any) -> Path:
     """Pictures of 28 pixels; output weights tied."""
     vision = {
@@ -117,6 +122,7 @@ def write_paligemma(folder: Path, seed: int = 1, **fields: Any) -> Path:
     return _write(folder, values, network, seed, _LANGUAGE_LAST, settings, end, PALIGEMMA_SPECIAL)
 
 
+@written_once
 def write_ovis2_5(folder: Path, seed: int = 1, vision: dict[str, Any] | None = None, **fields: Any) -> Path:
     """A hundred visual words; pictures as large as the released ones, whose limits are in no file."""
     tower = {

@@ -17,6 +17,7 @@ from tests.support.qwen_checkpoints import (
     token_ids,
     write_tokenizer,
 )
+from tests.support.written_once import written_once
 
 ROBOTS = {"bridge_delta": 4, "fractal_delta": 3, "libero_all": 10}
 """Steps of a chunk."""
@@ -77,6 +78,7 @@ def action_config(robots: dict[str, int] | None = None) -> dict[str, Any]:
     return content
 
 
+@written_once
 def write_checkpoint(folder: Path, shards: int = 2, seed: int = 1, **fields: Any) -> Path:
     """Configuration, weights, tokenizer, processor. fields: of config.json."""
     folder.mkdir(parents=True, exist_ok=True)

@@ -13,6 +13,7 @@ from tokenizers.processors import TemplateProcessing
 
 from tests.support.pi05_checkpoints import HIGH, LEAST, LOW, MOST
 from tests.support.qwen_checkpoints import write_tokenizer
+from tests.support.written_once import written_once
 
 SPECIAL = ("<pad>", "<s>", "</s>", "<unk>")
 CHUNK, TEXT, DOMAINS, DOMAIN = 4, 64, 5, 3
@@ -32,6 +33,7 @@ FLORENCE: dict[str, Any] = {
 }  # fmt: skip
 
 
+@written_once
 def write_xvla(
     folder: Path, seed: int = 0, cameras: Sequence[str] = ("image",), views: int | None = 2, **fields: Any
 ) -> Path:

@@ -4,11 +4,11 @@ import pytest
 
 from probe_kit.hooks.conformance.check import Check
 from probe_kit.hooks.conformance.subject import Subject
-from tests.support.contracts import NATIVE, pairs
+from tests.support.contracts import MECHANISMS, NATIVE, pairs
 
 pytestmark = pytest.mark.filterwarnings("ignore:the model put out tokens")
 
 
-@pytest.mark.parametrize(("subject", "check"), pairs(NATIVE), indirect=["subject"])
+@pytest.mark.parametrize(("subject", "check"), pairs(NATIVE, MECHANISMS), indirect=["subject"])
 def test_the_contract_is_kept(subject: Subject, check: Check) -> None:
     check(subject)

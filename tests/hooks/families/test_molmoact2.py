@@ -38,7 +38,7 @@ def seen(molmoact2: MolmoAct2) -> list[Observation]:
     return examples_for(molmoact2, "Put the cube on the star", "Put the cube on the red shape")
 
 
-@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
+@pytest.mark.parametrize("dtype", ["float32", pytest.param("bfloat16", marks=pytest.mark.slow)])
 def test_actions_are_those_of_lerobots_own_policy_bit_for_bit(
     folder: Path, seen: list[Observation], dtype: str
 ) -> None:

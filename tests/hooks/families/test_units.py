@@ -18,7 +18,7 @@ from tests.support.every_checkpoint import WRITERS
 from tests.support.groot_checkpoints import write_nvidias
 
 UNITS = {"action": {"q01": [-0.5] * 7, "q99": [0.5] * 7, "mask": [True] * 6 + [False]}}
-FAMILIES = ("openvla", "spatialvla", "magma", "internvla-m1")
+FAMILIES = ("openvla", "magma", "internvla-m1", pytest.param("spatialvla", marks=pytest.mark.slow))
 DEFAULTS = {
     "openvla": {"unnorm_key": "bridge_orig"},
     "spatialvla": {"unnorm_key": "bridge_orig/1.0.0"},
@@ -131,10 +131,14 @@ UNGUARDED = {
     "xiaomi-r0": "statistics of actions alone",
     "pi0": "leaves the units of its observation.state to its evaluation",
 }
+LOADED = {"openvla", "xiaomi-r0", "pi0", "pi0 of Bridge", "pi05", "molmoact2", "groot of NVIDIA", "eo1"}
+"""With each reason, and with each way to read statistics of a state; the others share one of these."""
 NOTE = "units of states are not compared with statistics: "
 
 
-@pytest.mark.parametrize("name", MADE)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name not in LOADED)) for name in MADE]
+)
 def test_a_state_in_other_units_is_refused_or_the_family_says_why_it_is_not_compared(
     name: str, tmp_path: Path
 ) -> None:

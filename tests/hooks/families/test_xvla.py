@@ -54,7 +54,7 @@ def lerobots(folder: Path) -> tuple[XVLAPolicy, Any, Any]:
     return XVLAPolicy.from_pretrained(str(folder)), before, behind
 
 
-@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
+@pytest.mark.parametrize("dtype", ["float32", pytest.param("bfloat16", marks=pytest.mark.slow)])
 def test_actions_are_those_of_lerobots_own_loading_processors_and_sampling_bit_for_bit(
     folder: Path, tmp_path: Path, seen: list[Observation], dtype: str
 ) -> None:
