@@ -35,15 +35,11 @@ MECHANISMS = {
     "every_option_reaches_the_card",
     "hooks_are_gone_after_an_exception",
     "nested_captures_are_refused",
-    "an_edit_is_what_a_capture_inside_it_reads",
     "attention_patterns_are_the_models_own",
-    "what_is_rewritten_in_a_block_is_read_behind_it",
-    "rewriting_every_site_with_itself_changes_no_action_bit_for_bit",
-    "values_of_one_role_are_replaced_in_that_role_only",
     "actions_with_a_graph_are_the_actions",
     "gradients_at_sites_are_central_differences",
 }
-"""Checks of code that all families share."""
+"""Checks of code that all families share; edits stay in the default suite, because taps are of each family."""
 LOADING = {"every_file_that_is_read_reaches_the_card", "random_twins_differ_by_their_seed_and_repeat_by_it"}
 """Checks of code that families with the same loader share."""
 
