@@ -305,8 +305,8 @@ def test_a_store_that_ignores_conditions_is_refused_before_a_run_is_begun(
     assert not locate(f"{deaf_bucket}/run").exists("run.json")
 
 
-def test_a_run_is_not_continued_in_a_store_that_ignores_conditions(whole: Path, deaf_bucket: str) -> None:
-    here, there = locate(whole), locate(f"{deaf_bucket}/run")
+def test_a_run_is_not_continued_in_a_store_that_ignores_conditions(in_folder: Run, deaf_bucket: str) -> None:
+    here, there = in_folder.location, locate(f"{deaf_bucket}/run")
     for key in here.keys(""):
         there.write(key, here.read(key))
     with pytest.raises(StoreError, match=r"created run\.json a second time"):

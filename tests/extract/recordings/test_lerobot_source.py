@@ -308,7 +308,7 @@ FILES = {
 
 @pytest.fixture(
     params=[
-        pytest.param(source, marks=pytest.mark.slow if source not in ("scene", "recordings") else ())
+        pytest.param(source, marks=pytest.mark.slow if source != "recordings" else ())
         for source in SOURCES
     ]
 )
