@@ -57,7 +57,7 @@ def stop_after(count: int):
 
 
 def test_an_unfinished_run_does_not_read_as_whole(suite: Suite, tmp_path: Path) -> None:
-    settings = ExtractSettings("expert", suite=suite.folder)
+    settings = ExtractSettings("expert", suite=suite.folder, scene=SHORT)
     with pytest.raises(CrashError):
         extract_run(settings, tmp_path / "run", stop_after(1))
     with pytest.raises(RunIncompleteError, match="of 4 episodes"):

@@ -577,6 +577,7 @@ def test_who_reads_while_another_writes_sees_whole_episodes_only(
     writing.start()
     seen, alive = set[int](), True
     while alive:
+        writing.join(0.02)  # the writer has a core too
         alive = writing.is_alive()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NotSealedWarning)
