@@ -54,6 +54,14 @@ def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 
 @pytest.fixture(scope="session", autouse=True)
+def _no_wait_for_the_disk() -> Iterator[None]:
+    """No test cuts the power: what was written is read from memory, and processes that are killed lose nothing."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("os.fsync", lambda _: None)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
 def _temporary_working_folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Relative paths of commands, such as the default `runs/`, never lead into the checkout."""
     with contextlib.chdir(tmp_path_factory.mktemp("working")):
