@@ -28,7 +28,7 @@ from tests.support.lerobot_recordings import CAMERA, write_recording
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
 
-ITEMS = 2
+ITEMS = 3
 
 
 @pytest.fixture(scope="module")
@@ -80,8 +80,9 @@ def test_recordings_of_scene_frames_give_the_numbers_of_the_scene_bit_for_bit(
         np.testing.assert_array_equal(pair.source.image, own.source.image)
         np.testing.assert_array_equal(pair.clean.state, own.source.state)
     asked = Interchange(sites=("backbone.01", "kv.01"), roles=("image",))
+    seeded = seeded[:4]  # both layouts of two items
     batches = [
-        replay(opened, pairs, asked.conditions(opened))
+        replay(opened, pairs[:4], asked.conditions(opened))
         for opened, pairs in ((session, scene_pairs), (observed, seeded))
     ]
     scene, frames = (batch.in_spreads() for batch in batches)
@@ -142,7 +143,7 @@ def test_what_needs_sides_or_another_input_is_refused_by_name(
 
 @pytest.mark.slow
 def test_a_frame_with_two_donors_is_read_toward_each_of_them(shown: Run, table: Path, twin: "Policy") -> None:
-    choice = ImageSwap(pairs=(*read_pairs(table), ("episode-000000", 0, "episode-000002", 0)))
+    choice = ImageSwap(pairs=(*read_pairs(table), ("episode-000000", 0, "episode-000004", 0)))
     with open_session(shown, ReplaySource(), lambda *_: twin, choice) as opened, opened.ready():
         assert isinstance(opened, FrameSession)
         near, far = (pair for pair in opened.pairs(opened.items[0]) if pair.row == 0)
