@@ -35,7 +35,7 @@ from probe_kit.extract import ExtractSettings, extract_run, prepare
 from probe_kit.extract.sources.player import LONGEST_TRACEBACK, add_traceback, traceback_of
 from probe_kit.hooks import Observation
 from probe_kit.hooks.checkpoints.third_party import contained, while_acting
-from probe_kit.hooks.families.pi0.adapter import Pi0
+from probe_kit.hooks.families.pi0.adapter import Pi0, load_pi0_tiny
 from probe_kit.hooks.family import Family
 from probe_kit.runs import Run, open_run
 from probe_kit.suite import Suite
@@ -48,7 +48,14 @@ PROVED = 2
 
 @pytest.fixture(scope="module")
 def settings(suite: Suite) -> ExtractSettings:
-    return ExtractSettings("pi0-tiny", suite=suite.folder, scene=SceneSpec(max_steps=2), env_workers=0)
+    return ExtractSettings(
+        "pi0-tiny", random_weights=True, suite=suite.folder, scene=SceneSpec(max_steps=2), env_workers=0
+    )
+
+
+@pytest.fixture(scope="module")
+def pi0_tiny() -> Pi0:
+    return load_pi0_tiny(random_weights=True)
 
 
 @pytest.fixture(scope="module")
