@@ -2,7 +2,9 @@
 
 import contextlib
 import gc
+import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -50,6 +52,14 @@ def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Tests neither read nor fill the user's cache; what one process draws for it, the others find."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PROBE_KIT_CACHE", str(shared_folder(tmp_path_factory) / "cache"))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _no_wait_for_the_disk() -> Iterator[None]:
+    """No test cuts the power: what was written is read from memory, and processes that are killed lose nothing."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("os.fsync", lambda _: None)
         yield
 
 
@@ -242,18 +252,40 @@ def little_runs(small_suite: "Suite", tmp_path_factory: pytest.TempPathFactory) 
     return made_once(tmp_path_factory, "little", make)
 
 
-@pytest.fixture(scope="session")
-def recorded_run(small_suite: "Suite", tmp_path_factory: pytest.TempPathFactory) -> "Run":
-    """A real run of pi0-tiny's untrained network with all tokens: 48 episodes of four actions."""
+def _recorded(suite: "Suite", tmp_path_factory: pytest.TempPathFactory, name: str, items: int) -> "Run":
+    """A real run of pi0-tiny's untrained network with all tokens: episodes of four actions, of two categories."""
     from probe_kit.env import SceneSpec
     from probe_kit.extract import ExtractSettings, extract_run
     from probe_kit.runs import open_run
 
     settings = ExtractSettings(
-        "pi0-tiny", random_weights=True, suite=small_suite.folder, scene=SceneSpec(max_steps=4), tokens="all",
-        env_workers=0,  # a run this small does not repay processes
+        "pi0-tiny", random_weights=True, suite=suite.folder, items=items, scene=SceneSpec(max_steps=4),
+        tokens="all", env_workers=0,  # a run this small does not repay processes
     )  # fmt: skip
-    return open_run(made_once(tmp_path_factory, "recorded", lambda folder: extract_run(settings, folder)))
+    return open_run(made_once(tmp_path_factory, name, lambda folder: extract_run(settings, folder)))
+
+
+@pytest.fixture(scope="session")
+def recorded_run(small_suite: "Suite", tmp_path_factory: pytest.TempPathFactory) -> "Run":
+    """A real run of 24 episodes; see `_recorded`."""
+    return _recorded(small_suite, tmp_path_factory, "recorded", 6)
+
+
+@pytest.fixture(scope="session")
+def trainable_run(small_suite: "Suite", tmp_path_factory: pytest.TempPathFactory) -> "Run":
+    """A real run of 48 episodes, of enough groups for probes; see `_recorded`. Only slow tests wait for it."""
+    return _recorded(small_suite, tmp_path_factory, "trainable", 12)
+
+
+@pytest.fixture(scope="session")
+def two_steps(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The embedded checkpoint with two steps of its flow: an inference takes a third of the time of ten steps."""
+    from probe_kit.models.embedded import embedded_checkpoint
+
+    folder = shutil.copytree(embedded_checkpoint("pi0-tiny"), tmp_path_factory.mktemp("two-steps") / "pi0-tiny")
+    config = json.loads((folder / "config.json").read_text(encoding="utf-8"))
+    (folder / "config.json").write_text(json.dumps({**config, "num_inference_steps": 2}), encoding="utf-8")
+    return folder
 
 
 @pytest.fixture(scope="session")

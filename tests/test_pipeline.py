@@ -17,13 +17,13 @@ PLANTED = Site("backbone", 2)
 
 
 @pytest.fixture
-def planted_run(recorded_run: Run, tmp_path: Path) -> Run:
+def planted_run(trainable_run: Run, tmp_path: Path) -> Run:
     """The recorded run with the answer added along one direction of one layer's mean."""
-    copy = Path(shutil.copytree(recorded_run.path, tmp_path / "planted"))
+    copy = Path(shutil.copytree(trainable_run.path, tmp_path / "planted"))
     pooled = zarr.open_array(copy / "data.zarr/backbone/pooled", mode="r+")
-    answer = np.where(recorded_run.episodes["side_correct"] == "left", 1.0, -1.0)
+    answer = np.where(trainable_run.episodes["side_correct"] == "left", 1.0, -1.0)
     direction = np.random.default_rng(0).normal(size=pooled.shape[-1])
-    view = recorded_run.views("backbone").index("mean")
+    view = trainable_run.views("backbone").index("mean")
     values = pooled[: answer.size]  # the array has room for a million episodes
     values[:, 0, PLANTED.layer, view] += answer[:, None] * direction
     for row, content in enumerate(values):

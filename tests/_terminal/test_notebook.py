@@ -20,9 +20,9 @@ INLINE = "module://matplotlib_inline.backend_inline"
 
 
 @pytest.fixture(scope="module")
-def probed(recorded_run: Run, tmp_path_factory: pytest.TempPathFactory) -> tuple[Run, ProbeResults]:
+def probed(trainable_run: Run, tmp_path_factory: pytest.TempPathFactory) -> tuple[Run, ProbeResults]:
     """Probes of a copy of the recorded run, so that other tests find theirs the newest."""
-    copy = shutil.copytree(recorded_run.path, tmp_path_factory.mktemp("probed") / "run")
+    copy = shutil.copytree(trainable_run.path, tmp_path_factory.mktemp("probed") / "run")
     run = open_run(copy)
     return run, train_probes(run, ["color"], permutations=20, controls=())
 

@@ -42,10 +42,13 @@ def run_command(*arguments: object) -> Any:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(two_steps: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     def make(made: Path) -> None:
-        new = ("--categories", "color", "--items", 16, "--env-workers", 0, "--out", made / "run")
-        answer = run_command("pi0-tiny", *new, *FRAMES, "--html", made / "why.html", "--format", "json")
+        policy = ("--checkpoint", two_steps, "--categories", "color", "--items", 16, "--env-workers", 0)
+        new = (*policy, "--out", made / "run")
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("probe_kit.diagnose.measure.DONORS", 2)
+            answer = run_command("pi0-tiny", *new, *FRAMES, "--html", made / "why.html", "--format", "json")
         assert answer.exit_code == 0, answer.output
         (made / "first.json").write_text(answer.stdout, encoding="utf-8")
 

@@ -427,13 +427,11 @@ def test_two_environments_in_one_process_are_independent(make_env):
     still.advance(STAY)
 
 
-def test_worker_processes_give_the_same_observations_as_the_parent(shared_env):
-    envs = gym.vector.AsyncVectorEnv([Act2AnswerEnv, Act2AnswerEnv], context="forkserver")
-    images = envs.reset(seed=[0, 0])[0]["pixels"]["image"].copy()
+def test_a_worker_process_gives_the_same_observations_as_the_parent(shared_env):
+    envs = gym.vector.AsyncVectorEnv([Act2AnswerEnv], context="forkserver")
+    (image,) = envs.reset(seed=[0])[0]["pixels"]["image"].copy()
     envs.close()
-    expected = shared_env.reset(seed=0)[0]["pixels"]["image"]
-    for image in images:
-        np.testing.assert_array_equal(image, expected)
+    np.testing.assert_array_equal(image, shared_env.reset(seed=0)[0]["pixels"]["image"])
 
 
 @pytest.mark.slow

@@ -57,7 +57,7 @@ def stop_after(count: int):
 
 
 def test_an_unfinished_run_does_not_read_as_whole(suite: Suite, tmp_path: Path) -> None:
-    settings = ExtractSettings("expert", suite=suite.folder)
+    settings = ExtractSettings("expert", suite=suite.folder, scene=SHORT)
     with pytest.raises(CrashError):
         extract_run(settings, tmp_path / "run", stop_after(1))
     with pytest.raises(RunIncompleteError, match="of 4 episodes"):
@@ -366,8 +366,8 @@ def test_who_does_not_act_infers_at_the_first_control_step_and_a_script_never(
 # -- seconds ------------------------------------------------------------------------------------------------
 
 
-def test_seconds_of_inference_and_simulation_are_stored_per_episode(acted: Run) -> None:
-    seconds = acted.episodes[["seconds_inference", "seconds_simulation"]]
+def test_seconds_of_inference_and_simulation_are_stored_per_episode(recorded_run: Run) -> None:
+    seconds = recorded_run.episodes[["seconds_inference", "seconds_simulation"]]
     assert (seconds > 0).all(axis=None)
     assert (seconds.sum(axis=1) < 120).all()
 
@@ -437,15 +437,15 @@ def test_a_label_is_changed_and_stored_probes_are_found_under_the_new_one(
 
 
 @pytest.mark.parametrize("label", ["", "two\nlines", "x" * 201])
-def test_what_no_table_can_print_is_no_label(acted: Run, label: str) -> None:
+def test_what_no_table_can_print_is_no_label(recorded_run: Run, label: str) -> None:
     with pytest.raises(UsageError, match="expected 1 to 200 printable characters"):
-        label_run(acted.path, label)
+        label_run(recorded_run.path, label)
 
 
 def test_a_lost_label_and_one_of_another_run_are_damage_that_a_new_label_repairs(
-    acted: Run, tmp_path: Path
+    recorded_run: Run, tmp_path: Path
 ) -> None:
-    place = Path(shutil.copytree(acted.path, tmp_path / "run"))
+    place = Path(shutil.copytree(recorded_run.path, tmp_path / "run"))
     (place / "label.json").unlink()
     with pytest.raises(RunDamagedError, match=r"label\.json is missing.*probe-kit run show .* --label"):
         open_run(place)

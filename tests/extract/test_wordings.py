@@ -7,7 +7,7 @@ import pytest
 
 from probe_kit.env import SceneSpec
 from probe_kit.errors import InstructionError, UsageError
-from probe_kit.extract import ExtractSettings, extract_run, prepare
+from probe_kit.extract import ExtractSettings, prepare
 from probe_kit.hooks import Site
 from probe_kit.retention import retention_table
 from probe_kit.runs import open_run
@@ -25,13 +25,13 @@ def suite(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def ladder(suite, tmp_path_factory):
+def ladder(suite, pi0_tiny, tmp_path_factory):
     """The embedded policy, asked in the two wordings whose words it knows."""
     settings = ExtractSettings(
         "pi0-tiny", suite=suite.folder, categories=("color",), wordings=("knowledge", "named"), scene=SHORT,
         env_workers=0,
     )  # fmt: skip
-    return extract_run(settings, tmp_path_factory.mktemp("worded") / "ladder")
+    return prepare(settings, model=pi0_tiny).run(tmp_path_factory.mktemp("worded") / "ladder")
 
 
 def test_every_item_is_planned_in_every_wording_that_it_has_on_the_same_seeds(suite):

@@ -35,6 +35,13 @@ def _own_modules() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
+def pi0_tiny(two_steps: Path) -> "Pi0":
+    from probe_kit.hooks.families.pi0.adapter import load_pi0_tiny
+
+    return load_pi0_tiny(str(two_steps))
+
+
+@pytest.fixture(scope="module")
 def played(_own_modules: None, pi0_tiny: "Pi0", tmp_path_factory: pytest.TempPathFactory) -> Run:
     """Six episodes in three groups, whose block and colour differ by the seed."""
     source = EnvSource("reach_env:ReachEnv", max_steps=6, options={"count": str(EPISODES)})
@@ -78,14 +85,15 @@ def test_the_first_action_of_every_episode_is_inferred_again_bit_for_bit(
             np.testing.assert_array_equal(chunk[:3], actions[pair.row, 0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("intervention", "rows"),
     [
-        pytest.param(ImageSwap(), 1, marks=pytest.mark.slow),
-        pytest.param(InstructionSwap(), 1, marks=pytest.mark.slow),
-        pytest.param(ImageSwap(vary="state"), 1, marks=pytest.mark.slow),
+        (ImageSwap(), 1),
+        (InstructionSwap(), 1),
+        (ImageSwap(vary="state"), 1),
         (Interchange(sites=("backbone.01", "kv.*"), roles=("image",)), 4),
-        pytest.param(AttentionReadout(roles=("image",)), None, marks=pytest.mark.slow),
+        (AttentionReadout(roles=("image",)), None),
     ],
 )
 def test_kinds_work_in_an_environment_and_are_read_again(
@@ -106,7 +114,10 @@ def test_an_input_of_the_environment_moves_the_action_and_patches_are_shares_of_
     played: Run, pi0_tiny: "Pi0"
 ) -> None:
     """All that the acting stream reads of the picture carries no more than the exchange of the picture."""
-    (swap,) = run_intervention(played, ImageSwap(), load=lambda *_: pi0_tiny).effects
+    swapped = run_intervention(played, ImageSwap(), load=lambda *_: pi0_tiny)
+    (swap,) = swapped.effects
+    assert swapped.certificate["replay"]["equal"] == EPISODES
+    assert run_intervention(played, ImageSwap(), load=not_loaded).to_csv() == swapped.to_csv()
     assert swap.changed == 1
     assert swap.size > swap.control_size
     first = Interchange(sites=("backbone.00",), roles=("image",))

@@ -232,7 +232,8 @@ def test_a_note_before_the_replay_names_what_is_really_patched(
     copy: Run, small_suite: Suite, twin: "Policy", kind: type[Interchange], is_noted: bool
 ) -> None:
     notes: list[str] = []
-    intervention = kind(roles=("image",), categories=("color",), items=1, seed=int(is_noted))
+    places = ("backbone.02", "backbone.03")
+    intervention = kind(sites=places, roles=("image",), categories=("color",), items=1, seed=int(is_noted))
     source = ReplaySource(small_suite.folder)
     result = run_intervention(copy, intervention, source, load=lambda *_: twin, on_note=notes.append)
     assert [note.startswith("unread: backbone.03. ") for note in notes] == [True] * is_noted

@@ -305,8 +305,8 @@ def test_a_store_that_ignores_conditions_is_refused_before_a_run_is_begun(
     assert not locate(f"{deaf_bucket}/run").exists("run.json")
 
 
-def test_a_run_is_not_continued_in_a_store_that_ignores_conditions(whole: Path, deaf_bucket: str) -> None:
-    here, there = locate(whole), locate(f"{deaf_bucket}/run")
+def test_a_run_is_not_continued_in_a_store_that_ignores_conditions(in_folder: Run, deaf_bucket: str) -> None:
+    here, there = in_folder.location, locate(f"{deaf_bucket}/run")
     for key in here.keys(""):
         there.write(key, here.read(key))
     with pytest.raises(StoreError, match=r"created run\.json a second time"):
@@ -315,15 +315,16 @@ def test_a_run_is_not_continued_in_a_store_that_ignores_conditions(whole: Path, 
 
 
 @pytest.mark.slow
-def test_numbers_and_probes_of_a_bucket_are_those_of_a_folder(recorded_run: Run, copied: Run) -> None:
+def test_numbers_and_probes_of_a_bucket_are_those_of_a_folder(trainable_run: Run, bucket: str) -> None:
+    copied = copy_to(bucket, trainable_run.location)
     assert copied.sealed
-    np.testing.assert_array_equal(copied.column(SITE), recorded_run.column(SITE))
-    for ours, theirs in zip(copied.tokens(SITE), recorded_run.tokens(SITE), strict=True):
+    np.testing.assert_array_equal(copied.column(SITE), trainable_run.column(SITE))
+    for ours, theirs in zip(copied.tokens(SITE), trainable_run.tokens(SITE), strict=True):
         np.testing.assert_array_equal(ours, theirs)
-    assert copied.xarray().sizes == recorded_run.xarray().sizes
+    assert copied.xarray().sizes == trainable_run.xarray().sizes
     chosen = {"categories": ["color"], "views": ["mean"], "permutations": 0}
     results = train_probes(copied, **chosen)
-    expected = train_probes(recorded_run, **chosen)
+    expected = train_probes(trainable_run, **chosen)
     again = load_results(open_run(copied.location))
     assert again.key == results.key == expected.key
     np.testing.assert_array_equal(again.scores["accuracy"], expected.scores["accuracy"])
@@ -577,6 +578,7 @@ def test_who_reads_while_another_writes_sees_whole_episodes_only(
     writing.start()
     seen, alive = set[int](), True
     while alive:
+        writing.join(0.02)  # the writer has a core too
         alive = writing.is_alive()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NotSealedWarning)

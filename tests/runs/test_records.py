@@ -222,7 +222,7 @@ def test_sealing_again_gives_the_same_bytes_and_a_second_time_does_nothing(copy:
     assert hashes(copy) == before
     shutil.rmtree(copy / "columns.zarr")
     answer = CliRunner().invoke(app, ["run", "verify", str(copy), "--seal"])
-    assert (answer.exit_code, "48 of 48 episodes, sealed" in answer.stdout) == (0, True), answer.output
+    assert (answer.exit_code, "24 of 24 episodes, sealed" in answer.stdout) == (0, True), answer.output
     assert hashes(copy) == before
 
 
@@ -245,7 +245,7 @@ def test_what_a_killed_seal_left_is_cleared_by_the_next_one(copy: Path, finished
 def test_a_slab_smaller_than_the_run_changes_nothing(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = hashes(copy)
     shutil.rmtree(copy / "columns.zarr")
-    monkeypatch.setattr("probe_kit.runs.verify.SLAB_BYTES", 3 * 48 * 96 * 4)
+    monkeypatch.setattr("probe_kit.runs.verify.SLAB_BYTES", 3 * 24 * 96 * 4)
     seal(copy)
     assert hashes(copy) == before
 
@@ -258,7 +258,7 @@ def test_columns_of_other_commits_are_not_used_until_sealed_again(copy: Path) ->
     shutil.rmtree(copy / "sealed")
     run = open_run(copy, allow_partial=True)
     with pytest.warns(NotSealedWarning, match=r"probe-kit run verify .* --seal"):
-        assert run.column(SITES[0]).shape == (47, 96)
+        assert run.column(SITES[0]).shape == (23, 96)
     assert seal(copy)
     again = open_run(copy, allow_partial=True)
     assert again.sealed
@@ -300,7 +300,7 @@ def test_token_blocks_put_together_are_the_tokens(recorded_run: Run) -> None:
 
 def test_the_gram_matrix_equals_the_one_computed_in_float64(recorded_run: Run) -> None:
     values, mask = recorded_run.tokens(SITES[0], "language")
-    flat = values.astype(np.float64).reshape(48, -1)
+    flat = values.astype(np.float64).reshape(24, -1)
     expected = flat @ flat.T / np.sqrt(np.outer(mask.sum(1), mask.sum(1)))
     np.testing.assert_allclose(recorded_run.gram(SITES[0], "language"), expected, rtol=1e-5)
 

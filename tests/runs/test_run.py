@@ -51,8 +51,8 @@ def damaged(recorded_run: Run, tmp_path: Path) -> Path:
 
 def test_episodes_come_in_plan_order_with_labels_and_outcomes(recorded_run: Run) -> None:
     episodes = recorded_run.episodes
-    assert len(episodes) == 48
-    assert episodes["episode"].tolist() == list(range(48))
+    assert len(episodes) == 24
+    assert episodes["episode"].tolist() == list(range(24))
     assert set(episodes["category"]) == {"color", "shape"}
     assert (episodes.groupby("item_id")["layout"].nunique() == 2).all()
     assert (episodes.groupby("item_id")["side_correct"].nunique() == 2).all()
@@ -63,7 +63,7 @@ def test_every_site_has_finite_rows_that_differ_between_episodes(recorded_run: R
     for stream, width in (("backbone", 96), ("expert", 64)):
         for site in recorded_run.sites(stream):
             column = recorded_run.column(site)
-            assert column.shape == (48, width)
+            assert column.shape == (24, width)
             assert column.dtype == np.float32
             assert np.isfinite(column).all()
     last = recorded_run.column(recorded_run.sites("backbone")[-1])
@@ -174,7 +174,7 @@ def test_a_run_shows_the_first_items_of_some_categories(recorded_run: Run) -> No
         (["colour"], None, "unknown category 'colour'"),
         ([], None, "no category selected"),
         (None, 0, "items is 0"),
-        (None, 14, r"plans 12 items of 'color'; give a number from 1 to 12"),
+        (None, 14, r"plans 6 items of 'color'; give a number from 1 to 6"),
         (["shape"], 3, "role-exchanged twins"),
     ],
 )
@@ -258,7 +258,7 @@ def test_every_episode_keeps_its_trajectory(recorded_run: Run) -> None:
         assert trajectory.held[-1] == row["is_grasped"]
         assert np.isfinite(trajectory.frames[1:]).all()
     last = str(episodes["episode_id"].iloc[-1])
-    np.testing.assert_array_equal(recorded_run.trajectory(last).frames, recorded_run.trajectory(47).frames)
+    np.testing.assert_array_equal(recorded_run.trajectory(last).frames, recorded_run.trajectory(23).frames)
 
 
 def test_a_trajectory_takes_a_few_kilobytes(recorded_run: Run) -> None:
@@ -275,8 +275,8 @@ def test_the_instruction_is_kept_as_the_policy_was_delivered_it(recorded_run: Ru
 
 
 def test_an_episode_that_is_not_there_is_named(recorded_run: Run) -> None:
-    for episode in ("color-9999:o", 48, -1):
-        with pytest.raises(UsageError, match="48, from 'a2a"):
+    for episode in ("color-9999:o", 24, -1):
+        with pytest.raises(UsageError, match="24, from 'a2a"):
             recorded_run.trajectory(episode)
 
 
@@ -300,7 +300,7 @@ def test_trajectories_that_are_read_together_are_those_that_are_read_alone(
 ) -> None:
     array = zarr.open_array(str(copy / "data.zarr"), path="trajectory", mode="r")
     monkeypatch.setattr(arrays, "_BLOCK_BYTES", together * array[0].nbytes)
-    assert len(list(recorded_run.trajectories)) == 48
+    assert len(list(recorded_run.trajectories)) == 24
     for position, trajectory in enumerate(recorded_run.trajectories):
         np.testing.assert_array_equal(trajectory.frames, recorded_run.trajectories[position].frames)
     chunk = copy / "data.zarr/trajectory/c/17/0/0"

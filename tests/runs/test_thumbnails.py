@@ -22,7 +22,7 @@ from tests.support.episode_tables import without_seconds
 @pytest.fixture(scope="module")
 def settings(tmp_path_factory: pytest.TempPathFactory) -> ExtractSettings:
     suite = build_suite(tmp_path_factory.mktemp("suite") / "two", ["color"], 2)
-    return ExtractSettings("expert", suite=suite.folder, scene=SceneSpec(max_steps=40))
+    return ExtractSettings("expert", suite=suite.folder, scene=SceneSpec(max_steps=40), env_workers=0)
 
 
 @pytest.fixture(scope="module")

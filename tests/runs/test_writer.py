@@ -34,6 +34,7 @@ from probe_kit.runs.store import locate
 from probe_kit.runs.writer import EpisodeRecord, RunWriter
 from probe_kit.suite import Suite, build_suite
 from tests.runs.contents import hashes
+from tests.runs.killing import extract, plan_for
 from tests.support.little_run import (
     episode,
     intervene_on_little_run,
@@ -241,8 +242,8 @@ ROOT = Path(__file__).parents[2]
 KILLING = ("-m", "tests.runs.killing")
 
 
-def start(run: Path, suite: Suite, *point: str) -> subprocess.Popen[bytes]:
-    return subprocess.Popen([sys.executable, *KILLING, str(run), str(suite.folder), *point], cwd=ROOT)
+def start(run: Path, suite: Suite, point: str) -> subprocess.Popen[bytes]:
+    return subprocess.Popen([sys.executable, *KILLING, str(run), str(suite.folder), point], cwd=ROOT)
 
 
 @pytest.fixture(scope="module")
@@ -254,7 +255,7 @@ def suite(tmp_path_factory: pytest.TempPathFactory) -> Suite:
 def whole(suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An undisturbed run."""
     run = tmp_path_factory.mktemp("whole") / "run"
-    assert start(run, suite).wait() == 0
+    extract(str(run), plan_for(suite.folder))
     return run
 
 
@@ -273,7 +274,7 @@ def test_a_kill_at_any_point_of_an_episode_costs_at_most_that_episode(
     committed = 3 if point == "after-commit" else 2
     assert len(open_run(run, allow_partial=True).episodes) == committed
     assert verify_run(run, deep=True).ok
-    assert start(run, suite).wait() == 0
+    extract(str(run), plan_for(suite.folder))
     assert hashes(run) == hashes(whole)
 
 
@@ -287,7 +288,7 @@ def test_leftovers_of_a_killed_process_are_cleared_by_the_next_owner(
     for orphan in (*(f"{folder}/abc.tmp" for folder in aside), *data):
         (run / orphan).parent.mkdir(parents=True, exist_ok=True)
         (run / orphan).write_text("torn", encoding="utf-8")
-    assert start(run, suite).wait() == 0
+    extract(str(run), plan_for(suite.folder))
     assert hashes(run) == hashes(whole)
 
 
@@ -325,7 +326,7 @@ def test_a_full_disk_is_named_and_leaves_a_store_that_resumes(suite: Suite, whol
     assert 0 < found.committed < 12
     assert not list(run.rglob("*.tmp"))
     subprocess.run(["mount", "-o", "remount,size=20m", str(small_disk)], check=True)
-    assert start(run, suite).wait() == 0
+    extract(str(run), plan_for(suite.folder))
     assert hashes(run) == hashes(whole)
 
 
@@ -363,15 +364,15 @@ def full_disk(tmp_path: Path) -> Iterator[Path]:
 def test_a_full_disk_is_named_and_nothing_is_left(little_runs: Path, full_disk: Path, words: str) -> None:
     name, *options = words.split()
     out = ["--out", str(full_disk / "out")] if name == "export" else [str(full_disk / "out")]
-    command = [sys.executable, "-m", "probe_kit", "run", name, str(little_runs / "run"), *options, *out]
-    done = subprocess.run(command, capture_output=True, encoding="utf-8", check=False)
-    assert done.returncode == DiskSpaceError.exit_code, done.stderr
+    command = ["run", name, str(little_runs / "run"), *options, *out]
+    done = CliRunner().invoke(app, command)
+    assert done.exit_code == DiskSpaceError.exit_code, done.stderr
     assert "DiskSpaceError" in done.stderr
     assert "is full; nothing was written there" in " ".join(done.stderr.split())
     assert list(full_disk.iterdir()) == []
     subprocess.run(["mount", "-o", "remount,size=40m", str(full_disk)], check=True)
-    again = subprocess.run(command, capture_output=True, encoding="utf-8", check=False)
-    assert again.returncode == 0, again.stderr
+    again = CliRunner().invoke(app, command)
+    assert again.exit_code == 0, again.stderr
 
 
 def test_an_error_of_a_part_of_a_draft_names_the_path_that_was_requested(tmp_path: Path) -> None:

@@ -307,10 +307,7 @@ FILES = {
 
 
 @pytest.fixture(
-    params=[
-        pytest.param(source, marks=pytest.mark.slow if source not in ("scene", "recordings") else ())
-        for source in SOURCES
-    ]
+    params=[pytest.param(source, marks=pytest.mark.slow if source != "recordings" else ()) for source in SOURCES]
 )
 def made(
     request: pytest.FixtureRequest,

@@ -31,11 +31,11 @@ from probe_kit.errors import (
     PolicyFailedError,
     UsageError,
 )
-from probe_kit.extract import ExtractSettings, extract_run
+from probe_kit.extract import ExtractSettings, extract_run, prepare
 from probe_kit.extract.sources.player import LONGEST_TRACEBACK, add_traceback, traceback_of
 from probe_kit.hooks import Observation
 from probe_kit.hooks.checkpoints.third_party import contained, while_acting
-from probe_kit.hooks.families.pi0.adapter import Pi0
+from probe_kit.hooks.families.pi0.adapter import Pi0, load_pi0_tiny
 from probe_kit.hooks.family import Family
 from probe_kit.runs import Run, open_run
 from probe_kit.suite import Suite
@@ -54,9 +54,14 @@ def settings(suite: Suite) -> ExtractSettings:
 
 
 @pytest.fixture(scope="module")
-def plain(settings: ExtractSettings, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+def pi0_tiny() -> Pi0:
+    return load_pi0_tiny(random_weights=True)
+
+
+@pytest.fixture(scope="module")
+def plain(settings: ExtractSettings, pi0_tiny: Pi0, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     """What a policy that behaves leaves."""
-    return numbers(extract_run(settings, tmp_path_factory.mktemp("plain") / "run"))
+    return numbers(prepare(settings, model=pi0_tiny).run(tmp_path_factory.mktemp("plain") / "run"))
 
 
 def numbers(run: Run) -> dict[str, str]:
@@ -138,12 +143,13 @@ def fork(_: Any, chunks: Any) -> Any:
 )
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
 def test_what_a_policy_changes_around_itself_changes_no_number_and_is_put_back(
-    spoil: Any, settings: ExtractSettings, plain: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    spoil: Any, settings: ExtractSettings, pi0_tiny: Pi0, plain: dict[str, str], tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
     monkeypatch.chdir(tmp_path)
     misbehave(monkeypatch, spoil)
     before = surroundings()
-    extract_run(settings, Path("run"))
+    prepare(settings, model=pi0_tiny).run("run")
     assert surroundings() == before
     assert numbers(open_run(tmp_path / "run")) == plain
     KEPT.clear()
@@ -250,11 +256,11 @@ def test_what_is_no_action_costs_its_own_episode_by_name_and_no_other(
 
 
 def test_a_policy_that_draws_from_global_numbers_is_refused(
-    settings: ExtractSettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    settings: ExtractSettings, pi0_tiny: Pi0, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     misbehave(monkeypatch, lambda _, chunks: chunks + np.float32(np.random.rand()))  # noqa: NPY002
     with pytest.raises(CaptureChangedActionError, match="not deterministic"):
-        extract_run(settings, tmp_path / "run")
+        prepare(settings, model=pi0_tiny).run(tmp_path / "run")
 
 
 @pytest.mark.slow

@@ -1,6 +1,5 @@
 """One of every kind is stored, in many orders: whatever came last, nothing takes another's place."""
 
-import random
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -197,8 +196,8 @@ def read(run: ArrayRun) -> dict[str, Any]:
     }
 
 
-ORDERS = [list(POOL), list(POOL)[::-1], *(random.Random(seed).sample(list(POOL), len(POOL)) for seed in range(1))]
-"""Of any two, each comes last in one of the first two."""
+ORDERS = [list(POOL), list(POOL)[::-1]]
+"""Of any two, each comes last in one of them."""
 
 
 def test_what_is_read_does_not_depend_on_the_order_in_which_it_was_stored(run: ArrayRun) -> None:
