@@ -49,6 +49,27 @@ from tests.support.s3_server import BadServer, now_and_then
 BEGINNING = {"plan.json": b"plan", "data.zarr/zarr.json": b"{}", "run.json": b"run"}
 
 
+def test_an_object_is_on_the_disk_before_it_has_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A cut of the power then leaves a whole object or none. Tests else do not wait for the disk."""
+    flushed: list[tuple[bytes, bool]] = []
+
+    def note(handle: int) -> None:
+        file = Path(f"/proc/self/fd/{handle}").resolve()
+        flushed.append((file.read_bytes(), (tmp_path / "object").exists()))
+
+    monkeypatch.setattr("os.fsync", note)
+    folder = Folder(tmp_path)
+    assert folder.create("object", b"first")
+    assert flushed == [(b"first", False)]
+    folder.write("object", b"second")
+    assert flushed[1:] == [(b"second", True)]
+    folder.write("object", b"made again at any time", durable=False)
+    assert len(flushed) == 2
+
+
+
 class LocationContract:
     """A kind of location passes all of it."""
 
