@@ -294,7 +294,9 @@ def test_the_picture_for_the_policy_can_be_smaller_than_the_rendered_one(make_en
 
 
 @pytest.mark.parametrize("arm", ARMS)
-@pytest.mark.parametrize("tile_side", [0.088, 0.11, 0.154])
+@pytest.mark.parametrize(
+    "tile_side", [pytest.param(0.088, marks=pytest.mark.slow), pytest.param(0.11, marks=pytest.mark.slow), 0.154]
+)
 @pytest.mark.parametrize("preset", ["bridge", "frontal"])
 def test_both_pictures_are_fully_seen_in_the_first_frame(preset, tile_side, arm, make_env):
     visibility = make_env(preset, arm=arm, tile_side=tile_side).reset(seed=0)[1]["tile_visibility"]

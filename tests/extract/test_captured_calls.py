@@ -89,7 +89,7 @@ def in_bfloat16(values: np.ndarray) -> np.ndarray:
     return torch.from_numpy(values).to(torch.bfloat16).to(torch.float32).numpy()
 
 
-@pytest.mark.parametrize("sealed", [False, True])
+@pytest.mark.parametrize("sealed", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_later_inferences_that_keep_the_mean_have_it_in_bfloat16(run: Run, mean_run: Run, sealed: bool) -> None:
     if sealed:
         seal(mean_run.location)

@@ -82,6 +82,7 @@ def test_a_column_is_two_files_and_stands_in_every_format(use: Callable[[str, st
     assert "success.median_distance" in printed
 
 
+@pytest.mark.slow
 def test_a_format_is_one_file(use: Callable[[str, str], str]) -> None:
     assert block("To add a format of tables", "diff").count("+++ ") == 1
     code = """
@@ -122,6 +123,7 @@ print(CliRunner().invoke(app, ["retention", "--help-all"]).output)
     assert "released-disc" in printed.partition("seen from above")[2]
 
 
+@pytest.mark.slow
 def test_a_control_is_its_features_and_its_words(use: Callable[[str, str], str]) -> None:
     code = """
 from types import SimpleNamespace

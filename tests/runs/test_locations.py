@@ -49,9 +49,7 @@ from tests.support.s3_server import BadServer, now_and_then
 BEGINNING = {"plan.json": b"plan", "data.zarr/zarr.json": b"{}", "run.json": b"run"}
 
 
-def test_an_object_is_on_the_disk_before_it_has_its_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_object_is_on_the_disk_before_it_has_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A cut of the power then leaves a whole object or none. Tests else do not wait for the disk."""
     flushed: list[tuple[bytes, bool]] = []
 
@@ -67,7 +65,6 @@ def test_an_object_is_on_the_disk_before_it_has_its_name(
     assert flushed[1:] == [(b"second", True)]
     folder.write("object", b"made again at any time", durable=False)
     assert len(flushed) == 2
-
 
 
 class LocationContract:

@@ -174,4 +174,4 @@ class Extraction(RuleBasedStateMachine):
 @pytest.mark.filterwarnings(f"ignore::{NotSealedWarning.__module__}.{NotSealedWarning.__name__}")
 def test_a_run_is_its_committed_episodes_whatever_happened_on_the_way(small_suite: Suite) -> None:
     machine = type("SuiteExtraction", (Extraction,), {"suite": small_suite})
-    run_state_machine_as_test(machine, settings=settings(max_examples=3, stateful_step_count=8, deadline=None))
+    run_state_machine_as_test(machine, settings=settings(max_examples=2, stateful_step_count=8, deadline=None))

@@ -186,6 +186,7 @@ def copied(study: LoadedStudy, folder: Path) -> Path:
     return file
 
 
+@pytest.mark.slow
 def test_no_change_of_a_study_folder_is_silent(played: LoadedStudy, tmp_path: Path) -> None:
     assert_none_silent(copied(played, tmp_path), tmp_path / "out", range(FEW))
 

@@ -18,6 +18,8 @@ from probe_kit.train.results.inventory import inventory
 from probe_kit.train.results.store import SweepCheckpoint
 from tests.train.conftest import episode_table
 
+TASKS = ("binary", "classes", "continuous")
+
 ITEMS, TOKENS, WIDTH = 40, 5, 6
 SITES = Site("backbone", 0), Site("backbone", 1)
 QUICK: dict[str, Any] = {"permutations": 19, "controls": ()}
@@ -56,7 +58,9 @@ def target_of(run: ArrayRun, task: str) -> Target:
     return Target.read(run.episodes[["episode_id"]].assign(label=values[task]), "label", task)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("task", ["binary", "classes", "continuous"])
+@pytest.mark.parametrize(
+    "task", [pytest.param(task, marks=[pytest.mark.slow] * (task != "classes")) for task in TASKS]
+)
 def test_every_token_is_a_sample_and_decides_as_the_mean_of_its_episode(run: ArrayRun, task: str) -> None:
     results = train_probes(run, target=target_of(run, task), views=("tokens", "mean"), **QUICK)
     scores = results.scores.set_index(["view", "layer"])["score"]

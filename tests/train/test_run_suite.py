@@ -94,7 +94,11 @@ def repeated(array: NDArray[np.generic], times: int) -> NDArray[np.generic]:
 
 
 @pytest.mark.parametrize("items", [pytest.param(None, marks=pytest.mark.slow), 12])
-@pytest.mark.parametrize("emptied", [True, False], ids=["cache emptied since", "cache as extract left it"])
+@pytest.mark.parametrize(
+    "emptied",
+    [True, pytest.param(False, marks=pytest.mark.slow)],
+    ids=["cache emptied since", "cache as extract left it"],
+)
 def test_what_extract_drew_is_drawn_again_or_found(
     items: int | None, emptied: bool, filled: Path, tmp_path: Path
 ) -> None:

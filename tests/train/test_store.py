@@ -140,7 +140,9 @@ def test_saving_keeps_what_is_there(planted_run: PlantedRun) -> None:
     assert file.read_text(encoding="utf-8") == "edited by hand"
 
 
-@pytest.mark.parametrize("stored_format", [1, FORMAT - 1, FORMAT + 1, "labels-3", None])
+@pytest.mark.parametrize(
+    "stored_format", [pytest.param(1, marks=pytest.mark.slow), FORMAT - 1, FORMAT + 1, "labels-3", None]
+)
 def test_results_of_another_format_are_refused_by_its_name(
     planted_run: PlantedRun, stored_format: int | str | None
 ) -> None:
