@@ -69,6 +69,7 @@ def test_help_lists_every_public_name(package: str) -> None:
     assert not [name for name in names if not re.search(own.format(name), listed, re.MULTILINE)]
 
 
+@pytest.mark.slow
 def test_the_names_are_completed_in_ipython_without_loading_torch() -> None:
     pytest.importorskip("IPython")
     printed = ask(

@@ -62,7 +62,7 @@ def sound(little_runs: Path) -> Path:
         pytest.param(edited("probes", "run_settings", "0" * 64), marks=pytest.mark.slow),
         pytest.param(edited("interventions", "format", 99), marks=pytest.mark.slow),
         edited("interventions", "kind", "no-such-kind"),
-        edited("interventions", "seed", 17),
+        pytest.param(edited("interventions", "seed", 17), marks=pytest.mark.slow),
     ],
     ids=[
         "probes among interventions", "interventions among probes", "format of probes", "key of probes",

@@ -57,6 +57,7 @@ FUSED = (
     "paligemma",
     "xiaomi-r0",
 )
+TYPICAL = ("magma", "prismatic", "qwen2.5-vl", "internvl")
 """Families whose decoder transformers runs with torch's fused attention."""
 
 
@@ -104,7 +105,9 @@ def test_patterns_of_eager_attention_are_what_it_returns_bit_for_bit(
         assert torch.equal(patterns[site], expected[site].float())
 
 
-@pytest.mark.parametrize("family", FUSED)
+@pytest.mark.parametrize(
+    "family", [pytest.param(name, marks=[pytest.mark.slow] * (name not in TYPICAL)) for name in FUSED]
+)
 def test_patterns_of_fused_attention_are_those_of_transformers_eager_attention(
     family: str, tmp_path: Path
 ) -> None:

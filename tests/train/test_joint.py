@@ -75,6 +75,7 @@ WORLDS: dict[str, Callable[[], np.ndarray]] = {
     "a dependent feature": lambda: np.column_stack([NOISE, NOISE[:, :3].sum(axis=1)]),
     "nothing varies": lambda: np.ones((COUNTS.sum(), 3)),
 }
+TYPICAL = ("weak signal", "separable", "outlying, shifted and constant features", "nothing varies")
 
 
 def alone(samples: Samples, labels: np.ndarray) -> list[FittedFold]:
@@ -97,9 +98,11 @@ def assert_same(found: list[FittedFold], expected: list[FittedFold]) -> None:
             np.testing.assert_allclose(getattr(one.inner, part), getattr(other.inner, part), rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("world", WORLDS.values(), ids=WORLDS.keys())
-def test_training_sets_together_decide_and_choose_as_each_on_its_own(world: Callable[[], np.ndarray]) -> None:
-    samples = tokens(world())
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name not in TYPICAL)) for name in WORLDS]
+)
+def test_training_sets_together_decide_and_choose_as_each_on_its_own(name: str) -> None:
+    samples = tokens(WORLDS[name]())
     site = JointSite.of(samples, FOLDS)
     assert can_be_joint(samples, 3)
     assert site.alike

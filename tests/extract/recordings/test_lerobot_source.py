@@ -216,7 +216,7 @@ ASKED = {
 
 
 @pytest.mark.parametrize(
-    "source", [pytest.param(source, marks=[pytest.mark.slow] * (source == "environment")) for source in ASKED]
+    "source", [pytest.param(source, marks=[pytest.mark.slow] * (source != "recordings")) for source in ASKED]
 )
 def test_a_model_is_asked_about_every_frame_episode_or_picture(source: str, home: Path) -> None:
     options, count = ASKED[source]
