@@ -157,8 +157,8 @@ def _train(
         say(marked("[yellow]left out:[/] call {}: {}", number, reason))
     if not fitted[0].controls.comparisons:
         say(
-            "signal is judged against chance only: add the control random-features, or --untrained RUN, a run with "
-            "random weights"
+            "signal is judged against chance only: add the control random-features, or --untrained RUN, a run "
+            "with random weights"
         )
     for sentence in best_sites_findings(fitted[0]):
         out.print(sentence, markup=False, highlight=False)
