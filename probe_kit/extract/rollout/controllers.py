@@ -448,39 +448,39 @@ class PolicyController(ModelController["Policy", Observation]):
         """Return the chunks (B, chunk, D) of one call, with activations kept for the turns that are captured."""
         observations = copied([turn.observation for turn in turns])
         seeds = [turn.derived_seed("inference") for turn in turns]
+        infer = partial(self._chunks, [turn.observation for turn in turns], seeds)
         captured = {row: turn.buffers for row, turn in enumerate(turns) if turn.call < self.captured_calls}
         if not captured:
             with self._edited(observations):
-                return self._chunks(turns, seeds)
+                return infer()
         return self._capturer.run(
-            lambda: self._chunks(turns, seeds),
+            infer,
             lambda actions: actions,
             self.model.roles(observations),
             captured,
             lambda: self._edited(observations),
         )
 
-    def _chunks(self, turns: Sequence[Turn], seeds: Sequence[int]) -> NDArray[np.float32]:
-        """Return the chunks (B, chunk, D), a copy of the policy's answer, which it cannot change later."""
-        chunks = self._called([turn.observation for turn in turns], seeds)
-        if self._source.own_units:
-            check_predictions(chunks, len(turns))
-        elif not self.capture_only:
-            check_predictions(chunks, len(turns), ACTION_SIZE)
-        return np.array(chunks)
+    def _chunks(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+        """Return the chunks (B, chunk, D) of one call: a copy of the answer, which the policy cannot change later.
 
-    def _called(self, observations: Sequence[Observation], seeds: Sequence[int]) -> Any:
-        policy = self.model
+        Raises:
+            PolicyFailedError: For an answer that is no such array.
+        """
+        policy, own_units = self.model, self._source.own_units
         acts = policy.infer_without_acting if self.capture_only else policy.act
         # Copies: adapters of others may write into what they are given, and a proof of capture reads it again.
-        return (policy.predict if self._source.own_units else acts)(copied(observations), list(seeds))
+        chunks = (policy.predict if own_units else acts)(copied(observations), list(seeds))
+        if own_units or not self.capture_only:
+            check_predictions(chunks, len(observations), None if own_units else ACTION_SIZE)
+        return np.array(chunks)
 
     def _try_inputs(self, turn: Turn) -> None:
         seed = turn.derived_seed("inference")
 
         def infer(observation: Observation) -> NDArray[np.float32]:
             begin_randomness(derive_seed("global", turn.derived_seed("call")))
-            return np.array(self._called([observation], [seed]))
+            return self._chunks([observation], [seed])
 
         (observation,) = copied([turn.observation])
         variants = varied(observation, self._source.instructions, self._ids_of, self.model.absent_inputs)
@@ -489,7 +489,7 @@ class PolicyController(ModelController["Policy", Observation]):
     def run_preflight(self, observations: Sequence[Observation], seeds: Sequence[int]) -> None:
         """Make one inference of which nothing is kept, to measure what another one will take."""
         with self._acting():
-            self._called(observations, seeds)
+            self._chunks(observations, seeds)
 
     def _executed(self, turn: Turn, chunk: NDArray[np.float32]) -> NDArray[np.float32] | None:
         if self.capture_only:

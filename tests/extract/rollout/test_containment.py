@@ -42,8 +42,8 @@ from probe_kit.suite import Suite
 from tests.support.episode_tables import without_seconds
 
 ACT = Pi0.act
-PROVED = 2
-"""Inferences of the first call: with hooks and without."""
+PROVED = 5
+"""Inferences of the first call: three that check the inputs, then one with hooks and one without."""
 
 
 @pytest.fixture(scope="module")
@@ -241,7 +241,7 @@ def test_what_is_no_action_costs_its_own_episode_by_name_and_no_other(
     seen: list[Any] = []
 
     def once(_: Any, chunks: Any) -> Any:
-        """The third inference of all; its episode is tried again, and is the last one then."""
+        """The first inference of the second episode, which is tried again, and is the last one then."""
         seen.append(None)
         return spoil(chunks) if len(seen) == PROVED + 1 else chunks
 
@@ -339,7 +339,7 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
 def test_a_model_that_hangs_in_a_worker_is_ended_and_its_episodes_are_played_again(
     installed: str, settings: ExtractSettings, tmp_path: Path
 ) -> None:
-    """The third call of every worker hangs: the first episode of each is kept, and the last ones are named."""
+    """The second episode of every worker hangs: the first one is kept, and the last ones are named."""
     hurried = settings.changed(model=installed, workers=1, inference_limit=15.0)
     said = r"worker 0 was ended, because a call of its model took longer than --inference-limit 15 s"
     with pytest.warns(WorkerLostWarning, match=said), suppress(EpisodesFailedError):
@@ -373,10 +373,6 @@ def test_a_call_within_its_limit_is_not_ended_later() -> None:
         pass
     time.sleep(0.3)
     assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
-
-
-CALLS_BEFORE = 2
-"""Inferences that go well: the first is made twice, with hooks and without."""
 
 
 def short_settings(suite: Suite) -> ExtractSettings:
@@ -430,7 +426,7 @@ def test_what_a_policy_does_wrong_gives_its_episodes_up_by_name(
 
     def spoiled(self: Pi0, *arguments: Any) -> Any:
         chunks = act(self, *arguments)
-        return chunks if next(calls) < CALLS_BEFORE else spoil(chunks)
+        return chunks if next(calls) < PROVED else spoil(chunks)
 
     monkeypatch.setattr(Pi0, "act", spoiled)
     with pytest.raises(EpisodesFailedError) as caught:
@@ -448,9 +444,7 @@ def test_a_failure_is_stored_with_the_traceback_of_the_policys_own_code(
     suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     act, calls = Pi0.act, iter(range(1000))
-    monkeypatch.setattr(
-        Pi0, "act", lambda *args: (fall if next(calls) >= CALLS_BEFORE else lambda a: act(*a))(args)
-    )
+    monkeypatch.setattr(Pi0, "act", lambda *args: (fall if next(calls) >= PROVED else lambda a: act(*a))(args))
     with pytest.raises(EpisodesFailedError) as caught:
         extract_run(short_settings(suite), tmp_path / "run")
     files = sorted((tmp_path / "run" / "failed").iterdir())
