@@ -167,6 +167,8 @@ def test_role_curves_have_a_line_per_view(probed_run: ProbedRun) -> None:
     results = load_results(probed_run({"color": SIGNAL}))
     display = RoleCurvesDisplay.from_results(results, "color", "expert")
     np.testing.assert_allclose(display.curves["mean"].score, [0.6, 0.7])
+    twice = RoleCurvesDisplay.from_results(results, "color", "expert", views=("mean", "mean"))
+    assert list(twice.curves) == ["mean"]
     role_curves(results).savefig(io.BytesIO())
 
 

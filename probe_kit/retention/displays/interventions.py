@@ -108,7 +108,7 @@ class SiteEffectDisplay(Display):
                 f"{run.location} has no stored interchange of {category!r} in a layer of the backbone or of the "
                 f"keys and values. Run `probe-kit intervene {run.location} --kind interchange`"
             )
-        probed_curve(results, view, category)
+        probed_curve(results, view, category)  # raises where there is none; `scores_of` would be empty
         scores = scores_of(results, category, view, BACKBONE).sort_values("layer")
         by_role: dict[str, list[PatchEffect]] = {}
         for row in rows:

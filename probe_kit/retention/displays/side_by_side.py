@@ -131,11 +131,12 @@ class RoleCurvesDisplay(CurvesDisplay):
         curve_of(results, category, results.settings.views[0])
         curves = _curves({view: scores_of(results, category, view, stream) for view in candidates}, iterations)
         # By default a view that other streams have alone is left out; one that is named is not.
-        if not curves or (views and len(curves) < len(candidates)):
-            missing = ", ".join(view for view in candidates if view not in curves)
+        missing = [view for view in candidates if view not in curves]
+        if not curves or (views and missing):
             probed = dict.fromkeys(results.scores.loc[results.scores["stream"] == stream, "view"])
             raise UnknownSiteError(
-                f"stream {stream!r} was not probed in {missing}; its probed views: {', '.join(probed) or 'none'}"
+                f"stream {stream!r} was not probed in {', '.join(missing)}; "
+                f"its probed views: {', '.join(probed) or 'none'}"
             )
         certificate = ProvenanceLine.of_results(results, next(iter(curves)))
         title = f"{title_of(category)}: {label_of(stream)}"
