@@ -17,6 +17,7 @@ from probe_kit.suite.converters.curation import read_curation
 from probe_kit.suite.own_questions import read_rows
 from probe_kit.train import Target
 from tests.support.parsed import package_nodes
+from tests.support.slow_cases import slow_but
 
 ROOT = Path(__file__).parents[2]
 Rows = Sequence[Sequence[str]]
@@ -88,9 +89,7 @@ def refusal(reader: str, content: bytes, folder: Path) -> str:
     return str(refused.value)
 
 
-@pytest.mark.parametrize(
-    "reader", [pytest.param(name, marks=[pytest.mark.slow] * (name != "labels")) for name in READERS]
-)  # all read by one function, see below
+@pytest.mark.parametrize("reader", slow_but(["labels"], READERS))  # all read by one function, see below
 @pytest.mark.parametrize("separator", [",", ";", "\t"])
 @pytest.mark.parametrize(
     "encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le with mark", "utf-16-be with mark"]

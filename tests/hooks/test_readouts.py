@@ -43,7 +43,7 @@ from probe_kit.hooks.conformance.subject import examples_for
 from probe_kit.hooks.families.paligemma.adapter import PaliGemma
 from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.hooks.outputs import outputs_of
-from tests.support.every_checkpoint import WRITERS
+from tests.support.every_checkpoint import WRITERS, families
 
 pytestmark = pytest.mark.filterwarnings("ignore:the model put out tokens that name no action")
 FUSED = (
@@ -57,7 +57,6 @@ FUSED = (
     "paligemma",
     "xiaomi-r0",
 )
-TYPICAL = ("magma", "prismatic", "qwen2.5-vl", "internvl")
 """Families whose decoder transformers runs with torch's fused attention."""
 
 
@@ -105,9 +104,7 @@ def test_patterns_of_eager_attention_are_what_it_returns_bit_for_bit(
         assert torch.equal(patterns[site], expected[site].float())
 
 
-@pytest.mark.parametrize(
-    "family", [pytest.param(name, marks=[pytest.mark.slow] * (name not in TYPICAL)) for name in FUSED]
-)
+@pytest.mark.parametrize("family", families(FUSED))
 def test_patterns_of_fused_attention_are_those_of_transformers_eager_attention(
     family: str, tmp_path: Path
 ) -> None:

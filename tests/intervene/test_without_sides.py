@@ -79,7 +79,7 @@ def test_recordings_of_scene_frames_give_the_numbers_of_the_scene_bit_for_bit(
         assert isinstance(pair.source, Observation)
         np.testing.assert_array_equal(pair.source.image, own.source.image)
         np.testing.assert_array_equal(pair.clean.state, own.source.state)
-    asked = Interchange(sites=("backbone.01", "kv.01"), roles=("image",))
+    asked = Interchange(sites=("backbone.01", "kv.01"), roles=("all", "image"))
     seeded = seeded[:4]  # both layouts of two items
     batches = [
         replay(opened, pairs[:4], asked.conditions(opened))

@@ -29,6 +29,7 @@ from probe_kit.train import ArrayRun, ProbeCurve, load_results
 from probe_kit.train.controls import add_untrained
 from tests.retention.conftest import runs_in
 from tests.support.inner_qualities import stream_of
+from tests.support.slow_cases import slow_but
 
 ProbedRun = Callable[..., ArrayRun]
 PERFECT = ([1.0, 1.0], [[1.0, 1.0]])
@@ -46,14 +47,10 @@ WORLDS = {
 }
 Found = tuple[str, float, float, float]
 
-
 IN_DEFAULT = ("perfect and good", "hopeless", "mixed")
 
 
-@pytest.fixture(
-    scope="module",
-    params=[pytest.param(name, marks=() if name in IN_DEFAULT else pytest.mark.slow) for name in WORLDS],
-)
+@pytest.fixture(scope="module", params=slow_but(IN_DEFAULT, WORLDS))
 def table(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> RetentionTable:
     """A run of the world against an equal one, and a group of two good ones."""
     world, probed_run = WORLDS[request.param], runs_in(tmp_path_factory.mktemp("world"))

@@ -4,8 +4,6 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 from tests.support import (
     eo1_checkpoints,
     groot_checkpoints,
@@ -22,6 +20,7 @@ from tests.support import (
     xiaomi_checkpoints,
     xvla_checkpoints,
 )
+from tests.support.slow_cases import slow_but
 
 WRITERS: dict[str, tuple[Callable[[Path], Path], dict[str, Any]]] = {
     "pi0": (pi0_checkpoints.write_intact, {}),
@@ -50,4 +49,4 @@ REPRESENTATIVES = ("pi0", "groot", "openvla", "magma", "qwen2.5-vl")
 
 def families(names: Iterable[str] = WRITERS) -> list[Any]:
     """Return parameters of a test of what one function does for all families: the others' are slow."""
-    return [pytest.param(name, marks=[pytest.mark.slow] * (name not in REPRESENTATIVES)) for name in names]
+    return slow_but(REPRESENTATIVES, names)

@@ -16,6 +16,7 @@ from probe_kit.runs import Run, open_run
 from probe_kit.train import ArrayRun, Target, load_results, train_probes, transfer_probes
 from probe_kit.train.results.inventory import inventory
 from probe_kit.train.results.store import SweepCheckpoint
+from tests.support.slow_cases import slow_but
 from tests.train.conftest import episode_table
 
 TASKS = ("binary", "classes", "continuous")
@@ -58,9 +59,7 @@ def target_of(run: ArrayRun, task: str) -> Target:
     return Target.read(run.episodes[["episode_id"]].assign(label=values[task]), "label", task)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize(
-    "task", [pytest.param(task, marks=[pytest.mark.slow] * (task != "classes")) for task in TASKS]
-)
+@pytest.mark.parametrize("task", slow_but(["classes"], TASKS))
 def test_every_token_is_a_sample_and_decides_as_the_mean_of_its_episode(run: ArrayRun, task: str) -> None:
     results = train_probes(run, target=target_of(run, task), views=("tokens", "mean"), **QUICK)
     scores = results.scores.set_index(["view", "layer"])["score"]

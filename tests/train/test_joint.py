@@ -25,6 +25,7 @@ from probe_kit.train.crossval.logistic_folds import (
 from probe_kit.train.crossval.nested_folds import STRENGTHS, FittedFold, nested_folds
 from probe_kit.train.samples import Samples
 from probe_kit.train.solver.arrays import Array, RowSubset
+from tests.support.slow_cases import slow_but
 
 GENERATOR = np.random.default_rng(0)
 ITEMS = np.repeat(np.arange(30), 2)
@@ -98,9 +99,7 @@ def assert_same(found: list[FittedFold], expected: list[FittedFold]) -> None:
             np.testing.assert_allclose(getattr(one.inner, part), getattr(other.inner, part), rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name not in TYPICAL)) for name in WORLDS]
-)
+@pytest.mark.parametrize("name", slow_but(TYPICAL, WORLDS))
 def test_training_sets_together_decide_and_choose_as_each_on_its_own(name: str) -> None:
     samples = tokens(WORLDS[name]())
     site = JointSite.of(samples, FOLDS)

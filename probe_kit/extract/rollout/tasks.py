@@ -137,7 +137,7 @@ class Act(_Task):
 
     def texts(self, settings: ExtractSettings, source: Source[Any]) -> Iterable[str]:
         """Return the instructions of a scene; those of other sources are checked with cameras and state."""
-        return () if not settings.source.is_scene else source.instructions
+        return source.instructions if settings.source.is_scene else ()
 
     def early_checks(
         self, settings: ExtractSettings, source: Source[Any], fetch: bool

@@ -26,6 +26,7 @@ from probe_kit.runs import verify_run
 from probe_kit.runs.plan import Row
 from probe_kit.runs.run_source import Origin
 from probe_kit.suite import Suite
+from tests.support.slow_cases import slow_but
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
 TOP, WRIST = "observation.images.top", "observation.images.wrist"
@@ -215,9 +216,7 @@ ASKED = {
 }
 
 
-@pytest.mark.parametrize(
-    "source", [pytest.param(source, marks=[pytest.mark.slow] * (source != "recordings")) for source in ASKED]
-)
+@pytest.mark.parametrize("source", slow_but(["recordings"], ASKED))
 def test_a_model_is_asked_about_every_frame_episode_or_picture(source: str, home: Path) -> None:
     options, count = ASKED[source]
     asked = ask(*options, "--tokens", "pooled", "--out", "asked")

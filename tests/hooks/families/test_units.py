@@ -16,6 +16,7 @@ from probe_kit.hooks import load_policy
 from probe_kit.hooks.registry import find_family, own_families
 from tests.support.every_checkpoint import WRITERS
 from tests.support.groot_checkpoints import write_nvidias
+from tests.support.slow_cases import slow_but
 
 UNITS = {"action": {"q01": [-0.5] * 7, "q99": [0.5] * 7, "mask": [True] * 6 + [False]}}
 FAMILIES = ("openvla", "magma", "internvla-m1", pytest.param("spatialvla", marks=pytest.mark.slow))
@@ -136,9 +137,7 @@ LOADED = {"openvla", "xiaomi-r0", "pi0", "pi0 of Bridge", "pi05", "molmoact2", "
 NOTE = "units of states are not compared with statistics: "
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name not in LOADED)) for name in MADE]
-)
+@pytest.mark.parametrize("name", slow_but(LOADED, MADE))
 def test_a_state_in_other_units_is_refused_or_the_family_says_why_it_is_not_compared(
     name: str, tmp_path: Path
 ) -> None:
