@@ -280,14 +280,14 @@ def print_input_notes(run: "Run") -> None:
 
 
 def _print_outcomes(run: "Run") -> None:
-    from probe_kit.runs.layout import AT_END, ONCE
+    from probe_kit.runs.environment_success import EnvironmentSuccess
 
     counts = run.episodes["outcome"].value_counts()
     text = ", ".join(f"{name} {count}" for name, count in counts.items())
     text = "captured without acting" if run.capture_only else text
     say(f"{counted(len(run.episodes), 'episode')}: {text}")
-    if ONCE in run.episodes and (lost := int((run.episodes[ONCE] & ~run.episodes[AT_END]).sum())):
-        say(f"{lost} of them had success before their end only; see the columns {ONCE} and {AT_END}")
+    if (success := EnvironmentSuccess.of(run.episodes)) is not None:
+        say(marked("[yellow]{}[/]" if success.stopped else "{}", success.sentence))
     print_input_notes(run)
     say(marked("next: [bold]{}[/]", _next_command(run)))
     out.print(str(run.location), soft_wrap=True)

@@ -375,6 +375,10 @@ class EnvironmentSource(Source[EnvSource]):
         self.truths: list[str] = []
         self.chunk = 0
         self.starts: dict[str, str] = {}
+        is_typed = settings.max_steps is not None
+        self._has_limits_of_episodes = not is_typed and any(
+            episode.max_steps is not None for _, episode in self.episodes
+        )
 
     @classmethod
     def open(cls, settings: EnvSource, selects_only: bool) -> Self:
@@ -548,12 +552,6 @@ class EnvironmentSource(Source[EnvSource]):
         if not self.cameras and declared is not None:
             self.watched(declared)
         return tuple(self.cameras) or None
-
-    @property
-    def _has_limits_of_episodes(self) -> bool:
-        """Whether episodes end at limits of their own."""
-        is_typed = self.settings.max_steps is not None
-        return not is_typed and any(episode.max_steps is not None for _, episode in self.episodes)
 
     def _with_cameras(self, policy: "Policy", observation: Observation) -> "Policy":
         self.cameras = [*policy.card.cameras[:1], *observation.cameras]
