@@ -287,7 +287,7 @@ def _block_folds_and_permutations(
             f"{name} has one class, {classes[0]!r}; expected two or more. Leave the category out"
         )
     _check_groups(name, run, target, labels, classes, samples)
-    _warn_of_equal_starts(name, run, target, samples)
+    warn_of_equal_starts(name, run, target, samples)
     scope = () if category == EVERYWHERE else (category,)
     seed = derive_seed("label folds", settings.seed, *scope)
     folds = nested_folds(samples.strata, samples.groups, seed, stratified_folds)
@@ -360,7 +360,7 @@ def _check_groups(
             )
 
 
-def _warn_of_equal_starts(name: str, run: RunReader, target: Target, samples: TargetSamples) -> None:
+def warn_of_equal_starts(name: str, run: RunReader, target: Target, samples: TargetSamples) -> None:
     """Warn where groups of an environment hold episodes that start with the same observation."""
     column, starts = dependent_episodes(run)
     if column != START or target.group_by is not None:

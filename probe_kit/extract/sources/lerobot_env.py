@@ -175,13 +175,13 @@ def _refused_options(kind: str, config: Any, typed: Sequence[str], error: Except
     names, task = _task_names(kind, config), str(config.task or "")
     unknown = [part.strip() for part in task.split(",") if _bare_task(kind, part) not in names]
     if names and unknown:
-        whose = "" if "task" in typed else "lerobot's own default "
+        default = "" if "task" in typed else ", lerobot's default"
         bare = _bare_task(kind, unknown[0])
         nearest = get_close_matches(bare, names, len(names), 0)
         more = f" … ({len(names)} in all)" if len(names) > MOST_LISTED else ""
         return (
-            f"--env lerobot:{kind}: the installed simulator has no {whose}task {unknown[0]!r} ({reason}). It has "
-            f"{', '.join(nearest[:MOST_LISTED])}{more}; give one with --env-option task={nearest[0]}"
+            f"--env lerobot:{kind}: the installed simulator has no task {unknown[0]!r}{default} ({reason}). "
+            f"It has {', '.join(nearest[:MOST_LISTED])}{more}; give one with --env-option task={nearest[0]}"
         )
     fields = ", ".join(
         f"{field.name}={getattr(config, field.name)!r}"
