@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# lerobot 0.6.1 with metaworld 3.0.0, the version that its extra names. Two things about its Meta-World:
+# lerobot 0.6.1 with metaworld 3.0.0, the version that its extra names, and mujoco 3.8.1. Two things about its Meta-World:
 # 1. A picture size is taken and declared (observation_space), and pictures are 480 x 480 all the same. A policy that is built from the declared
 #    space gets pictures of another size than its configuration says.
 # 2. The default task of its configuration, metaworld-push-v2, is in no version of the simulator that it installs: EnvConfig's default cannot be made.
@@ -9,10 +9,10 @@ folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 if command -v uv >/dev/null; then
     uv venv --quiet --python 3.12 "$folder/env"
-    uv pip install --quiet --python "$folder/env/bin/python" lerobot[metaworld]==0.6.1 packaging
+    uv pip install --quiet --python "$folder/env/bin/python" lerobot[metaworld]==0.6.1 mujoco==3.8.1 packaging
 else
     python3.12 -m venv "$folder/env"
-    "$folder/env/bin/python" -m pip install --quiet lerobot[metaworld]==0.6.1 packaging
+    "$folder/env/bin/python" -m pip install --quiet lerobot[metaworld]==0.6.1 mujoco==3.8.1 packaging
 fi
 export HF_HUB_OFFLINE=1 MUJOCO_GL=${MUJOCO_GL:-osmesa} # needs Debian's libosmesa6, or MUJOCO_GL=egl with libegl1
 cd "$folder"

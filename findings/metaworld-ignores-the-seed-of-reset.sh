@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# metaworld 3.1.1 (gymnasium 1.4.0, mujoco 3.8.1). An environment that gym.make("Meta-World/MT1", env_name="push-v3", seed=42) made ignores
+# metaworld 3.1.1 (gymnasium 1.4.0, mujoco 3.3.0). An environment that gym.make("Meta-World/MT1", env_name="push-v3", seed=42) made ignores
 # reset(seed=...), by which Gymnasium's API seeds an environment. Two resets with the seed 0 place the object 0.17 m apart. Another environment,
 # made with the seed 42 again and reset with the seed 99, starts where the first one did with the seed 0: the seed of gym.make and the number of
 # resets decide a start.

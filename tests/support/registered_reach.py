@@ -1,6 +1,8 @@
 """Environments as packages register them: `Reach` in Gymnasium's registry, and lerobot's configurations of it."""
 
+import sys
 from dataclasses import dataclass, field
+from types import ModuleType
 from typing import Any
 
 import gymnasium as gym
@@ -14,6 +16,7 @@ from probe_kit.hooks import Observation
 
 LIMIT = 300
 PACKAGE = "gym_probe_kit_reach"
+sys.modules.setdefault(PACKAGE, ModuleType(PACKAGE))  # lerobot imports it where a task is not registered
 gym.register(f"{PACKAGE}/Reach-v0", Reach)
 gym.register(f"{PACKAGE}/Long-v0", Reach, max_episode_steps=LIMIT)
 

@@ -108,8 +108,10 @@ def test_tasks_of_several_limits_end_at_their_own() -> None:
 
 def test_more_seeds_than_stored_initial_states_share_a_group(monkeypatch: pytest.MonkeyPatch) -> None:
     """Seed n starts from the n-th state, counted round, as lerobot's LIBERO does."""
-    monkeypatch.setattr(Reach, "init_state_id", 0, raising=False)
-    monkeypatch.setattr(Reach, "_init_states", [0, 1, 2], raising=False)
+    import reach_env
+
+    monkeypatch.setattr(reach_env.Reach, "init_state_id", 0, raising=False)
+    monkeypatch.setattr(reach_env.Reach, "_init_states", [0, 1, 2], raising=False)
     groups = [episode.group for episode in LeRobotEnvironment("probe_kit_reach", 5, "x").episodes()]
     assert [groups[seed] == groups[0] for seed in range(5)] == [True, False, False, True, False]
     assert {episode.group for episode in LeRobotEnvironment("probe_kit_reach", 3, "x").episodes()} == {None}
