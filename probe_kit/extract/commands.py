@@ -234,7 +234,9 @@ def print_sufficiency(extraction: "Extraction") -> None:
     if suite is None:
         groups = len({row.columns["group_id"] for row in plan.episodes})
         if groups < GROUPS_FOR_PROBES:
-            say(marked("[yellow]{} {}; probes need {} or more[/]", groups, source.groups, GROUPS_FOR_PROBES))
+            more = source.smaller_groups(plan.episodes) if len(plan.episodes) >= GROUPS_FOR_PROBES else ""
+            few = f"{groups} {source.groups}; probes need {GROUPS_FOR_PROBES} or more" + f". {more}" * bool(more)
+            say(marked("[yellow]{}[/]", few))
         return
     scored = not extraction.identity().get("capture_only")
     table = Table(show_header=False, title=f"enough for ({Smallest.of(suite).words})", box=None)

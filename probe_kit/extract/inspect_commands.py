@@ -367,8 +367,8 @@ def check_environment(
         if not as_json:
             state, colour = ("passed", "green") if check.passed else ("failed", "bold red")
             out.print(marked(f"[{colour}]{{}}[/] {{}}", f"{state:8}", check.sentence), soft_wrap=True)
-            if seen := check.problem or check.facts:
-                out.print(marked("         [dim]seen[/] {}", terminal_safe(seen)), soft_wrap=True)
+            if evidence := check.problem or check.facts:
+                out.print(marked("         [dim]seen[/] {}", terminal_safe(evidence)), soft_wrap=True)
     failed = sum(not check.passed for check in checks)
     if as_json:
         listed = [{**asdict(check), "passed": check.passed} for check in checks]
@@ -377,10 +377,10 @@ def check_environment(
         out.print(f"{len(checks) - failed} passed, {failed} failed")
     else:
         out.print(f"{len(checks)} passed")
-        given = [
+        options = [
             *(f"--env-option {quote(text)}" for text in env_options or ()),
             *(f"--rotate {turn}" for turn in rotate or ()),
         ]
-        command = " ".join(["probe-kit extract --model NAME --env", environment, *given, "--out runs/own"])
+        command = " ".join(["probe-kit extract --model NAME --env", environment, *options, "--out runs/own"])
         say(marked("next: [bold]{}[/]", command))
     raise typer.Exit(FAILED if failed else 0)

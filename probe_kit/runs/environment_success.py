@@ -1,4 +1,4 @@
-"""Success rates of runs in environments of the user's own, and what stands beside each of them."""
+"""Success rates of runs in environments of the user's own, and what may have lowered them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -35,14 +35,14 @@ class EnvironmentSuccess:
         """Return the rates of a run's episodes; None of episodes without the fact `success`."""
         if not {ONCE, AT_END} <= set(episodes) or episodes.empty:
             return None
-        known = episodes.dropna(subset=[ONCE, AT_END])
-        stopped = known.iloc[:0]
-        if {LIMIT, "steps", "done"} <= set(known):
-            stopped = known[~known["done"].astype(bool) & (known["steps"] < known[LIMIT])]
+        rated = episodes.dropna(subset=[ONCE, AT_END])
+        stopped = rated.iloc[:0]
+        if {LIMIT, "steps", "done"} <= set(rated):
+            stopped = rated[~rated["done"].astype(bool) & (rated["steps"] < rated[LIMIT])]
         return cls(
-            len(known),
-            float(known[AT_END].astype(bool).mean()),
-            float(known[ONCE].astype(bool).mean()),
+            len(rated),
+            float(rated[AT_END].astype(bool).mean()),
+            float(rated[ONCE].astype(bool).mean()),
             len(stopped),
             tuple(sorted({int(steps) for steps in stopped["steps"]})) if len(stopped) else (),
             tuple(sorted({int(limit) for limit in stopped[LIMIT]})) if len(stopped) else (),

@@ -82,9 +82,9 @@ class _Trial:
     def play(self) -> str:
         """Play the episodes, write their first picture, and say where the environment ends them."""
         self.steps = [self._play(self.environment, episode) for episode in self.episodes]
-        shown = self.steps[0][0].observation
+        start = self.steps[0][0].observation
         if self.picture is not None:
-            Image.fromarray(np.hstack(_of_one_height([shown.image, *shown.cameras.values()]))).save(self.picture)
+            Image.fromarray(np.hstack(_of_one_height([start.image, *start.cameras.values()]))).save(self.picture)
         limits = [episode.max_steps for episode in self.episodes if episode.max_steps is not None]
         limit = max(limits, default=None) or declared_limit(self.environment, self.source.name)
         end = "the environment declares no limit" if limit is None else f"an episode ends after {limit} actions"

@@ -184,9 +184,13 @@ class RotatedEnvironment:
         return replace(step, observation=self._rotated(step.observation)) if is_step else step
 
     def _rotated(self, observation: Observation) -> Observation:
-        others = observation.cameras
-        first = next((camera for camera, _ in self._rotations if camera not in (*others, EVERY_CAMERA)), "")
-        cameras = {name: _turned(picture, degrees_of(self._rotations, name)) for name, picture in others.items()}
+        further_cameras = observation.cameras
+        first = next(
+            (camera for camera, _ in self._rotations if camera not in (*further_cameras, EVERY_CAMERA)), ""
+        )
+        cameras = {
+            name: _turned(picture, degrees_of(self._rotations, name)) for name, picture in further_cameras.items()
+        }
         image = _turned(observation.image, degrees_of(self._rotations, first))
         return replace(observation, image=image, cameras=cameras)
 
@@ -419,14 +423,15 @@ class EnvironmentSource(Source[EnvSource]):
         episodes = [episode for _, episode in self.episodes[:2]]
         environment, name = open_environment(self.settings), self.name
         try:
-            first, *others = (started(environment, episode, name) for episode in episodes)
+            first, *later_starts = (started(environment, episode, name) for episode in episodes)
             again = started(environment, episodes[0], name)
         finally:
             environment.close()
         if not self.settings.accept_nondeterminism:
             self._check_repeats(first, again)
             self.starts = {
-                episode.id: start_digest(step) for episode, step in zip(episodes, (first, *others), strict=True)
+                episode.id: start_digest(step)
+                for episode, step in zip(episodes, (first, *later_starts), strict=True)
             }
 
     def _check_repeats(self, first: Step, again: Step) -> None:
@@ -461,6 +466,12 @@ class EnvironmentSource(Source[EnvSource]):
             and len(set(self.starts.values())) == 1
             and len({episode.group or episode.id for episode in episodes}) > 1
         )
+
+    def smaller_groups(self, rows: Sequence[Row]) -> str:
+        """Return the option by which each start is a group; empty where seeds are seen to start equally."""
+        has_names = any(row.content.group is not None for row in rows)
+        same = len(set(self.starts.values())) < len(self.starts)
+        return f"train --group-by {START} makes a group of each start" if has_names and not same else ""
 
     def most_steps(self, episode: EnvEpisode) -> int:
         """Return the number of actions after which an episode ends."""
@@ -680,8 +691,8 @@ class EnvironmentSource(Source[EnvSource]):
         if settings.max_steps is None:
             if not limits:
                 return f"{actions}: the environment declares no limit of its own, --max-steps gives another"
-            kept = " up to" if limits[-1] > most[-1] else ""
-            return f"{actions}:{kept} the environment's own limit{f' of {limits[-1]}' if kept else ''}"
+            bounded = " up to" if limits[-1] > most[-1] else ""
+            return f"{actions}:{bounded} the environment's own limit{f' of {limits[-1]}' if bounded else ''}"
         if not limits:
             return f"{actions}: --max-steps; the environment declares no limit of its own"
         shorter = "; rates are not the benchmark's" if most[-1] < limits[-1] else ""
@@ -691,8 +702,8 @@ class EnvironmentSource(Source[EnvSource]):
         groups: list[str | None] = [row.content.group for row in rows]
         if all(group is None for group in groups):
             return "every episode is one, because its seed starts it anew"
-        named = "the environment names them"
-        return named if None not in groups else f"{named}; an episode without one is its own"
+        words = "the environment names them"
+        return words if None not in groups else f"{words}; an episode without one is its own"
 
     @property
     def _start_words(self) -> str:

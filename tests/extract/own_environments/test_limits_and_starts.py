@@ -221,7 +221,10 @@ def test_a_process_in_which_an_episode_starts_otherwise_ends_the_run() -> None:
 
 def test_a_group_is_what_the_environment_names_and_else_an_episode() -> None:
     assert "the environment names them" in words_of(opened())["groups"]
-    assert "12 in 6 groups" in words_of(opened())["episodes"]
+    source = opened()
+    assert "12 in 6 groups" in words_of(source)["episodes"]
+    assert source.smaller_groups(source.rows(0)) == f"train --group-by {START} makes a group of each start"
+    assert source.smaller_groups(()) == ""
 
 
 @pytest.mark.slow
