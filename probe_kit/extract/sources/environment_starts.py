@@ -56,4 +56,4 @@ def _difference(was: NDArray[np.generic] | None, now: NDArray[np.generic] | None
     if was.ndim == 1:
         number = int(distances.argmax())
         return f" (number {number} by {distances[number]:.3g})"
-    return f" ({distances.any(axis=-1).mean():.0%} of its pixels, by up to {distances.max():.0f} of 255)"
+    return f" ({distances.any(axis=-1).mean():.1%} of its pixels, by up to {distances.max():.0f} of 255)"

@@ -8,7 +8,7 @@ import pytest
 
 from probe_kit.errors import MissingExtraError, OwnEnvironmentError, UsageError
 from probe_kit.extract import EnvSource, check_environment
-from probe_kit.extract.sources.environment_source import open_environment
+from probe_kit.extract.sources.environment_source import EnvironmentSource, open_environment
 from probe_kit.extract.sources.lerobot_env import LeRobotEnvironment
 from tests.support.reach_env import Reach
 
@@ -133,3 +133,24 @@ def test_a_simulator_that_asks_a_question_at_its_import_is_named(monkeypatch: py
 def test_an_environment_without_a_text_asks_for_one() -> None:
     with pytest.raises(OwnEnvironmentError, match="has no instruction for probe_kit_reach-0; give one"):
         list(LeRobotEnvironment("probe_kit_reach").episodes())
+
+
+@pytest.mark.parametrize(
+    ("kind", "package", "options", "limit"),
+    [
+        ("pusht", "gym_pusht", {"instruction": "push the T"}, 300),
+        ("aloha", "gym_aloha", {}, 400),
+        ("metaworld", "metaworld", {"task": "push-v3"}, 500),
+    ],
+)
+def test_a_real_simulator_ends_where_its_benchmark_does_and_repeats(
+    kind: str, package: str, options: dict[str, Any], limit: int
+) -> None:
+    """Where its package is installed; the table of docs/own-environments.md has all that were run."""
+    pytest.importorskip(package)
+    source = EnvSource(f"lerobot:{kind}", {**options, "per_task": 6}).open()  # type: ignore[arg-type]
+    assert isinstance(source, EnvironmentSource)
+    source.rehearse(source.rows(0))
+    assert source.settings.steps() == limit
+    assert len({row.columns["group_id"] for row in source.rows(0)}) == 6
+    assert len(set(source.starts.values())) == 2
