@@ -234,7 +234,9 @@ def print_sufficiency(extraction: "Extraction") -> None:
     if suite is None:
         groups = len({row.columns["group_id"] for row in plan.episodes})
         if groups < GROUPS_FOR_PROBES:
-            say(marked("[yellow]{} {}; probes need {} or more[/]", groups, source.groups, GROUPS_FOR_PROBES))
+            more = source.smaller_groups(plan.episodes) if len(plan.episodes) >= GROUPS_FOR_PROBES else ""
+            few = f"{groups} {source.groups}; probes need {GROUPS_FOR_PROBES} or more" + f". {more}" * bool(more)
+            say(marked("[yellow]{}[/]", few))
         return
     scored = not extraction.identity().get("capture_only")
     table = Table(show_header=False, title=f"enough for ({Smallest.of(suite).words})", box=None)
@@ -280,14 +282,14 @@ def print_input_notes(run: "Run") -> None:
 
 
 def _print_outcomes(run: "Run") -> None:
-    from probe_kit.runs.layout import AT_END, ONCE
+    from probe_kit.runs.environment_success import EnvironmentSuccess
 
     counts = run.episodes["outcome"].value_counts()
     text = ", ".join(f"{name} {count}" for name, count in counts.items())
     text = "captured without acting" if run.capture_only else text
     say(f"{counted(len(run.episodes), 'episode')}: {text}")
-    if ONCE in run.episodes and (lost := int((run.episodes[ONCE] & ~run.episodes[AT_END]).sum())):
-        say(f"{lost} of them had success before their end only; see the columns {ONCE} and {AT_END}")
+    if (success := EnvironmentSuccess.of(run.episodes)) is not None:
+        say(marked("[yellow]{}[/]" if success.stopped else "{}", success.sentence))
     print_input_notes(run)
     say(marked("next: [bold]{}[/]", _next_command(run)))
     out.print(str(run.location), soft_wrap=True)

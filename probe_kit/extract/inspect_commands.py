@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -334,12 +335,23 @@ def check_environment(
         typer.Argument(metavar="MODULE:CLASS", help="Your environment, or lerobot:TYPE such as lerobot:libero."),
     ],
     env_options: EnvOptions = None,
+    rotate: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--rotate", metavar="[CAMERA=]DEGREES", help="Rotate pictures, as extract does with the same option."
+        ),
+    ] = None,
+    picture: Annotated[
+        Path | None,
+        typer.Option("--picture", metavar="FILE", help="Write the first picture of every camera, side by side."),
+    ] = None,
     as_json: common.AsJson = False,
 ) -> None:
     """Check an environment of your own against its contract, without a model.
 
-    Two episodes of five actions are played, twice. Each check is one line: passed or failed, and the promise that
-    is checked. A failure says what was seen and what was expected.
+    Two episodes of five actions are played, twice, and once in another process. Each check is one line: passed or
+    failed, and the promise that is checked. A failure says what was seen and what was expected. Look at the file
+    of --picture: where it stands on its head, give --rotate 180 here and to extract.
 
     Example: `probe-kit check-environment kitchen:Kitchen`
 
@@ -348,15 +360,15 @@ def check_environment(
     from probe_kit.extract import EnvSource
     from probe_kit.extract import check_environment as checks_of
 
-    source = EnvSource(environment, options=env_options or ())
+    source = EnvSource(environment, options=env_options or (), rotations=rotate or ())
     checks = []
-    for check in checks_of(source):
+    for check in checks_of(source, picture):
         checks.append(check)
         if not as_json:
             state, colour = ("passed", "green") if check.passed else ("failed", "bold red")
             out.print(marked(f"[{colour}]{{}}[/] {{}}", f"{state:8}", check.sentence), soft_wrap=True)
-            if check.problem:
-                out.print(marked("         [dim]seen[/] {}", terminal_safe(check.problem)), soft_wrap=True)
+            if evidence := check.problem or check.facts:
+                out.print(marked("         [dim]seen[/] {}", terminal_safe(evidence)), soft_wrap=True)
     failed = sum(not check.passed for check in checks)
     if as_json:
         listed = [{**asdict(check), "passed": check.passed} for check in checks]
@@ -365,5 +377,10 @@ def check_environment(
         out.print(f"{len(checks) - failed} passed, {failed} failed")
     else:
         out.print(f"{len(checks)} passed")
-        say(marked("next: [bold]probe-kit extract --model NAME --env {}[/] --out runs/own", environment))
+        options = [
+            *(f"--env-option {quote(text)}" for text in env_options or ()),
+            *(f"--rotate {turn}" for turn in rotate or ()),
+        ]
+        command = " ".join(["probe-kit extract --model NAME --env", environment, *options, "--out runs/own"])
+        say(marked("next: [bold]{}[/]", command))
     raise typer.Exit(FAILED if failed else 0)

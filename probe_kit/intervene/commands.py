@@ -409,6 +409,7 @@ def show(
         print_json(
             {
                 **asdict(facts),
+                "success": None if facts.success is None else facts.success.to_json(),
                 "interventions": listed,
                 "unfinished_interventions": unfinished,
                 "input_notes": notes,

@@ -41,6 +41,7 @@ from probe_kit.retention.rows.build import (
     with_holm_of_targets,
 )
 from probe_kit.retention.rows.row import RetentionRow
+from probe_kit.runs.environment_success import EnvironmentSuccess
 from probe_kit.runs.reader import RunReader, check_sides
 from probe_kit.runs.store import Location
 from probe_kit.statistics.sufficiency import ABSENT_BELOW
@@ -422,7 +423,7 @@ def retention_table(
     }
     if targets is not None:
         rows = with_holm_of_targets(rows, results) if family == "table" else rows
-        notes += [*_label_notes(table_runs, rows, family), *mixed_episodes(every)]
+        notes += [*_label_notes(table_runs, rows, family), *mixed_episodes(every), *_success_notes(table_runs)]
         return RetentionTable(
             rows, [], results=results, iterations=iterations, notes=tuple(notes), runs=tuple(table_runs)
         )
@@ -613,6 +614,13 @@ def _label_notes(runs: Sequence[TableRun], rows: Sequence[RetentionRow], family:
         tried = stored_targets(table_run.run)
         if sum(tried.values()) > 1:
             yield f"{table_run.name} has probes of {_in_words(tried)}; p is {corrected}."
+
+
+def _success_notes(runs: Sequence[TableRun]) -> Iterator[str]:
+    """Yield the success rates of runs in environments, which have no rows of their own."""
+    for table_run in runs:
+        if (success := EnvironmentSuccess.of(table_run.run.episodes)) is not None:
+            yield f"{table_run.name}: {success.sentence}."
 
 
 def _in_words(tried: Mapping[str, int]) -> str:

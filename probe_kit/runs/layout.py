@@ -84,6 +84,12 @@ SaeDtype = Literal["bfloat16", "float16"]
 """The numbers in a memory map to train sparse autoencoders on."""
 ONCE, AT_END = "success_once", "success_at_end"
 """The columns of episodes with whether `success` was true after any action, and after the last one."""
+LIMIT, START = "limit", "start_blake2b"
+"""Columns of episodes of environments.
+
+They hold the number of actions after which the benchmark ends an episode, where it declares one, and the hash of
+the first observation.
+"""
 CAPTURE_ONLY = "capture_only"
 """The outcome of an episode whose model was captured and did not act: there is no success rate."""
 DATASET = "dataset"

@@ -21,7 +21,7 @@ from probe_kit.extract.sources.lerobot_folder import (
 )
 from probe_kit.extract.sources.lerobot_meta import IMAGE
 from probe_kit.extract.sources.player import SIDE, Answer, InputsPlayer, Opens
-from probe_kit.extract.sources.recording import LeRobotSource, Pairs
+from probe_kit.extract.sources.recording import EVERY_CAMERA, LeRobotSource, Pairs, degrees_of
 from probe_kit.extract.sources.source import (
     MOST_UNUSUAL,
     Played,
@@ -184,11 +184,13 @@ class RecordingSource(Source[LeRobotSource]):
         """Return the same recordings with a feature for the model's cameras. Raises RecordingError without."""
         pairs = mapped_cameras(self.settings.cameras, cameras, self.folder.cameras)
         names = [camera for camera, _ in pairs]
-        if strange := [camera for camera, _ in self.settings.rotations if camera not in names]:
+        rotations = self.settings.rotations
+        if strange := [camera for camera, _ in rotations if camera not in (*names, EVERY_CAMERA)]:
             raise RecordingError(
                 f"--rotate {strange[0]}=…: that camera gets no picture; those with one are {', '.join(names)}"
             )
-        return type(self)(self.settings.changed(cameras=pairs), self.folder, self.stretch)
+        turns = {camera: turn for camera in names if (turn := degrees_of(rotations, camera))}
+        return type(self)(self.settings.changed(cameras=pairs, rotations=turns), self.folder, self.stretch)
 
     def check_state_width(self, checkpoint: str, expected: int | None) -> None:
         """Raise RecordingError unless the recorded state has as many numbers as the model reads."""

@@ -258,6 +258,11 @@ class Source[Chosen: SourceSettings](ABC):
         """Return the parts of a run's default name beside its identity."""
         return []
 
+    def smaller_groups(self, rows: "Sequence[Row]") -> str:
+        """Return how probes get more groups of these rows than their own, in words; empty where they cannot."""
+        del rows
+        return ""
+
     def rehearse(self, rows: "Iterable[Row]") -> None:
         """Set the first rows up. Raises an error if none can be."""
         del rows
