@@ -30,7 +30,7 @@ _NAMING = ("peft_type", "base_model_name_or_path")
 _WITHOUT_EFFECT = (
     "task_type", "auto_mapping", "peft_version", "inference_mode", "target_modules", "exclude_modules",
     "lora_dropout", "layers_to_transform", "layers_pattern", "megatron_core", "qalora_group_size",
-    "runtime_config", "eva_config", "loftq_config", "velora_config",
+    "runtime_config", "eva_config", "loftq_config", "velora_config", "ensure_weight_tying",
 )  # fmt: skip
 """Fields of training, speed, and rules for choosing modules: the tensors themselves say which ones they change."""
 _INERT: Mapping[str, tuple[Any, ...]] = {
