@@ -135,11 +135,14 @@ def picture_values(folders: Path | Sequence[Path]) -> PictureValues | None:
 def describe_picture_conflict(folder: Path) -> str:
     """Return which settings of pictures two files of a folder give different values; empty where they agree.
 
+    Where an adapter is joined with its base, the adapter's file counts and the base's is no conflict.
+
     Raises:
         CheckpointError: For a file that cannot be read.
     """
     sources = _picture_sources(folder)
-    if len(sources) < len((PROCESSOR_FILE, PICTURES_FILE)):
+    origins = {(folder / name).resolve().parent for name in (PROCESSOR_FILE, PICTURES_FILE)}
+    if len(sources) < len((PROCESSOR_FILE, PICTURES_FILE)) or len(origins) > 1:
         return ""
     inside, apart = sources
     both = sorted((inside.values.keys() & apart.values.keys()) - {*_NAMING})
@@ -160,8 +163,8 @@ def processor_settings(folder: Path, needed: Sequence[str], optional: Sequence[s
     stored = picture_values(folder)
     if stored is None:
         raise CheckpointError(
-            f"{folder} has neither {PROCESSOR_FILE} with {PICTURES} nor {PICTURES_FILE}, which define how "
-            "pictures are prepared for this checkpoint. Save the processor that it was trained with there, with "
+            f"{folder / PICTURES_FILE} is missing, and so is {PICTURES} in {PROCESSOR_FILE}; one of the two defines "
+            "how pictures are prepared for this checkpoint. Save the processor that it was trained with there, with "
             "its save_pretrained; the base's file is right only if training prepared pictures in the same way"
         )
     values = stored.values
