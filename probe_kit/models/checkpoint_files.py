@@ -163,9 +163,9 @@ def processor_settings(folder: Path, needed: Sequence[str], optional: Sequence[s
     stored = picture_values(folder)
     if stored is None:
         raise CheckpointError(
-            f"{folder / PICTURES_FILE} is missing, and so is {PICTURES} in {PROCESSOR_FILE}; one of the two defines "
-            "how pictures are prepared for this checkpoint. Save the processor that it was trained with there, with "
-            "its save_pretrained; the base's file is right only if training prepared pictures in the same way"
+            f"{folder / PICTURES_FILE} is missing, and so is {PICTURES} in {PROCESSOR_FILE}; one of the two "
+            "defines how pictures are prepared for this checkpoint. Save the processor that it was trained with "
+            "there, with its save_pretrained; the base's file is right only if training prepared pictures alike"
         )
     values = stored.values
     if missing := [name for name in needed if values.get(name) is None]:

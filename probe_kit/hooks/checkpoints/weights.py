@@ -30,6 +30,10 @@ _FACTORS = (
 )  # fmt: skip
 
 
+_PATTERNS = ("rank_pattern", "alpha_pattern")
+"""The settings that give single modules other values, by regular expressions of their paths."""
+
+
 @dataclass(frozen=True)
 class Adapter:
     """A LoRA adapter with its tensors, by the names that peft gave them."""
@@ -167,7 +171,10 @@ class Adapter:
             inner = inner.get_submodule(parent)
         inner.add_module(last, twin)
         # The tensors say which modules change; "all-linear" and patterns would be resolved by peft's own rules.
-        config = peft.LoraConfig(target_modules=[path], bias="none", inference_mode=True, **self.scaling)
+        scaling = {
+            name: _of_path(value, path) if name in _PATTERNS else value for name, value in self.scaling.items()
+        }
+        config = peft.LoraConfig(target_modules=[path], bias="none", inference_mode=True, **scaling)
         try:
             wrapped = peft.get_peft_model(tree, config)
         except (ValueError, TypeError) as error:
@@ -215,6 +222,14 @@ class _AdapterParts(NamedTuple):
     factors: dict[str, dict[str, Tensor]]
     bases: dict[str, Tensor]
     copies: dict[str, Tensor]
+
+
+def _of_path(pattern: Mapping[str, Any], path: str) -> dict[str, Any]:
+    """The one entry of a pattern that is for a module, if any; peft warns about the others, which have no module."""
+    from peft.utils import get_pattern_key
+
+    key = get_pattern_key(pattern, path)
+    return {key: pattern[key]} if key in pattern else {}
 
 
 def _is_embedding(name: str) -> bool:
