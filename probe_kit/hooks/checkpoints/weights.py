@@ -225,8 +225,8 @@ class _AdapterParts(NamedTuple):
 
 
 def _of_path(pattern: Mapping[str, Any], path: str) -> dict[str, Any]:
-    """The one entry of a pattern that is for a module, if any; peft warns about the others, which have no module."""
-    from peft.utils import get_pattern_key
+    """The one entry of a pattern that is for a module, if any; peft warns about entries that match none."""
+    from peft.utils.other import get_pattern_key
 
     key = get_pattern_key(pattern, path)
     return {key: pattern[key]} if key in pattern else {}
