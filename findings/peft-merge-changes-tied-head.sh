@@ -2,7 +2,7 @@
 # peft 0.21.2 with transformers 5.5.4. A LoRA on the embedding of a network whose output head is tied to it changes the embedding alone while it
 # is trained and loaded. merge_and_unload adds the factors to the one tensor that both share, so that the merged network puts out other logits.
 # peft warns of "complications" when the LoRA is made, and says nothing when it merges; without a tied head both agree to rounding.
-# Seen: largest difference of logits, merged against loaded: tied 7.5 (logits up to 6), not tied 1e-06
+# Seen: largest difference of logits, merged against loaded: tied 3.5 (logits up to 0.55), not tied 0
 set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
@@ -30,7 +30,7 @@ for tied in (True, False):
     with torch.no_grad():
         for name, value in tuned.named_parameters():
             if "lora_" in name:
-                value.copy_(torch.randn(value.shape))
+                value.copy_(0.1 * torch.randn(value.shape))
     tuned.save_pretrained("tuned")
     loaded = PeftModel.from_pretrained(Qwen2ForCausalLM.from_pretrained("base"), "tuned").eval()
     with torch.no_grad():

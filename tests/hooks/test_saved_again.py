@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from transformers import Qwen2VLImageProcessor
 
-from probe_kit.errors import CheckpointError, WeightsError
+from probe_kit.errors import CheckpointError, InstructionError, WeightsError
 from probe_kit.hooks import Observation, Prompt, load_model
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.families.shared.vlm import Prefill
@@ -26,6 +27,7 @@ from probe_kit.models.checkpoint_files import LANGUAGE_FIRST, SIGLIP_TOWER, pict
 from tests.support import saved_again
 from tests.support.every_checkpoint import WRITERS, families
 from tests.support.saved_again import CLASSES, LAYOUTS, copied, join_processor, rename_weights
+from tests.support.slow_cases import slow_but
 from tests.support.vlm_checkpoints import write_paligemma
 
 PICTURE = np.random.default_rng(0).integers(0, 255, (60, 60, 3)).astype(np.uint8)
@@ -36,6 +38,7 @@ SEEN = Observation(
     intrinsics=np.array([[60, 0, 32], [0, 60, 32], [0, 0, 1]], np.float32),
 )
 QUESTION = Prompt(SEEN, "Do you see red?")
+LONGEST = ("paligemma", "5.24, from a configuration")
 NEWEST = ("transformers==5.24.0", "tokenizers==0.23.3")
 
 
@@ -47,7 +50,8 @@ def outputs(family: str, folder: Path) -> NDArray[Any]:
     model = load_model(family, str(folder), **WRITERS[family][1], **FURTHER_OPTIONS.get(family, {}))
     if hasattr(model, "prefill"):
         return np.asarray(model.prefill([QUESTION]).logits.float())
-    return np.asarray(model.predict([SEEN], [3]))
+    state = np.zeros(getattr(model, "state_numbers", len(SEEN.state)), np.float32)
+    return np.asarray(model.predict([replace(SEEN, state=state)], [3]))
 
 
 def written(family: str, tmp_path: Path) -> Path:
@@ -55,7 +59,14 @@ def written(family: str, tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("family", "layout"), [(family, layout) for family, layouts in LAYOUTS.items() for layout in layouts]
+    ("family", "layout"),
+    [
+        pytest.param(
+            family, layout, marks=[pytest.mark.slow] * ((family, layout) not in [("internvl", "5.5"), LONGEST])
+        )
+        for family, layouts in LAYOUTS.items()
+        for layout in layouts
+    ],
 )
 def test_every_naming_of_weights_gives_the_same_answers(family: str, layout: str, tmp_path: Path) -> None:
     source = written(family, tmp_path)
@@ -108,7 +119,9 @@ def test_one_tensor_under_two_names_counts_once_if_both_are_equal_and_is_refused
 # -- processors -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("first", ["processor_config.json", "preprocessor_config.json"])
+@pytest.mark.parametrize(
+    "first", ["processor_config.json", pytest.param("preprocessor_config.json", marks=pytest.mark.slow)]
+)
 def test_where_two_files_have_pictures_the_one_counts_that_transformers_reads(first: str, tmp_path: Path) -> None:
     """The reader of transformers is the oracle; the card says what the other file has."""
     folder = copied(written("qwen3-vl", tmp_path), tmp_path / "both")
@@ -134,7 +147,7 @@ def test_equal_settings_in_two_files_are_no_conflict(tmp_path: Path) -> None:
     assert not any("pictures" in note for note in load_model("paligemma", str(folder)).card.notes)
 
 
-@pytest.mark.parametrize("family", ["paligemma", "internvl", "qwen2.5-vl", "ovis2.5"])
+@pytest.mark.parametrize("family", slow_but(("paligemma",), ["paligemma", "internvl", "qwen2.5-vl", "ovis2.5"]))
 def test_without_any_settings_of_pictures_both_files_are_named_and_no_copy_is_advised(
     family: str, tmp_path: Path
 ) -> None:
@@ -173,10 +186,27 @@ def test_the_pictures_of_an_adapter_count_before_its_bases_in_whichever_file_the
     assert stored.values["image_mean"] == changed["image_mean"]
 
 
+def test_words_that_a_processor_added_beyond_the_vocabulary_are_refused_where_a_text_has_one(
+    tmp_path: Path,
+) -> None:
+    """PaliGemma's processor adds 1,152 words to a tokenizer without them, and the network is saved as it was."""
+    from tokenizers import Tokenizer
+
+    folder = copied(written("paligemma", tmp_path), tmp_path / "added")
+    tokenizer = Tokenizer.from_file(str(folder / "tokenizer.json"))
+    tokenizer.add_tokens([f"<loc{number:04}>" for number in range(100)])
+    tokenizer.save(str(folder / "tokenizer.json"))
+    model = load_model("paligemma", str(folder))
+    expected = outputs("paligemma", tmp_path / "released")
+    np.testing.assert_array_equal(model.prefill([QUESTION]).logits.numpy(), expected)
+    with pytest.raises(InstructionError, match="'<loc0099>', which was added to the tokenizer"):
+        model.prefill([replace(QUESTION, text="detect <loc0099>")])
+
+
 # -- configurations -------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("family", ["qwen2.5-vl", "qwen3-vl"])
+@pytest.mark.parametrize("family", slow_but(("qwen3-vl",), ["qwen2.5-vl", "qwen3-vl"]))
 @pytest.mark.parametrize("theta", [10000.0, 500.0])
 def test_frequencies_of_a_vision_tower_that_the_installed_network_cannot_have_are_refused(
     family: str, theta: float, tmp_path: Path
@@ -223,19 +253,12 @@ def tuned_paligemma(base: Path, **settings: Any) -> Any:
     return tuned
 
 
-def save_adapter(tuned: Any, folder: Path, base: Path, **options: Any) -> Path:
-    with pytest.warns() if options.get("save_embedding_layers") else _silently():
-        tuned.save_pretrained(folder, **options)
+def save_adapter(tuned: Any, folder: Path, base: Path) -> Path:
+    tuned.save_pretrained(folder)
     settings = json.loads((folder / "adapter_config.json").read_text(encoding="utf-8"))
     settings["base_model_name_or_path"] = str(base)
     (folder / "adapter_config.json").write_text(json.dumps(settings), encoding="utf-8")
     return folder
-
-
-def _silently() -> Any:
-    import warnings
-
-    return warnings.catch_warnings(action="ignore")
 
 
 def peft_logits(model: Any, network: Any) -> NDArray[Any]:
@@ -283,6 +306,7 @@ def test_an_adapter_of_tied_embeddings_answers_as_peft_does_without_merging(kind
     )
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_an_embedding_of_another_base_beside_the_factors_replaces_the_bases_and_is_said(tmp_path: Path) -> None:
     from transformers import PaliGemmaForConditionalGeneration
