@@ -228,7 +228,7 @@ def _of_path(pattern: Mapping[str, Any], path: str) -> dict[str, Any]:
     """The one entry of a pattern that is for a module, if any; peft warns about entries that match none."""
     from peft.utils.other import get_pattern_key
 
-    key = get_pattern_key(pattern, path)
+    key = get_pattern_key(tuple(pattern), path)
     return {key: pattern[key]} if key in pattern else {}
 
 
