@@ -50,7 +50,7 @@ def outputs(family: str, folder: Path) -> NDArray[Any]:
     model = load_model(family, str(folder), **WRITERS[family][1], **FURTHER_OPTIONS.get(family, {}))
     if hasattr(model, "prefill"):
         return np.asarray(model.prefill([QUESTION]).logits.float())
-    state = np.zeros(getattr(model, "state_numbers", len(SEEN.state)), np.float32)
+    state = np.zeros(model.state_numbers or len(SEEN.state), np.float32)
     return np.asarray(model.predict([replace(SEEN, state=state)], [3]))
 
 
