@@ -1,7 +1,7 @@
 """Frames of a LeRobotDataset as a source: settings of what is shown."""
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -50,6 +50,17 @@ def read_episodes(value: Any) -> Any:
     if not several:
         raise UsageError(f"--episodes {value!r} names none; expected START:STOP, such as 0:5")
     return tuple(sorted(set(several)))
+
+
+def episodes_text(episodes: Sequence[int]) -> str:
+    """Return ascending episodes as `read_episodes` reads them, such as `0:5,7`."""
+    runs: list[list[int]] = []
+    for episode in episodes:
+        if runs and episode == runs[-1][1]:
+            runs[-1][1] += 1
+        else:
+            runs.append([episode, episode + 1])
+    return ",".join(str(start) if stop == start + 1 else f"{start}:{stop}" for start, stop in runs)
 
 
 Episodes = Annotated[

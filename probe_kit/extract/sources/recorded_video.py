@@ -1,0 +1,117 @@
+"""A video file of recordings: the exact times of its frames, without decoding, and the picture at one of them."""
+
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.suite.pictures import LARGEST_PICTURE
+
+_TIMELESS = "has no frame with a time. Write it again as MP4"
+
+
+class VideoError(Exception):
+    """A video that cannot be read."""
+
+
+@dataclass(frozen=True)
+class _Packets:
+    """The packets of shown frames.
+
+    Attributes:
+        times: Their times in ticks, ascending.
+        starts: Times from which decoding can begin, ascending.
+    """
+
+    times: tuple[int, ...]
+    starts: tuple[int, ...]
+
+
+class RecordedVideo:
+    """The first video stream of a file.
+
+    Attributes:
+        base: The seconds of a tick, in which the stream counts time.
+        lasts: Seconds from the header.
+        rate: Frames per second from the header; 0 where it says none.
+
+    Raises:
+        VideoError: For a file that PyAV does not open, without a video, or with too large pictures.
+    """
+
+    def __init__(self, path: Path) -> None:
+        import av
+
+        try:
+            self._container = av.open(str(path))
+            stream = self._stream = self._container.streams.video[0]
+        except (av.error.FFmpegError, IndexError, OSError) as error:
+            reason = str(error)[:200]
+            raise VideoError(f"is no video that PyAV opens ({reason}). Copy the data set again") from error
+        if max(stream.width, stream.height) > LARGEST_PICTURE:
+            raise VideoError(
+                f"claims to be {stream.width}×{stream.height} pixels; at most {LARGEST_PICTURE} are read. Make it "
+                "smaller"
+            )
+        if not stream.time_base:
+            raise VideoError(_TIMELESS)
+        self.base: Fraction = stream.time_base
+        file_lasts = (self._container.duration or 0) / av.time_base
+        self.lasts = float(stream.duration * self.base) if stream.duration else file_lasts
+        self.rate = float(stream.average_rate or 0)
+
+    @property
+    def times(self) -> tuple[int, ...]:
+        """The times of all frames that are shown, in ticks, ascending. Edit lists are applied."""
+        return self._packets.times
+
+    @cached_property
+    def _packets(self) -> _Packets:
+        packets = [
+            (packet.pts, packet.is_keyframe)
+            for packet in self._demuxed()
+            if packet.pts is not None and not packet.is_discard
+        ]
+        if not packets:
+            raise VideoError(_TIMELESS)
+        times = tuple(sorted(time for time, _ in packets))
+        return _Packets(times, tuple(sorted({times[0], *(time for time, is_start in packets if is_start)})))
+
+    def _demuxed(self) -> Any:
+        """Yield the packets up to the end of the file, or to the place where it is cut off."""
+        import av
+
+        try:
+            yield from self._container.demux(self._stream)
+        except av.error.FFmpegError:
+            return
+
+    def picture(self, time: int) -> NDArray[np.uint8]:
+        """Return the picture (H, W, 3) uint8 at one of `times`.
+
+        Decoding begins at the last key frame before it. Where pictures before a key frame in time lie behind it in
+        the file, it begins at the key frame before that one, then at the first.
+
+        Raises:
+            VideoError: If the stream shows no whole picture at that time.
+        """
+        import av
+
+        earlier = [start for start in self._packets.starts if start <= time]
+        reason = "no picture was decoded"
+        for start in dict.fromkeys((*earlier[:-3:-1], self._packets.starts[0])):
+            try:
+                self._container.seek(start, backward=True, any_frame=False, stream=self._stream)
+                for frame in self._container.decode(self._stream):
+                    if frame.pts is None or frame.pts < time:
+                        continue
+                    if frame.pts == time and not frame.is_corrupt:
+                        return np.ascontiguousarray(frame.to_ndarray(format="rgb24"))
+                    break
+            except (av.error.FFmpegError, OSError) as error:
+                reason = f"{type(error).__name__}: {str(error)[:200]}"
+        raise VideoError(reason)
