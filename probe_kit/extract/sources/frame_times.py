@@ -18,6 +18,7 @@ NEAR = 3
 """A time names a frame at most 1 / NEAR of a frame step away, if every other one is at least twice as far."""
 BY_FAR = "within a third of a frame step, and every other one at least twice as far"
 NONE = -1
+_LITTLE = 0.001
 
 
 @dataclass(frozen=True)
@@ -111,5 +112,7 @@ class Drift:
     def __str__(self) -> str:
         """Describe the distance and where it is."""
         against = "frame / fps" if self.camera is None else f"the video of {self.camera}"
+        if self.steps < _LITTLE:
+            return f"less than {_LITTLE:g} of a frame step"
         distance = f"{self.steps:.2g} of a frame step ({1000 * self.seconds:.2g} ms) from {against}"
         return f"{distance}, at frame {self.frame} of episode {self.episode}"

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from probe_kit._system.parquet_files import read_parquet
 from probe_kit.errors import RecordingError, UsageError
 from probe_kit.extract.sources.frame_times import BY_FAR, NONE, Drift, TickTimes, nearest_by_far
+from probe_kit.extract.sources.lerobot_formats import EPISODES
 from probe_kit.extract.sources.lerobot_meta import (
-    EPISODES,
     HALF,
     IMAGE,
     KEYS,
