@@ -457,17 +457,13 @@ class LeRobotFrames:
         path = self.folder.path / part.file
         video, timestamps = self._video(path), self.numbers(episode, ())["timestamp"][:, 0]
         times = TickTimes.of(timestamps.tolist(), part.begin, video.base)
-        try:
-            match = nearest_by_far(times, video.times, 1 / (fps * video.base))
-        except VideoError as error:
-            raise RecordingError(f"{self._where(path)} {error}") from error
+        match = nearest_by_far(times, video.times, 1 / (fps * video.base))
         repeated = np.r_[False, np.diff(match.positions) < 1]
         if (off := np.flatnonzero((match.positions == NONE) | repeated)).size:
             frame = int(off[0])
             raise RecordingError(
                 f"{self._where(path)} shows no picture of {camera} for frames {_listed(off)} of episode "
-                f"{episode}: "
-                f"frame {frame} is at {part.begin + timestamps[frame]:.4f} s, "
+                f"{episode}: frame {frame} is at {part.begin + timestamps[frame]:.4f} s, "
                 + (
                     "where the video shows the picture of the frame before it"
                     if match.positions[frame] != NONE
@@ -503,12 +499,14 @@ class LeRobotFrames:
     def _check_video(self, episode: EpisodeMeta, camera: str) -> None:
         """Raise RecordingError for a video that ends before an episode, or has another rate than the data set."""
         part, fps = episode.videos[camera], self.folder.fps
-        video = self._video(self.folder.path / part.file)
-        if video.lasts < part.end - HALF / fps or (video.rate and abs(video.rate - fps) > OTHER_RATE * fps):
+        path = self.folder.path / part.file
+        video = self._video(path)
+        ends = float(video.times[-1] * video.base) + 1 / fps
+        if ends < part.end - HALF / fps or (video.rate and abs(video.rate - fps) > OTHER_RATE * fps):
             raise RecordingError(
-                f"{self.folder.path.name}: {part.file} lasts {video.lasts:.4f} s at {video.rate:g} frames per "
-                f"second; meta says {fps:g} frames per second, and that it shows episode {episode.number} until "
-                f"{part.end:.4f} s. Copy the data set again, or repair its meta"
+                f"{self._where(path)} ends at {ends:.4f} s and has {video.rate:g} frames per second; meta says "
+                f"{fps:g} frames per second, and that it shows episode {episode.number} until {part.end:.4f} s. "
+                "Copy the data set again, or repair its meta"
             )
 
     def _opened_video(self, path: Path) -> RecordedVideo:

@@ -79,8 +79,8 @@ def _conversion(root: Path, info: Mapping[str, Any], repo: str | None, revision:
         root = _free(Path.cwd() / repo.rpartition("/")[2])
     if "'" in str(root):
         return (
-            f"The converter of lerobot opens no videos in {root}, because of the apostrophe. Move the data set to a "
-            "path without one, and run the same command again"
+            f"The converter of lerobot opens no videos in {root}, because of the apostrophe. Move the data set to "
+            "a path without one, and run the same command again"
         )
     steps = []
     if repo is not None:

@@ -1,8 +1,6 @@
 """A video file of recordings: the exact times of its frames, without decoding, and the picture at one of them."""
 
-from dataclasses import dataclass
 from fractions import Fraction
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -18,34 +16,22 @@ class VideoError(Exception):
     """A video that cannot be read."""
 
 
-@dataclass(frozen=True)
-class _Packets:
-    """The packets of shown frames.
-
-    Attributes:
-        times: Their times in ticks, ascending.
-        starts: Times from which decoding can begin, ascending.
-    """
-
-    times: tuple[int, ...]
-    starts: tuple[int, ...]
-
-
 class RecordedVideo:
     """The first video stream of a file.
 
     Attributes:
         base: The seconds of a tick, in which the stream counts time.
-        lasts: Seconds from the header.
-        rate: Frames per second from the header; 0 where it says none.
+        times: The times of all frames that are shown, in ticks, ascending. Edit lists are applied.
+        rate: The frames per second by its header; 0 where it says none.
 
     Raises:
-        VideoError: For a file that PyAV does not open, without a video, or with too large pictures.
+        VideoError: For a file that PyAV does not open, without a video or its times, or with too large pictures.
     """
 
     def __init__(self, path: Path) -> None:
         import av
 
+        self._path = path
         try:
             self._container = av.open(str(path))
             stream = self._stream = self._container.streams.video[0]
@@ -60,17 +46,7 @@ class RecordedVideo:
         if not stream.time_base:
             raise VideoError(_TIMELESS)
         self.base: Fraction = stream.time_base
-        file_lasts = (self._container.duration or 0) / av.time_base
-        self.lasts = float(stream.duration * self.base) if stream.duration else file_lasts
         self.rate = float(stream.average_rate or 0)
-
-    @property
-    def times(self) -> tuple[int, ...]:
-        """The times of all frames that are shown, in ticks, ascending. Edit lists are applied."""
-        return self._packets.times
-
-    @cached_property
-    def _packets(self) -> _Packets:
         packets = [
             (packet.pts, packet.is_keyframe)
             for packet in self._demuxed()
@@ -78,8 +54,8 @@ class RecordedVideo:
         ]
         if not packets:
             raise VideoError(_TIMELESS)
-        times = tuple(sorted(time for time, _ in packets))
-        return _Packets(times, tuple(sorted({times[0], *(time for time, is_start in packets if is_start)})))
+        self.times = tuple(sorted(time for time, _ in packets))
+        self._starts = tuple(sorted({self.times[0], *(time for time, is_start in packets if is_start)}))
 
     def _demuxed(self) -> Any:
         """Yield the packets up to the end of the file, or to the place where it is cut off."""
@@ -101,12 +77,11 @@ class RecordedVideo:
         """
         import av
 
-        earlier = [start for start in self._packets.starts if start <= time]
+        starts = [start for start in self._starts if start <= time]
         reason = "no picture was decoded"
-        for start in dict.fromkeys((*earlier[:-3:-1], self._packets.starts[0])):
+        for start in (*starts[:-3:-1], None):
             try:
-                self._container.seek(start, backward=True, any_frame=False, stream=self._stream)
-                for frame in self._container.decode(self._stream):
+                for frame in self._decoded(start):
                     if frame.pts is None or frame.pts < time:
                         continue
                     if frame.pts == time and not frame.is_corrupt:
@@ -115,3 +90,14 @@ class RecordedVideo:
             except (av.error.FFmpegError, OSError) as error:
                 reason = f"{type(error).__name__}: {str(error)[:200]}"
         raise VideoError(reason)
+
+    def _decoded(self, start: int | None) -> Any:
+        """Yield the frames from a time on, or of the file opened again for None: not every format can seek."""
+        import av
+
+        if start is None:
+            with av.open(str(self._path)) as container:
+                yield from container.decode(video=0)
+            return
+        self._container.seek(start, backward=True, any_frame=False, stream=self._stream)
+        yield from self._container.decode(self._stream)

@@ -458,7 +458,7 @@ VIDEOS: dict[str, tuple[Callable[[Path], None], str]] = {
             time(f, "from", lambda rows: [*rows[:2], rows[2] + 1]),
             time(f, "to", lambda rows: [*rows[:2], rows[2] + 1]),
         )[0],
-        r"lasts 3\.6000 s at 5 frames per second; meta says .* episode 2 until 4\.6000 s",
+        r"ends at 3\.6000 s and has 5 frames per second; meta says .* episode 2 until 4\.6000 s",
     ),
     "a range that is not a number": (
         lambda f: time(f, "from", lambda rows: [float("nan"), *rows[1:]]),
