@@ -23,8 +23,8 @@ _API = ("/api/models/", "/api/datasets/")
 class Hub:
     """failures: first answers to commits, a status or 0 for a cut connection. files: of commits, by path.
 
-    models: files of commits of a model or a data set, by repository and commit. names: commits of branches and tags. refusals: of
-    a repository, the status and the code of an error.
+    models: files of commits of a model or a data set, by repository and commit. names: commits of branches and
+    tags. refusals: of a repository, the status and the code of an error.
     """
 
     failures: list[int] = field(default_factory=list)

@@ -133,7 +133,8 @@ def check_recorded(root: Path, info: Mapping[str, Any]) -> None:
     """
     total = info.get("total_episodes")
     if total == 0 and not any((root / EPISODES).rglob("*.parquet")):
-        pictures = "Pictures of an unfinished episode lie in images. " if (root / "images").is_dir() else ""
+        unsaved = any((root / "images").rglob("*.png"))
+        pictures = "Pictures of an unfinished episode lie in images. " if unsaved else ""
         raise RecordingError(
             f"{root.name} has no episode: {INFO} has total_episodes 0, because the recording ended before an "
             f"episode was saved. {pictures}Record it again"

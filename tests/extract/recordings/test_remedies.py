@@ -28,7 +28,7 @@ pytestmark = pytest.mark.usefixtures("_lerobot_cache")
 DATA = "data/chunk-000/file-000.parquet"
 EPISODES = "meta/episodes/chunk-000/file-000.parquet"
 STATE = "observation.state"
-OFFLINE = {"HF_HUB_OFFLINE": "1", "HF_TOKEN": "", "OMP_NUM_THREADS": "1"}
+OFFLINE = {"HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1", "PYTHONPATH": str(Path(__file__).parents[3])}
 
 
 @pytest.fixture
@@ -147,7 +147,8 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from tests.extract.recordings.conftest import observations
 from tests.support.lerobot_recordings import CAMERA, add_episodes, write_recording
 
-folder, episodes, videos, resumed = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3] == "True", sys.argv[4] == "True"
+folder, episodes = Path(sys.argv[1]), int(sys.argv[2])
+videos, resumed = (argument == "True" for argument in sys.argv[3:])
 finalize = LeRobotDataset.finalize
 LeRobotDataset.finalize = lambda self: os._exit(9)
 if resumed:
@@ -225,9 +226,8 @@ def line(text: str) -> str:
 def typed(command: str, folder: Path, **environment: str) -> None:
     """Run a command as typed in a shell, whose working folder is another one."""
     variables = {**os.environ, **OFFLINE, **environment}
-    done = subprocess.run(
-        command, shell=True, cwd=folder, env=variables, capture_output=True, text=True, check=False
-    )
+    shell = ["bash", "-c", command]
+    done = subprocess.run(shell, cwd=folder, env=variables, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
 
 
@@ -281,9 +281,7 @@ def test_the_rate_that_the_converter_cuts_is_written_again_as_the_message_says(t
 
 
 @pytest.mark.slow
-def test_the_printed_line_downloads_and_converts_a_data_set_of_the_hub(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_printed_line_downloads_and_converts_a_data_set_of_the_hub(tmp_path: Path) -> None:
     """The cache, in which only its meta is, stays as it was."""
     folder = write_v21(tmp_path / "made", observations())
     commit = "5" * 40
