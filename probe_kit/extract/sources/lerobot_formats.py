@@ -15,7 +15,7 @@ from probe_kit.errors import RecordingError
 
 INFO, TASKS, EPISODES = "meta/info.json", "meta/tasks.parquet", "meta/episodes"
 PARQUET = "parquet"
-READ = "this version of probe_kit reads v3.0"
+READ = "this version reads v3.0"
 _CONVERTER = "-m lerobot.scripts.convert_dataset_v21_to_v30"
 _OLD_INFO = "meta_data/info.json"
 """The file of formats 1.x."""
@@ -58,8 +58,8 @@ def check_format(root: Path, info: Mapping[str, Any], repo: str | None, revision
         raise RecordingError(f"{name} {_older(version)}")
     if (stored := info.get("storage_format", PARQUET)) != PARQUET:
         raise RecordingError(
-            f"{name} has the storage_format {stored!r}; expected {PARQUET!r}. Write the data set again with "
-            "lerobot, as Parquet"
+            f"{name} has the storage_format {stored!r}; this version reads {PARQUET!r}. Write the data set "
+            "again as Parquet"
         )
 
 
