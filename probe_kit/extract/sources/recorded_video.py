@@ -1,5 +1,7 @@
 """A video file of recordings: the exact times of its frames, without decoding, and the picture at one of them."""
 
+from bisect import bisect_right
+from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -54,10 +56,12 @@ class RecordedVideo:
         ]
         if not packets:
             raise VideoError(_TIMELESS)
+        self._last: int | None = None
+        self._decoding: Iterator[Any] = iter(())
         self.times = tuple(sorted(time for time, _ in packets))
         self._starts = tuple(sorted({self.times[0], *(time for time, is_start in packets if is_start)}))
 
-    def _demuxed(self) -> Any:
+    def _demuxed(self) -> Iterator[Any]:
         """Yield the packets up to the end of the file, or to the place where it is cut off."""
         import av
 
@@ -69,29 +73,42 @@ class RecordedVideo:
     def picture(self, time: int) -> NDArray[np.uint8]:
         """Return the picture (H, W, 3) uint8 at one of `times`.
 
-        Decoding begins at the last key frame before it. Where pictures before a key frame in time lie behind it in
-        the file, it begins at the key frame before that one, then at the first.
+        Decoding goes on from the picture before, or begins at the last key frame before the time. Where pictures
+        before a key frame in time lie behind it in the file, it begins at the key frame before that one, then at
+        the first.
 
         Raises:
             VideoError: If the stream shows no whole picture at that time.
         """
         import av
 
-        starts = [start for start in self._starts if start <= time]
         reason = "no picture was decoded"
-        for start in (*starts[:-3:-1], None):
+        for frames in self._attempts(time):
             try:
-                for frame in self._decoded(start):
-                    if frame.pts is None or frame.pts < time:
+                for frame in frames:
+                    if frame.pts is None:
                         continue
+                    self._last = frame.pts
                     if frame.pts == time and not frame.is_corrupt:
                         return np.ascontiguousarray(frame.to_ndarray(format="rgb24"))
-                    break
+                    if frame.pts >= time:
+                        break
             except (av.error.FFmpegError, OSError) as error:
                 reason = f"{type(error).__name__}: {str(error)[:200]}"
+        self._last = None
         raise VideoError(reason)
 
-    def _decoded(self, start: int | None) -> Any:
+    def _attempts(self, time: int) -> Iterator[Iterator[Any]]:
+        """Yield decoded frames from one place after another, the nearest one before a time first."""
+        count = bisect_right(self._starts, time)
+        starts = self._starts[max(count - 2, 0) : count]
+        if self._last is not None and starts[-1] <= self._last < time:
+            yield self._decoding
+        for start in (*reversed(starts), None):
+            self._decoding = self._decoded(start)
+            yield self._decoding
+
+    def _decoded(self, start: int | None) -> Iterator[Any]:
         """Yield the frames from a time on, or of the file opened again for None: not every format can seek."""
         import av
 
