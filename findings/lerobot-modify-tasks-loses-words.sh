@@ -10,7 +10,7 @@
 # Seen: recorded with hash seeds 0 to 5, words of the four frames before and after, such as
 #   red red green green  ->  green green green green     (or  blue blue blue blue)
 #
-# Prints what it saw; exits 0 if it is still so, 1 if something changed.
+# Prints what it saw; exits 0 if it is still so, 1 if it changed.
 set -u
 work=$(mktemp -d); trap 'rm -rf "$work"' EXIT; cd "$work"
 python3.12 -m venv venv >/dev/null && ./venv/bin/pip install -q "lerobot[dataset]==0.6.1" || exit 2

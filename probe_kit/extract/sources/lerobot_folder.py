@@ -93,13 +93,19 @@ class LeRobotFolder(LeRobotMeta):
         return by_file
 
     @cached_property
-    def by_video(self) -> Mapping[tuple[str, Path], list[EpisodeMeta]]:
-        """The episodes of every video file by camera, in the order of their times."""
-        by_video: dict[tuple[str, Path], list[EpisodeMeta]] = {}
+    def frames_before(self) -> Mapping[tuple[str, int], tuple[int, int]]:
+        """The frames of earlier episodes, and of all, in the video file of a camera and an episode."""
+        totals: dict[tuple[str, Path], int] = {}
+        earlier: dict[tuple[str, int], int] = {}
         for camera in filter(self.is_video, self.cameras):
             for episode in sorted(self.episodes, key=lambda episode: episode.videos[camera].begin):
-                by_video.setdefault((camera, self.path / episode.videos[camera].file), []).append(episode)
-        return by_video
+                file = camera, episode.videos[camera].file
+                earlier[camera, episode.number] = totals.get(file, 0)
+                totals[file] = totals.get(file, 0) + episode.length
+        return {
+            (camera, number): (before, totals[camera, self.episodes[number].videos[camera].file])
+            for (camera, number), before in earlier.items()
+        }
 
     # -- files -----------------------------------------------------------------------------------------
 
@@ -485,15 +491,13 @@ class LeRobotFrames:
             first: The position in the video of its first frame.
             count: The number of frames of the video.
         """
-        path = self.folder.path / episode.videos[camera].file
-        episodes = self.folder.by_video[camera, path]
-        due = sum(other.length for other in episodes[: episodes.index(episode)])
-        if count == sum(other.length for other in episodes) and first != due:
+        part = episode.videos[camera]
+        due, total = self.folder.frames_before[camera, episode.number]
+        if count == total and first != due:
             raise RecordingError(
-                f"{self._where(path)}: {EPISODES} says that episode {episode.number} begins at "
-                f"{episode.videos[camera].begin:.4f} s, where the video shows its frame {first}; expected "
-                f"frame {due}, because its {count} frames are those of its episodes one after another. Repair "
-                "from_timestamp"
+                f"{self._where(self.folder.path / part.file)}: {EPISODES} says that episode {episode.number} "
+                f"begins at {part.begin:.4f} s, where the video shows its frame {first}; expected frame {due}, "
+                f"because its {count} frames are those of its episodes one after another. Repair from_timestamp"
             )
 
     def _check_video(self, episode: EpisodeMeta, camera: str) -> None:
