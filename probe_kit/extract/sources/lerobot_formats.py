@@ -143,8 +143,8 @@ def check_recorded(root: Path, info: Mapping[str, Any]) -> None:
 
 def check_complete(root: Path, info: Mapping[str, Any]) -> None:
     """Raise RecordingError for a data set without tasks, or without any episode that can be read."""
-    readable = any(path not in unfinished_files(root) for path in (root / EPISODES).rglob("*.parquet"))
-    if not readable and (unfinished := unfinished_files(root)):
+    unfinished = unfinished_files(root)
+    if unfinished and set(_parquet_files(root, EPISODES)) <= set(unfinished):
         total = info.get("total_episodes")
         raise RecordingError(
             f"{root.name}: {INFO} has total_episodes {total}, and {EPISODES} none that can be read. "
@@ -187,8 +187,12 @@ def _remains(root: Path, unfinished: Sequence[Path]) -> str:
 
 def unfinished_files(root: Path) -> list[Path]:
     """Return the Parquet files of data and episodes that begin as such and have no end, in order."""
-    paths = [path for folder in ("data", EPISODES) for path in sorted((root / folder).rglob("*.parquet"))]
-    return [path for path in paths if path.name[0] != "." and lacks_end(path)]
+    return [path for folder in ("data", EPISODES) for path in _parquet_files(root, folder) if lacks_end(path)]
+
+
+def _parquet_files(root: Path, folder: str) -> list[Path]:
+    """Return the files of a folder of the data set in order, without hidden ones."""
+    return [path for path in sorted((root / folder).rglob("*.parquet")) if path.name[0] != "."]
 
 
 def lacks_end(path: Path) -> bool:
