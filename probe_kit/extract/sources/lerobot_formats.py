@@ -186,8 +186,14 @@ def _remains(root: Path, unfinished: Sequence[Path]) -> str:
 
 
 def unfinished_files(root: Path) -> list[Path]:
-    """Return the Parquet files of data and episodes that begin as such and have no end, in order."""
-    return [path for folder in ("data", EPISODES) for path in _parquet_files(root, folder) if lacks_end(path)]
+    """Return the Parquet files of data and episodes that a recording left without an end, in order.
+
+    It leaves at least one of data. Without such a one, a file of episodes without an end is a damaged file.
+    """
+    data, episodes = (
+        [path for path in _parquet_files(root, folder) if _lacks_end(path)] for folder in ("data", EPISODES)
+    )
+    return [*data, *episodes] if data else []
 
 
 def _parquet_files(root: Path, folder: str) -> list[Path]:
@@ -195,7 +201,7 @@ def _parquet_files(root: Path, folder: str) -> list[Path]:
     return [path for path in sorted((root / folder).rglob("*.parquet")) if path.name[0] != "."]
 
 
-def lacks_end(path: Path) -> bool:
+def _lacks_end(path: Path) -> bool:
     """Whether a file begins as Parquet and does not end as such."""
     if not path.is_file():
         return False

@@ -25,7 +25,7 @@ from probe_kit.extract.sources.lerobot_formats import (
     check_format,
     check_is_data_set,
     check_recorded,
-    lacks_end,
+    unfinished_files,
 )
 
 EXTRA = "datasets"
@@ -421,9 +421,9 @@ def _read_episodes(root: Path, files: HashedFiles, info: Mapping[str, Any]) -> I
     parts = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
     columns = [_NUMBER, _LENGTH, _FROM, _TO, _CHUNK, _FILE]
     columns += [f"videos/{camera}/{part}" for camera in cameras for part in parts]
-    paths = sorted(
-        path for path in (root / EPISODES).rglob("*.parquet") if path.name[0] != "." and not lacks_end(path)
-    )
+    unfinished = unfinished_files(root)
+    paths = sorted(path for path in (root / EPISODES).rglob("*.parquet") if path.name[0] != ".")
+    paths = [path for path in paths if path not in unfinished]
     lines = [
         (path, line) for path in paths for line in _read_table(root, files, path, columns).to_pylist()
     ]  # fmt: skip
