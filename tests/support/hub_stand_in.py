@@ -120,7 +120,10 @@ def hub() -> Iterator[Hub]:
             self.wfile.write(content)
 
         def do_GET(self) -> None:
-            if not self.path.startswith(_API) and "/resolve/" not in self.path:
+            served = self.path.startswith("/api/models/") or any(
+                f"/datasets/{name}" in self.path for name in found.models
+            )
+            if not served and "/resolve/" not in self.path:
                 self.do_POST()
                 return
             found.requests.append((self.command, self.path, str(self.headers.get("authorization"))))

@@ -86,9 +86,11 @@ def nearest_by_far(times: TickTimes, frames: Sequence[int], step: Fraction) -> F
             position = after - 1
         nearest = abs(frames[position] * unit - time)
         sides = (side for side in (position - 1, position + 1) if 0 <= side < count)
-        others = (abs(frames[side] * unit - time) for side in sides)
+        distances = (abs(frames[side] * unit - time) for side in sides)
         drifts[number] = nearest / whole_step
-        if NEAR * nearest <= whole_step and all(nearest < other and 2 * nearest <= other for other in others):
+        if NEAR * nearest <= whole_step and all(
+            nearest < distance and 2 * nearest <= distance for distance in distances
+        ):
             positions[number] = position
     return FrameMatch(positions, drifts)
 

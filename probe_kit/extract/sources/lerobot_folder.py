@@ -537,12 +537,12 @@ def _size_of(metadata: Any, columns: Sequence[str]) -> int:
 
 def _first_fault(faults: Mapping[int, str], episodes: Sequence[int]) -> str:
     """Return the fault of the first episode, with the option that chooses the episodes without one."""
-    text, *others = faults.values()
+    text = next(iter(faults.values()))
     sound = [episode for episode in episodes if episode not in faults]
-    if others:
+    if len(faults) > 1:
         text += f". Of {len(episodes)} episodes, {len(faults)} are refused: {_listed(list(faults))}"
     if sound:
-        text += f". Without {'it' if not others else 'them'}: --episodes {episodes_text(sound)}"
+        text += f". Without {'it' if len(faults) == 1 else 'them'}: --episodes {episodes_text(sound)}"
     return text
 
 

@@ -1,7 +1,7 @@
 """Folders of lerobot that are no readable data set of format 3.0: what they are, and what makes them one.
 
-A line that is printed for a shell was run on such a folder by `tests/extract/recordings/test_remedies.py`. None
-publishes anything: the converter of lerobot uploads, and removes files on the hub, unless it is told not to.
+Tests run each printed line on such a folder. No line publishes anything: without `--push-to-hub=false`, the
+converter of lerobot uploads its result and removes files on the hub.
 """
 
 import re
@@ -86,7 +86,7 @@ def _conversion(root: Path, info: Mapping[str, Any], repo: str | None, revision:
     if repo is not None:
         download = ["download", repo, "--repo-type=dataset", f"--revision={revision}", f"--local-dir={root}"]
         steps.append(f"{python_command()} -m huggingface_hub.cli.hf {shlex.join(download)}")
-    old, new = _beside(root, "_old"), _beside(root, "_v30")
+    old, new = _with_suffix(root, "_old"), _with_suffix(root, "_v30")
     removed = [path for path in (old, new) if path.exists()]
     steps += [shlex.join(["mv", str(path), str(_free(path))]) for path in removed]
     options = [f"--repo-id={repo or f'local/{root.name}'}", f"--root={root}", "--push-to-hub=false"]
@@ -108,7 +108,7 @@ def _conversion(root: Path, info: Mapping[str, Any], repo: str | None, revision:
     return ". ".join(sentences)
 
 
-def _beside(folder: Path, suffix: str) -> Path:
+def _with_suffix(folder: Path, suffix: str) -> Path:
     return folder.with_name(folder.name + suffix)
 
 
@@ -116,7 +116,7 @@ def _free(path: Path) -> Path:
     """Return the path, or one beside it at which nothing is."""
     free, number = path, 1
     while free.exists():
-        free, number = _beside(path, f"_{number}"), number + 1
+        free, number = _with_suffix(path, f"_{number}"), number + 1
     return free
 
 

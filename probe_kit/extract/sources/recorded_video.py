@@ -73,9 +73,9 @@ class RecordedVideo:
     def picture(self, time: int) -> NDArray[np.uint8]:
         """Return the picture (H, W, 3) uint8 at one of `times`.
 
-        Decoding goes on from the picture before, or begins at the last key frame before the time. Where pictures
-        before a key frame in time lie behind it in the file, it begins at the key frame before that one, then at
-        the first.
+        Decoding continues from the last picture, or begins at the last key frame before the time. Pictures before
+        a key frame in time may lie behind it in the file. Then decoding begins one key frame earlier, or at the
+        first.
 
         Raises:
             VideoError: If the stream shows no whole picture at that time.

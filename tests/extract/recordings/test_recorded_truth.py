@@ -162,9 +162,7 @@ def test_a_run_does_not_grow_after_a_file_was_replaced_with_its_old_time_stamp(
     run((0,))
     replace_same_size(copy / DATA, negated((copy / DATA).read_bytes(), float(WRITTEN[0, 1])))
     for episodes in ((0,), (0, 1)):
-        with pytest.raises(
-            SettingsMismatchError, match="files of the data set that hold episode-000000 have changed"
-        ):
+        with pytest.raises(SettingsMismatchError, match="the files that episode-000000 shows have changed"):
             run(episodes)
 
 
