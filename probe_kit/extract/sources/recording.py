@@ -52,6 +52,17 @@ def read_episodes(value: Any) -> Any:
     return tuple(sorted(set(several)))
 
 
+def episodes_text(episodes: Sequence[int]) -> str:
+    """Return ascending episodes as `read_episodes` reads them, such as `0:5,7`."""
+    runs: list[list[int]] = []
+    for episode in episodes:
+        if runs and episode == runs[-1][1]:
+            runs[-1][1] += 1
+        else:
+            runs.append([episode, episode + 1])
+    return ",".join(str(start) if stop == start + 1 else f"{start}:{stop}" for start, stop in runs)
+
+
 Episodes = Annotated[
     tuple[int, ...] | None,
     BeforeValidator(read_episodes),

@@ -393,6 +393,7 @@ class RecordingSource(Source[LeRobotSource]):
             STATE: self._numbers(STATE),
             ACTION: self._numbers(ACTION),
             "columns": ", ".join(folder.columns) or "none",
+            **({} if (drift := self.reader.largest_drift) is None else {"largest time drift": str(drift)}),
             "data sha": f"meta {folder.meta_blake2b[:12]}",
         }
 

@@ -162,9 +162,7 @@ def test_a_run_does_not_grow_after_a_file_was_replaced_with_its_old_time_stamp(
     run((0,))
     replace_same_size(copy / DATA, negated((copy / DATA).read_bytes(), float(WRITTEN[0, 1])))
     for episodes in ((0,), (0, 1)):
-        with pytest.raises(
-            SettingsMismatchError, match="files of the data set that hold episode-000000 have changed"
-        ):
+        with pytest.raises(SettingsMismatchError, match="the files that episode-000000 shows have changed"):
             run(episodes)
 
 
@@ -458,7 +456,7 @@ VIDEOS: dict[str, tuple[Callable[[Path], None], str]] = {
             time(f, "from", lambda rows: [*rows[:2], rows[2] + 1]),
             time(f, "to", lambda rows: [*rows[:2], rows[2] + 1]),
         )[0],
-        r"lasts 3\.6000 s at 5 frames per second; meta says .* episode 2 until 4\.6000 s",
+        r"ends at 3\.6000 s and has 5 frames per second; meta says .* episode 2 until 4\.6000 s",
     ),
     "a range that is not a number": (
         lambda f: time(f, "from", lambda rows: [float("nan"), *rows[1:]]),
