@@ -164,8 +164,20 @@ class RecordingSource(Source[LeRobotSource]):
         """Return the instruction at every frame of an episode."""
         if self.settings.instruction is not None:
             return [self.settings.instruction] * self.folder.lengths[episode]
-        numbers = self.reader.numbers(episode, [_TASK])[_TASK][:, 0].astype(int)
-        return [self.folder.task(number) for number in numbers]
+        return [self._task_texts[number] for number in self._task_numbers(episode)]
+
+    def _task_numbers(self, episode: int) -> list[int]:
+        """Return the number of the task at every frame of an episode."""
+        return self.reader.numbers(episode, [_TASK])[_TASK][:, 0].astype(int).tolist()  # type: ignore[no-any-return]
+
+    @cached_property
+    def _task_texts(self) -> dict[int, str]:
+        """The texts of the tasks of the chosen episodes, by number. Raises RecordingError for one without a text."""
+        episodes_of: dict[int, list[int]] = {}
+        for episode in self.episodes:
+            for number in dict.fromkeys(self._task_numbers(episode)):
+                episodes_of.setdefault(number, []).append(episode)
+        return {number: self.folder.task(number, episodes) for number, episodes in episodes_of.items()}
 
     # -- a model -------------------------------------------------------------------------------------
 
