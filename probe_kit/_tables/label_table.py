@@ -115,8 +115,8 @@ class LabelTable:
                 raise UsageError(f"{self.where(row, column)} is empty; expected a name in every {self.unit}")
             if isinstance(cell, float) and not abs(cell) <= EXACT:
                 raise UsageError(
-                    f"{self.where(row, column)} is {cell:g}, a number in place of a name, of which digits are lost. "
-                    f"Read names as text, in pandas with dtype={{{column!r}: str}}"
+                    f"{self.where(row, column)} is {cell:g}, a number in place of a name, of which digits "
+                    f"are lost. Read names as text, in pandas with dtype={{{column!r}: str}}"
                 )
             if isinstance(cell, str):
                 self._kind(row, column, cell)

@@ -75,7 +75,7 @@ class Frames:
 
     @cached_property
     def by_name(self) -> dict[tuple[str, int], Frame]:
-        """The frames by number and episode, item, or number of a recorded episode: a table of pairs may name any."""
+        """The frames by number and episode, item or recorded episode: a table of pairs may name any of them."""
         # Episodes come last, so that a name which is both is an episode's.
         sources = self.run.episodes["source_episode"].tolist() if self.run.recorded else []
         names = {(str(sources[frame.row]), frame.number): frame for frame in self.index if sources}

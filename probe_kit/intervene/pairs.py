@@ -82,8 +82,8 @@ PAIR_COLUMNS = ("episode", "frame", "donor_episode", "donor_frame")
 def read_pairs(path: Path) -> tuple[PairRow, ...]:
     """Return the rows of a table with the columns episode, frame, donor_episode, donor_frame.
 
-    Names of episodes are texts as they are written. A recorded episode may be called by its number; only the run can
-    tell that from a name such as `007`.
+    Names of episodes are texts as they are written. A recorded episode may be called by its number; only
+    the run can tell that from a name such as `007`.
 
     Raises:
         UsageError: For a table without one of the columns, without a row, or with a frame that is no number.

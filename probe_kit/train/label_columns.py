@@ -56,7 +56,9 @@ def read_table(
     """
     requested = [*requested, *names]
     if not isinstance(table, str | Path):
-        columns = table.to_frame() if table.ndim == 1 else table
+        import pandas as pd
+
+        columns: Any = table if isinstance(table, pd.DataFrame) else table.to_frame()
         frame = columns.reset_index() if any(name is not None for name in table.index.names) else columns
         headings = tuple(str(name) for name in frame.columns)
         position_of = _places(headings, requested, "DataFrame")

@@ -391,13 +391,13 @@ def _check_recorded(
     for row, episode in enumerate(episodes):
         if int(episode) >= count:
             raise UsageError(
-                f"{table.where(row, _present(table, SOURCES))} is {episode}; the data set of {run.location} has {count} episodes, "
-                "counted from 0. Correct the numbers of the episodes"
+                f"{table.where(row, _present(table, SOURCES))} is {episode}; the data set of {run.location} has "
+                f"{count} episodes, counted from 0. Correct the numbers of the episodes"
             )
         if frames is not None and frames[row] >= lengths.get(episode, frames[row] + 1):
             raise UsageError(
-                f"{table.where(row, _present(table, FRAMES))} is {frames[row]}; episode {episode} of the data set of "
-                f"{run.location} has {lengths[episode]} frames, counted from 0 in each episode. Correct the "
+                f"{table.where(row, _present(table, FRAMES))} is {frames[row]}; episode {episode} of the data set "
+                f"of {run.location} has {lengths[episode]} frames, counted from 0 in each episode. Correct the "
                 "table, which may count from 1, or by the column `index` of the data set"
             )
 
@@ -437,8 +437,8 @@ def _numbers_of_either(table: LabelTable, names: Sequence[str]) -> tuple[int, ..
         for row, (number, other) in enumerate(zip(numbers, others, strict=True)):
             if number != other:
                 raise UsageError(
-                    f"{table.where(row)}: {first!r} is {number} and {second!r} is {other}; expected the same number. "
-                    "Leave one of the two columns out"
+                    f"{table.where(row)}: {first!r} is {number} and {second!r} is {other}; expected the same "
+                    "number. Leave one of the two columns out"
                 )
     return next(iter(read.values()), None)
 
@@ -462,10 +462,11 @@ def _check_source_keys(run: RunReader, target: Target) -> None:
                 continue  # an episode that the run lacks is refused where labels find their samples
             due = int(steps[row, call]) if is_frame else int(due_sources[row])
             if cell != due and due >= 0:
+                due_key = f"{'frame' if is_frame else 'episode'} {due} of the data set"
+                label = f"{EPISODE} {episode!r}" + (f", {INFERENCE} {call}," if is_frame else "")
                 raise UsageError(
-                    f"{table.where(number, key)} is {cell!r}, and {EPISODE} {episode!r} is "
-                    f"{_COUNTED[key].partition(' ')[2]} {due} of the data set{', inference ' + str(call) if is_frame else ''}; "
-                    f"expected keys of one episode. Leave one of the two columns out"
+                    f"{table.where(number, key)} is {cell!r}, and {label} is {due_key}; expected keys of the same "
+                    "label. Leave one of the two columns out"
                 )
 
 

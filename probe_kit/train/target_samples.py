@@ -239,8 +239,8 @@ def _reason(name: str, ids: Sequence[str]) -> str:
     if (similar := similar_name(name, ids)) is None:
         return "`probe-kit labels RUN` writes the ids"
     return (
-        f"It has {similar!r}, which a program that takes names for numbers writes so. Read the table of the ids as "
-        f"text, in pandas with dtype={{{EPISODE!r}: str}}"
+        f"It has {similar!r}, which a program that takes names for numbers writes so. Read the ids as text, "
+        f"in pandas with dtype={{{EPISODE!r}: str}}"
     )
 
 

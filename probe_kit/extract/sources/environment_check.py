@@ -12,11 +12,13 @@ from probe_kit.extract.sources.environment import EnvEpisode, EnvSource, OwnEnvi
 from probe_kit.extract.sources.environment_source import (
     checked_step,
     fact_values,
+    frames_of_steps,
     listed_episodes,
     naming_environment,
     open_environment,
     started,
 )
+from probe_kit.runs.input_content import content_notes
 
 STEPS = 5
 """The actions per episode that the check executes."""
@@ -31,11 +33,13 @@ class EnvironmentCheck:
 
     Attributes:
         problem: The text of what was seen and expected; empty where the promise holds.
+        notes: Sentences about inputs without content, such as a black camera; the promise holds with them.
     """
 
     name: str
     sentence: str
     problem: str = ""
+    notes: tuple[str, ...] = ()
 
     @property
     def passed(self) -> bool:
@@ -52,6 +56,7 @@ class _Trial:
 
     def __init__(self, source: EnvSource) -> None:
         self.source = source
+        self.notes: tuple[str, ...] = ()
 
     def __getattr__(self, name: str) -> NoReturn:
         raise _BrokenError(f"there is no {name} to check, see above")
@@ -69,6 +74,10 @@ class _Trial:
 
     def play(self) -> None:
         self.steps = [self._play(self.environment, episode) for episode in self.episodes]
+        names = ["the picture", *(f"the camera {name!r}" for name in self.steps[0][0].observation.cameras)]
+        pairs = zip(self.episodes, self.steps, strict=True)
+        frames = [frames_of_steps(episode.id, steps) for episode, steps in pairs]
+        self.notes = tuple(content_notes(frames, names))
 
     def facts_are_constant(self) -> None:
         after = [step for steps in self.steps for step in steps[1:]]
@@ -172,7 +181,7 @@ def check_environment(source: EnvSource | str) -> Iterator[EnvironmentCheck]:
         except ProbeKitError as error:
             yield EnvironmentCheck(name, sentence, str(error))
         else:
-            yield EnvironmentCheck(name, sentence)
+            yield EnvironmentCheck(name, sentence, notes=trial.notes if check is _Trial.play else ())
 
 
 def _shapes(step: Step) -> dict[str, tuple[int, ...]]:

@@ -239,7 +239,11 @@ class LeRobotMeta:
         texts = self._texts.get(number, [])
         if len(texts) == 1 and isinstance(texts[0], str) and texts[0].strip():
             return texts[0]
-        seen = f"{texts[0]!r} as the task {number}" if len(texts) == 1 else f"{len(texts)} tasks of the number {number}"
+        seen = (
+            f"{texts[0]!r} as the task {number}"
+            if len(texts) == 1
+            else f"{len(texts)} tasks of the number {number}"
+        )
         expected = "a text" if len(texts) == 1 else "one"
         raise RecordingError(
             f"{self.name}: {TASKS} has {seen}, which frames of {ranges_of(episodes, 'episode')} name; expected "

@@ -399,7 +399,10 @@ def test_texts_of_tasks_are_a_column_or_the_index_of_pandas(
         (lambda table: table.assign(task=[1, 2]), "expected task_index, and the texts of the tasks in one column"),
         (lambda table: table.rename(columns={"task": "words"}), "has the columns words, task_index; expected"),
         (lambda table: table[["task"]], "has the columns task; expected task_index"),
-        (lambda table: table.assign(task=["", None]), "as the task 0, which frames of episodes 0 to 2 name; expected a text"),
+        (
+            lambda table: table.assign(task=["", None]),
+            "as the task 0, which frames of episodes 0 to 2 name; expected a text",
+        ),
         (lambda table: table.assign(task_index=0), "has 2 tasks of the number 0"),
     ],
 )
