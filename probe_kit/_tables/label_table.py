@@ -78,7 +78,7 @@ class LabelTable:
         for row, cell in enumerate(cells):
             if cell is None:
                 continue
-            kind = self._kind(row, column, cell)
+            kind = self._kind(row, column, cell, otherwise)
             if first is None:
                 first = kind, row
             elif _ARTICLE[kind] != _ARTICLE[first[0]]:
@@ -130,7 +130,7 @@ class LabelTable:
         """Return the cells of one column, with numbers in place of the texts that spell them."""
         return [number_or_cell(cell) for cell in self.columns[column]]
 
-    def _kind(self, row: int, column: str, cell: Cell) -> Kind:
+    def _kind(self, row: int, column: str, cell: Cell, otherwise: str = "") -> Kind:
         if isinstance(cell, bool):
             return "boolean"
         if isinstance(cell, int):
@@ -142,7 +142,9 @@ class LabelTable:
             return "integer"
         if isinstance(cell, float):
             if isinf(cell):
-                raise UsageError(f"{self.where(row, column)} is infinite; expected a finite number or no entry")
+                raise UsageError(
+                    f"{self.where(row, column)} is infinite; expected a finite number or no entry{otherwise}"
+                )
             return "number"
         if unsafe := UNSAFE.search(str(cell)):
             raise UsageError(

@@ -175,9 +175,10 @@ def test_classes_that_are_declared_are_names(
     assert Target.read(table, "y", "classes").coded.classes == classes
 
 
-def test_a_hash_among_undeclared_labels_is_refused_with_the_task() -> None:
-    table = table_of(["a", "b", "c"]).assign(y=["5e2100", "ab12cd34", "cd34ab12"])
-    with pytest.raises(UsageError, match=r"expected one type.*--task classes"):
+@pytest.mark.parametrize(("cell", "message"), [("5e2100", "is infinite"), ("5e10", "expected one type")])
+def test_a_hash_among_undeclared_labels_is_refused_with_the_task(cell: str, message: str) -> None:
+    table = table_of(["a", "b", "c"]).assign(y=[cell, "ab12cd34", "cd34ab12"])
+    with pytest.raises(UsageError, match=rf"{message}.*--task classes"):
         Target.read(table, "y")
 
 
