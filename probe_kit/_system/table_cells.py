@@ -144,8 +144,8 @@ def alike(name: str) -> str:
     A program that takes names for numbers drops zeros in front, or adds `.0`.
     """
     text = _printed(name_of(name))
-    whole = _WHOLE.fullmatch(with_minus(text))
-    return f"{whole[1]}{whole[2]}" if whole else text
+    match = _WHOLE.fullmatch(with_minus(text))
+    return f"{match[1]}{match[2]}" if match else text
 
 
 def similar_name(name: str, names: Iterable[str]) -> str | None:
@@ -232,8 +232,8 @@ def values_of(
     numbers = _numbers(texts, where, semicolons, as_names)
     if not as_names:
         _check_quantities(numbers, where, otherwise)
-    kept = as_names and any(isinstance(cell, str) and number_of(cell) is not None for cell in numbers)
-    check_spellings(texts, where, UsageError, as_names=kept)
+    are_names = as_names and any(isinstance(cell, str) and number_of(cell) is not None for cell in numbers)
+    check_spellings(texts, where, UsageError, as_names=are_names)
     return numbers
 
 

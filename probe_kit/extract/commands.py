@@ -192,7 +192,7 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
 
 def content_warning(note: str) -> "Text":
     """Return a sentence about an input without content as a line of a terminal."""
-    return marked("[yellow]without content:[/] {}; a probe of it says nothing about the model", note)
+    return marked("[yellow]without content:[/] {}; scores of its probes are no evidence", note)
 
 
 def _weights(extraction: "Extraction") -> str:

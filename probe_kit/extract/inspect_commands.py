@@ -362,7 +362,7 @@ def check_environment(
             if check.problem:
                 out.print(marked("         [dim]seen[/] {}", terminal_safe(check.problem)), soft_wrap=True)
             for note in check.notes:
-                moved = f", in {STEPS} small actions of each episode"
+                moved = f", with {STEPS} small actions per episode"
                 out.print(marked("         [yellow]without content[/] {}", note + moved), soft_wrap=True)
     failed = sum(not check.passed for check in checks)
     if as_json:

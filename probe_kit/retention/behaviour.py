@@ -463,7 +463,7 @@ _COMPARED: Mapping[str, Callable[[ProbeSettings], str]] = {
 def without_content(runs: Sequence[RunReader]) -> list[str]:
     """Return a sentence for every input of some runs without content, such as a black camera."""
     return [
-        f"{run.label}: {note}. A probe of it says nothing about the model."
+        f"{run.label}: {note}. Scores of its probes are no evidence."
         for run in runs
         for note in notes_of_content(run)
     ]

@@ -133,11 +133,11 @@ def _moving(episodes: Sequence[EpisodeFrames]) -> list[EpisodeFrames]:
     states = [episode.state for episode in episodes if episode.state is not None]
     if len(states) < len(episodes) or not states:
         return list(episodes)
-    rest = AT_REST * np.ptp(np.concatenate(states), axis=0)
-    if not rest.any():
+    least = AT_REST * np.ptp(np.concatenate(states), axis=0)
+    if not least.any():
         return list(episodes)
     return [
-        episode for episode, state in zip(episodes, states, strict=True) if (np.ptp(state, axis=0) > rest).any()
+        episode for episode, state in zip(episodes, states, strict=True) if (np.ptp(state, axis=0) > least).any()
     ]
 
 

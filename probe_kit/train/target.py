@@ -433,8 +433,8 @@ def _numbers_of_either(table: LabelTable, names: Sequence[str]) -> tuple[int, ..
         UsageError: For two columns that contradict each other, and as `_numbers`.
     """
     read = {name: numbers for name in names if (numbers := _numbers(table, name)) is not None}
-    for (first, numbers), (second, others) in pairwise(read.items()):
-        for row, (number, other) in enumerate(zip(numbers, others, strict=True)):
+    for (first, numbers), (second, other_numbers) in pairwise(read.items()):
+        for row, (number, other) in enumerate(zip(numbers, other_numbers, strict=True)):
             if number != other:
                 raise UsageError(
                     f"{table.where(row)}: {first!r} is {number} and {second!r} is {other}; expected the same "

@@ -74,7 +74,7 @@ class _Trial:
 
     def play(self) -> None:
         self.steps = [self._play(self.environment, episode) for episode in self.episodes]
-        names = ["the picture", *(f"the camera {name!r}" for name in self.steps[0][0].observation.cameras)]
+        names = ["the first camera", *(f"the camera {name!r}" for name in self.steps[0][0].observation.cameras)]
         pairs = zip(self.episodes, self.steps, strict=True)
         frames = [frames_of_steps(episode.id, steps) for episode, steps in pairs]
         self.notes = tuple(content_notes(frames, names))

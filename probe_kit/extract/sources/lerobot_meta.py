@@ -246,7 +246,7 @@ class LeRobotMeta:
         )
         expected = "a text" if len(texts) == 1 else "one"
         raise RecordingError(
-            f"{self.name}: {TASKS} has {seen}, which frames of {ranges_of(episodes, 'episode')} name; expected "
+            f"{self.name}: {TASKS} has {content}, which frames of {ranges_of(episodes, 'episode')} name; expected "
             f"{expected}. Repair the data set, leave these episodes out (--episodes), or give --instruction TEXT"
         )
 

@@ -338,8 +338,8 @@ class RecordingSource(Source[LeRobotSource]):
 
     def _frames(self, episode: int, features: Sequence[str]) -> EpisodeFrames:
         """Return the first, the middle and the last chosen frame of an episode, and the states of all of them."""
-        chosen = range(0, self.folder.lengths[episode], self.settings.every)
-        frames = [chosen[number] for number in sorted({0, len(chosen) // 2, len(chosen) - 1})]
+        selection = range(0, self.folder.lengths[episode], self.settings.every)
+        frames = [selection[number] for number in sorted({0, len(selection) // 2, len(selection) - 1})]
         pictures = [list(self.reader.pictures(episode, frame, features).values()) for frame in frames]
         state = None
         if self.folder.width(STATE) is not None:
