@@ -239,7 +239,7 @@ class LeRobotMeta:
         texts = self._texts.get(number, [])
         if len(texts) == 1 and isinstance(texts[0], str) and texts[0].strip():
             return texts[0]
-        seen = (
+        content = (
             f"{texts[0]!r} as the task {number}"
             if len(texts) == 1
             else f"{len(texts)} tasks of the number {number}"
