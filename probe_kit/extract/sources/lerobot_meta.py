@@ -226,12 +226,12 @@ class LeRobotMeta:
         names = _flat_names(self.features[feature].get("names"))
         return names if names is not None and (len(names),) == tuple(self.features[feature]["shape"]) else None
 
-    def task(self, number: int, episodes: Sequence[int]) -> str:
+    def task(self, number: int, episodes: Sequence[int] = ()) -> str:
         """Return the text of a task.
 
         Args:
             number: The number of the task.
-            episodes: The episodes whose frames name it, for the message.
+            episodes: The episodes whose frames name it, for the message; empty if they are unknown.
 
         Raises:
             RecordingError: For a number that is not named once, or has no text.
@@ -245,9 +245,11 @@ class LeRobotMeta:
             else f"{len(texts)} tasks of the number {number}"
         )
         expected = "a text" if len(texts) == 1 else "one"
+        naming = f"frames of {ranges_of(episodes, 'episode')} name" if episodes else "a frame names"
+        leave = ", leave these episodes out (--episodes)" * bool(episodes)
         raise RecordingError(
-            f"{self.name}: {TASKS} has {content}, which frames of {ranges_of(episodes, 'episode')} name; expected "
-            f"{expected}. Repair the data set, leave these episodes out (--episodes), or give --instruction TEXT"
+            f"{self.name}: {TASKS} has {content}, which {naming}; expected "
+            f"{expected}. Repair the data set{leave}, or give --instruction TEXT"
         )
 
     @cached_property
