@@ -240,9 +240,13 @@ def _planned_frames(rows: "Iterable[Row]", in_scene: bool) -> dict[tuple[str, in
 
     Of the scene they are first frames.
     """
-    names = ("episode_id",) if in_scene else ("episode_id", "item_id")
+    names = ("episode_id",) if in_scene else ("episode_id", "item_id", "source_episode")
     return {
-        (str(row.columns[name]), number): None for row in rows for number in row.frames or (0,) for name in names
+        (str(row.columns[name]), number): None
+        for row in rows
+        for number in row.frames or (0,)
+        for name in names
+        if name in row.columns
     }
 
 

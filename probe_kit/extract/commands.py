@@ -18,6 +18,8 @@ from probe_kit.extract.settings import AskSettings, ExtractSettings
 from probe_kit.extract.sources.scene import SceneOptions
 
 if TYPE_CHECKING:
+    from rich.text import Text
+
     from probe_kit.extract import Extraction
     from probe_kit.extract.settings import Settings
     from probe_kit.runs import Run
@@ -184,6 +186,13 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
         if value:
             table.add_row(marked("[dim]{}[/]", name), value)
     err.print(table)
+    for note in extraction.source.content_notes():
+        err.print(content_warning(note))
+
+
+def content_warning(note: str) -> "Text":
+    """Return a sentence about an input without content as a line of a terminal."""
+    return marked("[yellow]without content:[/] {}; scores of its probes are no evidence", note)
 
 
 def _weights(extraction: "Extraction") -> str:
@@ -274,9 +283,12 @@ def _next_command(run: "Run") -> str:
 
 
 def print_input_notes(run: "Run") -> None:
-    """Print which inputs did not change the first output, in yellow."""
+    """Print which inputs have no content, and which did not change the first output, in yellow."""
     from probe_kit.runs.provenance import input_notes
+    from probe_kit.runs.run_inputs import notes_of_content
 
+    for note in notes_of_content(run):
+        say(content_warning(note))
     for note in input_notes(run.certificate):
         say(marked("[yellow]{}; [bold]probe-kit diagnose {}[/] says where it is lost[/]", note, run.location))
 

@@ -305,6 +305,7 @@ def show_dataset(
     """  # noqa: D301 - click reads the \b
     from rich.table import Table
 
+    from probe_kit.extract.commands import content_warning
     from probe_kit.extract.extraction import load
     from probe_kit.extract.sources.recording_source import RecordingSource
 
@@ -325,6 +326,8 @@ def show_dataset(
     for name, value in facts.items():
         table.add_row(name, marked("{}", terminal_safe(value)))
     out.print(table)
+    for note in recording.content_notes():
+        out.print(content_warning(note), soft_wrap=True)
     if model is not None:
         recording.check_recorded_units(policy, settings.machine.accept_units)
 
@@ -359,6 +362,7 @@ def check_environment(
     """
     from probe_kit.extract import EnvSource
     from probe_kit.extract import check_environment as checks_of
+    from probe_kit.extract.sources.environment_check import STEPS
 
     source = EnvSource(environment, options=env_options or (), rotations=rotate or ())
     checks = []
@@ -369,6 +373,9 @@ def check_environment(
             out.print(marked(f"[{colour}]{{}}[/] {{}}", f"{state:8}", check.sentence), soft_wrap=True)
             if evidence := check.problem or check.facts:
                 out.print(marked("         [dim]seen[/] {}", terminal_safe(evidence)), soft_wrap=True)
+            for note in check.notes:
+                moved = f", with {STEPS} small actions per episode"
+                out.print(marked("         [yellow]without content[/] {}", note + moved), soft_wrap=True)
     failed = sum(not check.passed for check in checks)
     if as_json:
         listed = [{**asdict(check), "passed": check.passed} for check in checks]

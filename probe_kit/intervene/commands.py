@@ -387,8 +387,8 @@ def show(
     from probe_kit.intervene.inventory import listed_interventions
     from probe_kit.runs import label_run, open_run
     from probe_kit.runs.layout import INTERVENTIONS
-    from probe_kit.runs.provenance import input_notes
     from probe_kit.runs.results import unfinished_bundles
+    from probe_kit.runs.run_inputs import notes_of_inputs
     from probe_kit.train.commands import facts_table
     from probe_kit.train.results.inventory import inventory
     from probe_kit.train.results.store import how_to_probe
@@ -403,7 +403,7 @@ def show(
     opened = open_run(run, allow_partial=True)
     facts, interventions = inventory(opened), listed_interventions(opened)
     unfinished = unfinished_bundles(opened.location, INTERVENTIONS)
-    notes = input_notes(opened.certificate) if facts.episodes else []
+    notes = notes_of_inputs(opened) if facts.episodes else []
     if as_json:
         listed = [asdict(intervention) for intervention in interventions]
         print_json(

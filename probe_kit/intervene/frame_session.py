@@ -75,9 +75,11 @@ class Frames:
 
     @cached_property
     def by_name(self) -> dict[tuple[str, int], Frame]:
-        """The frames by number and episode, or item: a table of pairs may name either."""
+        """The frames by number and episode, item or recorded episode: a table of pairs may name any of them."""
         # Episodes come last, so that a name which is both is an episode's.
-        names = {(frame.item, frame.number): frame for frame in self.index}
+        sources = self.run.episodes["source_episode"].tolist() if self.run.recorded else []
+        names = {(str(sources[frame.row]), frame.number): frame for frame in self.index if sources}
+        names |= {(frame.item, frame.number): frame for frame in self.index}
         return names | {(frame.episode, frame.number): frame for frame in self.index}
 
     def check_varied(self, vary: str) -> None:

@@ -5,6 +5,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from probe_kit._system.table_cells import similar_name
 from probe_kit.errors import SettingsMismatchError, UsageError
 from probe_kit.hooks.checkpoints.checkpoint import cached_folder, pinned_commits
 from probe_kit.hooks.contract.card import EMBEDDED
@@ -88,7 +89,8 @@ def check_pairs(table: Sequence[PairRow], frames: Collection[tuple[str, int]]) -
             numbers = sorted(frame for name, frame in frames if name == episode)
             first = next(iter(frames), ("none", 0))[0]
             some = ", ".join(map(str, numbers[:MOST_FRAMES])) + ", …" * (len(numbers) > MOST_FRAMES)
-            its = f"of that episode {some}" if numbers else f"episodes such as {first!r}"
+            similar = similar_name(episode, dict.fromkeys(name for name, _ in frames))
+            its = f"of that episode {some}" if numbers else f"episodes such as {similar or first!r}"
             raise UsageError(
                 f"the run has no frame {number} of {episode!r}, which the table of pairs names; it has {its}"
             )

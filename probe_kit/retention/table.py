@@ -19,6 +19,7 @@ from probe_kit.retention.behaviour import (
     mixed_episodes,
     mixed_settings,
     scored,
+    without_content,
 )
 from probe_kit.retention.choices import Family, Iterations, Section
 from probe_kit.retention.columns.columns import averaged_fields
@@ -424,6 +425,7 @@ def retention_table(
     if targets is not None:
         rows = with_holm_of_targets(rows, results) if family == "table" else rows
         notes += [*_label_notes(table_runs, rows, family), *mixed_episodes(every), *_success_notes(table_runs)]
+        notes += without_content(every)
         return RetentionTable(
             rows, [], results=results, iterations=iterations, notes=tuple(notes), runs=tuple(table_runs)
         )
@@ -456,7 +458,7 @@ def retention_table(
         if run.is_captured_only
     ]
     notes += [*unjudged, *captured_only, *mixed_settings(results, views)]
-    notes += [*mixed_episodes(every), *chosen_wordings(every), *left_out(every)]
+    notes += [*mixed_episodes(every), *chosen_wordings(every), *left_out(every), *without_content(every)]
     return RetentionTable(
         rows,
         [mean for of_run in rows_of_runs for mean in _means(of_run)],

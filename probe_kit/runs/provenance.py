@@ -150,6 +150,10 @@ INPUT_CHECK = "input_check"
 """An entry of a certificate: by input, the last thing that changed with it at the first inference of a process."""
 
 
+INPUT_CONTENT = "input_content"
+"""An entry of a certificate: inputs without content, in the frames at which a process looked before it played."""
+
+
 class Certificate(Record):
     """The record of one process.
 

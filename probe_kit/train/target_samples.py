@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._system.table_cells import similar_name
 from probe_kit.errors import UsageError
 from probe_kit.runs.layout import START
 from probe_kit.runs.reader import RunReader, check_call, reached_calls
@@ -238,7 +239,7 @@ def _label_grid(run: RunReader, target: Target) -> NDArray[np.float64]:
                 continue
             raise UsageError(
                 f"{target.table.where(number)}: {run.location} has no episode {name!r}; it has {len(row_of)}, "
-                f"such as {next(iter(row_of), 'none')!r}. `probe-kit labels RUN` writes the ids"
+                f"such as {next(iter(row_of), 'none')!r}. {_reason(name, [*row_of, *planned])}"
             )
         inference = 0 if target.inferences is None else target.inferences[number]
         if target.per_step and not (inference < reached.shape[1] and reached[row, inference]):
@@ -249,6 +250,16 @@ def _label_grid(run: RunReader, target: Target) -> NDArray[np.float64]:
             )
         grid[row, inference] = target.coded.values[number]
     return grid
+
+
+def _reason(name: str, ids: Sequence[str]) -> str:
+    """Return why an id is perhaps not that of a run, and what to do."""
+    if (similar := similar_name(name, ids)) is None:
+        return "`probe-kit labels RUN` writes the ids"
+    return (
+        f"It has {similar!r}, which a program that takes names for numbers writes so. Read the ids as text, "
+        f"in pandas with dtype={{{EPISODE!r}: str}}"
+    )
 
 
 def _column(run: RunReader, target: Target, name: str | None, cells: Sequence[str] | None) -> NDArray[np.str_]:

@@ -411,7 +411,7 @@ def test_spellings_that_may_be_one_class_are_refused(
 
 def test_equal_rows_count_once_and_contradicting_ones_are_refused(tmp_path: Path) -> None:
     file = tmp_path / "labels.csv"
-    file.write_text("episode_id,y,scene\na,yes,7\nb,no,8\na,Yes,7.0\nb,no,8\n", encoding="utf-8")
+    file.write_text("episode_id,y,scene\na,yes,7\nb,no,8\na,Yes,7\nb,no,8\n", encoding="utf-8")
     labels = Target.read(file, "y", group_by="scene")
     assert (labels.episodes, labels.groups, labels.table.lines) == (("a", "b"), ("7", "8"), [2, 3])
     assert labels.coded.values.tolist() == [1, 0]

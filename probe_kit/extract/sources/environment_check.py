@@ -17,6 +17,7 @@ from probe_kit.extract.sources.environment import EnvEpisode, EnvSource, OwnEnvi
 from probe_kit.extract.sources.environment_source import (
     checked_step,
     fact_values,
+    frames_of_steps,
     listed_episodes,
     naming_environment,
     open_environment,
@@ -24,6 +25,7 @@ from probe_kit.extract.sources.environment_source import (
 )
 from probe_kit.extract.sources.environment_starts import compare_steps
 from probe_kit.extract.sources.step_limits import declared_limit
+from probe_kit.runs.input_content import content_notes
 
 STEPS = 5
 """The actions per episode that the check executes."""
@@ -39,12 +41,14 @@ class EnvironmentCheck:
     Attributes:
         problem: The text of what was seen and expected; empty where the promise holds.
         facts: What the environment declares or shows, such as its limit and the sizes of its pictures.
+        notes: Sentences about inputs without content, such as a black camera; the promise holds with them.
     """
 
     name: str
     sentence: str
     problem: str = ""
     facts: str = ""
+    notes: tuple[str, ...] = ()
 
     @property
     def passed(self) -> bool:
@@ -61,6 +65,7 @@ class _Trial:
 
     def __init__(self, source: EnvSource, picture: Path | None = None) -> None:
         self.source, self.picture = source, picture
+        self.notes: tuple[str, ...] = ()
 
     def __getattr__(self, name: str) -> NoReturn:
         raise _BrokenError(f"there is no {name} to check, see above")
@@ -82,6 +87,10 @@ class _Trial:
     def play(self) -> str:
         """Play the episodes, write their first picture, and say where the environment ends them."""
         self.steps = [self._play(self.environment, episode) for episode in self.episodes]
+        names = ["the first camera", *(f"the camera {name!r}" for name in self.steps[0][0].observation.cameras)]
+        pairs = zip(self.episodes, self.steps, strict=True)
+        frames = [frames_of_steps(episode.id, steps) for episode, steps in pairs]
+        self.notes = tuple(content_notes(frames, names))
         start = self.steps[0][0].observation
         if self.picture is not None:
             Image.fromarray(np.hstack(_of_one_height([start.image, *start.cameras.values()]))).save(self.picture)
@@ -219,7 +228,8 @@ def check_environment(source: EnvSource | str, picture: Path | str | None = None
         except ProbeKitError as error:
             yield EnvironmentCheck(name, sentence, str(error))
         else:
-            yield EnvironmentCheck(name, sentence, facts=facts or "")
+            notes = trial.notes if check is _Trial.play else ()
+            yield EnvironmentCheck(name, sentence, facts=facts or "", notes=notes)
 
 
 def _shapes(step: Step) -> dict[str, tuple[int, ...]]:

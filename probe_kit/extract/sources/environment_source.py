@@ -38,7 +38,7 @@ from probe_kit.extract.sources.environment import (
     Step,
 )
 from probe_kit.extract.sources.environment_starts import compare_steps, start_digest
-from probe_kit.extract.sources.player import SIDE, Answer, Ending, InputsPlayer, Opens
+from probe_kit.extract.sources.player import SIDE, Answer, Ending, InputsPlayer, Opens, frames_of_episode
 from probe_kit.extract.sources.recording import EVERY_CAMERA, degrees_of
 from probe_kit.extract.sources.source import (
     FIRST_EPISODES,
@@ -52,6 +52,7 @@ from probe_kit.extract.sources.source import (
 from probe_kit.extract.sources.step_limits import checked_limit, declared_limit
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.observation import Observation, checked_picture
+from probe_kit.runs.input_content import EpisodeFrames, content_notes
 from probe_kit.runs.layout import AT_END, ENVIRONMENT, LIMIT, ONCE, START, TRUTHS
 from probe_kit.runs.plan import Row
 from probe_kit.runs.small_frames import SmallFrames, shrink
@@ -383,6 +384,7 @@ class EnvironmentSource(Source[EnvSource]):
         self._has_limits_of_episodes = not is_typed and any(
             episode.max_steps is not None for _, episode in self.episodes
         )
+        self._frames: list[EpisodeFrames] = []
 
     @classmethod
     def open(cls, settings: EnvSource, selects_only: bool) -> Self:
@@ -508,8 +510,14 @@ class EnvironmentSource(Source[EnvSource]):
         finally:
             environment.close()
         self.seen, self.cameras = first.observation, [*cameras[:1], *first.observation.cameras]
+        self._frames = [frames_of_steps(self.episodes[0][1].id, [first])]
         self._note_facts(first)
         return self
+
+    def content_notes(self) -> tuple[str, ...]:
+        """Return a sentence for every camera of one colour or under two names, in the first frames of episodes."""
+        names = self.cameras or ["picture"]
+        return tuple(content_notes(self._frames, names))
 
     def check(self, policy: "Policy", accept_units: bool) -> "tuple[Self, Policy]":
         """Set up the first chosen episodes, let the policy predict once, and execute one action of the first.
@@ -538,12 +546,16 @@ class EnvironmentSource(Source[EnvSource]):
             chunk = self._predicted(policy, first.observation)
             with naming_environment(name, "step()"):
                 second = environment.step(np.array(chunk[0]))
-            self._note_facts(checked_step(second, self.episodes[0][1], f"{name}, step() 1"))
+            second = checked_step(second, self.episodes[0][1], f"{name}, step() 1")
+            self._note_facts(second)
             later = [episode for _, episode in self.episodes[1:FIRST_EPISODES]]
             later = later if policy.state_numbers is not None else []
             begins = [first, *(started(environment, episode, name) for episode in later)]
             for begin in begins:
                 self._check_state(policy, begin.observation)
+            ids = [episode.id for _, episode in self.episodes]
+            steps = [[first, second], *([begin] for begin in begins[1:])]
+            self._frames = [frames_of_steps(*pair) for pair in zip(ids, steps, strict=False)]
             unusual = unusual_shares(policy, np.stack([begin.observation.state for begin in begins]))
         finally:
             environment.close()
@@ -797,6 +809,12 @@ class EnvironmentPlayer(InputsPlayer):
     def _small_frames(self, last: list[NDArray[np.uint8]]) -> SmallFrames:
         """Return the first and the last frame of all cameras side by side, in small."""
         return () if self._played.frames == "none" else (shrink(*self._first), shrink(*last))
+
+
+def frames_of_steps(name: str, steps: Sequence[Step]) -> EpisodeFrames:
+    """Return pictures and states of some steps of an episode, to look for inputs without content."""
+    states = np.stack([step.observation.state for step in steps]).astype(np.float64)
+    return frames_of_episode(name, [_pictures(step) for step in steps], states)
 
 
 def _pictures(step: Step) -> list[NDArray[np.uint8]]:

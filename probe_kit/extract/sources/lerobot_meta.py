@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, Self
 
 from probe_kit._system.bounded_files import open_regular, read_json_object
+from probe_kit._system.counting import ranges_of
 from probe_kit._system.imports import require
 from probe_kit._system.parquet_files import open_parquet, read_parquet
 from probe_kit.errors import RecordingError
@@ -237,20 +238,31 @@ class LeRobotMeta:
         names = _flat_names(self.features[feature].get("names"))
         return names if names is not None and (len(names),) == tuple(self.features[feature]["shape"]) else None
 
-    def task(self, number: int) -> str:
-        """Return the text of a task. Raises RecordingError for a number that is not named once, or has no text."""
+    def task(self, number: int, episodes: Sequence[int] = ()) -> str:
+        """Return the text of a task.
+
+        Args:
+            number: The number of the task.
+            episodes: The episodes whose frames name it, for the message; empty if they are unknown.
+
+        Raises:
+            RecordingError: For a number that is not named once, or has no text.
+        """
         texts = self._texts.get(number, [])
-        if len(texts) != 1:
-            raise RecordingError(
-                f"{self.name}: {TASKS} has {len(texts)} tasks of the number {number}, which a frame names; "
-                "expected one. Repair the data set, or give --instruction TEXT"
-            )
-        if not isinstance(texts[0], str) or not texts[0].strip():
-            raise RecordingError(
-                f"{self.name}: {TASKS} has {texts[0]!r} as the task {number}, which a frame names; expected a "
-                "text. Repair the data set, or give --instruction TEXT"
-            )
-        return texts[0]
+        if len(texts) == 1 and isinstance(texts[0], str) and texts[0].strip():
+            return texts[0]
+        content = (
+            f"{texts[0]!r} as the task {number}"
+            if len(texts) == 1
+            else f"{len(texts)} tasks of the number {number}"
+        )
+        expected = "a text" if len(texts) == 1 else "one"
+        naming = f"frames of {ranges_of(episodes, 'episode')} name" if episodes else "a frame names"
+        leave = ", leave these episodes out (--episodes)" * bool(episodes)
+        raise RecordingError(
+            f"{self.name}: {TASKS} has {content}, which {naming}; expected "
+            f"{expected}. Repair the data set{leave}, or give --instruction TEXT"
+        )
 
     @cached_property
     def _texts(self) -> dict[Any, list[Any]]:

@@ -1,6 +1,7 @@
 """Opened recordings: chosen frames of a LeRobotDataset on this machine, and the player that shows them."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from functools import cached_property, partial
 from importlib.metadata import version
 from itertools import groupby
@@ -20,7 +21,7 @@ from probe_kit.extract.sources.lerobot_folder import (
     open_lerobot,
 )
 from probe_kit.extract.sources.lerobot_meta import IMAGE
-from probe_kit.extract.sources.player import SIDE, Answer, InputsPlayer, Opens
+from probe_kit.extract.sources.player import SIDE, Answer, InputsPlayer, Opens, frames_of_episode
 from probe_kit.extract.sources.recording import EVERY_CAMERA, LeRobotSource, Pairs, degrees_of
 from probe_kit.extract.sources.source import (
     MOST_UNUSUAL,
@@ -35,6 +36,7 @@ from probe_kit.extract.sources.source import (
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.observation import ARM_NUMBERS, Observation
 from probe_kit.hooks.families.shared.kinds import ACTION, IMAGES, STATE
+from probe_kit.runs.input_content import EpisodeFrames, content_notes
 from probe_kit.runs.layout import CAPTURE_ONLY, DATASET, OTHER_ACTIONS, RECORDED_EPISODES, TRUTHS
 from probe_kit.runs.plan import Row
 
@@ -49,6 +51,8 @@ NAMED = 0.01
 """The share of unusual values of a number of the state, from which on it is named."""
 _LONGEST = 12
 """The most tasks and numbers that are listed."""
+LOOKED_AT = 4
+"""The episodes of which three pictures are decoded before a run, spread over the chosen ones."""
 _TASK = "task_index"
 
 
@@ -164,8 +168,20 @@ class RecordingSource(Source[LeRobotSource]):
         """Return the instruction at every frame of an episode."""
         if self.settings.instruction is not None:
             return [self.settings.instruction] * self.folder.lengths[episode]
-        numbers = self.reader.numbers(episode, [_TASK])[_TASK][:, 0].astype(int)
-        return [self.folder.task(number) for number in numbers]
+        return [self._task_texts[number] for number in self._task_numbers(episode)]
+
+    def _task_numbers(self, episode: int) -> list[int]:
+        """Return the number of the task at every frame of an episode."""
+        return self.reader.numbers(episode, [_TASK])[_TASK][:, 0].astype(int).tolist()  # type: ignore[no-any-return]
+
+    @cached_property
+    def _task_texts(self) -> dict[int, str]:
+        """The texts of the tasks of the chosen episodes, by number. Raises RecordingError for an empty one."""
+        episodes_of: dict[int, list[int]] = {}
+        for episode in self.episodes:
+            for number in dict.fromkeys(self._task_numbers(episode)):
+                episodes_of.setdefault(number, []).append(episode)
+        return {number: self.folder.task(number, episodes) for number, episodes in episodes_of.items()}
 
     # -- a model -------------------------------------------------------------------------------------
 
@@ -302,6 +318,35 @@ class RecordingSource(Source[LeRobotSource]):
         """Open a player, which opens the data set again."""
         del played
         return partial(RecordingPlayer, self.settings)
+
+    def content_notes(self) -> tuple[str, ...]:
+        """Return a sentence for every input without content, in frames that are spread over a few chosen episodes.
+
+        Pictures are those of the mapped cameras; before, those of all cameras of a data set on this machine.
+        """
+        return self._content_notes
+
+    @cached_property
+    def _content_notes(self) -> tuple[str, ...]:
+        every = [] if self.folder.repo is not None else [(name, name) for name in self.folder.cameras]
+        pairs, frames = self.settings.cameras or tuple(every), []
+        at = np.linspace(0, len(self.episodes) - 1, min(len(self.episodes), LOOKED_AT)).round().astype(int)
+        for episode in (self.episodes[number] for number in at):
+            # A picture that is not here yet, or cannot be read, costs its own episode when it is played.
+            with suppress(RecordingError):
+                frames.append(self._frames(episode, [feature for _, feature in pairs]))
+        lossy = [name for name, feature in pairs if self.folder.is_video(feature)]
+        return tuple(content_notes(frames, [name for name, _ in pairs], lossy))
+
+    def _frames(self, episode: int, features: Sequence[str]) -> EpisodeFrames:
+        """Return the first, the middle and the last chosen frame of an episode, and the states of all of them."""
+        selection = range(0, self.folder.lengths[episode], self.settings.every)
+        frames = [selection[number] for number in sorted({0, len(selection) // 2, len(selection) - 1})]
+        pictures = [list(self.reader.pictures(episode, frame, features).values()) for frame in frames]
+        state = None
+        if self.folder.width(STATE) is not None:
+            state = self.reader.numbers(episode, [STATE])[STATE][:: self.settings.every]
+        return frames_of_episode(str(episode), pictures, state)
 
     # -- what a run says of it -----------------------------------------------------------------------
 

@@ -277,6 +277,13 @@ class Source[Chosen: SourceSettings](ABC):
         """The name and version of the decoder of stored videos on this machine; None where nothing is decoded."""
         return None
 
+    def content_notes(self) -> tuple[str, ...]:
+        """Return a sentence for every input without content, such as a black camera, in a few frames.
+
+        They are empty where the source has not shown anything yet.
+        """
+        return ()
+
     def targets(self) -> tuple[str, ...]:
         """Return the built-in targets of probes that the rows have, such as `side.correct` or `env.left`."""
         return ()

@@ -397,7 +397,10 @@ def test_texts_of_tasks_are_a_column_or_the_index_of_pandas(
         (lambda table: table.assign(task=[1, 2]), "expected task_index, and the texts of the tasks in one column"),
         (lambda table: table.rename(columns={"task": "words"}), "has the columns words, task_index; expected"),
         (lambda table: table[["task"]], "has the columns task; expected task_index"),
-        (lambda table: table.assign(task=["", None]), "as the task 0, which a frame names; expected a text"),
+        (
+            lambda table: table.assign(task=["", None]),
+            "as the task 0, which a frame names; expected a text",
+        ),
         (lambda table: table.assign(task_index=0), "has 2 tasks of the number 0"),
     ],
 )
@@ -407,6 +410,16 @@ def test_tasks_that_are_no_texts_are_refused(
     retask(copy, of)
     with pytest.raises(RecordingError, match=message):
         tasks(copy)
+
+
+def test_an_empty_task_names_its_episodes(copy: Path) -> None:
+    """Before a model is loaded, and only where a chosen episode has the task."""
+    retask(copy, lambda table: table.assign(task=["" if number == 0 else "go" for number in table["task_index"]]))
+    numbers = pd.read_parquet(copy / DATA)[["episode_index", "task_index"]]
+    empty = sorted(set(numbers[numbers["task_index"] == 0]["episode_index"].tolist()))
+    with pytest.raises(RecordingError, match=rf"'' as the task 0, which frames of episodes? {empty[0]}.* name"):
+        _ = LeRobotSource(str(copy)).open().instructions
+    assert LeRobotSource(str(copy), instruction="go").open().instructions == ("go",)
 
 
 # -- videos -------------------------------------------------------------------------------------------------------
