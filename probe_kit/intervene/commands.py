@@ -109,7 +109,7 @@ Coefficients = Annotated[
         "--coefficients",
         parser=Numbers.parse,
         metavar="1,2,…",
-        help="Coefficients, comma-separated, in half class-mean differences.",
+        help="Coefficients, comma-separated: half class-mean differences, or lengths of a file's vector.",
     ),
 ]
 TargetSide = Annotated[
@@ -133,6 +133,15 @@ PairTable = Annotated[
         "--pairs",
         metavar="FILE",
         help="Table of pairs of your own, with the columns episode, frame, donor_episode, donor_frame.",
+    ),
+]
+Instructions = Annotated[
+    Path | None,
+    _pairs_option(
+        "--instructions",
+        metavar="FILE",
+        help="Words of other tasks, where the data set has one task: a line each, or a table with a column "
+        "instruction.",
     ),
 ]
 ReadoutName = Annotated[
@@ -194,6 +203,7 @@ def intervene(
     vary: Vary = None,
     frames: FramesEach = None,
     pairs: PairTable = None,
+    instructions: Instructions = None,
     wording: common.Wording = None,
     device: common.Device = "cpu",
     style: Format = "table",
@@ -209,6 +219,7 @@ def intervene(
     probe-kit intervene runs/mine --kind interchange --sites "backbone.*"
     """  # noqa: D301 - click reads the \b
     from probe_kit.intervene import ReplaySource
+    from probe_kit.intervene.further_instructions import read_instructions
     from probe_kit.intervene.pairs import read_pairs
     from probe_kit.runs import open_run
 
@@ -216,6 +227,7 @@ def intervene(
     of_every_kind: dict[str, Any] = {
         "categories": categories, "items": items, "readout": readout, "vary": vary or "", "frames": frames,
         "pairs": () if pairs is None else read_pairs(pairs),
+        "instructions": () if instructions is None else read_instructions(instructions),
     }  # fmt: skip
     inside: dict[str, Any] = {
         "sites": sites, "roles": roles, "direction": direction, "controls": controls,

@@ -89,7 +89,7 @@ class RecordingSource(Source[LeRobotSource]):
         folder = open_lerobot(settings)
         if folder.repo is not None:
             settings = settings.changed(folder=f"{folder.repo}@{folder.revision}")
-        opened = cls(settings, folder)
+        opened = cls(settings, folder, 1 if settings.single else MOST_FRAMES)
         opened._check_features()
         fetched(opened.folder, opened.episodes, ())
         opened.folder.check_files(opened.episodes, ())
