@@ -25,8 +25,8 @@ def doctor(
         _print_findings(findings)
     missing = any(finding.state == "missing" for finding in findings)
     if not missing:
-        demo, diagnose = "[bold]probe-kit demo[/]", "[bold]probe-kit diagnose MODEL[/]"
-        say(marked(f"next: {demo}; {diagnose} says which inputs a policy uses"))
+        commands = "probe-kit demo", "probe-kit diagnose MODEL"
+        say(marked("next: [bold]{}[/]; [bold]{}[/] says which inputs a policy uses", *commands))
     raise typer.Exit(1 if missing else 0)
 
 

@@ -18,8 +18,9 @@ from probe_kit.diagnose.results import FRAMES, check_names, diagnosis_table
 from probe_kit.errors import UsageError
 from probe_kit.extract import commands as start
 from probe_kit.extract.config_files import MovedOptions, moved_of
+from probe_kit.extract.parts import SCRIPTED
 from probe_kit.extract.settings import ExtractSettings
-from probe_kit.extract.sources.inputs import GIVE_WORDS, INSTRUCTION, normal_form
+from probe_kit.extract.sources.inputs import GIVE_WORDS, INSTRUCTION, describe_spellings, normal_form
 from probe_kit.intervene.commands import Instructions, PairTable
 
 if TYPE_CHECKING:
@@ -111,6 +112,7 @@ def diagnose(
     from probe_kit.intervene.further_instructions import read_instructions
     from probe_kit.intervene.pairs import read_pairs
     from probe_kit.intervene.settings import has_sides
+    from probe_kit.train import Target
     from probe_kit.train.command_options import TargetOptions
 
     # A camera's name is known once the source is open; any other mistake is said before.
@@ -125,6 +127,8 @@ def diagnose(
     options = None if target is None else TargetOptions(target, labels, None, None, None)
     if options is not None:
         options.check(None)
+        if labels is not None:
+            Target.read(labels, options.name)  # a column that it lacks is said before anything is captured
     elif labels is not None:
         raise UsageError(f"--labels {labels} is a table of --target; name the column")
     request = _Request(frames, tuple(require or ()), table, base, further, options, inside)
@@ -266,7 +270,8 @@ def _stored(name: str, typed: Mapping[str, Any], request: _Request) -> "Run":
     check_readable(run, source, request.instructions)
     if request.base is not None:
         check_base(run, source, request.base)
-    _note_spellings(run.episodes["instruction"].astype(str))
+    for sentence in describe_spellings(run.episodes["instruction"].astype(str)):
+        say_note(f"{sentence}.")
     return run
 
 
@@ -284,18 +289,10 @@ def _frames_of_run(run: "Run", source: "ReplaySource") -> Collection[tuple[str, 
         frames.close()
 
 
-def _note_spellings(instructions: Iterable[str]) -> None:
-    """Say which instructions are one but for their spelling."""
-    from probe_kit.extract.sources.inputs import describe_spellings
-
-    for sentence in describe_spellings(instructions):
-        say_note(f"{sentence}.")
-
-
 def _prepared(
     name: str, typed: Mapping[str, Any], request: _Request, out_folder: str | None, *, fetch: bool
 ) -> "tuple[Extraction, Location, int]":
-    """Return the extraction of the frames that are used, and most inferences, after its plan and cost were printed.
+    """Return the extraction of the frames that are used, and its largest cost, after both were printed.
 
     What is wrong with the request is raised before weights are read.
     """
@@ -318,6 +315,8 @@ def _prepared(
     if "dataset" in typed and request.target is None:
         settings = settings.changed(source=settings.source.changed(single=True))
     model = settings.model
+    if model.family in SCRIPTED:
+        raise UsageError(f"{model.family} is scripted and has no network; diagnose a policy")
     if request.instructions and (family := get_family(model.family)) is not None:
         family.check_words(request.instructions, model.checkpoint)
         family.check_instructions(model.checkpoint, request.instructions, model.options, fetch)
@@ -338,7 +337,8 @@ def _prepared(
     location = locate(out_folder or Path("runs") / f"diagnose-{extraction.default_name()}")
     print_plan(extraction, location)
     source, rows = extraction.source, extraction.plan.episodes
-    _note_spellings(source.instructions)
+    for sentence in source.same_instructions():
+        say_note(f"{sentence}.")
     cameras = 1 + len(source.example(rows[0].instruction).cameras)
     texts = [*(row.instruction for row in rows), *request.instructions]
     inputs = _inputs(texts, cameras, in_scene)
@@ -386,9 +386,7 @@ def _captured(extraction: "Extraction", location: "Location", most: int) -> "Run
     # The first one warms the network up; what was captured before took no time now.
     if len(ended) > FEWEST_PACED:
         seconds = most * (ended[-1] - ended[0]) / (len(ended) - 1)
-        say(
-            f"about {spoken(seconds)} for at most {most:,} inferences, at the pace of the frames that were captured"
-        )
+        say(f"about {spoken(seconds)} for at most {most:,} inferences, at the pace of the captured frames")
     return run
 
 

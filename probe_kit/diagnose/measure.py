@@ -140,7 +140,7 @@ class InputExchange:
         return pairs
 
     def candidates(self, name: str) -> Sequence[Frame]:
-        """Return the frames among which donors are drawn: all, and of the instruction also those with other words."""
+        """Return the frames among which donors are drawn: all, and of the instruction those with other words."""
         if name != INSTRUCTION or not self.words:
             return self.frames
         return self._with_words

@@ -3,7 +3,7 @@
 The meaning of an option for a kind is in the kind's file.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -32,6 +32,7 @@ from probe_kit.suite.categories import category_of
 if TYPE_CHECKING:
     import pandas as pd
 
+    from probe_kit.hooks.contract.sites import Stream
     from probe_kit.intervene.kinds.base import Intervention
     from probe_kit.intervene.results import InterventionResult
     from probe_kit.intervene.sessions import ReplaySource
@@ -243,9 +244,10 @@ def intervene(
     result = _run(opened, intervention, source)
     print_result(result, style, details)
     if style == "table":
-        following = "retention {}[/]  use beside probes and success"
-        following = following if result.outcomes.has_sides else "run show {}[/]  what the run stores"
-        say(marked(f"next: [bold]probe-kit {following}", run))
+        has_sides = result.outcomes.has_sides
+        following = f"retention {run}" if has_sides else f"run show {run}"
+        what = "use beside probes and success" if has_sides else "what the run stores"
+        say(marked("next: [bold]probe-kit {}[/]  {}", following, what))
     say(marked("stored as {}", result.key))
 
 
@@ -421,6 +423,7 @@ def show(
         print_json(
             {
                 **asdict(facts),
+                "streams": {name: _shape(stream, opened.views(name)) for name, stream in opened.streams.items()},
                 "interventions": listed,
                 "unfinished_interventions": unfinished,
                 "input_notes": notes,
@@ -438,6 +441,11 @@ def show(
     if not facts.probes:
         why = f". {how_to_probe(opened)}" if facts.streams else ": a policy without streams has none"
         out.print(f"no probes{why}", soft_wrap=True)
+
+
+def _shape(stream: "Stream", views: Sequence[str]) -> dict[str, Any]:
+    """Return the numbers of a stream that a run stores, and the names of its views."""
+    return {**stream.shape_json(), "views": list(views)}
 
 
 def _show_action_errors(run: str, partial: bool, as_json: bool) -> None:

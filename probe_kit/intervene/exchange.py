@@ -57,8 +57,8 @@ def describe_seed(every: float) -> str:
 def describe_trace(exchange: str, whole: float) -> str:
     """Return a sentence, without its stop, on an exchange of inputs that changes less than `TRACE`."""
     return (
-        f"the {exchange} changes {100 * whole:.1g} % of the action's variance, less than {whole_percent(TRACE)} %: "
-        "shares of it are shares of next to nothing"
+        f"the {exchange} changes {100 * whole:.1g} % of the action's variance, less than "
+        f"{whole_percent(TRACE)} %: shares of it are shares of next to nothing"
     )
 
 

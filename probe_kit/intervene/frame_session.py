@@ -24,6 +24,7 @@ from probe_kit.extract.sources.inputs import (
     InputComparison,
     draw_donors,
     hardly_changed,
+    normal_form,
     why_not_varied,
     with_input,
 )
@@ -82,15 +83,22 @@ class Frames:
         names = {(frame.item, frame.number): frame for frame in self.index}
         return names | {(frame.episode, frame.number): frame for frame in self.index}
 
-    def check_varied(self, vary: str) -> None:
-        """Refuse an input that the frames do not have, such as a mistyped camera.
+    def check_varied(self, vary: str, further: Sequence[str] = ()) -> None:
+        """Refuse an input that the frames do not have, such as a mistyped camera, and a single instruction.
+
+        Args:
+            vary: The input.
+            further: Words of other tasks.
 
         Raises:
-            UsageError: For an input that the frames do not have.
+            UsageError: For an input that the frames do not have, or an instruction that they all share.
         """
         inputs = (INSTRUCTION, PICTURE, *(f"{PICTURE}.{name}" for name in self.cameras), STATE)
         if vary not in inputs:
             raise UsageError(f"vary is {vary!r}; expected one of {', '.join(inputs)}")
+        instructions = [frame.instruction for frame in self.index]
+        if vary == INSTRUCTION and not further and len(set(map(normal_form, instructions))) == 1:
+            raise UsageError(why_not_varied(instructions, vary))
 
     def observe(self, frame: Frame) -> Observation:
         """Show a frame.

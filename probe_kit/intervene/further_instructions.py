@@ -21,8 +21,8 @@ def read_instructions(path: Path) -> tuple[str, ...]:
     text are left out.
 
     Raises:
-        UsageError: For a file without instructions or with too many, an empty line, and a text that is there twice;
-            texts that differ in case, spaces, punctuation or Unicode form alone are one text.
+        UsageError: For a file without instructions or with too many, an empty line, and a text that is there
+            twice; texts that differ in case, spaces, punctuation or Unicode form alone are one text.
     """
     is_table = path.suffix.lower() in TABLES
     lines = [] if is_table else read_lines(path)

@@ -155,7 +155,7 @@ def open_session(
             on_failure.callback(frames.close)
             check_pairs(table, frames.by_name)
             if choice is not None:
-                frames.check_varied(choice.varied)
+                frames.check_varied(choice.varied, choice.instructions)
             session = FrameSession(run, policy().with_cameras(list(frames.cameras)), frames, choice)
         check_policy(run, session.policy)
         on_failure.pop_all()

@@ -111,7 +111,7 @@ class InterventionResult(Measurement):
         ]
 
     def _trace(self) -> list[str]:
-        """Return a note where the exchange, of which effects inside the network are shares, changes next to nothing."""
+        """Return a note where the exchange, of which effects are shares, changes next to nothing."""
         outcomes = self.outcomes
         # Swaps of an input play all of the donor's inputs as well, and have their own floor.
         is_part = IMAGE_SWAP in outcomes.conditions and DONOR not in outcomes.conditions

@@ -8,6 +8,7 @@ import unicodedata
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
+from itertools import groupby
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,16 +63,11 @@ def normal_form(text: str) -> str:
     """
     folded = unicodedata.normalize("NFKC", unicodedata.normalize("NFKC", text).casefold())
     visible = "".join(sign for sign in folded if unicodedata.category(sign) not in ("Cf", "Cc") or sign.isspace())
-    kept = []
-    for at, sign in enumerate(visible):
-        if not _is_separator(sign):
-            kept.append(sign)
-        elif at == 0 or not _is_separator(visible[at - 1]):  # the first of a run stands for all of it
-            end = at + next(
-                (n for n, later in enumerate(visible[at:]) if not _is_separator(later)), len(visible) - at
-            )
-            kept.append(_kept_of(visible[at:end], visible[at - 1 : at], visible[end : end + 1]))
-    return "".join(kept)
+    runs = ["".join(signs) for _, signs in groupby(visible, _is_separator)]
+    between = zip(["", *runs], runs, [*runs[1:], ""], strict=False)
+    return "".join(
+        _kept_of(run, before[-1:], after[:1]) if _is_separator(run[0]) else run for before, run, after in between
+    )
 
 
 def _is_separator(sign: str) -> bool:
@@ -126,8 +122,8 @@ def least_step(states: NDArray[np.floating]) -> NDArray[np.float64]:
 class InputComparison:
     """Whether frames hold two values of one input; of pictures it keeps the means of blocks.
 
-    Instructions differ by their value, see `values_of_texts`. Of pictures some block's mean differs, of states some
-    number, by more than the control of the input changes it, see `BEYOND`.
+    Instructions differ by their value, see `values_of_texts`. Of pictures some block's mean differs, of states
+    some number, by more than the control of the input changes it, see `BEYOND`.
 
     Attributes:
         observe: A function that returns the observation of a frame by its index.
@@ -163,7 +159,7 @@ class InputComparison:
         return any(self._picture_differs(clean, other, camera) for camera in _cameras(first, self.vary))
 
     def values(self, count: int) -> NDArray[np.intp]:
-        """Return a number (count,) of the value of each of the first frames; the first with a value stands for it."""
+        """Return a number (count,) of each first frame's value; the first frame with a value stands for it."""
         if self.vary == INSTRUCTION:
             return self.texts[:count]
         firsts: list[int] = []
@@ -352,7 +348,8 @@ def why_not_varied(instructions: Sequence[str], vary: str) -> str:
     """Return why no frame of another group has another value of an input, and what to do."""
     none = f"no frame of another group has another {vary}"
     if vary != INSTRUCTION:
-        return f"{none}, by {BEYOND:g} times what its control changes; extract more episodes, or choose another --vary"
+        beyond = f"{none}, by {BEYOND:g} times what its control changes"
+        return f"{beyond}; extract more episodes, or choose another --vary"
     spelt = "; ".join(describe_spellings(instructions))
     return f"{none}{f': {spelt}' if spelt else ''}. {GIVE_WORDS}, or choose another --vary"
 
@@ -363,7 +360,7 @@ def describe_spellings(instructions: Iterable[str]) -> list[str]:
     for text in instructions:
         by_form.setdefault(normal_form(text), {})[text] = None
     return [
-        f"{', '.join(map(repr, texts))} are one instruction: they differ in case, spaces, punctuation or form alone"
+        f"{', '.join(map(repr, texts))} are one instruction: case, spaces, punctuation or form alone differ"
         for texts in by_form.values()
         if len(texts) > 1
     ]
@@ -379,8 +376,8 @@ def draw_donors(
 ) -> list[tuple[int, int]]:
     """Return pairs (frame, donor) of indices: up to `count` donors per frame.
 
-    A donor is of another group, and has another value of the input, see `InputComparison`. The donor of a picture is
-    one of the `NEAREST` frames by state, in spreads of every number, and of all that are equally near. Frames
+    A donor is of another group, and has another value of the input, see `InputComparison`. The donor of a picture
+    is one of the `NEAREST` frames by state, in spreads of every number, and of all that are equally near. Frames
     without any donor are left out.
 
     Args:

@@ -158,8 +158,8 @@ class Intervention(Choice, ABC):
         """Raise UsageError for further instructions that nothing exchanges, or that the run has already."""
         if self.varied != INSTRUCTION:
             raise UsageError(
-                f"--instructions gives words, and the {self.varied} is exchanged; add --vary {INSTRUCTION}, or leave "
-                "it out"
+                f"--instructions gives words, and the {self.varied} is exchanged; add --vary {INSTRUCTION}, or "
+                "leave it out"
             )
         if self.pairs:
             raise UsageError(

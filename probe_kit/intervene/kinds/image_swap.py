@@ -169,8 +169,8 @@ def input_effect(outcomes: ConditionOutcomes, swapped: str, vary: str) -> InputE
 def _finding(share: SwapShare | None, p: float, ratio: float, by_seed: bool, is_trace: bool) -> Finding:
     """Return the verdict of an input.
 
-    Where the seed decides, a share of the exchange of all inputs is a share of nothing; the rules are then those of
-    `probe-kit diagnose`.
+    Where the seed decides, a share of the exchange of all inputs is a share of nothing; the rules are then those
+    of `probe-kit diagnose`.
 
     Args:
         share: Share of the exchange of all inputs; None where that changes nothing.

@@ -18,6 +18,7 @@ from probe_kit.intervene.kinds.base import (
     interval_text,
     is_resolved,
     lines_of,
+    p_of,
 )
 from probe_kit.intervene.kinds.interchange import cells_at, check_roles_apart
 from probe_kit.intervene.outcomes import CLEAN, ConditionOutcomes, Effect
