@@ -306,8 +306,9 @@ def _prepared(
     in_scene = not {"dataset", "env", "pictures"} & set(typed)
     # Of an environment too the first observation of an episode is all that is read.
     captured = {"no_act": True} if in_scene else {"max_steps": 1, "execute": 1} if "env" in typed else {}
-    # A target is probed in all that is captured: twice as many groups as are exchanged, and every frame.
-    groups = count_groups(request.frames) if request.target is None else request.frames
+    # A target is probed in all that is captured, and a table of pairs names any item: twice as many groups then.
+    is_drawn = request.target is None and not request.pairs
+    groups = count_groups(request.frames) if is_drawn else request.frames
     items = {"items": 2 * groups} if in_scene and "items" not in typed else {}
     # A policy that ignores both picture and instruction is what is looked for here.
     ignored = {"accept_ignored_inputs": True}
@@ -376,7 +377,7 @@ def _captured(extraction: "Extraction", location: "Location", most: int) -> "Run
     """Return the run of the planned frames, and say how long `most` inferences take by the pace of these."""
     ended: list[float] = []
     with progress() as bar:
-        count = counter(bar, "episodes")
+        count = counter(bar, "frames")
 
         def advance(finished: int, total: int, *what: object) -> None:
             ended.append(monotonic())

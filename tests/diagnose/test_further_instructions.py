@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from probe_kit.cli import app
 from probe_kit.diagnose.diagnosis import diagnose_run
-from probe_kit.diagnose.measure import InputExchange
+from probe_kit.diagnose.measure import DONORS, InputExchange
 from probe_kit.diagnose.results import Diagnosis, exit_code
 from probe_kit.errors import InstructionError, UsageError
 from probe_kit.extract import ExtractSettings, LeRobotSource, extract_run
@@ -66,7 +66,7 @@ def test_words_of_other_tasks_show_that_the_policy_obeys_and_what_is_varied_stay
     alone, with_words = InputExchange(obey, given), InputExchange(obey, given, words=OTHERS)
     words, picture, _ = with_words.measure()
     assert words.verdict == "decides"
-    assert words.n_pairs == 3 * len(given), "one donor of each further task"
+    assert words.n_pairs == DONORS * len(given), "each further task, with several pictures"
     assert words.control == 0, "another spelling changes nothing"
     assert (picture.share, picture.n_pairs) == (alone.measure(["picture"])[0].share, alone.measure()[1].n_pairs)
     donors = {

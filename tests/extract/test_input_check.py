@@ -191,6 +191,11 @@ def test_a_blank_picture_changes_nothing_but_the_picture() -> None:
     assert (blank.instruction, blank.state.tolist()) == (clean.instruction, clean.state.tolist())
 
 
+def test_another_spelling_of_an_instruction_is_no_other_instruction() -> None:
+    (words, *_) = varied(observation("lift it"), ["Lift it.", "LIFT  IT", "push it"], letters)["instruction"]
+    assert words.instruction == "push it"
+
+
 GROUPS = 12
 
 
