@@ -111,7 +111,6 @@ def diagnose(
     from probe_kit.diagnose.inputs import names_of, read_paraphrases
     from probe_kit.intervene.further_instructions import read_instructions
     from probe_kit.intervene.pairs import read_pairs
-    from probe_kit.intervene.settings import has_sides
     from probe_kit.train import Target
     from probe_kit.train.command_options import TargetOptions
 
@@ -134,7 +133,7 @@ def diagnose(
     request = _Request(frames, tuple(require or ()), table, base, further, options, inside)
     if _is_run(model_or_run, typed):
         run, source = _stored(model_or_run, typed, request), True
-        _say_cost(run.model, list(run.streams.values()), _inputs_of(run, further), request, has_sides(run))
+        _say_cost(run.model, list(run.streams.values()), _inputs_of(run, further), request)
     else:
         source = False
         extraction, location, most = _prepared(model_or_run, typed, request, out_folder, fetch=not dry_run)
@@ -200,7 +199,7 @@ class _Request(NamedTuple):
         if not self.pairs:
             check_groups(episodes, self.frames, in_scene, lambda: f"{subject} has")
         if self.instructions:
-            check_words(self.instructions, episodes["instruction"].astype(str), in_scene, bool(self.pairs))
+            check_words(self.instructions, episodes["instruction"].astype(str), bool(self.pairs))
         if self.target is None:
             return
         if self.target.is_side and not in_scene:
@@ -217,11 +216,13 @@ class _Request(NamedTuple):
 
 def check_writable(html: Path) -> None:
     """Raise UsageError for a page that cannot be written, before anything is loaded for it."""
-    if html.is_dir() or not html.parent.is_dir():
-        what = "is a folder" if html.is_dir() else f"lies in {html.parent}, which is no folder"
-        raise UsageError(f"--html {html} {what}; give the name of a file in a folder that exists")
-    if not os.access(html if html.exists() else html.parent, os.W_OK):
-        raise UsageError(f"--html {html} cannot be written; give another place")
+    if html.is_dir():
+        raise UsageError(f"--html {html} is a folder; give the name of a file")
+    nearest = next(place for place in (html, *html.absolute().parents) if place.exists())
+    if not os.access(nearest, os.W_OK) or not (nearest == html or nearest.is_dir()):
+        raise UsageError(
+            f"--html {html} cannot be written: {nearest} is no folder that can be; give another place"
+        )
 
 
 def _replay_source(run: "Run", typed: Mapping[str, Any]) -> "ReplaySource":
@@ -343,7 +344,7 @@ def _prepared(
     cameras = 1 + len(source.example(rows[0].instruction).cameras)
     texts = [*(row.instruction for row in rows), *request.instructions]
     inputs = _inputs(texts, cameras, in_scene)
-    return extraction, location, _say_cost(model.family, extraction.plan.streams, inputs, request, in_scene)
+    return extraction, location, _say_cost(model.family, extraction.plan.streams, inputs, request)
 
 
 def _chosen_rows(rows: "Sequence[Row]", request: _Request, subject: str, in_scene: bool) -> "Sequence[Row]":
@@ -418,9 +419,7 @@ def _inputs(instructions: Iterable[str], cameras: int, in_scene: bool) -> list[s
     return [*["instruction"] * (len(words) > 1), *pictures * cameras, *["state"] * (not in_scene)]
 
 
-def _say_cost(
-    family: str, streams: "Sequence[Any]", inputs: Sequence[str], request: _Request, in_scene: bool
-) -> int:
+def _say_cost(family: str, streams: "Sequence[Any]", inputs: Sequence[str], request: _Request) -> int:
     """Say and return at most how many inferences a diagnosis takes, of how many frames, inputs and sites."""
     from probe_kit.diagnose.measure import count_inferences
     from probe_kit.hooks.registry import get_family
@@ -436,6 +435,6 @@ def _say_cost(
     most = count_inferences(frames, len(inputs), sites, base, pairs)
     words = ", ".join(dict.fromkeys(inputs))
     say(f"at most {most:,} inferences: {frames} frames, {words}, {sites} sites" + ", and a base" * base)
-    if INSTRUCTION not in inputs and not in_scene:
+    if INSTRUCTION not in inputs:
         say_note(f"the frames have one instruction, which cannot vary. {GIVE_WORDS}.")
     return most

@@ -203,8 +203,7 @@ def diagnose_run(
         base: The checkpoint that the run's was tuned from, for a comparison on the same pairs; None for none.
         pairs: A table of your own in place of drawn donors: episode and frame, and those of the donor; `frames` is
             then not used.
-        instructions: Words of other tasks, beside the instructions of the frames, for a run that has one task; not
-            of the scene.
+        instructions: Words of other tasks, beside the instructions of the frames, for a run that has one task.
         seed: Seed of the draw of donors and of the probes.
         source: Where the model and the observations are now, as for `run_intervention`. The base is loaded by it
             too.
@@ -291,16 +290,14 @@ def check_diagnosis(
     if not pairs:
         check_groups(run.episodes, frames, has_sides(run), lambda: f"{run.location} has")
     if instructions:
-        check_words(instructions, run.episodes["instruction"].astype(str), has_sides(run), bool(pairs))
+        check_words(instructions, run.episodes["instruction"].astype(str), bool(pairs))
         check_readable(run, source, instructions)
     if base is not None:
         check_base(run, source, base)
 
 
-def check_words(instructions: Sequence[str], of_frames: Iterable[str], in_scene: bool, tabled: bool) -> None:
-    """Raise UsageError for further instructions of the scene, beside a table of pairs, or that frames have."""
-    if in_scene:
-        raise UsageError("--instructions is for recordings, pictures and environments; a suite has several tasks")
+def check_words(instructions: Sequence[str], of_frames: Iterable[str], tabled: bool) -> None:
+    """Raise UsageError for further instructions beside a table of pairs, or that frames have."""
     if tabled:
         raise UsageError("--instructions gives words of donors, and --pairs names donors; leave one of both out")
     check_further_instructions(instructions, of_frames)

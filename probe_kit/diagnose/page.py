@@ -71,4 +71,5 @@ def write_page(diagnosis: "Diagnosis", file: Path) -> None:
         content, size = picture_of(draw_passage(diagnosis))
         image = '<img alt="sites on the way to the action" width={} src="data:image/png;base64,{}">'
         parts.append(Markup(image).format(size["width"], b64encode(content).decode()))
+    file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text("".join(map(str, parts)), encoding="utf-8")
