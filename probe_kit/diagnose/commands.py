@@ -120,7 +120,7 @@ def diagnose(
         check_writable(html)
     words = {} if paraphrases is None else read_paraphrases(paraphrases)
     table = () if pairs is None else read_pairs(pairs)
-    further = () if instructions is None else read_instructions(instructions)
+    task_words = () if instructions is None else read_instructions(instructions)
     if table and frames != FRAMES:
         raise UsageError("--frames N draws frames, and --pairs names them; leave one of both out")
     options = None if target is None else TargetOptions(target, labels, None, None, None)
@@ -130,10 +130,10 @@ def diagnose(
             Target.read(labels, options.name)  # a column that it lacks is said before anything is captured
     elif labels is not None:
         raise UsageError(f"--labels {labels} is a table of --target; name the column")
-    request = _Request(frames, tuple(require or ()), table, base, further, options, inside)
+    request = _Request(frames, tuple(require or ()), table, base, task_words, options, inside)
     if _is_run(model_or_run, typed):
         run, source = _stored(model_or_run, typed, request), True
-        _say_cost(run.model, list(run.streams.values()), _inputs_of(run, further), request)
+        _say_cost(run.model, list(run.streams.values()), _inputs_of(run, task_words), request)
     else:
         source = False
         extraction, location, most = _prepared(model_or_run, typed, request, out_folder, fetch=not dry_run)
@@ -151,7 +151,7 @@ def diagnose(
             target=None if options is None else options.read(run),
             base=base,
             pairs=table,
-            instructions=further,
+            instructions=task_words,
             progress=lambda text: status.update(Text(text)),
         )
     if output_format == "json":
@@ -218,7 +218,7 @@ def check_writable(html: Path) -> None:
     """Raise UsageError for a page that cannot be written, before anything is loaded for it."""
     if html.is_dir():
         raise UsageError(f"--html {html} is a folder; give the name of a file")
-    nearest = next(place for place in (html, *html.absolute().parents) if place.exists())
+    nearest = next(path for path in (html, *html.absolute().parents) if path.exists())
     if not os.access(nearest, os.W_OK) or not (nearest == html or nearest.is_dir()):
         raise UsageError(
             f"--html {html} cannot be written: {nearest} is no folder that can be; give another place"
@@ -298,7 +298,7 @@ def _prepared(
     What is wrong with the request is raised before weights are read.
     """
     from probe_kit.diagnose.diagnosis import check_base_files
-    from probe_kit.diagnose.inputs import count_groups
+    from probe_kit.diagnose.results import count_groups
     from probe_kit.extract import prepare
     from probe_kit.extract.commands import print_plan
     from probe_kit.hooks.registry import get_family
@@ -364,10 +364,10 @@ def _chosen_rows(rows: "Sequence[Row]", request: _Request, subject: str, in_scen
     if in_scene or request.target is not None:
         return rows
     if request.pairs:
-        named = {part for pair in request.pairs for part in (pair[:2], pair[2:])}
-        return [row for row in rows if not named.isdisjoint(_planned_frames([row], in_scene))]
-    chosen = spread_over_groups([str(row.columns["group_id"]) for row in rows], request.frames)
-    return [rows[at] for at in sorted(chosen)]
+        frames = {part for pair in request.pairs for part in (pair[:2], pair[2:])}
+        return [row for row in rows if not frames.isdisjoint(_planned_frames([row], in_scene))]
+    positions = spread_over_groups([str(row.columns["group_id"]) for row in rows], request.frames)
+    return [rows[at] for at in sorted(positions)]
 
 
 FEWEST_PACED = 3
@@ -403,12 +403,12 @@ def _planned_frames(rows: "Iterable[Row]", in_scene: bool) -> dict[tuple[str, in
     }
 
 
-def _inputs_of(run: "Run", further: Sequence[str]) -> list[str]:
+def _inputs_of(run: "Run", task_words: Sequence[str]) -> list[str]:
     """Return the inputs that can vary between the frames of a stored run."""
     from probe_kit.diagnose.inputs import cameras_of
     from probe_kit.intervene.settings import has_sides
 
-    texts = [*run.episodes["instruction"].astype(str), *further]
+    texts = [*run.episodes["instruction"].astype(str), *task_words]
     return _inputs(texts, len(cameras_of(run)), has_sides(run))
 
 

@@ -382,7 +382,7 @@ def describe_origin(diagnosis: "Diagnosis") -> list[str]:
     settings = diagnosis.settings
     random = " (random weights)" * diagnosis.random_weights
     base = settings.get("base")
-    chosen = [
+    parts = [
         f"inputs {', '.join(settings['inputs'])}" if settings.get("inputs") else "all inputs",
         "sites patched" if settings.get("inside") else "no site patched",
         *([f"{len(settings['pairs'])} pairs of a table"] if settings.get("pairs") else []),
@@ -393,7 +393,7 @@ def describe_origin(diagnosis: "Diagnosis") -> list[str]:
     return [
         f"weights {diagnosis.weights_sha256[:12]} of checkpoint {diagnosis.checkpoint}{random}"
         + (f"; base {diagnosis.base} with weights {base[:12]}." if base else "."),
-        f"source {diagnosis.source}; settings: {', '.join(chosen)}; key {diagnosis.key}.",
+        f"source {diagnosis.source}; settings: {', '.join(parts)}; key {diagnosis.key}.",
     ]
 
 

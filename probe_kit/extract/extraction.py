@@ -66,7 +66,7 @@ class Extraction:
         calibration: The measurement that chose the batch; None if it was not requested or is left to workers.
         declared: The origin of the sizes of the streams, where no model was loaded and the run has no name yet.
             Empty where a model was loaded.
-        chosen: The ids of the planned rows, where only some of the source's are planned; else None.
+        row_ids: The ids of the planned rows, where only some of the source's are planned; else None.
     """
 
     settings: Settings
@@ -76,7 +76,7 @@ class Extraction:
     controller: Controller | None
     calibration: Calibration | None = None
     declared: str = ""
-    chosen: tuple[str, ...] | None = None
+    row_ids: tuple[str, ...] | None = None
 
     def identity(self) -> dict[str, Any]:
         """Return everything that decides the numbers of an episode, without selection, machine and label.
@@ -221,7 +221,7 @@ def load(
     """
     settings, source = open_checked(settings, location, model is not None, fetch)
     task = task_of(settings)
-    rows = _chosen(task.rows(settings, source), choose_rows)
+    rows = _select_rows(task.rows(settings, source), choose_rows)
     if not rehearsed:
         source.rehearse(rows)
     if model is not None:
@@ -243,13 +243,13 @@ def load(
     )
     if check_cameras is not None and (cameras := source.shown_cameras()) is not None:
         check_cameras(cameras)
-    rows = _chosen(task.rows(settings, source), choose_rows)  # of the source as the model is shown it
+    rows = _select_rows(task.rows(settings, source), choose_rows)  # of the source as the model is shown it
     plan = _plan(settings, source, rows, controller.streams, controller.execute)
-    chosen = _ids(rows, choose_rows)
-    return Extraction(settings, source, plan, controller.identity, controller, calibration, chosen=chosen)
+    row_ids = _ids(rows, choose_rows)
+    return Extraction(settings, source, plan, controller.identity, controller, calibration, row_ids=row_ids)
 
 
-def _chosen(rows: tuple[Row, ...], choose: ChooseRows | None) -> tuple[Row, ...]:
+def _select_rows(rows: tuple[Row, ...], choose: ChooseRows | None) -> tuple[Row, ...]:
     """Return the chosen rows, numbered anew in their order; all without a choice."""
     if choose is None:
         return rows
@@ -461,8 +461,8 @@ def play_episodes(
     Raises:
         SettingsMismatchError: If this machine has other settings or gives other numbers than those before it.
     """
-    settings, run, chosen = setup
-    prepared = load(settings, rehearsed=True, choose_rows=None if chosen is None else partial(_rows_of, chosen))
+    settings, run, row_ids = setup
+    prepared = load(settings, rehearsed=True, choose_rows=None if row_ids is None else partial(_rows_of, row_ids))
     writer = prepared.writer(locate(run))
     with writer.joined():
         writer.begin(settings.machine.allow_mixed)
@@ -482,7 +482,7 @@ def _played_here(
 
 def _pool(prepared: Extraction, run: str) -> Pool:
     settings = prepared.settings
-    setup = settings, run, prepared.chosen
+    setup = settings, run, prepared.row_ids
     if settings.machine.ray:
         return RayPool(play_episodes, setup, settings.machine.ray, partial(_gpus, settings))
     share = partial(share_of_machine, size=settings.machine.workers, device=settings.machine.device)

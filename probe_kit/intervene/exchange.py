@@ -54,10 +54,10 @@ def describe_seed(every: float) -> str:
     return f"all inputs together change {whole_percent(every)} % of the action: the seed decides it"
 
 
-def describe_trace(exchange: str, whole: float) -> str:
+def describe_trace(exchange: str, share: float) -> str:
     """Return a sentence, without its stop, on an exchange of inputs that changes less than `TRACE`."""
     return (
-        f"the {exchange} changes {100 * whole:.1g} % of the action's variance, less than "
+        f"the {exchange} changes {100 * share:.1g} % of the action's variance, less than "
         f"{whole_percent(TRACE)} %: shares of it are shares of next to nothing"
     )
 

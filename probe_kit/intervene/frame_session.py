@@ -83,12 +83,12 @@ class Frames:
         names = {(frame.item, frame.number): frame for frame in self.index}
         return names | {(frame.episode, frame.number): frame for frame in self.index}
 
-    def check_varied(self, vary: str, further: Sequence[str] = ()) -> None:
+    def check_varied(self, vary: str, task_words: Sequence[str] = ()) -> None:
         """Refuse an input that the frames do not have, such as a mistyped camera, and a single instruction.
 
         Args:
             vary: The input.
-            further: Words of other tasks.
+            task_words: Words of other tasks.
 
         Raises:
             UsageError: For an input that the frames do not have, or an instruction that they all share.
@@ -97,7 +97,7 @@ class Frames:
         if vary not in inputs:
             raise UsageError(f"vary is {vary!r}; expected one of {', '.join(inputs)}")
         instructions = [frame.instruction for frame in self.index]
-        if vary == INSTRUCTION and not further and len(set(map(normal_form, instructions))) == 1:
+        if vary == INSTRUCTION and not task_words and len(set(map(normal_form, instructions))) == 1:
             raise UsageError(why_not_varied(instructions, vary))
 
     def observe(self, frame: Frame) -> Observation:

@@ -27,9 +27,9 @@ def read_instructions(path: Path) -> tuple[str, ...]:
     is_table = path.suffix.lower() in TABLES
     lines = [] if is_table else read_lines(path)
     is_table |= bool(lines) and any(INSTRUCTION in lines[0].split(sign) for sign in SEPARATORS)
-    named = list(_of_table(path) if is_table else _of_lines(path, lines))
+    numbered = list(_of_table(path) if is_table else _of_lines(path, lines))
     texts: dict[str, tuple[str, str]] = {}
-    for where, text in named:
+    for where, text in numbered:
         if not normal_form(text):
             raise UsageError(f"{where} is {text!r}, which names no task; expected an instruction. Remove the line")
         if normal_form(text) in texts:
@@ -38,12 +38,12 @@ def read_instructions(path: Path) -> tuple[str, ...]:
                 f"{where} is {text!r}, and {before} is {other!r}; they are one instruction. Remove one of them"
             )
         texts[normal_form(text)] = where, text
-    if not 0 < len(named) <= MOST:
+    if not 0 < len(numbered) <= MOST:
         raise UsageError(
-            f"{path} has {len(named)} instructions; expected 1 to {MOST}, one per line, or a table with a column "
-            f"{INSTRUCTION}"
+            f"{path} has {len(numbered)} instructions; expected 1 to {MOST}, one per line, or a table with a "
+            f"column {INSTRUCTION}"
         )
-    return tuple(text for _, text in named)
+    return tuple(text for _, text in numbered)
 
 
 def _of_lines(path: Path, lines: list[str]) -> Iterable[tuple[str, str]]:
@@ -61,15 +61,15 @@ def _of_table(path: Path) -> Iterable[tuple[str, str]]:
     return [(table.where(line), cells[INSTRUCTION] or "") for line, cells in table.rows((INSTRUCTION,))]
 
 
-def check_further_instructions(further: Sequence[str], instructions: Iterable[str]) -> None:
+def check_further_instructions(task_words: Sequence[str], instructions: Iterable[str]) -> None:
     """Raise UsageError for a further instruction that frames hold already, but for spelling.
 
     Args:
-        further: The words of other tasks.
+        task_words: The words of other tasks.
         instructions: The instructions of the frames.
     """
     held = {normal_form(text): text for text in instructions}
-    for text in further:
+    for text in task_words:
         if (same := held.get(normal_form(text))) is not None:
             raise UsageError(
                 f"--instructions has {text!r}, which is the task {same!r} of these frames; expected the words of "
@@ -77,6 +77,6 @@ def check_further_instructions(further: Sequence[str], instructions: Iterable[st
             )
 
 
-def hash_of_instructions(further: Sequence[str]) -> str:
+def hash_of_instructions(task_words: Sequence[str]) -> str:
     """Return the first 12 hex digits of the sha256 of instructions, as results name them."""
-    return sha256("\n".join(further).encode()).hexdigest()[:12]
+    return sha256("\n".join(task_words).encode()).hexdigest()[:12]

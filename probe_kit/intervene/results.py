@@ -117,8 +117,8 @@ class InterventionResult(Measurement):
         is_part = IMAGE_SWAP in outcomes.conditions and DONOR not in outcomes.conditions
         if outcomes.has_sides or outcomes.size is None or not is_part:
             return []
-        whole = float(share_of_variance(outcomes.size[outcomes.conditions.index(IMAGE_SWAP)]).mean())
-        return [f"{describe_trace(self.exchange, whole)}."] if whole < TRACE else []
+        share = float(share_of_variance(outcomes.size[outcomes.conditions.index(IMAGE_SWAP)]).mean())
+        return [f"{describe_trace(self.exchange, share)}."] if share < TRACE else []
 
     def _one_step(self) -> list[str]:
         if not self.outcomes.has_sides:

@@ -311,7 +311,8 @@ class Target:
             text = f"{len(counted)} classes: {', '.join(counted[:_MOST_CLASSES])}{more}"
         else:
             text = f"{counts['labels']} numbers from {counts['minimum']:g} to {counts['maximum']:g}"
-        return text + f"; {counts['missing']} missing" * (counts["missing"] > 0)
+        missing: int = counts["missing"]
+        return text + f"; {missing} missing" * (missing > 0)
 
     def __repr__(self) -> str:
         present = int(np.isfinite(self.coded.values).sum())

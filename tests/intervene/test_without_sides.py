@@ -156,7 +156,7 @@ def test_a_frame_with_two_donors_is_read_toward_each_of_them(shown: Run, table: 
 
 
 def test_pairs_are_refused_in_the_scene(copy: Run, table: Path) -> None:
-    with pytest.raises(UsageError, match="--vary, --frames and --pairs"):
+    with pytest.raises(UsageError, match="--vary, --frames, --pairs and --instructions"):
         ImageSwap(pairs=read_pairs(table)).check_run(copy)
 
 

@@ -143,8 +143,8 @@ def _with_other_words(clean: Observation, texts: Iterable[str], ids: Ids) -> Ite
     """
     words = clean.instruction
     # Another spelling may be the same tokens: a model that reads every word would be called one that reads none.
-    others = (text for text in texts if normal_form(text) != normal_form(words))
-    candidates = dict.fromkeys([*islice(others, MOST_TEXTS), " ".join(reversed(words.split()))])
+    other_texts = (text for text in texts if normal_form(text) != normal_form(words))
+    candidates = dict.fromkeys([*islice(other_texts, MOST_TEXTS), " ".join(reversed(words.split()))])
     candidates.pop(words, None)
     length = _length(words, ids)
     for text in sorted(candidates, key=lambda text: _length(text, ids) != length):

@@ -99,9 +99,9 @@ def values_of_texts(texts: Sequence[str], same_meaning: Sequence[tuple[str, str]
         return form
 
     for pair in same_meaning:
-        one, other = (first_of(normal_form(text)) for text in pair)
-        if one != other:
-            same[other] = one
+        first, second = (first_of(normal_form(text)) for text in pair)
+        if first != second:
+            same[second] = first
     forms = [first_of(normal_form(text)) for text in texts]
     numbers = {form: number for number, form in enumerate(dict.fromkeys(forms))}
     return np.array([numbers[form] for form in forms], np.intp)
@@ -120,7 +120,7 @@ def least_step(states: NDArray[np.floating]) -> NDArray[np.float64]:
 
 @dataclass(eq=False)
 class InputComparison:
-    """Whether frames hold two values of one input; of pictures it keeps the means of blocks.
+    """The comparison of frames by their values of one input; of pictures it keeps the means of blocks.
 
     Instructions differ by their value, see `values_of_texts`. Of pictures some block's mean differs, of states
     some number, by more than the control of the input changes it, see `BEYOND`.

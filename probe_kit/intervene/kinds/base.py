@@ -572,9 +572,9 @@ UNRESOLVED = f"p –: the effect is below {RESOLUTION}, the resolution of its me
 """The entry of a legend for p-values that are not shown."""
 
 
-def p_of(value: float | None, shown: bool = True) -> str:
+def p_of(value: float | None, is_printed: bool = True) -> str:
     """Return a p-value in two digits; a dash for None, and for the p-value of an effect that is not resolved."""
-    if value is None or not shown:
+    if value is None or not is_printed:
         return "–"
     text = format(value, ".2g")
     return text.lstrip("-") if float(text) == 0 else text
