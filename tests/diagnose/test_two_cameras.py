@@ -1,5 +1,6 @@
 """A diagnosis of a network that is shown two cameras: each is an input of its own."""
 
+import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
@@ -98,4 +99,5 @@ def test_a_base_of_other_cameras_is_refused_by_its_configuration_alone(tmp_path:
     check_base(run, ReplaySource(), same)
     with pytest.raises(UsageError, match=r"other inputs: its cameras are .*front.*, those of .*tuned .*top"):
         check_base(run, ReplaySource(), other)
-    check_base(run, ReplaySource(checkpoint=other), other)  # a moved checkpoint is given, and is the one
+    with pytest.raises(UsageError, match=f"those of {re.escape(same)} "):
+        check_base(run, ReplaySource(checkpoint=same), other)  # where a checkpoint is given, it is that one
