@@ -41,7 +41,7 @@ BEYOND = 3.0
 """How many times the change by the control an exchange must change pictures and states to be one.
 
 Two lossy copies of one picture are further apart than either is from its JPEG round trip. The blocks of a scene's
-picture, encoded again at any quality from 50 or as video, lie within three times that.
+picture, encoded again as JPEG of any quality from 50 or as AV1 of CRF 30, lie within three times that.
 """
 BLOCK = 8
 """Side of the blocks over which pictures are compared: JPEG's, and noise within a block has no mean."""
