@@ -323,6 +323,9 @@ def _prepared(
         family.check_words(request.instructions, model.checkpoint)
         family.check_instructions(model.checkpoint, request.instructions, model.options, fetch)
 
+    if request.target is not None and request.target.file is None:
+        _check_target(request.target.name, in_scene, "env" in typed)
+
     def check_cameras(cameras: Sequence[str]) -> None:
         request.check_cameras(cameras)
         if request.base is not None:
@@ -336,6 +339,10 @@ def _prepared(
             check_cameras=check_cameras,
             choose_rows=lambda rows: _chosen_rows(rows, request, settings.source.subject, in_scene),
         )
+    target, columns = request.target, extraction.source.targets()
+    is_recorded = not in_scene and "env" not in typed
+    if is_recorded and target is not None and target.file is None and target.name not in columns:
+        raise UsageError(f"--target {target.name!r} is no column here; there are {', '.join(columns) or 'none'}")
     location = locate(out_folder or Path("runs") / f"diagnose-{extraction.default_name()}")
     print_plan(extraction, location)
     source, rows = extraction.source, extraction.plan.episodes
@@ -345,6 +352,21 @@ def _prepared(
     texts = [*(row.instruction for row in rows), *request.instructions]
     inputs = _inputs(texts, cameras, in_scene)
     return extraction, location, _say_cost(model.family, extraction.plan.streams, inputs, request)
+
+
+def _check_target(name: str, in_scene: bool, in_environment: bool) -> None:
+    """Raise UsageError for a built-in target that a new run of a diagnosis cannot have, whatever its model."""
+    from probe_kit.train.builtin_columns import ITEM, PLAYED, RECORDED, SIM
+    from probe_kit.train.choices import CHOSEN, SIDES
+
+    if in_scene and (name == CHOSEN or name.startswith(SIM)):
+        raise UsageError(
+            f"--target {name} is of what a policy did, and a new run of `probe-kit diagnose` captures first frames "
+            "alone. Diagnose a run of `probe-kit extract` that acted"
+        )
+    prefix = ITEM if in_scene else PLAYED if in_environment else RECORDED
+    if not name.startswith(prefix) and not (name in SIDES and in_scene):
+        raise UsageError(f"--target {name} is of another source; built-in columns here are called {prefix}NAME")
 
 
 def _chosen_rows(rows: "Sequence[Row]", request: _Request, subject: str, in_scene: bool) -> "Sequence[Row]":

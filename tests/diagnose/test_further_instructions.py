@@ -222,7 +222,7 @@ def test_one_task_in_two_spellings_is_said_with_the_remedy_and_no_policy_is_call
     [
         (ONE_TASK[1:], (), "which is the task"),
         (["Rearrange the quuxes"], (), "'quuxes'"),
-        (OTHERS, ("--target", "side.correct"), "is a side"),
+        (OTHERS, ("--target", "side.correct"), "is of another source"),
         (OTHERS, ("--html", "."), "is a folder; give the name of a file"),
         (OTHERS, ("--episodes", "0:4"), "frames of 4 groups; a diagnosis needs at least 6"),
         (OTHERS, ("--target", "dataset.state.s0", "--episodes", "0:4"), "groups"),
