@@ -361,8 +361,8 @@ def _check_target(name: str, in_scene: bool, in_environment: bool) -> None:
 
     if in_scene and (name == CHOSEN or name.startswith(SIM)):
         raise UsageError(
-            f"--target {name} is of what a policy did, and a new run of `probe-kit diagnose` captures first frames "
-            "alone. Diagnose a run of `probe-kit extract` that acted"
+            f"--target {name} is of what a policy did, and a new run of `probe-kit diagnose` captures first "
+            "frames alone. Diagnose a run of `probe-kit extract` that acted"
         )
     prefix = ITEM if in_scene else PLAYED if in_environment else RECORDED
     if not name.startswith(prefix) and not (name in SIDES and in_scene):

@@ -8,8 +8,9 @@ Control = Literal["position", "step", "state", "action", "instruction", "random-
 Task = Literal["binary", "classes", "continuous"]
 
 CORRECT: Side = "side.correct"
-CHOSEN: Side = "side.chosen"
 """The target of probes unless another is named."""
+CHOSEN: Side = "side.chosen"
+"""The target that only what a policy did or answered has."""
 SIDES: dict[str, str] = {
     CORRECT: "side of the correct picture",
     CHOSEN: "side on which the cube was placed (rule disc), or that a VLM named; others are left out",
