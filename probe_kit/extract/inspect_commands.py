@@ -52,7 +52,7 @@ def models(
         return
     rows = _model_rows(name)
     if as_json:
-        print_json(rows)
+        print_json([_row_json(row) for row in rows])
         return
     if name is None:
         out.print(_listed(rows))
@@ -167,6 +167,20 @@ def _model_rows(name: str | None) -> list[dict[str, Any]]:
         for model, text in third_party.items()
     ]
     return rows
+
+
+def _row_json(row: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a model's row with the numbers of its streams and weights in place of their words."""
+    from probe_kit.extract.sizes import weights_bytes_needed
+    from probe_kit.hooks.registry import own_families
+
+    family = own_families().get(row["model"])
+    numbers: dict[str, Any] = {} if family is None else {
+        "streams": family.streams_json(), "weights": weights_bytes_needed(family.name),
+    }  # fmt: skip
+    # A family that declares no shapes, as an embedded one, says them in words alone.
+    words = {} if numbers.get("streams") or not row["streams"] else {"streams_in_words": row["streams"]}
+    return {**row, "streams": {}, "weights": {}, **numbers, **words}
 
 
 # -- runs --------------------------------------------------------------------------------------------------------

@@ -309,18 +309,27 @@ class Target:
         return f"{terminal_safe(self.name)} ({self.task}), {self.values_in_words}"
 
     @property
-    def values_in_words(self) -> str:
-        """The classes with their counts, or the range of a quantity, and how many labels are missing."""
+    def value_counts(self) -> dict[str, Any]:
+        """The counts by class, or the range of a quantity, with how many labels there are and are missing."""
         values = self.coded.values
         present = values[np.isfinite(values)]
-        if self.coded.classes:
-            counts = np.bincount(present.astype(np.int64), minlength=len(self.coded.classes)).tolist()
-            counted = [f"{terminal_safe(name)} {n}" for name, n in zip(self.coded.classes, counts, strict=True)]
+        counts: dict[str, Any] = {"labels": int(present.size), "missing": int(np.isnan(values).sum())}
+        if not self.coded.classes:
+            return {**counts, "minimum": float(present.min()), "maximum": float(present.max())}
+        of_classes = np.bincount(present.astype(np.int64), minlength=len(self.coded.classes)).tolist()
+        return {**counts, "classes": dict(zip(map(str, self.coded.classes), of_classes, strict=True))}
+
+    @property
+    def values_in_words(self) -> str:
+        """The classes with their counts, or the range of a quantity, and how many labels are missing."""
+        counts = self.value_counts
+        if "classes" in counts:
+            counted = [f"{terminal_safe(name)} {n}" for name, n in counts["classes"].items()]
             more = f", and {len(counted) - _MOST_CLASSES} more" if len(counted) > _MOST_CLASSES else ""
             text = f"{len(counted)} classes: {', '.join(counted[:_MOST_CLASSES])}{more}"
         else:
-            text = f"{present.size} numbers from {present.min():g} to {present.max():g}"
-        missing = int(np.isnan(values).sum())
+            text = f"{counts['labels']} numbers from {counts['minimum']:g} to {counts['maximum']:g}"
+        missing: int = counts["missing"]
         return text + f"; {missing} missing" * (missing > 0)
 
     def __repr__(self) -> str:

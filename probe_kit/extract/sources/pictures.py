@@ -261,8 +261,9 @@ class PictureSource(Source[PictureFolder]):
         return {DATASET: data_set}
 
     def selection(self, rows: Sequence[Row]) -> dict[str, Any]:
-        """Return all lines of the table."""
-        selected = {"name": self.name, "episodes": list(range(len(rows))), RECORDED_EPISODES: len(rows)}
+        """Return the selected lines of the table."""
+        lines = [row.columns["source_episode"] for row in rows]
+        selected = {"name": self.name, "episodes": lines, RECORDED_EPISODES: len(self.lines)}
         return {"recording": {**selected, OTHER_ACTIONS: "pictures have no actions"}}
 
     def content_notes(self) -> tuple[str, ...]:

@@ -166,6 +166,7 @@ class LeRobotSource(SourceSettings):
         rotations: The degrees by camera of the model, counterclockwise; `*` names all cameras.
         instruction: The words that the model reads in place of the task of a frame; None for that task.
         pixels: Whether pictures at 32 × 32 are stored for controls.
+        single: Whether every frame is a row of its own, of which some can be chosen; no option gives it.
 
     Raises:
         UsageError: For what no data set can have.
@@ -209,6 +210,7 @@ class LeRobotSource(SourceSettings):
         str | None, _option("--instruction", help="What the model reads. Default: the task of each frame.")
     ] = None
     pixels: Pixels = True
+    single: bool = False
 
     command: ClassVar[str] = "--dataset FOLDER"
     opens: ClassVar[str] = "probe_kit.extract.sources.recording_source:RecordingSource"

@@ -93,7 +93,7 @@ class RecordingSource(Source[LeRobotSource]):
         folder = open_lerobot(settings)
         if folder.repo is not None:
             settings = settings.changed(folder=f"{folder.repo}@{folder.revision}")
-        opened = cls(settings, folder)
+        opened = cls(settings, folder, 1 if settings.single else MOST_FRAMES)
         opened._check_features()
         fetched(opened.folder, opened.episodes, ())
         opened.folder.check_files(opened.episodes, ())
@@ -132,6 +132,23 @@ class RecordingSource(Source[LeRobotSource]):
     def instructions(self) -> tuple[str, ...]:
         """The instructions, each once, in alphabetical order."""
         return tuple(sorted({text for episode in self.episodes for text in self._texts(episode)}))
+
+    def same_instructions(self) -> list[str]:
+        """Return a sentence, without its stop, for tasks of one text or of texts that differ in spelling alone."""
+        if self.settings.instruction is not None:
+            return []
+        numbers: dict[str, list[int]] = {}
+        for number, text in self.folder.tasks:
+            if text in self.instructions:
+                numbers.setdefault(text, []).append(number)
+        return [
+            *(
+                f"tasks {', '.join(map(str, sorted(of_text)))} of {self.name} have one text, {text!r}"
+                for text, of_text in numbers.items()
+                if len(of_text) > 1
+            ),
+            *super().same_instructions(),
+        ]
 
     def rows(self, seed: int) -> tuple[Row, ...]:
         """Return stretches of the chosen episodes, in order."""
@@ -434,6 +451,7 @@ class RecordingSource(Source[LeRobotSource]):
             "episodes": f"{len(lengths)} of {len(folder.lengths)}, {spanned(lengths)} frames each",
             "frames": f"{sum(-(-length // every) for length in lengths)} of {sum(lengths)} (every:{every})",
             "instructions": "; ".join(texts[:_LONGEST]) + more,
+            **({"same instruction": "; ".join(same)} if (same := self.same_instructions()) else {}),
             "cameras": "; ".join(map(self._camera, folder.cameras)) or "none",
             STATE: self._numbers(STATE),
             ACTION: self._numbers(ACTION),

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from probe_kit._terminal.field_options import FieldOption, Part, options_of
 from probe_kit.errors import InstructionError, PolicyFailedError, RecordingError, UnitsError, UsageError
+from probe_kit.extract.sources.inputs import describe_spellings
 from probe_kit.hooks.checkpoints.third_party import copied, while_acting
 from probe_kit.hooks.contract.observation import Observation
 
@@ -229,6 +230,10 @@ class Source[Chosen: SourceSettings](ABC):
     def instructions(self) -> tuple[str, ...]:
         """The instructions, each once, in alphabetical order."""
         return tuple(sorted({row.instruction for row in self.rows(0)}))
+
+    def same_instructions(self) -> list[str]:
+        """Return a sentence, without its stop, for all tasks that are one instruction, by spelling or by text."""
+        return describe_spellings(self.instructions)
 
     def early_checks(
         self, cameras: Sequence[str], state: int | None, checkpoint: str
