@@ -139,7 +139,7 @@ class Extraction:
                 check_if_full(space_needed(addition, self.settings), location)
             writer = self.writer(location)
             with writer.owned():
-                check_exclusive(location, RUN_FILE)
+                check_exclusive(location, RUN_FILE, writer.root.card.to_bytes())
                 if self.settings.label is not None:
                     label_run(location, run_label(self.settings))
                 remaining = writer.remaining()
