@@ -26,7 +26,7 @@ from probe_kit.hooks.contract.sites import Site
 from probe_kit.runs.array_store import ArrayStore
 from probe_kit.runs.arrays import bounded_codecs, open_array
 from probe_kit.runs.commits import Commit, commit_key, stamp_of
-from probe_kit.runs.layout import COLUMNS, LATER, SEALED
+from probe_kit.runs.layout import COLUMNS, LATER, METADATA, SEALED
 from probe_kit.runs.records import NAME_DIGITS, Checksum, Record, Sums, named_by_hash
 from probe_kit.runs.root import Root
 from probe_kit.runs.store import Location
@@ -34,10 +34,6 @@ from probe_kit.runs.store import Location
 if TYPE_CHECKING:
     import xarray as xr
     import zarr
-
-
-METADATA = "zarr.json"
-"""The name of the metadata of a group or array in Zarr v3."""
 
 
 class Seal(Record):

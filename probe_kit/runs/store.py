@@ -123,6 +123,7 @@ class Bucket:
         from obstore.exceptions import GenericError, JoinError
 
         refused = _refusals()
+        passing: tuple[type[Exception], ...] = (GenericError, JoinError, *refused)
         pauses = pauses_for(lambda: PATIENCE if self._answered else _QUICK)
         with self.explained_errors(key):
             while True:
@@ -131,7 +132,7 @@ class Bucket:
                 except FileNotFoundError:  # an answer too: the store is there, the object is not
                     self._answered = True
                     raise
-                except (GenericError, JoinError, *refused) as error:
+                except passing as error:
                     self._answered |= isinstance(error, refused)
                     pause = next(pauses, None)
                     if pause is None:
@@ -167,7 +168,8 @@ class Bucket:
             "(AWS_ENDPOINT_URL, AWS_ACCESS_KEY_ID …)"
         )
         if _NO_BUCKET in str(error):
-            why, advice = f"there is no bucket {self._bucket!r}", "Create it, or correct its name or AWS_ENDPOINT_URL"
+            why = f"there is no bucket {self._bucket!r}"
+            advice = "Create it, or correct its name or AWS_ENDPOINT_URL"
         elif isinstance(error, _refusals()):
             why = f"it refused {key or 'a request'} for {PATIENCE.total_seconds():.0f} s, as if in use ({why})"
             advice = "See that no other program writes there"
@@ -244,10 +246,10 @@ class Bucket:
     def _listing(self, folder: str) -> dict[str, int]:
         import obstore
 
-        return self._answer(
-            lambda objects: {meta["path"]: meta["size"] for page in obstore.list(objects, folder) for meta in page},
-            folder,
-        )
+        def sizes(objects: Any) -> dict[str, int]:
+            return {meta["path"]: meta["size"] for page in obstore.list(objects, folder) for meta in page}
+
+        return self._answer(sizes, folder)
 
     def flush(self, keys: Iterable[str]) -> None:
         """Do nothing: a put that was answered is durable."""
@@ -365,7 +367,7 @@ def pauses_for(time_to_repeat: Callable[[], timedelta]) -> Iterator[float]:
     """
     pause, start = 0.1, time.monotonic()
     while time.monotonic() + pause <= start + time_to_repeat().total_seconds():
-        yield random.uniform(pause / 2, pause)  # noqa: S311 - no secret
+        yield random.uniform(pause / 2, pause)
         pause = min(2 * pause, LONGEST_PAUSE)
 
 

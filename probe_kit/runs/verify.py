@@ -52,6 +52,8 @@ def seal(path: Path | str | Location) -> bool:
 
 
 def _seal(run: Run) -> bool:
+    if not run.root.left_out:
+        run.root.set_lengths()  # once more: of two processes that made it grow, the first may have written last
     if not run.streams or run.episodes.empty:
         return False
     if run.root.left_out:
@@ -93,7 +95,8 @@ def _write_vectors(run: "Run", name: str, kind: VectorKind, group: zarr.Group) -
     array = create_array(
         group, f"{name}/{kind}", (*lead, episodes, stored.width), (*(1 for _ in lead), block, stored.width),
         rows.array.dtype, rows.array.fill_value, run.settings["codec"],
-        ("call", *(["view"] * (kind == "pooled")), *stored.dimensions, "episode", "feature"),
+        ("call" if kind == "pooled" else "later_call", *(["view"] * (kind == "pooled")), *stored.dimensions,
+         "episode", "feature"),
         dict(rows.array.attrs),
     )  # fmt: skip
     for index, column in columns_of_rows(run, name, kind):
@@ -135,7 +138,8 @@ def _write_roles(run: "Run", name: str, group: zarr.Group) -> None:
     chunks = (1, min(len(spans), EPISODES_PER_CHUNK), codes.shape[2])
     array = create_array(
         group, f"{name}/role", codes.shape, chunks, "uint8", 0, run.settings["codec"],
-        ("call", "episode", "token"), {"roles": names},
+        # Another name where the pooled views are of the first inference alone, and so of another length.
+        ("call" if len(run.root.vector_kinds) == 1 else "captured_call", "episode", "token"), {"roles": names},
     )  # fmt: skip
     array[:] = codes
 
@@ -244,8 +248,8 @@ def _audit(location: Location, deep: bool) -> Audit:
     problems += filter(None, (stored.problem(sizes.get(stored.key)) for stored in objects))
     if deep:
         problems += _content_problems(location, objects)
-    for key in () if deep else root.card.objects:
-        checked(partial(root.check_metadata, key), None)
+    for key in root.card.objects:
+        checked(partial(root.read_metadata, key), b"")
     if deep and not problems and planned:  # readers of a damaged run would only repeat what is known
         run = Run(location)
         problems += _differences(run) if columns is not None else ()

@@ -16,7 +16,7 @@ from zarr.storage import MemoryStore
 from probe_kit.errors import SettingsMismatchError
 from probe_kit.hashing import canonical_json
 from probe_kit.runs.array_store import ArrayStore
-from probe_kit.runs.arrays import ROOM, WRITE_ALL, create_arrays, create_inputs, write_row
+from probe_kit.runs.arrays import WRITE_ALL, create_arrays, create_inputs, write_row
 from probe_kit.runs.commits import (
     Commit,
     Seconds,
@@ -34,6 +34,7 @@ from probe_kit.runs.layout import (
     INPUTS,
     LABEL_FILE,
     PLANS,
+    ROOM,
     RUN_FILE,
     TRAJECTORY,
     StoredStream,
@@ -206,6 +207,7 @@ class RunWriter:
             with self.location.locked(lambda: None), self.location.tended(PLANS):
                 root = self._grown()
         root.check()
+        root.set_lengths()
         return root
 
     def _lacks(self, root: Root) -> bool:
