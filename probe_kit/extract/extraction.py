@@ -34,7 +34,7 @@ from probe_kit.runs.layout import RUN_FILE, StoredStream
 from probe_kit.runs.plan import Plan, Row, further_rows
 from probe_kit.runs.provenance import provenance_here
 from probe_kit.runs.root import find_continuable, label_run
-from probe_kit.runs.run import Run, open_run
+from probe_kit.runs.run import Run
 from probe_kit.runs.run_folders import check_if_full
 from probe_kit.runs.store import Location, check_exclusive, locate
 from probe_kit.runs.verify import seal
@@ -147,7 +147,7 @@ class Extraction:
                     writer.begin(self.settings.machine.allow_mixed)
                     self._play(writer, remaining, progress or notebook_progress("episodes"))
                 seal(location)
-        return open_run(location)
+            return writer.opened()
 
     def further_plan(self, location: Location) -> Plan:
         """Return the plan of the episodes that the run at `location` does not plan yet; all if there is none.

@@ -50,8 +50,8 @@ READERS = 32
 """The small objects that are read at once, because each of them takes a round trip. A choice, not measured."""
 PATIENCE = timedelta(seconds=60)
 """The time for repeating a request; the last try may then take its own time, 30 s unless AWS_TIMEOUT says so."""
-LONGEST_PAUSE = 5.0
-"""The seconds between two requests of the same thing."""
+FIRST_PAUSE, LONGEST_PAUSE = 0.1, 5.0
+"""The seconds between two requests of the same thing, at first and at most."""
 _QUICK = timedelta(seconds=5)
 """The time of `PATIENCE` with a store that never answered."""
 _NO_BUCKET = "NoSuchBucket"
@@ -365,7 +365,7 @@ def pauses_for(time_to_repeat: Callable[[], timedelta]) -> Iterator[float]:
     Pauses double up to `LONGEST_PAUSE`. Each is drawn between a half and all of that, so that two writers which
     met do not meet again.
     """
-    pause, start = 0.1, time.monotonic()
+    pause, start = FIRST_PAUSE, time.monotonic()
     while time.monotonic() + pause <= start + time_to_repeat().total_seconds():
         yield random.uniform(pause / 2, pause)
         pause = min(2 * pause, LONGEST_PAUSE)
