@@ -317,9 +317,8 @@ def test_damaged_columns_are_built_again_by_the_command_that_the_error_names(cop
     elif damage == "the seal's bit":
         sealed.write_bytes(sealed.read_bytes().replace(b'"seal', b'"sead').replace(b'"stamp"', b'"stamq"'))
     else:
-        {"an object": chunk, "the metadata": next(copy.glob("columns.zarr/*/zarr.json")), "the seal": sealed}[
-            damage
-        ].unlink()
+        metadata = next(copy.glob("columns.zarr/*/zarr.json"))
+        {"an object": chunk, "the metadata": metadata, "the seal": sealed}[damage].unlink()
     assert damage == "the seal" or not verify_run(copy, deep=True).ok
     answer = CliRunner().invoke(app, ["run", "verify", str(copy), "--seal", "--deep"])
     assert (answer.exit_code, hashes(copy)) == (0, before), answer.output
