@@ -30,7 +30,7 @@ from probe_kit.extract.sources.source import Source, raise_together
 from probe_kit.hashing import canonical_json, sha256_json
 from probe_kit.hooks.registry import find_family, get_family
 from probe_kit.runs.commits import failure_key
-from probe_kit.runs.layout import RUN_FILE, StoredStream
+from probe_kit.runs.layout import GROUP_FILE, RUN_FILE, StoredStream
 from probe_kit.runs.plan import Plan, Row, further_rows
 from probe_kit.runs.provenance import provenance_here
 from probe_kit.runs.root import find_continuable, label_run
@@ -139,7 +139,7 @@ class Extraction:
                 check_if_full(space_needed(addition, self.settings), location)
             writer = self.writer(location)
             with writer.owned():
-                check_exclusive(location, RUN_FILE, writer.root.card.to_bytes())
+                check_exclusive(location, GROUP_FILE, writer.root.stored_metadata[GROUP_FILE])
                 if self.settings.label is not None:
                     label_run(location, run_label(self.settings))
                 remaining = writer.remaining()

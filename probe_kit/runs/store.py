@@ -29,7 +29,6 @@ from functools import cached_property
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Literal
-from urllib.parse import urlsplit
 
 from probe_kit._system.imports import require
 from probe_kit.errors import SettingsMismatchError, StoreError, UsageError
@@ -57,8 +56,12 @@ _QUICK = timedelta(seconds=5)
 _NO_BUCKET = "NoSuchBucket"
 _BUCKET_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 _ENDPOINTS = ("AWS_ENDPOINT_URL", "AWS_ENDPOINT", "AWS_ENDPOINT_URL_S3")
-_OF_STORES = ("AWS_", "GOOGLE_", "AZURE_")
-"""The beginnings of the names of environment variables that lead to stores."""
+_ENDPOINT = re.compile(r"https?://[^\s/]+(/\S*)?", re.IGNORECASE)
+_HEADERS = (
+    "AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY", "AWS_SESSION_TOKEN", "AWS_TOKEN", "AWS_REGION",
+    "AWS_DEFAULT_REGION",
+)  # fmt: skip
+"""The variables that are part of every request, or of its signature."""
 _METADATA_SERVICES = ("169.254.169.254", "169.254.170.2", "metadata.google.internal")
 """The services of cloud machines, where a client looks last for credentials."""
 
@@ -108,7 +111,8 @@ class Bucket:
     def _objects(self) -> "ObjectStore":
         from obstore.store import AzureStore, GCSStore, S3Store
 
-        _check_environment(str(self))
+        if self._scheme == "s3":
+            _check_environment(str(self))
         # Not by obstore's `from_url`: it drops what follows # or ?, and reads %20 as a space.
         kinds: dict[str, Callable[..., ObjectStore]] = {"s3": S3Store, "gs": GCSStore, "az": AzureStore}
         with self.explained_errors():  # `_answer` repeats
@@ -344,18 +348,17 @@ def _refusals() -> tuple[type[Exception], ...]:
 
 def _check_environment(where: str) -> None:
     """Raise StoreError for variables that obstore cannot take; it then stops with many lines about itself."""
-    for name, value in os.environ.items():
-        if name.startswith(_OF_STORES) and not value.isprintable():
+    for name in _HEADERS:
+        if not os.environ.get(name, "").isprintable():
             raise StoreError(
                 f"{where} cannot be used: the environment variable {name} holds a line break or another control "
                 "character. Set it again without"
             )
     for name in _ENDPOINTS:
-        parts = urlsplit(os.environ.get(name, "http://host"))
-        if parts.scheme not in ("http", "https") or not parts.hostname or " " in parts.netloc:
+        if not _ENDPOINT.fullmatch(os.environ.get(name, "http://host")):
             raise StoreError(
                 f"{where} cannot be used: the environment variable {name} is {os.environ[name]!r}; expected "
-                "https://HOST or http://HOST:PORT. Correct it, or unset it for the store of the scheme"
+                "https://HOST or http://HOST:PORT. Correct it, or unset it to use Amazon's"
             )
 
 

@@ -204,6 +204,27 @@ class TestBucket(LocationContract):
             _ = location.path
 
 
+class TestOtherStores(LocationContract):
+    """Stores that say of an object that is gone that it is not found, as those of Google and Azure do."""
+
+    @pytest.fixture(params=["gs", "az"])
+    def location(
+        self, request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> Location:
+        stores = pytest.importorskip("obstore.store", reason="obstore is not installed (extra `remote`)")
+        (tmp_path / "objects").mkdir()
+        stored = stores.MemoryStore() if request.param == "gs" else stores.LocalStore(tmp_path / "objects")
+        monkeypatch.setattr(buckets.Bucket, "_objects", stored)
+        return locate(f"{request.param}://bucket/prefix/run")
+
+    def test_what_is_gone_is_removed(self, location: Location) -> None:
+        for key in ("c/1.json", "c/3.json"):
+            location.write(key, b"")
+        location._delete(["c/1.json", "c/2.json", "c/3.json"])
+        location.delete("c/1.json")
+        assert location.keys("") == []
+
+
 def test_what_is_no_location_is_refused_and_says_why() -> None:
     for where, why in {
         "https://host/run": "s3://",
