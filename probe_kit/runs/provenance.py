@@ -203,7 +203,7 @@ def _record_key(record: Mapping[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class Processes:
-    """What the records of a run say of the processes that played it.
+    """The records of the processes that played a run.
 
     Attributes:
         provenances: The provenances by name.
@@ -232,9 +232,9 @@ def read_processes(root: Root, names: Collection[str]) -> Processes:
     if not names:
         return Processes(provenances, {}, (), remade)
     first, records = _read_first(root), _read_records(root)
-    if first and first["provenance"] not in provenances and (made := _provenance_in(first, records)):
-        provenances[name_of(made)] = made
-        remade[provenance_key(name_of(made))] = _provenance_bytes(made)
+    if first and first["provenance"] not in provenances and (lost := _provenance_in(first, records)):
+        provenances[name_of(lost)] = lost
+        remade[provenance_key(name_of(lost))] = _provenance_bytes(lost)
     if missing := sorted({*names} - {*provenances}):
         raise RunDamagedError(
             f"{root.location}/{provenance_key(missing[0])} is missing, though episodes name it; it was there when "
@@ -242,8 +242,8 @@ def read_processes(root: Root, names: Collection[str]) -> Processes:
             "were played: it writes the record again"
         )
     if not first and records:
-        known = [record for record in records if record["provenance"] in provenances]
-        first = {**known[0], **provenances[known[0]["provenance"]]} if known else {}
+        complete = [{**record, **provenances.get(record["provenance"], {})} for record in records]
+        first = next((certificate for certificate in complete if "versions" in certificate), {})
         if first:
             remade[CERTIFICATE_FILE] = Certificate.model_validate(first).to_bytes()
     if not first:

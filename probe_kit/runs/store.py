@@ -386,8 +386,8 @@ def _parts_of(url: str) -> tuple[str, str, str]:
     Raises:
         UsageError: For a URL that names no place exactly.
     """
-    scheme, _, rest = url.partition("://")
-    bucket, _, prefix = rest.partition("/")
+    scheme, _, address = url.partition("://")
+    bucket, _, prefix = address.partition("/")
     prefix = prefix.removesuffix("/")
     expected = f"expected {scheme}://BUCKET/PREFIX/RUN"
     if not (bucket and prefix):

@@ -330,7 +330,7 @@ def test_arrays_of_an_earlier_run_are_read_and_shortened_by_its_seal(copy: Path,
         path.write_bytes(without_length(path.read_bytes()))
     earlier = open_run(copy)
     assert (earlier.root.identity, earlier.stamp) == (identity, recorded_run.stamp)
-    assert len(zarr.open_array(copy / "data.zarr/backbone/pooled", mode="r")) == 1_000_000
+    assert zarr.open_array(copy / "data.zarr/backbone/pooled", mode="r").shape[0] == 1_000_000
     assert verify_run(copy, deep=True).ok
     assert not seal(copy)
     assert hashes(copy) == before

@@ -70,7 +70,7 @@ def check_done(location: Location, call: str, answer: object) -> None:
     """The call did what it says."""
     expected = {"get": b"kept", "head": True, "list": ["kept", "object"]}
     assert answer == expected.get(call, answer)
-    if call == "create":  # a reply that is lost leaves an object, whose creator nobody knows
+    if call == "create":  # a reply that is lost leaves the object
         assert location.read("created") == b"ours"
     assert location.exists("kept") == (call != "delete")
     stored = {"put": b"new", **dict.fromkeys(MULTIPART, LARGE)}

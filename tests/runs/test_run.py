@@ -121,7 +121,7 @@ def test_other_tools_read_all_of_a_finished_run_at_once(kind: str, request: pyte
     names = []
     for name, path in every_array(run):
         array = zarr.open_array(path, mode="r")
-        assert (len(array), array.attrs["episodes"]) == (len(run.episodes),) * 2
+        assert (array.shape[0], array.attrs["episodes"]) == (len(run.episodes),) * 2
         whole, rows = array[:], Rows(open_array(run.data, name), run.episodes["episode"].tolist())
         np.testing.assert_array_equal(whole[run.episodes["episode"]], np.stack(list(rows)))
         np.testing.assert_array_equal(tree[name].load().values, whole)
