@@ -43,7 +43,7 @@ from probe_kit.intervene.tokens import PairTokens, roles_of_tokens
 from probe_kit.runs.layout import DIAGNOSES
 from probe_kit.runs.reader import origin_of
 from probe_kit.runs.records import as_json
-from probe_kit.runs.results import HEAD, read_bundle, write_bundle
+from probe_kit.runs.results import is_complete, read_bundle, write_bundle
 from probe_kit.train.choices import EVERYWHERE
 
 if TYPE_CHECKING:
@@ -236,7 +236,7 @@ def diagnose_run(
         "seed": seed,
     }
     key = key_of(settings)
-    if run.location.exists(f"{DIAGNOSES}/{key}/{HEAD}"):
+    if is_complete(run.location, DIAGNOSES, key):
         return replace(load_diagnosis(run, key), knowledge=knowledge)
     with open_session(run, source, load, table=pairs, instructions=instructions) as session, session.ready():
         if base_policy is not None:

@@ -30,11 +30,11 @@ from probe_kit.extract.sources.source import Source, raise_together
 from probe_kit.hashing import canonical_json, sha256_json
 from probe_kit.hooks.registry import find_family, get_family
 from probe_kit.runs.commits import failure_key
-from probe_kit.runs.layout import RUN_FILE, StoredStream
+from probe_kit.runs.layout import GROUP_FILE, RUN_FILE, StoredStream
 from probe_kit.runs.plan import Plan, Row, further_rows
 from probe_kit.runs.provenance import provenance_here
 from probe_kit.runs.root import find_continuable, label_run
-from probe_kit.runs.run import Run, open_run
+from probe_kit.runs.run import Run
 from probe_kit.runs.run_folders import check_if_full
 from probe_kit.runs.store import Location, check_exclusive, locate
 from probe_kit.runs.verify import seal
@@ -143,7 +143,7 @@ class Extraction:
                 check_if_full(space_needed(addition, self.settings), location)
             writer = self.writer(location)
             with writer.owned():
-                check_exclusive(location, RUN_FILE)
+                check_exclusive(location, GROUP_FILE, writer.root.stored_metadata[GROUP_FILE])
                 if self.settings.label is not None:
                     label_run(location, run_label(self.settings))
                 remaining = writer.remaining()
@@ -151,7 +151,7 @@ class Extraction:
                     writer.begin(self.settings.machine.allow_mixed)
                     self._play(writer, remaining, progress or notebook_progress("episodes"))
                 seal(location)
-        return open_run(location)
+            return writer.opened()
 
     def further_plan(self, location: Location) -> Plan:
         """Return the plan of the episodes that the run at `location` does not plan yet; all if there is none.

@@ -204,7 +204,7 @@ def verify(
     from probe_kit.runs import seal, verify_run
 
     if build:
-        say("sealed" if seal(run) else "nothing to seal")
+        say("sealed" if seal(run, deep=True) else "nothing to seal")
     audit = verify_run(run, deep)
     if as_json:
         print_json({**asdict(audit), "ok": audit.ok, "finished": audit.finished})

@@ -34,6 +34,12 @@ from pydantic.dataclasses import dataclass
 
 from probe_kit.hooks.contract.sites import QUANTITIES, Part, Site, Stream
 
+METADATA = "zarr.json"
+"""The name of the metadata of a group or array in Zarr v3."""
+GROUP_FILE = "data.zarr/zarr.json"
+"""The metadata of the group of all arrays, which never changes."""
+ROOM = 1_000_000
+"""The episodes an array has room for; one chunk holds one episode, and no chunk exists before its episode."""
 SCHEMA_VERSION = 6
 """The only schema version that is written and read."""
 TOKEN_BLOCK = 128
