@@ -105,13 +105,12 @@ class _Lines(io.StringIO):
 
 _MARKUP = re.compile(
     r"""
-    [\\*|$]                        # escapes, emphasis, cells, mathematics
+    [\\*|$~]                       # escapes, emphasis, cells, mathematics, struck out (GitHub: by one ~ as well)
     | (?<![^\W_])_ | _(?![^\W_])   # emphasis; not inside a word, where it means nothing
-    | ~(?=~) | (?<=~)~             # struck out
     | <(?=[A-Za-z/!?])             # HTML and links in angle brackets
     | &(?=\#?\w+;)                 # entities
     | \](?=[(\[:])                 # links, pictures and their definitions
-    | ^\s*(?:\#|>|[-+](?=[-\s]|$)|=+\s*$|```|~~~)   # headings, quotations, lists, rules, code
+    | ^\s*(?:\#|>|[-+](?=[-\s]|$)|=+\s*$|```)   # headings, quotations, lists, rules, code
     | ^\s*\d{1,9}[.)](?=\s|$)      # numbered lists
     | (?<=:)/(?=/)                 # addresses, which become links by themselves
     | (?<=www)\.

@@ -262,6 +262,9 @@ class Scene:
         self._load_tiles()
         self.cube = self._box((spec.cube_side,) * 3, LIMBO, (*spec.cube_color, 1), spec.cube_mass)
         model = ARMS[spec.arm]
+        if spec.arm_urdf is not None:
+            # PyBullet keeps meshes by name for the whole process: an edited mesh would be drawn as it was before.
+            client.setPhysicsEngineParameter(enableFileCaching=0)
         self.arm = Arm(client, model, spec.physics, spec.arm_urdf or model.urdf(folder))
         resting = (*self.tiles.values(), *self.quads.values())
         self._film = FilmCamera(client, self.backdrop, resting, (self.cube, self.arm.body))

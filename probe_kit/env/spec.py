@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit._system.bounded_files import read_regular
+from probe_kit.env.urdf_files import files_of_description
 from probe_kit.errors import SceneError
 from probe_kit.scene_names import ArmName, Rendering
 from probe_kit.suite.items import Side
@@ -294,13 +295,16 @@ class SceneSpec:
     def to_json(self) -> dict[str, Any]:
         """Return the record as plain JSON values, with the outcome radius that is really used.
 
-        A file is identified by the sha256 of its content, not by its path.
+        A file is identified by the sha256 of its content, not by its path; an arm's description by that of itself
+        and of the meshes, materials and textures that it names.
 
         Raises:
             SceneError: If a file cannot be read.
         """
         plain = asdict(self) | {"epsilon": self.zone_radius}
-        return {key: _content_sha256(value) if isinstance(value, Path) else value for key, value in plain.items()}
+        return {
+            key: _content_sha256(key, value) if isinstance(value, Path) else value for key, value in plain.items()
+        }
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any], files: Mapping[str, Path] = MappingProxyType({})) -> Self:
@@ -396,16 +400,22 @@ def _file_of(name: str, expected: str, files: Mapping[str, Path]) -> Path:
     """Return the file that a stored scene names by its hash."""
     if name not in files:
         raise SceneError(f"the scene was made with a file as {name}, {expected[:19]}…; give that file again")
-    if (content := _content_sha256(files[name])) != expected:
+    if (content := _content_sha256(name, files[name])) != expected:
         raise SceneError(
             f"{files[name]} is {content[:19]}…; the scene was made with {expected[:19]}… as {name}. Give that file"
         )
     return files[name]
 
 
-def _content_sha256(path: Path) -> str:
+def _content_sha256(name: str, path: Path) -> str:
+    """Return the hash of a scene's file; of an arm's description also over the meshes that it names."""
     try:
-        return f"sha256:{hashlib.sha256(read_regular(path)).hexdigest()}"
+        (_, content), *named = files_of_description(path) if name == "arm_urdf" else [("", read_regular(path))]
+        digest = hashlib.sha256(content)
+        for spelled, content in named:
+            digest.update(f"{spelled}\0{len(content)}\0".encode("utf-8", "surrogateescape"))
+            digest.update(content)
+        return f"sha256:{digest.hexdigest()}"
     except OSError as error:
         raise SceneError(
             f"{path} cannot be read ({error.strerror}). Give another file, or leave it out."

@@ -37,6 +37,7 @@ from probe_kit.intervene.tokens import token_mask
 from probe_kit.runs.direction_files import FileDirection
 from probe_kit.runs.run import Run
 from probe_kit.statistics.folds import Fold, grouped_folds
+from probe_kit.train.solver.arrays import Standardiser
 
 Vector = NDArray[np.float32]
 MEAN_DIFFERENCE, PROBE = "mean-difference", "probe"
@@ -263,7 +264,8 @@ def fit_pooled_directions(
     if direction not in DIRECTIONS:
         raise UsageError(f"unknown direction {direction!r}; expected one of {', '.join(DIRECTIONS)}")
     episodes = run.episodes
-    features = run.column(site, resolve_view(view_of(role), run.views(site.stream))).astype(np.float64)
+    stored = run.column(site, resolve_view(view_of(role), run.views(site.stream)))
+    features = stored.astype(np.float64)
     names = control_names(controls)
     bases: dict[tuple[str, str], Vector] = {}
     halves: dict[str, NDArray[np.float64]] = {}
@@ -281,7 +283,8 @@ def fit_pooled_directions(
                 raise NoDirectionError(
                     f"{category}, {site}, role {role}: no direction for {direction}: {NO_DIRECTION}"
                 )
-            unit = _direction(training, labels, direction)
+            varies = Standardiser.fit(stored[rows[fold.train]]).varies  # in the stored type, as `train` decides it
+            unit = _direction(training, labels, direction, varies)
             draw = np.random.default_rng(derive_seed("control", seed, category, str(site), role, number))
             drawn = {name: _control(training, [unit, _unit(difference)], draw) for name in names}
             of_fold = {
@@ -294,17 +297,30 @@ def fit_pooled_directions(
     return Directions(bases, halves, names)
 
 
-def _direction(training: NDArray[np.float64], is_left: NDArray[np.bool_], direction: str) -> NDArray[np.float64]:
-    """Return a direction (D,) of length 1, toward `left`."""
+def _direction(
+    training: NDArray[np.float64], is_left: NDArray[np.bool_], direction: str, varies: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """Return a direction (D,) of length 1, toward `left`.
+
+    Args:
+        training: (N, D) features.
+        is_left: (N,) whether the correct picture lies left.
+        direction: Name of the direction.
+        varies: (D,) the features that a probe may use. One that is constant but for its last bit would be divided
+            by that bit, and its rounding would be the whole direction.
+    """
     if direction == MEAN_DIFFERENCE:
         return _unit(training[is_left].mean(axis=0) - training[~is_left].mean(axis=0))
     from sklearn.linear_model import LogisticRegression
     from sklearn.preprocessing import StandardScaler
 
-    scaler = StandardScaler().fit(training)
+    varying = training[:, varies]
+    scaler = StandardScaler().fit(varying)
     # A strong penalty: features are many and episodes few.
-    fitted = LogisticRegression(C=0.01, max_iter=1000).fit(scaler.transform(training), is_left)
-    return _unit(fitted.coef_[0] / scaler.scale_)
+    fitted = LogisticRegression(C=0.01, max_iter=1000).fit(scaler.transform(varying), is_left)
+    weights = np.zeros(training.shape[1])
+    weights[varies] = fitted.coef_[0] / scaler.scale_
+    return _unit(weights)
 
 
 def _control(

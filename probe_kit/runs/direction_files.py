@@ -1,15 +1,17 @@
 """Directions from outside: vectors in safetensors or npz files, and the decoders of sparse autoencoders.
 
-A file holds arrays (D,) or (K, D) by name. The entry `directions` has, as JSON by name, the site, the role, the
-space and the hash of the weights. In safetensors it is metadata, in npz an array of one text. A direction in the
-space `standardised` has an array NAME.scale (D,), by which it is multiplied. SAELens writes folders with
-`sae_weights.safetensors` and `cfg.json`; there NAME is the number of a feature, whose row of the decoder is read.
+A file holds arrays (D,) or (K, D) of finite real numbers by name. The entry `directions` has, as JSON by name, the
+site, the role, the space and the hash of the weights. In safetensors it is metadata, in npz an array of one text.
+A direction in the space `standardised` has an array NAME.scale (D,), by which it is multiplied. SAELens writes
+folders with `sae_weights.safetensors` and `cfg.json`; there NAME is the number of a feature, whose row of the
+decoder is read.
 """
 
 import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit._system.bounded_files import UNREADABLE, open_arrays, parse_json, read_json_object
+from probe_kit._system.counting import counted
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.sites import Site, role_of_view
 
@@ -24,6 +27,7 @@ ENTRY = "directions"
 SUFFIXES = (".safetensors", ".npz")
 SAE_WEIGHTS, SAE_SETTINGS, DECODER = "sae_weights.safetensors", "cfg.json", "W_dec"
 Space = Literal["raw", "standardised"]
+BFLOAT16_ROUNDING = 2.0**-7
 _SITE_KEYS = ("site", "hook_name")
 """The keys by which `cfg.json` may name the site: ours, and the one that SAELens writes."""
 
@@ -38,6 +42,7 @@ class FileDirection:
         site: The site that the file names; empty where it names none.
         role: The role of the tokens; empty where the file names none.
         weights: The hash of the weights that the direction was found in; empty where the file names none.
+        rounding: The relative rounding of the file's numbers: rows that differ by less are one direction.
     """
 
     name: str
@@ -45,11 +50,31 @@ class FileDirection:
     site: str = ""
     role: str = ""
     weights: str = ""
+    rounding: float = float(np.finfo(np.float32).eps)
+
+    @cached_property
+    def basis(self) -> NDArray[np.float32]:
+        """The orthonormal rows (R, D) that span the vectors: R = K, or fewer where rows depend on each other.
+
+        By a QR decomposition; of dependent rows the first R right singular vectors. A QR decomposition would fill
+        the rest with arbitrary directions.
+        """
+        unit = self.vectors / np.linalg.norm(self.vectors, axis=1, keepdims=True)
+        _, values, rows = np.linalg.svd(unit, full_matrices=False)
+        rank = int((values > self.rounding * values[0]).sum())
+        spanning = np.linalg.qr(self.vectors.T)[0].T if rank == len(self.vectors) else rows[:rank]
+        return np.asarray(spanning, np.float32)
 
     @property
-    def basis(self) -> NDArray[np.float32]:
-        """The orthonormal rows (K, D) that span the vectors, by a QR decomposition."""
-        return np.asarray(np.linalg.qr(self.vectors.T)[0].T, np.float32)
+    def note(self) -> str:
+        """A sentence on rows that depend on each other; empty where none do."""
+        count, rank = len(self.vectors), len(self.basis)
+        if rank == count:
+            return ""
+        return (
+            f"the {count} rows of {self.name} depend on each other and span {counted(rank, 'direction')}; tokens "
+            "are patched within these alone"
+        )
 
     def check(self, site: str, width: int, weights: str | None) -> None:
         """Raise UsageError for a site of another name or width, or for other weights."""
@@ -97,8 +122,14 @@ def read_direction(text: str) -> FileDirection:
     if space == "standardised":
         if f"{name}.scale" not in arrays:
             raise UsageError(f"--direction {text}: a standardised direction needs the array {name}.scale")
-        vectors = vectors * _rows(arrays[f"{name}.scale"], text)
-    return _direction(name, vectors, about)
+        scale = _rows(arrays[f"{name}.scale"], f"{text}, {name}.scale")
+        if scale.shape != (1, vectors.shape[1]):
+            raise UsageError(
+                f"--direction {text}: {name}.scale has the shape {arrays[f'{name}.scale'].shape}; expected "
+                f"({vectors.shape[1]},), a number for each of the direction's"
+            )
+        vectors = vectors * scale
+    return _direction(name, vectors, about, _rounding(arrays[name]))
 
 
 def write_directions(
@@ -164,8 +195,18 @@ def _contents(path: Path) -> tuple[dict[str, NDArray[Any]], Mapping[str, Mapping
 
 
 def _as_numpy(tensor: Any) -> NDArray[Any]:
-    """Return a tensor of any float type as float32, and one of integers as it is."""
-    return np.asarray((tensor.float() if tensor.is_floating_point() else tensor).numpy())
+    """Return a tensor as an array; one of bfloat16, which numpy has no type for, as float32."""
+    import torch
+
+    return np.asarray((tensor.float() if tensor.dtype == torch.bfloat16 else tensor).numpy())
+
+
+def _rounding(values: NDArray[Any]) -> float:
+    """Return the relative rounding of stored numbers, at least float32's; of float32 that fit bfloat16, its."""
+    if values.dtype == np.float32 and not (np.ascontiguousarray(values).view(np.uint32) & 0xFFFF).any():
+        return BFLOAT16_ROUNDING
+    least = float(np.finfo(np.float32).eps)
+    return max(least, float(np.finfo(values.dtype).eps)) if values.dtype.kind == "f" else least
 
 
 def _of_autoencoder(folder: Path, name: str) -> FileDirection:
@@ -186,22 +227,32 @@ def _of_autoencoder(folder: Path, name: str) -> FileDirection:
         )
     }
     about["weights"] = str(metadata.get("weights") or "")
-    return _direction(f"feature-{name}", _rows(arrays[DECODER][int(name)], folder.name), about)
+    row = arrays[DECODER][int(name)]
+    return _direction(f"feature-{name}", _rows(row, folder.name), about, _rounding(row))
 
 
 def _rows(values: NDArray[Any], text: str) -> NDArray[np.float64]:
-    rows = np.atleast_2d(np.asarray(values, np.float64))
-    if rows.ndim != 2 or not np.isfinite(rows).all() or (np.linalg.norm(rows, axis=1) == 0).any():
-        raise UsageError(
-            f"--direction {text}: an array of shape {np.shape(values)}; expected (D,) or (K, D), not zero"
-        )
+    """Return vectors (K, D), in memory of their own.
+
+    Raises:
+        UsageError: For other numbers than real ones, another shape, NaN, infinity and rows of zeros.
+    """
+    if values.dtype.kind not in "fiu":
+        raise UsageError(f"--direction {text}: an array of {values.dtype}; expected real numbers")
+    rows = np.atleast_2d(np.array(values, np.float64))
+    if rows.ndim != 2 or 0 in rows.shape:
+        raise UsageError(f"--direction {text}: an array of shape {np.shape(values)}; expected (D,) or (K, D)")
+    if not np.isfinite(rows).all() or (np.linalg.norm(rows, axis=1) == 0).any():
+        raise UsageError(f"--direction {text}: it has NaN, infinity or a row of zeros; expected directions")
     return rows
 
 
-def _direction(name: str, vectors: NDArray[np.float64], about: Mapping[str, Any]) -> FileDirection:
+def _direction(
+    name: str, vectors: NDArray[np.float64], about: Mapping[str, Any], rounding: float
+) -> FileDirection:
     digest = hashlib.sha256(np.ascontiguousarray(vectors).tobytes()).hexdigest()[:8]
     plain = "".join(letter if letter.isalnum() or letter in "-." else "-" for letter in name)
     # A hash in the name: directions of one name in two files, or of a changed file, stay apart in results.
     parts = {part: str(about.get(part) or "") for part in ("site", "role", "weights")}
     parts["site"] = _place_name(parts["site"])
-    return FileDirection(f"{plain}-{digest}", vectors, **parts)
+    return FileDirection(f"{plain}-{digest}", vectors, **parts, rounding=rounding)

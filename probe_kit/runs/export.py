@@ -9,6 +9,7 @@ import hashlib
 import io
 import json
 from collections.abc import Callable, Iterator, Sequence
+from math import prod
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -31,6 +32,10 @@ from probe_kit.runs.store import Location
 from probe_kit.runs.thumbnails import decode_frames, read_sheet
 from probe_kit.version import __version__
 
+LARGEST_CHUNK = 2**30
+"""Bytes of the largest chunk that h5 gets. From 4 GiB on, HDF5 2.0 writes a layout that no HDF5 1.x opens."""
+LARGEST_HEADER = 100_000_000
+"""Bytes of metadata that readers of safetensors accept (version 0.8)."""
 SUMS = "SHA256SUMS"
 """The file with the hashes of all other files of a folder."""
 
@@ -174,8 +179,9 @@ def _fill(file: Any, run: Run, safe: "_SafeFile") -> None:
     file.attrs["settings"] = json.dumps(run.settings)
     for stream, kind, rows in _arrays(run):
         shape = rows.array.shape[1:]
+        chunk = _chunk_below((1, *shape), rows.array.dtype.itemsize, LARGEST_CHUNK)
         dataset = file.create_dataset(
-            f"{stream}/{kind}", (len(rows), *shape), rows.array.dtype, chunks=(1, *shape), fletcher32=True
+            f"{stream}/{kind}", (len(rows), *shape), rows.array.dtype, chunks=chunk, fletcher32=True
         )
         dataset.attrs["views"] = list(run.views(stream))
         dataset.attrs["dtype"] = "float32" if kind == "pooled" else "bfloat16 bits"
@@ -187,6 +193,23 @@ def _fill(file: Any, run: Run, safe: "_SafeFile") -> None:
         # HDF5 has no column of mixed types, and no null among numbers: such a column becomes text.
         numeric = all(isinstance(value, bool | int | float) for value in values)
         file[f"episodes/{name}"] = values if numeric else ["" if v is None else str(v) for v in values]
+
+
+def _chunk_below(shape: tuple[int, ...], item: int, limit: int) -> tuple[int, ...]:
+    """Return the shape of a chunk of at most `limit` bytes: an episode, or equal parts of it along its first axes.
+
+    Args:
+        shape: Shape of an episode's array, with a 1 in front.
+        item: Bytes of a number.
+        limit: Largest chunk in bytes.
+    """
+    chunk = list(shape)
+    for axis, length in enumerate(shape):
+        others = item * prod(chunk) // length
+        chunk[axis] = max(1, min(length, limit // others))
+        if item * prod(chunk) <= limit:
+            break
+    return tuple(chunk)
 
 
 class _SafeFile(io.RawIOBase):
@@ -262,9 +285,18 @@ def write_safetensors(run: Run, out: Path) -> None:
 
 
 def _write_header(file: BinaryIO, header: dict[str, Any]) -> None:
-    """Write the length, then JSON padded to eight bytes, as the format requires."""
+    """Write the length, then JSON padded to eight bytes, as the format requires.
+
+    Raises:
+        UsageError: For more JSON than readers of the format accept.
+    """
     text = json.dumps(header).encode()
     text += b" " * (-len(text) % 8)
+    if len(text) > LARGEST_HEADER:
+        raise UsageError(
+            f"settings and episodes take {len(text):,} bytes; readers of safetensors accept {LARGEST_HEADER:,}. "
+            "Export with --format h5"
+        )
     file.write(len(text).to_bytes(8, "little") + text)
 
 

@@ -1,13 +1,16 @@
 """"""
 
+import re
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pybullet
 import pybullet_data
 import pytest
+from numpy.typing import NDArray
 
-from probe_kit.env import LimitSpec
+from probe_kit.env import Act2AnswerEnv, LimitSpec
 from probe_kit.env import arm as arm_module
 from probe_kit.env.arm import ARMS, DeltaController, check_action, write_urdf
 from probe_kit.env.rotations import Pose, SerialChain, from_euler_xyz, from_rpy, to_rpy, to_vector, yaw_quaternion
@@ -251,6 +254,60 @@ def test_a_description_of_another_robot_is_refused(make_env):
     other = Path(pybullet_data.getDataPath()) / "r2d2.urdf"
     with pytest.raises(SceneError, match="does not describe this arm"):
         make_env(arm_urdf=other).reset(seed=0)
+
+
+@pytest.fixture
+def copied_arm(tmp_path: Path) -> Path:
+    """The description of a copy of the Panda whose meshes a test may change."""
+    folder = shutil.copytree(Path(pybullet_data.getDataPath()) / "franka_panda", tmp_path / "arm")
+    urdf = folder / "panda.urdf"
+    urdf.write_text(urdf.read_text().replace("package://", f"{folder}/"))
+    return urdf
+
+
+def enlarge_hand(urdf: Path) -> None:
+    for mesh in (urdf.parent / "meshes").rglob("hand.obj"):
+        grown = re.sub(r"^v (\S+) (\S+) (\S+)", lambda v: "v " + " ".join(str(2 * float(x)) for x in v.groups()),
+                       mesh.read_text(), flags=re.MULTILINE)  # fmt: skip
+        mesh.write_text(grown)
+
+
+@pytest.mark.parametrize("change", ["mesh", "material", "texture"])
+def test_a_scene_is_another_once_a_file_of_its_arm_changed(copied_arm: Path, change: str) -> None:
+    before = SceneSpec(arm_urdf=copied_arm).to_json()
+    assert SceneSpec(arm_urdf=copied_arm).to_json() == before
+    if change == "mesh":
+        enlarge_hand(copied_arm)
+    else:
+        material = next((copied_arm.parent / "meshes" / "visual").glob("hand.mtl"))
+        material.write_text(f"{material.read_text()}\nmap_Kd colour.png\n")
+        picture = material.with_name("colour.png")
+        picture.write_bytes(b"one")
+        if change == "texture":
+            before = SceneSpec(arm_urdf=copied_arm).to_json()
+            picture.write_bytes(b"two")
+    after = SceneSpec(arm_urdf=copied_arm).to_json()
+    assert [name for name in after if after[name] != before[name]] == ["arm_urdf"]
+    with pytest.raises(SceneError, match="Give that file"):
+        SceneSpec.from_json(before, {"arm_urdf": copied_arm})
+
+
+def test_an_edited_mesh_is_drawn_in_the_same_process(copied_arm: Path) -> None:
+    def picture() -> NDArray[np.uint8]:
+        env = Act2AnswerEnv(SceneSpec(arm_urdf=copied_arm))
+        env.reset(seed=0)
+        drawn = env.render()
+        env.close()
+        return drawn
+
+    before = picture()
+    enlarge_hand(copied_arm)
+    after = picture()
+    assert (before != after).any()
+    fresh = shutil.copytree(copied_arm.parent, copied_arm.parent.with_name("fresh")) / "panda.urdf"
+    fresh.write_text(fresh.read_text().replace(f"{copied_arm.parent}/", f"{fresh.parent}/"))
+    copied_arm = fresh  # a name that PyBullet never read in this process
+    np.testing.assert_array_equal(picture(), after)
 
 
 @pytest.mark.parametrize("model", ARMS.values(), ids=ARMS)

@@ -16,7 +16,8 @@ from probe_kit.errors import (
     UnknownSiteError,
     UsageError,
 )
-from probe_kit.hooks import ActivationCache, Observation, Site, capture, edit
+from probe_kit.hooks import ActivationCache, Observation, Site, capture, edit, load_policy
+from probe_kit.hooks.capturing.capture_context import Reduce, compiled_parts
 from probe_kit.hooks.capturing.edits import Edit, apply_edits, vector_hash
 from probe_kit.hooks.families.pi0.adapter import Pi0
 
@@ -158,6 +159,59 @@ def test_nan_in_an_activation_is_an_error_that_names_the_site(pi0_tiny: Pi0, obs
     site = Site("expert", 0, iteration=0)
     with pytest.raises(NonFiniteActivationError, match=re.escape(str(site))), capture(pi0_tiny, [site]):
         pi0_tiny.act([broken], [0])
+
+
+@pytest.mark.parametrize("reduce", [None, lambda _site, activation: activation.mean(1, keepdim=True)])
+def test_a_probe_trains_on_any_part_of_what_was_captured(
+    pi0_tiny: Pi0, observation: Observation, reduce: Reduce | None
+) -> None:
+    with capture(pi0_tiny, pi0_tiny.sites(), reduce) as activations:
+        pi0_tiny.act([observation, observation], [0, 1])
+    assert not any(kept.is_inference() or kept.requires_grad for kept in activations.values())
+    tokens = activations["backbone.02.residual"].float()
+    probe = torch.nn.Linear(tokens.shape[-1], 2)
+    torch.nn.functional.cross_entropy(probe(tokens[:, -1]), torch.tensor([0, 1])).backward()
+    assert probe.weight.grad is not None
+    assert probe.weight.grad.abs().sum() > 0
+
+
+@pytest.mark.slow
+def test_a_site_that_a_compiled_function_passes_over_names_that_function(observation: Observation) -> None:
+    policy = load_policy("pi0-tiny")
+    inner = policy.network.model
+    inner.denoise_step = torch.compile(inner.denoise_step, backend="eager")
+    policy.act([observation], [0])  # compiled code calls no hook that is attached after this
+    named = r"fired 0 times .*torch\.compile or torch\.jit: model\.denoise_step"
+    try:
+        with pytest.raises(SiteNeverFiredError, match=named), capture(policy, [Site("expert", 0, iteration=0)]):
+            policy.act([observation], [0])
+    finally:
+        torch.compiler.reset()
+
+
+@pytest.mark.filterwarnings("ignore:.torch.jit.trace:DeprecationWarning")
+def test_every_way_of_compiling_a_part_is_recognised() -> None:
+    class Network(torch.nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.plain, self.block, self.traced = (
+                torch.nn.Linear(2, 2),
+                torch.nn.Linear(2, 2),
+                torch.nn.Linear(2, 2),
+            )
+            self.block.compile()
+            self.traced = torch.jit.trace(self.traced, torch.zeros(1, 2))
+            self.step = torch.compile(self.plain.forward)
+            self.wrapped = torch.compile(torch.nn.Linear(2, 2))
+
+    class Adapter:
+        network = None
+
+        def __init__(self) -> None:
+            self.network = Network()
+
+    assert {"block", "traced", "step", "wrapped"} <= set(compiled_parts(Adapter()))
+    assert "plain" not in compiled_parts(Adapter())
 
 
 def test_a_compiled_module_is_refused_with_the_remedy(pi0_tiny: Pi0, monkeypatch: pytest.MonkeyPatch) -> None:

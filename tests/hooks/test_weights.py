@@ -264,6 +264,20 @@ def last_linear(network: nn.Module) -> str:
     ][-1]
 
 
+@pytest.mark.parametrize("family", families())
+def test_weights_that_are_overwritten_in_place_leave_a_loaded_model_as_it_is(family: str, tmp_path: Path) -> None:
+    write, options = WRITERS[family]
+    folder = write(tmp_path / "current")
+    network = network_of(load_model(family, str(folder), **options))
+    before = {name: tensor.clone() for name, tensor in network.state_dict().items()}
+    for file in folder.rglob("*.safetensors"):
+        content = bytearray(file.read_bytes())
+        content[-len(content) // 2 :] = bytes(len(content) // 2)
+        with file.open("r+b") as opened:  # as rsync --inplace and cp do
+            opened.write(content)
+    assert all(torch.equal(tensor, before[name]) for name, tensor in network.state_dict().items())
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("family", families())
 def test_an_adapter_is_added_to_the_weights_of_the_base_in_every_family(family: str, tmp_path: Path) -> None:

@@ -4,10 +4,13 @@ import json
 import os
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from probe_kit.cli import app
@@ -128,7 +131,9 @@ def test_an_export_has_half_the_difference_of_the_class_means_and_steers_by_it(
     [
         ({"a": np.ones(3), "b": np.ones(3)}, "", "directions a, b"),
         ({"a": np.ones(3)}, "#c", "directions a"),
-        ({"a": np.zeros(3)}, "", "not zero"),
+        ({"a": np.zeros(3)}, "", "a row of zeros"),
+        ({"a": np.array([1.0, np.nan])}, "", "NaN"),
+        ({"a": np.ones((0, 3))}, "", "shape"),
         ({"a": np.ones((2, 2, 2))}, "", "shape"),
     ],
 )
@@ -138,6 +143,49 @@ def test_a_file_without_the_direction_is_refused(
     path = written(tmp_path / "some.npz", vectors)
     with pytest.raises(UsageError, match=named):
         read_direction(f"{path}{name}")
+
+
+@pytest.mark.parametrize("values", [np.ones(3, complex), np.array(["1", "2"]), np.ones(3, bool)])
+def test_a_direction_of_other_than_real_numbers_is_refused(tmp_path: Path, values: Any) -> None:
+    np.savez(tmp_path / "some.npz", a=values)
+    with pytest.raises(UsageError, match="expected real numbers"):
+        read_direction(str(tmp_path / "some.npz"))
+
+
+def test_a_scale_of_another_shape_than_the_direction_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "some.npz"
+    write_directions(path, {"a": np.ones(4), "a.scale": np.ones((5, 4))}, {"a": {"space": "standardised"}})
+    with pytest.raises(UsageError, match=r"a\.scale has the shape \(5, 4\); expected \(4,\)"):
+        read_direction(str(path))
+
+
+@given(
+    rank=st.integers(1, 4),
+    extra=st.integers(0, 3),
+    dtype=st.sampled_from(["float16", "bfloat16", "float32", "float64"]),
+    seed=st.integers(0, 2**16),
+)
+@settings(deadline=None, max_examples=40)
+def test_rows_that_depend_on_each_other_span_no_further_direction(
+    rank: int, extra: int, dtype: str, seed: int
+) -> None:
+    import torch
+    from safetensors.torch import save_file
+
+    draw = np.random.default_rng(seed)
+    independent = draw.normal(size=(rank, 64))
+    # Stored numbers are rounded: a sum of rows, a multiple and a negative are dependent up to that rounding.
+    dependent = draw.normal(size=(extra, rank)) @ independent
+    stored = torch.tensor(np.concatenate([independent, dependent])).to(getattr(torch, dtype))
+    with TemporaryDirectory() as folder:
+        save_file({"a": stored}, Path(folder) / "some.safetensors")
+        direction = read_direction(f"{folder}/some.safetensors")
+    basis = direction.basis.astype(np.float64)
+    assert len(basis) == rank
+    np.testing.assert_allclose(basis @ basis.T, np.eye(rank), atol=1e-5)
+    projected = direction.vectors @ basis.T @ basis
+    np.testing.assert_allclose(projected, direction.vectors, atol=0.1 if "16" in dtype else 1e-5)
+    assert bool(direction.note) == bool(extra)
 
 
 def test_what_is_no_file_of_directions_is_refused(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 import csv
 import hashlib
 import json
+import math
 import os
 import shutil
 from dataclasses import replace
@@ -12,6 +13,8 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 from safetensors import safe_open
 
@@ -25,6 +28,7 @@ from probe_kit.errors import (
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.retention import retention_table
 from probe_kit.runs import Run, copy_run, export_run, open_run, seal, verify_run
+from probe_kit.runs.export import _chunk_below
 from probe_kit.runs.store import locate
 from probe_kit.runs.thumbnails import as_thumbnail, thumbnail_key
 from probe_kit.runs.writer import RunWriter
@@ -190,6 +194,15 @@ def test_safetensors_hold_the_numbers_and_true_bfloat16(recorded_run: Run, tmp_p
 
 
 @pytest.mark.slow
+@given(st.lists(st.integers(1, 5000), min_size=1, max_size=5), st.integers(1, 8), st.integers(64, 2**20))
+def test_a_chunk_of_h5_is_a_part_of_one_episode_below_the_limit(shape: list[int], item: int, limit: int) -> None:
+    chunk = _chunk_below((1, *shape), item, limit)
+    assert item * math.prod(chunk) <= limit
+    assert all(1 <= part <= whole for part, whole in zip(chunk, (1, *shape), strict=True))
+    if item * math.prod(shape) <= limit:
+        assert chunk == (1, *shape)
+
+
 def test_h5_holds_the_numbers_and_the_episodes(recorded_run: Run, tmp_path: Path) -> None:
     h5py = pytest.importorskip("h5py", reason="h5py is not installed")
     with h5py.File(export_run(recorded_run.path, "h5", tmp_path / "run.h5")) as file:

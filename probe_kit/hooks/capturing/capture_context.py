@@ -14,6 +14,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import groupby
 from typing import Any
 from weakref import WeakSet
@@ -232,6 +233,9 @@ def capture(model: Model, sites: Iterable[Site], reduce: Reduce | None = None) -
         reduce: Gives what to keep of a site, such as a pooled view. It is called with (site, (B, T, D)) on the
             device at the moment the site fires, and must return a new tensor. None keeps a copy.
 
+    What is kept can be trained on: although policies infer in `torch.inference_mode`, it is no inference tensor,
+    which torch refuses to train on, and carries no gradient. `reduce` runs outside that mode too.
+
     Raises:
         SiteNeverFiredError: If a site fired less often than its tap promises.
         SiteFiredTooOftenError: If a site fired more often than its tap promises.
@@ -241,10 +245,15 @@ def capture(model: Model, sites: Iterable[Site], reduce: Reduce | None = None) -
     if model in _captured_now:
         raise CaptureError("this model is being captured already; leave the first capture before the next")
     cache = ActivationCache()
+    kept_of = reduce or (lambda _, activation: activation.clone())
 
     def keep(site: Site, tap: Tap, passing: Tensor) -> None:
         activation = tap.select(passing).detach()
-        cache._kept[site] = activation.clone() if reduce is None else reduce(site, activation)
+        if torch.is_inference_mode_enabled():  # torch refuses to train on tensors that are made in it
+            with torch.inference_mode(False), torch.no_grad():
+                cache._kept[site] = kept_of(site, activation)
+        else:
+            cache._kept[site] = kept_of(site, activation)
 
     with ExitStack() as stack:
         _captured_now.add(model)
@@ -294,17 +303,44 @@ def _attach(model: Model, sites: Iterable[Site], handle: Handle, stack: ExitStac
     groups: dict[tuple[str, int, str], list[Site]] = defaultdict(list)
     for site in dict.fromkeys(sites):
         groups[site.stream, site.layer, site.quantity].append(site)
-    hooks = [_CountingHook(model.tap(group[0]), group, handle) for group in groups.values()]
+    compiled = partial(compiled_parts, model)
+    hooks = [_CountingHook(model.tap(group[0]), group, handle, compiled) for group in groups.values()]
     for hook in hooks:
         stack.callback(hook.attach().remove)
     return hooks
 
 
+def compiled_parts(model: Model) -> list[str]:
+    """Return the names of compiled modules and functions in a model's networks, such as `model.denoise_step`.
+
+    They were compiled by `torch.compile`, `Module.compile` or `torch.jit`. A compiled function that no module has
+    as an attribute, such as a global one, cannot be recognised.
+    """
+    networks = {name: part for name, part in vars(model).items() if isinstance(part, nn.Module)}
+    compiled: list[str] = []
+    for network in networks.values():
+        for path, module in network.named_modules():
+            prefix = f"{path}." if path else ""
+            if _is_compiled(module):
+                compiled.append(path or type(module).__name__)
+            compiled += [f"{prefix}{name}" for name, value in vars(module).items() if _is_compiled(value)]
+            compiled += [f"{prefix}{name}" for name, value in vars(type(module)).items() if _is_compiled(value)]
+    return list(dict.fromkeys(compiled))
+
+
+def _is_compiled(part: object) -> bool:
+    """Whether torch compiled this module or function."""
+    if isinstance(part, nn.Module):
+        is_script = isinstance(part, torch.jit.ScriptModule)
+        return is_script or isinstance(part, torch._dynamo.OptimizedModule) or part._compiled_call_impl is not None
+    return hasattr(part, "_torchdynamo_orig_callable") or isinstance(part, torch.jit.ScriptFunction)
+
+
 class _CountingHook:
     """A hook that counts the calls of one module and handles those of its sites."""
 
-    def __init__(self, tap: Tap, sites: list[Site], handle: Handle) -> None:
-        self.tap, self.first, self.handle = tap, sites[0], handle
+    def __init__(self, tap: Tap, sites: list[Site], handle: Handle, compiled: Callable[[], Sequence[str]]) -> None:
+        self.tap, self.first, self.handle, self.compiled = tap, sites[0], handle, compiled
         self.at_fire = {site.iteration or 0: site for site in sites}
         self.count = 0
 
@@ -354,9 +390,15 @@ class _CountingHook:
             return
         wrong = SiteNeverFiredError if self.count < expected else SiteFiredTooOftenError
         least = "at least " if self.tap.more else ""
+        counts = f"{self.first} fired {self.count} times in one inference; expected {least}{expected}."
+        if self.count < expected and (compiled := self.compiled()):
+            raise wrong(
+                f"{counts} Compiled by torch.compile or torch.jit: {', '.join(compiled[:3])}. Compiled code calls "
+                "no hook that is attached after its first run: load the model uncompiled to capture it"
+            )
         raise wrong(
-            f"{self.first} fired {self.count} times in one inference; expected {least}{expected}. The model does "
-            "not call this module the way the adapter declares: correct the tap, or run the model once per context"
+            f"{counts} The model does not call this module the way the adapter declares: correct the tap, or run "
+            "the model once per context"
         )
 
 

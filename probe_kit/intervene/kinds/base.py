@@ -3,6 +3,7 @@
 It loads neither torch nor a simulator, and neither do the kinds: tables read them without a model.
 """
 
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -276,6 +277,8 @@ class AlongDirection(Intervention):
         super().__post_init__()
         if names_file(self.direction):
             vector = read_direction(self.direction)
+            if vector.note:
+                warnings.warn(vector.note, stacklevel=4)
             object.__setattr__(self, "vector", vector)
             object.__setattr__(self, "direction", vector.name)
         elif self.direction != NONE or not self.takes_none:

@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 
 Metric = Callable[[Any, Given], float]
 """Function from the output of an inference and its input to a number, such as metres to the left."""
+CELL_INCHES = 0.4
+"""Width and height of a cell of a heatmap, in inches."""
 SEED_TEXT = "patching"
 """Text that seeds all random draws over pairs: for a run it is the run's `seed_text`."""
 
@@ -123,6 +125,7 @@ class Sweep:
             UsageError: For sets of several cells, or without any number in the column.
         """
         from matplotlib.figure import Figure
+        from matplotlib.ticker import MaxNLocator
 
         if any(len(cells) > 1 for cells in self.cells):
             raise UsageError("a heatmap shows single cells; this sweep has sets of several, use its table")
@@ -138,12 +141,20 @@ class Sweep:
         grid = np.full((len(roles), len(places)), np.nan)
         for (cell,), value in zip(self.cells, values, strict=True):
             grid[roles.index(cell.role), places.index(cell.site_group.name)] = value
-        figure = Figure(figsize=(2 + 0.4 * len(places), 1.5 + 0.4 * len(roles)), layout="constrained")
+        # The layout takes the room of long names from the cells: names are measured in a large figure first.
+        width, height = (max(CELL_INCHES * count, 1.2) for count in (len(places), len(roles)))
+        figure = Figure(figsize=(width + 20, height + 20), layout="constrained")
         axes = figure.add_subplot()
         image = axes.imshow(grid, aspect="auto", cmap="viridis")
         axes.set_xticks(range(len(places)), places, rotation=90)
         axes.set_yticks(range(len(roles)), roles)
-        figure.colorbar(image, label=column)
+        figure.colorbar(image, label=column, ticks=MaxNLocator(max(2, int(2 * height))))
+        figure.draw_without_rendering()
+        below, beside = (
+            max(getattr(name.get_window_extent(), side) for name in names) / figure.dpi
+            for names, side in ((axes.get_xticklabels(), "height"), (axes.get_yticklabels(), "width"))
+        )
+        figure.set_size_inches(width + beside + 1.4, height + below + 0.4)
         return figure
 
 

@@ -1,5 +1,8 @@
 """Sweeps and sets of cells on policies whose wiring is written down; see `wirings`."""
 
+from dataclasses import replace
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -59,6 +62,25 @@ def test_a_heatmap_has_layers_by_roles(copied: pt.Sweep) -> None:
     table = copied.table.set_index("cells")
     assert grid[2, 5] == pytest.approx(table.loc["kv.01 language", "moved"])
     assert np.isnan(grid[0, 5]), "kv was not swept over all tokens"
+
+
+@pytest.mark.parametrize("quantity", ["heads", "a_quantity_with_a_name_that_is_as_long_as_any"])
+@pytest.mark.parametrize(("places", "roles"), [(1, 1), (4, 1), (32, 1), (6, 3)])
+def test_a_heatmap_leaves_its_cells_room_beside_long_names(
+    copied: pt.Sweep, places: int, roles: int, quantity: str
+) -> None:
+    cell = copied.cells[0][0]
+    groups = [replace(cell.site_group, name=f"backbone.02.{quantity}.{n}") for n in range(places)]
+    cells = [(replace(cell, site_group=group, role=f"role-{r}"),) for group in groups for r in range(roles)]
+    patched = np.resize(copied.patched, (len(cells), copied.clean.size))
+    figure = replace(copied, cells=tuple(cells), patched=patched).heatmap("moved")
+    figure.draw_without_rendering()  # constrained layouts without room warn, which is an error here
+    axes, bar = figure.axes
+    size = axes.get_window_extent()
+    assert size.height / figure.dpi >= 0.9 * 0.4 * roles
+    assert size.width / figure.dpi >= 0.9 * 0.4 * places
+    ticks = sorted(t.get_window_extent().y0 for t in bar.get_yticklabels() if t.get_text())
+    assert all(upper - lower > 8 for lower, upper in pairwise(ticks))
 
 
 def test_a_share_of_noise_is_not_given(wired: WiredSession) -> None:

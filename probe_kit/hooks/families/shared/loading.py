@@ -152,7 +152,8 @@ def load_network[Network: nn.Module](
             if tensors_of is None
             else tensors_of(weights)
         )
-        audit = assign_weights(network, weights, as_dtype(tensors, DTYPES[name]), name_in_module)
+        owned = as_dtype(tensors, DTYPES[name], in_memory=torch.device(device).type == "cpu")
+        audit = assign_weights(network, weights, owned, name_in_module)
     network.requires_grad_(False)  # a gradient is asked for at activations only
     finish(network)
     seed = weights_seed if random_weights else None
@@ -195,9 +196,19 @@ def assign_weights(
     return audit
 
 
-def as_dtype(tensors: Mapping[str, Tensor], dtype: torch.dtype) -> dict[str, Tensor]:
-    """Return the tensors, those of real numbers in `dtype`."""
-    return {name: value.to(dtype) if value.is_floating_point() else value for name, value in tensors.items()}
+def as_dtype(tensors: Mapping[str, Tensor], dtype: torch.dtype, in_memory: bool) -> dict[str, Tensor]:
+    """Return the tensors, those of real numbers in `dtype`.
+
+    Args:
+        tensors: The tensors by name; of a safetensors file they are a map of that file.
+        dtype: The dtype of real numbers; others keep theirs.
+        in_memory: Whether every tensor gets memory of its own. Parameters that are a map of their file change with
+            it, when a newer checkpoint is copied over it. A network that goes to another device is copied anyway.
+    """
+    return {
+        name: value.to(dtype if value.is_floating_point() else value.dtype, copy=in_memory)
+        for name, value in tensors.items()
+    }
 
 
 def _check_filled(network: nn.Module, source: str) -> None:
