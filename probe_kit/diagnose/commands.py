@@ -407,8 +407,8 @@ def _captured(extraction: "Extraction", location: "Location", most: int) -> "Run
             count(finished, total, *what)
 
         run = extraction.run(location, progress=advance)
-    # The first one warms the network up; what was captured before took no time now.
-    if len(ended) > FEWEST_PACED:
+    # The first one warms the network up; what was captured before took no time now, and workers load meanwhile.
+    if len(ended) > FEWEST_PACED and extraction.controller is not None:
         seconds = most * (ended[-1] - ended[0]) / (len(ended) - 1)
         say(f"about {spoken(seconds)} for at most {most:,} inferences, at the pace of the captured frames")
     return run
