@@ -58,6 +58,8 @@ OF_OTHERS = {
     "--gpus": "docker's",
     "--check": "sha256sum's",
     "--length": "b2sum's",
+    "--root": "those of lerobot's converter",
+    "--push-to-hub": "those of lerobot's converter",
 }
 """Options in the text that are no command's of ours, and no benchmark's."""
 OF_BENCHMARKS = {

@@ -1,6 +1,6 @@
 """Numbers of things and lists of names in words."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 
 
 def counted(number: int, noun: str) -> str:
@@ -18,6 +18,17 @@ def spanned(numbers: Collection[int]) -> str:
     """Return the smallest and the largest of some numbers: `3`, `3 to 7`."""
     least, most = min(numbers), max(numbers)
     return f"{least}" if least == most else f"{least} to {most}"
+
+
+def ranges_of(numbers: Iterable[int], noun: str, most: int = 8) -> str:
+    """Return numbers in ranges behind their noun: `episode 3`, `episodes 0 to 2 and 7`; at most so many ranges."""
+    listed = sorted(set(numbers))
+    present = set(listed)
+    begins = [number for number in listed if number - 1 not in present]
+    ends = [number for number in listed if number + 1 not in present]
+    ranges = [spanned((begin, end)) for begin, end in zip(begins, ends, strict=True)]
+    more = [f"{len(ranges) - most} further ranges"] if len(ranges) > most else []
+    return f"{noun}{'s' * (len(listed) > 1)} {enumerated(ranges[:most] + more)}"
 
 
 def enumerated(names: Sequence[str]) -> str:

@@ -3,6 +3,7 @@
 import errno
 import fcntl
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -12,6 +13,8 @@ from pathlib import Path
 from probe_kit.errors import FULL_DISK, DiskSpaceError, UsageError
 
 _SUFFIX = ".tmp"
+_SCHEME = re.compile(r"[a-z][a-z0-9+.-]+:")
+"""The first part of a path that was a URL: `s3://bucket/file` is the path `s3:/bucket/file`."""
 
 
 @contextmanager
@@ -20,7 +23,16 @@ def draft_of(path: Path) -> Iterator[Path]:
 
     After the body the draft is gone. It lies in a hidden folder beside `path`, `.<name>.<letters>.tmp`, which is
     locked as long as its process lives. Drafts that killed processes left for the same `path` are removed first.
+
+    Raises:
+        UsageError: For a path that was a URL, which would become a folder of that name in the working folder.
     """
+    top = path.parts[0] if len(path.parts) > 1 else ""
+    if _SCHEME.fullmatch(top) and not Path(top).exists():
+        raise UsageError(
+            f"{path} was a URL before it became a path; files are written to folders of this machine. Give such a "
+            "path, and copy the result to its store afterwards"
+        )
     path.parent.mkdir(parents=True, exist_ok=True)
     _remove_abandoned(path)
     with _own_folder(path) as folder:

@@ -125,8 +125,8 @@ def _has_pip() -> bool:
 
 def _installer() -> str:
     if _has_pip():
-        return f"{_python()} -m pip install"
-    return f"{_uv()} pip install --python {_python()}"
+        return f"{python_command()} -m pip install"
+    return f"{_uv()} pip install --python {python_command()}"
 
 
 def _uv() -> str:
@@ -137,7 +137,7 @@ def _uv() -> str:
     return next((shlex.quote(str(path)) for path in usual if path.is_file()), "uv")
 
 
-def _python() -> str:
+def python_command() -> str:
     """Return the running Python as a shell finds it."""
     name = Path(sys.executable).name
     path = shutil.which(name)

@@ -1,7 +1,7 @@
 """The meaning of a cell in a table that people edit: missing, true or false, a number, a name."""
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 from unicodedata import category, normalize
 
@@ -28,6 +28,10 @@ MOST_DIGITS = 400
 
 _INTEGER = re.compile(r"[+-]?[0-9]+")
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+_PLAIN = re.compile(r"[+-]?(0|[1-9][0-9]*)(\.[0-9]*)?")
+"""A number that can be no short name: no zeros in front of it, and no exponent."""
+_WHOLE = re.compile(r"([+-]?)0*([0-9]+)(?:\.0*)?")
+"""A whole number, by its sign and its digits without zeros in front."""
 _INFINITE = re.compile(r"[+-]?inf(inity)?", re.IGNORECASE)
 _MINUS = re.compile(r"^[‐‑−–—－](?=\s*[0-9.,])")
 _MARK = re.compile(r"^'(?=[+-]?[.,]?[0-9])")
@@ -83,7 +87,17 @@ def name_of(cell: str) -> str:
     return " ".join(normalize("NFC", cell).split())
 
 
-def check_spellings(cells: Sequence[Any], where: Callable[[int], str], error: Callable[[str], Exception]) -> None:
+def name_in(cell: Any) -> str:
+    """Return the name that a typed cell spells: a text as it is written, a whole number by its digits.
+
+    Numbers without decimals are integers: tables with empty cells store integers as decimals.
+    """
+    return str(int(cell)) if isinstance(cell, float) and cell.is_integer() else str(cell)
+
+
+def check_spellings(
+    cells: Sequence[Any], where: Callable[[int], str], error: Callable[[str], Exception], as_names: bool = False
+) -> None:
     """Raise `error` for two spellings of what is probably one name: `red` and `Red`, `7` and `007`.
 
     Signs that print nothing, such as a soft hyphen, are a spelling too.
@@ -92,12 +106,15 @@ def check_spellings(cells: Sequence[Any], where: Callable[[int], str], error: Ca
         cells: Texts as they were written, and values of other types, which have one spelling.
         where: The place of a row by its index, for the message.
         error: The class of the error, or a function that makes one of a message.
+        as_names: Whether texts of digits are names. Then `7.0` and `7` are two spellings, and `1e5` and `1.10` are
+            other names than `100000` and `1.1`.
     """
     spelled: dict[str, tuple[str, int]] = {}
     for row, cell in enumerate(cells):
         if not isinstance(cell, str):
             continue
-        text, written = _spelling(name_of(cell))
+        name = name_of(cell)
+        text, written = (alike(name), name) if as_names else _spelling(name)
         before = spelled.setdefault(text, (written, row))
         if before[0] != written:
             raise error(
@@ -107,32 +124,47 @@ def check_spellings(cells: Sequence[Any], where: Callable[[int], str], error: Ca
 
 
 def _spelling(cell: str) -> tuple[str, str]:
-    """Return the part that two spellings of one name share, and the spelling: of a number its zeros in front."""
+    """Return the part that two spellings of one value share, and the spelling: of a number its zeros in front."""
     number = number_of(cell)
     if number is None:
-        return "".join(sign for sign in cell.casefold() if category(sign) != "Cf"), cell
+        return _printed(cell), cell
     digits = with_minus(cell).lstrip("+-")
     zeros = re.match(r"0+(?=[0-9])", digits)
     value = f"{number:.17g}" if isinstance(number, float) else str(number)
     return value, f"{zeros[0] if zeros else ''}{value.lstrip('-')}"
 
 
-def group_names(cells: Sequence[Any], where: Callable[[int], str], error: Callable[[str], Exception]) -> list[str]:
-    """Return cells as names of groups: `7` and `7.0` are one group; texts are compared as `name_of` returns them.
+def _printed(text: str) -> str:
+    return "".join(sign for sign in text.casefold() if category(sign) != "Cf")
 
-    Two spellings of one name, and a cell that may mean a missing value, raise `error`.
+
+def alike(name: str) -> str:
+    """Return what names share that differ only by what programs change: `007`, `7`, `7.0` and `'7`; `Red`, `red`.
+
+    A program that takes names for numbers drops zeros in front, or adds `.0`.
     """
-    names = []
+    text = _printed(name_of(name))
+    match = _WHOLE.fullmatch(with_minus(text))
+    return f"{match[1]}{match[2]}" if match else text
+
+
+def similar_name(name: str, names: Iterable[str]) -> str | None:
+    """Return the first of some names that differs from a name only by what programs change; None without one."""
+    text = alike(name)
+    return next((other for other in names if other != name and alike(other) == text), None)
+
+
+def group_names(cells: Sequence[Any], where: Callable[[int], str], error: Callable[[str], Exception]) -> list[str]:
+    """Return cells as names of groups, each as it is written: names are never numbers.
+
+    Texts are compared as `name_of` returns them. Two spellings of one name, and a cell that may mean a missing
+    value, raise `error`.
+    """
     for row, cell in enumerate(cells):
-        if isinstance(cell, str):
-            if problem := problem_of(cell):
-                raise error(f"{where(row)}: {problem}")
-            number = number_of(cell)
-            cell = name_of(cell) if number is None else number
-        if isinstance(cell, float) and cell.is_integer():
-            cell = int(cell)
-        names.append(str(cell))
-    check_spellings(cells, where, error)
+        if isinstance(cell, str) and (problem := problem_of(cell)):
+            raise error(f"{where(row)}: {problem}")
+    names = [name_of(name_in(cell)) for cell in cells]
+    check_spellings(names, where, error, as_names=True)
     return names
 
 
@@ -182,7 +214,8 @@ def values_of(
         cells: Texts as `cell_of` returns them, or typed values of a data frame.
         where: The place of a row by its index, for messages.
         semicolons: Whether they separate the cells: where a comma is the decimal sign, `1.000` may be a thousand.
-        as_names: Whether texts such as `10 cm` are names of classes.
+        as_names: Whether texts such as `10 cm` are names of classes. Then `01`, `1e5` and numbers beside texts
+            stay texts as well.
         otherwise: How the caller declares texts `as_names`, at the end of a message.
 
     Raises:
@@ -199,7 +232,8 @@ def values_of(
     numbers = _numbers(texts, where, semicolons, as_names)
     if not as_names:
         _check_quantities(numbers, where, otherwise)
-    check_spellings(texts, where, UsageError)
+    are_names = as_names and any(isinstance(cell, str) and number_of(cell) is not None for cell in numbers)
+    check_spellings(texts, where, UsageError, as_names=are_names)
     return numbers
 
 
@@ -231,6 +265,8 @@ def _word[Value: (bool, str)](cell: Cell, words: dict[str, Value]) -> Value | No
 def _numbers(cells: Sequence[Cell], where: Where, semicolons: bool, as_names: bool) -> list[Cell]:
     """Return the cells with numbers in place of the texts that spell them."""
     texts = {row: with_minus(cell) for row, cell in enumerate(cells) if isinstance(cell, str)}
+    if as_names and not all(_PLAIN.fullmatch(text) for text in texts.values()):
+        return [cell if cell is None or isinstance(cell, bool) else name_in(cell) for cell in cells]
     numbers = [number_or_cell(cell) for cell in cells]
     if as_names:
         return numbers

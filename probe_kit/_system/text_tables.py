@@ -146,6 +146,26 @@ def open_table(
     return TextTable(path, names, line, separator, encoding, error, most_characters)
 
 
+def read_lines(path: Path, error: type[ProbeKitError] = UsageError, most: int = 10_000) -> list[str]:
+    """Return the lines of a text file in UTF-8 or UTF-16, without spaces around them.
+
+    Args:
+        path: The file.
+        error: The class of all errors.
+        most: The most lines.
+
+    Raises:
+        ProbeKitError: As `open_table` raises it for a file that is no text, and for more lines, as `error`.
+    """
+    lines: list[str] = []
+    with _opened(path, _encoding(path, error), error) as file:
+        while text := file.readline(MOST_CHARACTERS):
+            if len(lines) == most:
+                raise error(f"{path} has more than {most:,} lines; expected a short list. Give another file")
+            lines.append(text.strip())
+    return lines
+
+
 def _separator(
     headings: dict[str, tuple[int, tuple[str, ...]]], keys: Collection[str], path: Path, error: type[ProbeKitError]
 ) -> str:

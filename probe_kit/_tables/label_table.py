@@ -6,7 +6,7 @@ from math import isinf
 from typing import Literal, Self
 
 from probe_kit._system.escaping import UNSAFE, terminal_safe
-from probe_kit._system.table_cells import Cell, group_names, number_or_cell, values_of
+from probe_kit._system.table_cells import Cell, group_names, name_in, number_or_cell, values_of
 from probe_kit._system.text_tables import TextTable
 from probe_kit.errors import UsageError
 
@@ -67,25 +67,25 @@ class LabelTable:
             if isinstance(cell, str):
                 self._kind(row, column, cell)
         values = values_of(cells, lambda row: self.where(row, column), self.semicolons, as_names, otherwise)
-        return self._of_one_kind(column, values)
+        return self._of_one_kind(column, values, otherwise)
 
     def typed(self, column: str) -> list[Cell]:
         """Return the cells of one column as they are, of one kind. Raises UsageError for others."""
         return self._of_one_kind(column, self.columns[column])
 
-    def _of_one_kind(self, column: str, cells: list[Cell]) -> list[Cell]:
+    def _of_one_kind(self, column: str, cells: list[Cell], otherwise: str = "") -> list[Cell]:
         first: tuple[Kind, int] | None = None
         for row, cell in enumerate(cells):
             if cell is None:
                 continue
-            kind = self._kind(row, column, cell)
+            kind = self._kind(row, column, cell, otherwise)
             if first is None:
                 first = kind, row
             elif _ARTICLE[kind] != _ARTICLE[first[0]]:
                 raise UsageError(
                     f"{self.where(row, column)}: {cell!r} is {_ARTICLE[kind]}, and {self.unit} "
                     f"{self.lines[first[1]]} has {_ARTICLE[first[0]]}; expected one type. Correct one of the two, "
-                    "or leave the cell empty"
+                    f"or leave the cell empty{otherwise if 'text' in (kind, first[0]) else ''}"
                 )
         self._check_exact(column, cells)
         return cells
@@ -104,24 +104,33 @@ class LabelTable:
             )
 
     def texts(self, column: str) -> list[str]:
-        """Return the cells of one column as they are written. Raises UsageError if one is missing."""
+        """Return the cells of one column as names, each as it is written; `name_in` says how.
+
+        Raises:
+            UsageError: For a missing name, and for a number that may be a name which a program has read as one.
+        """
         cells = self.columns[column]
         for row, cell in enumerate(cells):
             if cell is None:
                 raise UsageError(f"{self.where(row, column)} is empty; expected a name in every {self.unit}")
-            self._kind(row, column, cell)
-        return [str(cell) for cell in cells]
+            if isinstance(cell, float) and not abs(cell) <= EXACT:
+                raise UsageError(
+                    f"{self.where(row, column)} is {cell:g}, a number in place of a name, of which digits "
+                    f"are lost. Read names as text, in pandas with dtype={{{column!r}: str}}"
+                )
+            if isinstance(cell, str):
+                self._kind(row, column, cell)
+        return [name_in(cell) for cell in cells]
 
     def group_names(self, column: str) -> list[str]:
         """Return the cells of one column as names of groups. Raises UsageError if one is missing."""
-        self.texts(column)
-        return group_names(self.columns[column], lambda row: self.where(row, column), UsageError)
+        return group_names(self.texts(column), lambda row: self.where(row, column), UsageError)
 
     def numbers(self, column: str) -> list[Cell]:
         """Return the cells of one column, with numbers in place of the texts that spell them."""
         return [number_or_cell(cell) for cell in self.columns[column]]
 
-    def _kind(self, row: int, column: str, cell: Cell) -> Kind:
+    def _kind(self, row: int, column: str, cell: Cell, otherwise: str = "") -> Kind:
         if isinstance(cell, bool):
             return "boolean"
         if isinstance(cell, int):
@@ -133,7 +142,9 @@ class LabelTable:
             return "integer"
         if isinstance(cell, float):
             if isinf(cell):
-                raise UsageError(f"{self.where(row, column)} is infinite; expected a finite number or no entry")
+                raise UsageError(
+                    f"{self.where(row, column)} is infinite; expected a finite number or no entry{otherwise}"
+                )
             return "number"
         if unsafe := UNSAFE.search(str(cell)):
             raise UsageError(

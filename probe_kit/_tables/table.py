@@ -72,4 +72,5 @@ def _flat(number: Mapping[str, Any], intervals: set[str]) -> Iterator[tuple[str,
             low, high = value or (None, None)
             yield from ((f"{name}_low", low), (f"{name}_high", high))
         else:
-            yield name, value
+            # A cell of CSV that is a table itself has no other form than JSON's.
+            yield name, json.dumps(value, ensure_ascii=False) if isinstance(value, Mapping | list) else value

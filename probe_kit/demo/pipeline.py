@@ -315,8 +315,8 @@ class Demo:
             "        probe-kit models                the models that can be probed",
         ]
         if self.run.random_weights:
-            warning = "[bold yellow]The policy has random weights:[/] expect SR near 0 and no signal."
-            lines.insert(0, marked(warning))
+            random = "The policy has random weights:"
+            lines.insert(0, marked("[bold yellow]{}[/] expect SR near 0 and no signal.", random))
         return Text("\n").join(line if isinstance(line, Text) else Text(line) for line in lines)
 
     def viewer(self) -> Text:

@@ -3,7 +3,7 @@
 The knowledge of a target is that of `probe-kit train`'s probes, which the run stores too.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from copy import copy
 from dataclasses import replace
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from probe_kit.diagnose.importance import ActionScale
-from probe_kit.diagnose.inputs import cameras_of, frames_of, names_of, tabled_frames
+from probe_kit.diagnose.inputs import cameras_of, check_groups, frames_of, names_of, tabled_frames
 from probe_kit.diagnose.measure import Actions, Infer, InputExchange
 from probe_kit.diagnose.results import (
     FRAMES,
@@ -33,15 +33,17 @@ from probe_kit.extract.sources.inputs import STATE, with_input
 from probe_kit.hooks.contract.card import EMBEDDED
 from probe_kit.hooks.contract.sites import KV_STREAM
 from probe_kit.hooks.family import SIZE
+from probe_kit.intervene.further_instructions import check_further_instructions
+from probe_kit.intervene.open_session import check_readable
 from probe_kit.intervene.pairs import Chunk, Given, Pair, PairRow
 from probe_kit.intervene.patching.patch import Cell, patched
 from probe_kit.intervene.places import ALL, SiteGroup, resolve_sites
-from probe_kit.intervene.settings import key_of
+from probe_kit.intervene.settings import has_sides, key_of
 from probe_kit.intervene.tokens import PairTokens, roles_of_tokens
 from probe_kit.runs.layout import DIAGNOSES
 from probe_kit.runs.reader import origin_of
 from probe_kit.runs.records import as_json
-from probe_kit.runs.results import HEAD, read_bundle, write_bundle
+from probe_kit.runs.results import is_complete, read_bundle, write_bundle
 from probe_kit.train.choices import EVERYWHERE
 
 if TYPE_CHECKING:
@@ -167,7 +169,7 @@ def _relative_difference(group: SiteGroup, before: "ActivationCache", after: "Ac
 
 # -- the diagnosis of a run ----------------------------------------------------------------------------------
 
-FORMAT, FILE = "probe_kit diagnosis 4", "diagnosis.json"
+FORMAT, FILE = "probe_kit diagnosis 5", "diagnosis.json"
 Progress = Callable[[str], None]
 
 
@@ -181,6 +183,7 @@ def diagnose_run(
     target: "Target | str | None" = None,
     base: str | None = None,
     pairs: Sequence[PairRow] = (),
+    instructions: Sequence[str] = (),
     seed: int = 0,
     source: "ReplaySource | None" = None,
     load: "LoadPolicy | None" = None,
@@ -200,6 +203,7 @@ def diagnose_run(
         base: The checkpoint that the run's was tuned from, for a comparison on the same pairs; None for none.
         pairs: A table of your own in place of drawn donors: episode and frame, and those of the donor; `frames` is
             then not used.
+        instructions: Words of other tasks, beside the instructions of the frames, for a run that has one task.
         seed: Seed of the draw of donors and of the probes.
         source: Where the model and the observations are now, as for `run_intervention`. The base is loaded by it
             too.
@@ -208,16 +212,14 @@ def diagnose_run(
 
     Raises:
         UsageError: For a model that does not act, a run with too few groups, an unknown input, a pair of a frame
-            that the run lacks, or a base with other inputs.
+            that the run lacks, an instruction that the run has already, or a base with other inputs.
+        InstructionError: For instructions that the policy cannot read in full.
     """
     from probe_kit.intervene.open_session import load_policy_of, open_session
     from probe_kit.intervene.sessions import ReplaySource
 
-    check_network(run)
-    check_names(inputs, names_of(cameras_of(run)))
     source = source or ReplaySource()
-    if base is not None and load is None:
-        check_base(run, source, base)
+    check_diagnosis(run, frames, inputs, pairs, instructions, source, None if load is not None else base)
     if target is not None:
         progress("probes")
     knowledge = None if target is None else measure_knowledge(run, target, seed)
@@ -229,13 +231,14 @@ def diagnose_run(
         "inputs": list(inputs),
         "inside": inside,
         "paraphrases": dict(paraphrases),
+        **({"instructions": list(instructions)} if instructions else {}),
         "base": None if base_policy is None else base_policy.card.weights_sha256,
         "seed": seed,
     }
     key = key_of(settings)
-    if run.location.exists(f"{DIAGNOSES}/{key}/{HEAD}"):
+    if is_complete(run.location, DIAGNOSES, key):
         return replace(load_diagnosis(run, key), knowledge=knowledge)
-    with open_session(run, source, load, table=pairs) as session, session.ready():
+    with open_session(run, source, load, table=pairs, instructions=instructions) as session, session.ready():
         if base_policy is not None:
             base_policy = with_inputs_of(session.policy, base_policy)
         progress("frames")
@@ -243,18 +246,61 @@ def diagnose_run(
             drawn, rows = tabled_frames(session, pairs, paraphrases)
         else:
             drawn, rows = frames_of(session, frames, paraphrases), []
-        exchange = InputExchange(_inference(session), drawn, seed, rows)
+        exchange = InputExchange(_inference(session), drawn, seed, rows, instructions)
         diagnosed = _measure(session, exchange, inputs, inside, progress)
         if base_policy is not None:
             progress("inputs of the base")
             diagnosed = exchange.against(_inference(session, base_policy), diagnosed)
     clean = [drawn[index] for index in dict(rows)] or drawn  # of a table of pairs, each clean frame once
     groups = len({frame.group for frame in clean})
-    diagnosis = Diagnosis(key, run.label, len(clean), groups, diagnosed, base or "")
+    diagnosis = Diagnosis(
+        key,
+        run.label,
+        len(clean),
+        groups,
+        diagnosed,
+        base or "",
+        weights_sha256=str(run.weights_sha256),
+        checkpoint=str(run.certificate["policy"]["checkpoint"]),
+        random_weights=run.random_weights,
+        source=run.suite,
+        settings=settings,
+    )
     now = datetime.now(UTC).isoformat(timespec="microseconds")
     files = {FILE: as_json(diagnosis.to_json())}
     write_bundle(run.location, DIAGNOSES, key, {"settings": settings}, files, {"created": now})
     return replace(diagnosis, knowledge=knowledge)
+
+
+def check_diagnosis(
+    run: "Run",
+    frames: int,
+    inputs: Sequence[str],
+    pairs: Sequence[PairRow],
+    instructions: Sequence[str],
+    source: "ReplaySource",
+    base: str | None,
+) -> None:
+    """Check, before any weights are read, that a run can be diagnosed so; raises as `diagnose_run`.
+
+    The frames of a table of pairs are looked up when the source is open, see `open_session`.
+    """
+    check_network(run)
+    check_names(inputs, names_of(cameras_of(run)))
+    if not pairs:
+        check_groups(run.episodes, frames, has_sides(run), lambda: f"{run.location} has")
+    if instructions:
+        check_words(instructions, run.episodes["instruction"].astype(str), bool(pairs))
+        check_readable(run, source, instructions)
+    if base is not None:
+        check_base(run, source, base)
+
+
+def check_words(instructions: Sequence[str], of_frames: Iterable[str], tabled: bool) -> None:
+    """Raise UsageError for further instructions beside a table of pairs, or that frames have."""
+    if tabled:
+        raise UsageError("--instructions gives words of donors, and --pairs names donors; leave one of both out")
+    check_further_instructions(instructions, of_frames)
 
 
 def check_network(run: "Run") -> None:
@@ -399,7 +445,7 @@ def _look_inside(session: "ReplaySession", exchange: InputExchange, diagnosed: I
     pairs = []
     for index, donor in exchange.first_donors(diagnosed.name):
         clean = exchange.observations[index]
-        source = with_input(clean, diagnosed.name, exchange.observations[donor])
+        source = with_input(clean, diagnosed.name, exchange.candidates(diagnosed.name)[donor].observation)
         if _as_many_tokens(session.policy, clean, source):
             pairs.append(Pair(clean, source, frames[index].seed, group=frames[index].group))
     if not pairs:

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from probe_kit._tables.numbers import whole_percent
 from probe_kit.diagnose.results import (
     IDLE,
-    INPUTS_DECIDE,
     MATTERS,
     BaseComparison,
     Change,
@@ -23,6 +22,7 @@ from probe_kit.diagnose.results import (
     Verdict,
 )
 from probe_kit.hashing import derive_seed
+from probe_kit.intervene.exchange import INPUTS_DECIDE, TRACE, describe_seed, does_seed_decide
 from probe_kit.statistics.bootstrap import unbounded_student_interval
 from probe_kit.statistics.paired_tests import least_column_p, max_t
 from probe_kit.statistics.significance import SIGNIFICANCE
@@ -30,8 +30,6 @@ from probe_kit.statistics.significance import SIGNIFICANCE
 # The first two are choices, which `docs/diagnose.md` states as the rule.
 DECIDES = 0.5
 """Share of the change by all inputs together from which an input decides: it outweighs all others together."""
-TRACE = 0.01
-"""Share of the variance below which an effect does not matter: a tenth of the actions' spread, squared."""
 LEAST_SPREAD = 1e-3
 """Share of the largest spread of a number of the action: numbers with less are constant but for rounding.
 
@@ -85,6 +83,7 @@ class Exchanges:
         repeated: (P,) whether an earlier donor of the frame holds the same value.
         largest: (P,) the largest change of any number of the action under the donor's input.
         blanked: (F,) the largest change of any number of every frame's action under the blank.
+        seeded: (P,) share of the variance with another seed; None where it was not measured.
     """
 
     exchanged: NDArray[np.float64]
@@ -95,6 +94,12 @@ class Exchanges:
     repeated: NDArray[np.bool_]
     largest: NDArray[np.float64]
     blanked: NDArray[np.float64]
+    seeded: NDArray[np.float64] | None = None
+
+    @property
+    def seed(self) -> float:
+        """The share of the variance with another seed; NaN where it was not measured."""
+        return np.nan if self.seeded is None else float(self.seeded.mean())
 
 
 def importance_of(name: str, exchanges: Exchanges) -> InputDiagnosis:
@@ -107,6 +112,7 @@ def importance_of(name: str, exchanges: Exchanges) -> InputDiagnosis:
         "share_ci": (max(0.0, share_ci[0]), share_ci[1]),
         "control": np.nan if exchanges.control is None else float(exchanges.control.mean()),
         "every": float(exchanges.every.mean()),
+        "seed": exchanges.seed,
         "p": p,
         "n_pairs": groups.size,
         "n_groups": np.unique(groups).size,
@@ -190,10 +196,14 @@ def _verdict(exchanges: Exchanges, p: float) -> tuple[Verdict, str]:
         exchanges.exchanged - DECIDES * exchanges.every, groups, SIGNIFICANCE
     )
     inputs, _ = unbounded_student_interval(exchanges.every, groups, SIGNIFICANCE)
+    if exchanges.seeded is not None:
+        # Without noise all inputs together decide, however near donors are.
+        outweighs, _ = unbounded_student_interval(exchanges.every - exchanges.seeded, groups, SIGNIFICANCE)
+        inputs = INPUTS_DECIDE if outweighs > 0 else inputs
     if over_half >= 0 and inputs >= INPUTS_DECIDE:
         return "decides", "it changes at least half of what all inputs change together"
     if exchanges.control is None:
         return "open", "the model takes no other spelling of it as a control; give --paraphrases"
-    if float(exchanges.every.mean()) < INPUTS_DECIDE:
-        return "moves", "the seed decides the action, and all inputs together hardly do"
+    if does_seed_decide(every := float(exchanges.every.mean()), exchanges.seed):
+        return "moves", describe_seed(every)
     return "moves", "it changes less than half of what all inputs change together, or that was not shown"

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from hashlib import sha256
 from itertools import zip_longest
 from pathlib import Path
 from types import MappingProxyType
@@ -21,7 +20,6 @@ from probe_kit.extract.sources.inputs import (
     PICTURE,
     STATE,
     Frame,
-    content_of,
     hardly_changed,
     with_other_stop,
 )
@@ -60,13 +58,6 @@ def names_of(cameras: Sequence[str]) -> tuple[str, ...]:
     """Return the names of the inputs of a model that is shown these cameras."""
     pictures = [f"{PICTURE}.{name}" for name in cameras] if len(cameras) > 1 else [PICTURE]
     return (INSTRUCTION, *pictures, STATE)
-
-
-def values_of(observations: Sequence[Observation], name: str) -> NDArray[np.intp]:
-    """Return a number (F,) of every observation's value of an input; equal values have one number."""
-    digests = [sha256(content_of(observation, name)).digest() for observation in observations]
-    numbers = {digest: number for number, digest in enumerate(dict.fromkeys(digests))}
-    return np.array([numbers[digest] for digest in digests], np.intp)
 
 
 def controls_of(frame: Frame, name: str, spread: NDArray[np.float64]) -> list[Observation]:
@@ -156,7 +147,7 @@ def frames_of(
     """
     listed = _observed(session, count) if isinstance(session, FrameSession) else _drawn(session, count)
     frames = [_read(frame, paraphrases) for frame in listed]
-    _check_groups(frames, lambda: f"{session.run.location} has", "Extract more episodes or items")
+    _check_groups(frames, lambda: f"{session.run.location} has", REMEDY)
     return frames
 
 
@@ -188,11 +179,38 @@ def tabled_frames(
     return [_read(frame, paraphrases) for frame in frames], sorted(numbered)
 
 
-def _check_groups(frames: Sequence[Frame], subject: Callable[[], str], remedy: str) -> None:
-    groups = len({frame.group for frame in frames})
+REMEDY = "Extract more episodes or items"
+"""The remedy for too few groups of a run."""
+
+
+def check_groups(
+    episodes: pd.DataFrame, count: int, in_scene: bool, subject: Callable[[], str], remedy: str = REMEDY
+) -> None:
+    """Raise UsageError if the frames that would be drawn from some episodes are of too few groups.
+
+    Args:
+        episodes: The episodes of a run, or the rows of a planned one.
+        count: Largest number of frames.
+        in_scene: Whether first frames of the scene are drawn, see `frames_of`.
+        subject: A function that returns what has these episodes, with its verb.
+        remedy: What to do about it.
+    """
+    if in_scene:
+        drawn = episodes.loc[order_of_first_frames(episodes, count_groups(count))[:count], "group_id"]
+        groups = drawn.nunique()
+    else:
+        groups = min(count, episodes["group_id"].nunique())
+    _check_number(groups, subject, remedy)
+
+
+def _check_number(groups: int, subject: Callable[[], str], remedy: str) -> None:
     if groups < LEAST_GROUPS:
         has = f"{subject()} frames of {counted(groups, 'group')}"
         raise UsageError(f"{has}; a diagnosis needs at least {LEAST_GROUPS}. {remedy}")
+
+
+def _check_groups(frames: Sequence[Frame], subject: Callable[[], str], remedy: str) -> None:
+    _check_number(len({frame.group for frame in frames}), subject, remedy)
 
 
 def _read(frame: Frame, paraphrases: Mapping[str, str]) -> Frame:
@@ -203,23 +221,34 @@ def _read(frame: Frame, paraphrases: Mapping[str, str]) -> Frame:
 
 
 def _observed(session: FrameSession, count: int) -> Iterator[Frame]:
-    """Yield frames of recordings or of an environment, spread over groups and episodes.
+    """Yield frames of recordings or of an environment, see `spread_over_groups`."""
+    index = session.frames.index
+    yield from (index[at] for at in spread_over_groups([frame.group for frame in index], count))
 
-    One frame of every group comes in turn.
+
+def spread_over_groups(groups_of_frames: Sequence[str], count: int) -> list[int]:
+    """Return the positions of up to `count` frames, spread over groups and episodes.
+
+    One frame of every group comes in turn. Frames that are drawn from those alone that were drawn before are the
+    same, in the same order.
+
+    Args:
+        groups_of_frames: The group of every frame.
+        count: Largest number of frames.
     """
-    by_group: dict[str, list[Frame]] = {}
-    for frame in session.frames.index:
-        by_group.setdefault(frame.group, []).append(frame)
+    by_group: dict[str, list[int]] = {}
+    for at, group in enumerate(groups_of_frames):
+        by_group.setdefault(group, []).append(at)
     groups = list(by_group.values())
     # Data sets are often sorted by task: the first episodes alone would hold one instruction.
     drawn = np.linspace(0, len(groups) - 1, min(count, len(groups))).round().astype(int)
     turns = -(-count // len(drawn))
     spread = [_spread(groups[group], turns, number * GOLDEN % 1) for number, group in enumerate(drawn)]
     in_turn = [frame for turn in zip_longest(*spread) for frame in turn if frame is not None]
-    yield from in_turn[:count]
+    return in_turn[:count]
 
 
-def _spread(frames: list[Frame], turns: int, phase: float) -> list[Frame]:
+def _spread(frames: list[int], turns: int, phase: float) -> list[int]:
     """Return up to `turns` frames of a group at equal distances.
 
     Args:

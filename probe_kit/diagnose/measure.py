@@ -12,10 +12,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.diagnose.importance import ActionScale, Exchanges, compare_with_base, importance_of
-from probe_kit.diagnose.inputs import controls_of, inputs_of, spread_of_states, values_of
+from probe_kit.diagnose.inputs import controls_of, inputs_of, spread_of_states
 from probe_kit.diagnose.results import InputDiagnosis, check_names
 from probe_kit.errors import InstructionError, UsageError
-from probe_kit.extract.sources.inputs import Frame, blank_of, draw_donors, with_input
+from probe_kit.extract.sources.inputs import (
+    BEYOND,
+    GIVE_WORDS,
+    INSTRUCTION,
+    STATE,
+    Frame,
+    InputComparison,
+    blank_of,
+    content_of,
+    describe_spellings,
+    draw_donors,
+    with_input,
+)
 from probe_kit.hashing import derive_seed
 
 if TYPE_CHECKING:
@@ -59,13 +71,16 @@ class InputExchange:
         frames: The frames between which inputs are exchanged.
         seed: Seed of the draw of donors.
         table: Pairs (frame, donor) of the user's own in order; empty for drawn ones.
+        words: Further instructions that donors hold, beside those of the frames.
     """
 
     infer: Infer
     frames: Sequence[Frame]
     seed: int = 0
     table: Sequence[tuple[int, int]] = ()
+    words: Sequence[str] = ()
     _exchanges: dict[str, Exchanges] = field(default_factory=dict, repr=False)
+    _comparisons: dict[str, InputComparison] = field(default_factory=dict, repr=False)
 
     def measure(
         self, names: Sequence[str] = (), *, absent: Collection[str] = (), camera: str = ""
@@ -93,7 +108,7 @@ class InputExchange:
             base: Infers with the base checkpoint.
             inputs: Results of `measure` of this object.
         """
-        other = InputExchange(base, self.frames, self.seed, self.table)
+        other = InputExchange(base, self.frames, self.seed, self.table, self.words)
         compared = []
         for diagnosed in inputs:
             comparison = None
@@ -108,20 +123,31 @@ class InputExchange:
         """Return the pairs (frame, donor) of an input: from the table, or drawn by `draw_donors`.
 
         Every call returns the same pairs. Donors of a frame hold different values of the input, as far as there
-        are so many.
+        are so many. A donor is an index of `candidates`.
         """
-        values = self._values(name)
+        compared, candidates = self._compared(name), self.candidates(name)
         if self.table:
-            return [(index, donor) for index, donor in self.table if values[index] != values[donor]]
+            return [(index, donor) for index, donor in self.table if compared.differ(index, donor)]
+        values = compared.values(len(candidates))
         # A seed per input, so that the donors of one do not depend on which others are measured.
         rng, pairs = np.random.default_rng(derive_seed(self.seed, "donors", name)), []
-        drawn = draw_donors(self.frames, name, rng, len(self.frames))
+        drawn = draw_donors(candidates, name, rng, len(candidates), range(len(self.frames)), compared)
         for index, of_frame in groupby(drawn, key=itemgetter(0)):
             donors = [donor for _, donor in of_frame]
             distinct = [donors[at] for at in np.sort(np.unique(values[donors], return_index=True)[1])]
             repeated = [donor for donor in donors if donor not in distinct]
             pairs += [(index, donor) for donor in [*distinct, *repeated][:DONORS]]
         return pairs
+
+    def candidates(self, name: str) -> Sequence[Frame]:
+        """Return the frames among which donors are drawn: all, and of the instruction those with other words."""
+        if name != INSTRUCTION or not self.words:
+            return self.frames
+        return self._with_words
+
+    @cached_property
+    def _with_words(self) -> Sequence[Frame]:
+        return [*self.frames, *(frame.with_instruction(text) for text in self.words for frame in self.frames)]
 
     def first_donors(self, name: str) -> list[tuple[int, int]]:
         """Return one donor per frame of an input, of those that `donors` draws."""
@@ -150,13 +176,16 @@ class InputExchange:
         Raises:
             UsageError: If all actions are equal.
         """
-        other = self.infer(self.observations, [derive_seed(seed, "other") for seed in self._seeds])
-        scale = ActionScale.of(np.concatenate([self.clean, other]))
+        scale = ActionScale.of(np.concatenate([self.clean, self._with_other_seeds]))
         if not scale.varies.any():
             raise UsageError(
                 f"all {2 * len(self.frames)} actions are equal, whatever is seen; give frames that differ"
             )
         return scale
+
+    @cached_property
+    def _with_other_seeds(self) -> Actions:
+        return self.infer(self.observations, [derive_seed(seed, "other") for seed in self._seeds])
 
     @cached_property
     def _blank(self) -> "Observation":
@@ -175,21 +204,36 @@ class InputExchange:
     def _seeds(self) -> list[int]:
         return [frame.seed for frame in self.frames]
 
-    def _values(self, name: str) -> NDArray[np.intp]:
-        return values_of(self.observations, name)
+    def _compared(self, name: str) -> InputComparison:
+        if name not in self._comparisons:
+            self._comparisons[name] = InputComparison.of(self.candidates(name), name)
+        return self._comparisons[name]
+
+    def _why_not_varied(self, name: str) -> str:
+        """Return why no pair differs in an input, and what to do."""
+        frames = self.frames
+        values = self._compared(name).values(len(frames))
+        if np.unique(values).size > 1:
+            of = "pair of the table holds" if self.table else "two groups of frames hold"
+            return f"no {of} different values"
+        if name != INSTRUCTION:
+            exact = len({content_of(observation, name) for observation in self.observations}) == 1
+            than = "moves it" if name == STATE else "changes it"
+            near = "" if exact else f": they differ by less than {BEYOND:g} times what the control {than}"
+            return f"all {len(frames)} frames hold one value{near}"
+        spelt = "; ".join(describe_spellings(frame.instruction for frame in frames))
+        return f"all {len(frames)} frames hold one value{f': {spelt}' if spelt else ''}. {GIVE_WORDS}"
 
     def _measure(self, name: str) -> InputDiagnosis:
         frames, observations, clean, scale = self.frames, self.observations, self.clean, self.scale
-        values = self._values(name)
-        if np.unique(values).size == 1:
-            return InputDiagnosis(name, "not varied", f"all {len(frames)} frames hold one value")
         pairs = self.donors(name)
         if not pairs:
-            of = "pair of the table holds" if self.table else "two groups of frames hold"
-            return InputDiagnosis(name, "not varied", f"no {of} different values")
+            return InputDiagnosis(name, "not varied", self._why_not_varied(name))
         rows = np.array([index for index, _ in pairs])
         seeds = [frames[index].seed for index in rows]
-        donors = [observations[donor] for _, donor in pairs]
+        candidates = self.candidates(name)
+        values = self._compared(name).values(len(candidates))
+        donors = [candidates[donor].observation for _, donor in pairs]
         varied = [with_input(observations[index], name, donor) for index, donor in zip(rows, donors, strict=True)]
         exchanged, every = self.infer(varied, seeds), self.infer(donors, seeds)
         control = self._controlled(name)
@@ -203,6 +247,7 @@ class InputExchange:
             repeated=_repeated(rows, values[[donor for _, donor in pairs]]),
             largest=np.abs(exchanged - clean[rows]).max(axis=(1, 2)),
             blanked=np.abs(blanked - clean[: len(blanked)]).max(axis=(1, 2), initial=0.0),
+            seeded=scale.shares(self._with_other_seeds, clean)[rows],
         )
         return importance_of(name, self._exchanges[name])
 

@@ -1,9 +1,10 @@
 """The page of a diagnosis: its table, its sentences, and a figure from the layers to the action."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from probe_kit.diagnose.results import diagnosis_table, sentences
+from probe_kit.diagnose.results import diagnosis_table
 from probe_kit.retention.displays.display import footer, legend_above, panels, plain, series
 
 if TYPE_CHECKING:
@@ -62,11 +63,13 @@ def write_page(diagnosis: "Diagnosis", file: Path) -> None:
 
     from probe_kit.retention.displays.shown_figure import picture_of
 
-    items = Markup("").join(Markup("<li>{}</li>").format(line) for line in sentences(diagnosis))
-    parts = [_HEAD.format(title=escape(f"Inputs of {diagnosis.label}")), diagnosis_table(diagnosis)._repr_html_()]
+    table = diagnosis_table(diagnosis)
+    items = Markup("").join(Markup("<li>{}</li>").format(line) for line in table.notes)
+    parts = [_HEAD.format(title=escape(table.title)), replace(table, title="", notes=())._repr_html_()]
     parts.append(Markup("<ul>{}</ul>").format(items))
     if any(diagnosed.passage for diagnosed in diagnosis.inputs):
         content, size = picture_of(draw_passage(diagnosis))
         image = '<img alt="sites on the way to the action" width={} src="data:image/png;base64,{}">'
         parts.append(Markup(image).format(size["width"], b64encode(content).decode()))
+    file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text("".join(map(str, parts)), encoding="utf-8")

@@ -1,16 +1,19 @@
 """The results of a diagnosis, input by input: as they are stored, their table and sentences. Loads no model."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from math import isfinite, nan
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BeforeValidator, PlainSerializer
 
+from probe_kit._system.counting import counted
 from probe_kit._tables.numbers import p_text, whole_percent, with_limits
 from probe_kit._tables.table import Cell, Heading, Table
 from probe_kit.errors import UsageError
+from probe_kit.intervene.exchange import describe_seed, does_seed_decide
+from probe_kit.intervene.further_instructions import hash_of_instructions
 
 if TYPE_CHECKING:
     from pydantic import TypeAdapter
@@ -36,11 +39,6 @@ Verdict = Literal["decides", "moves", "no effect", "open", "does not arrive", "n
 MATTERS: tuple[Verdict, ...] = ("decides", "moves")
 IDLE: tuple[Verdict, ...] = ("no effect", "does not arrive")
 """Verdicts that an input does not matter; `open` is none of them."""
-INPUTS_DECIDE = 0.25
-"""Share of the variance of the actions below which the seed decides and no input does.
-
-It applies to the change by all inputs together. A choice: half of the spread, which is a quarter of the variance.
-"""
 CARRIES = 0.5
 """Share of the change of the action from which a site counts as carrying an input."""
 LIKE_NONE = 1e-6
@@ -120,6 +118,7 @@ class InputDiagnosis:
         passage: The sites in the order of the network.
         note: Reason why there are no sites.
         base: The same input in the base checkpoint; None without one.
+        seed: The index of another seed; NaN where it was not measured.
     """
 
     name: str
@@ -137,6 +136,7 @@ class InputDiagnosis:
     passage: tuple[SitePassage, ...] = ()
     note: str = ""
     base: BaseComparison | None = None
+    seed: Number = nan
 
     @property
     def arrives(self) -> bool:
@@ -263,6 +263,11 @@ class Diagnosis:
         n_groups: Number of groups of those frames.
         base: The checkpoint that it is compared with; empty for none.
         knowledge: The knowledge of a target; None for none.
+        weights_sha256: Hash of the weights that were diagnosed.
+        checkpoint: The checkpoint of these weights, as its card names it.
+        random_weights: Whether they are of an untrained network.
+        source: The suite, data set or environment of the frames.
+        settings: Everything that decides the numbers, of which the key is the hash.
     """
 
     key: str
@@ -272,6 +277,11 @@ class Diagnosis:
     inputs: tuple[InputDiagnosis, ...]
     base: str = ""
     knowledge: Knowledge | None = None
+    weights_sha256: str = ""
+    checkpoint: str = ""
+    random_weights: bool = False
+    source: str = ""
+    settings: Mapping[str, Any] = field(default_factory=dict)
 
     def exit_code(self, required: Sequence[str] = ()) -> int:
         """Return 0 if every required input arrives and matters, else 1; see `exit_code`."""
@@ -361,7 +371,34 @@ def diagnosis_table(diagnosis: "Diagnosis") -> Table:
     title = f"Inputs of {diagnosis.label}: {diagnosis.n_frames} frames of {diagnosis.n_groups} groups"
     title += f"; base {diagnosis.base}" * bool(diagnosis.base)
     numbers = tuple(diagnosis.to_json()["inputs"])
-    return Table.of(title, headings, rows, notes=sentences(diagnosis), numbers=numbers)
+    notes = [*sentences(diagnosis), *describe_origin(diagnosis)]
+    return Table.of(title, headings, rows, notes=notes, numbers=numbers)
+
+
+def describe_origin(diagnosis: "Diagnosis") -> list[str]:
+    """Return sentences on the weights, the checkpoint, the source and the settings of a diagnosis."""
+    if not diagnosis.weights_sha256:
+        return []
+    settings = diagnosis.settings
+    random = " (random weights)" * diagnosis.random_weights
+    base = settings.get("base")
+    parts = [
+        f"inputs {', '.join(settings['inputs'])}" if settings.get("inputs") else "all inputs",
+        "sites patched" if settings.get("inside") else "no site patched",
+        *([f"{len(settings['pairs'])} pairs of a table"] if settings.get("pairs") else []),
+        *([f"paraphrases of {len(settings['paraphrases'])} texts"] if settings.get("paraphrases") else []),
+        *(_words_of(settings["instructions"]) if settings.get("instructions") else []),
+        f"seed {settings.get('seed', 0)}",
+    ]
+    return [
+        f"weights {diagnosis.weights_sha256[:12]} of checkpoint {diagnosis.checkpoint}{random}"
+        + (f"; base {diagnosis.base} with weights {base[:12]}." if base else "."),
+        f"source {diagnosis.source}; settings: {', '.join(parts)}; key {diagnosis.key}.",
+    ]
+
+
+def _words_of(instructions: Sequence[str]) -> list[str]:
+    return [f"{counted(len(instructions), 'further instruction')} (sha256 {hash_of_instructions(instructions)})"]
 
 
 def _row(diagnosed: "InputDiagnosis", headings: Sequence[Heading]) -> Sequence[Cell]:
@@ -392,9 +429,12 @@ def _row(diagnosed: "InputDiagnosis", headings: Sequence[Heading]) -> Sequence[C
 def sentences(diagnosis: "Diagnosis") -> list[str]:
     """Return a sentence per input, one if the seed decides more than the inputs, and one about the target."""
     lines = [sentence(diagnosed) for diagnosed in diagnosis.inputs]
-    together = max((diagnosed.every for diagnosed in diagnosis.inputs if diagnosed.matters is not None), default=1)
-    if together < INPUTS_DECIDE:
-        lines.append(f"all inputs together change {whole_percent(together)} % of the action: the seed decides it.")
+    tested = [diagnosed for diagnosed in diagnosis.inputs if diagnosed.matters is not None]
+    most = max(tested, key=lambda diagnosed: diagnosed.every, default=None)
+    if most is not None and does_seed_decide(most.every, most.seed):
+        lines.append(f"{describe_seed(most.every)}.")
+    if not tested:
+        lines.append("no input varies between these frames, so that nothing was tested.")
     if diagnosis.knowledge is not None:
         decided = any(diagnosed.verdict == "decides" for diagnosed in diagnosis.inputs)
         lines.append(diagnosis.knowledge.describe(decided))

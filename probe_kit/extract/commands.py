@@ -18,6 +18,8 @@ from probe_kit.extract.settings import AskSettings, ExtractSettings
 from probe_kit.extract.sources.scene import SceneOptions
 
 if TYPE_CHECKING:
+    from rich.text import Text
+
     from probe_kit.extract import Extraction
     from probe_kit.extract.settings import Settings
     from probe_kit.runs import Run
@@ -184,6 +186,13 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
         if value:
             table.add_row(marked("[dim]{}[/]", name), value)
     err.print(table)
+    for note in extraction.source.content_notes():
+        err.print(content_warning(note))
+
+
+def content_warning(note: str) -> "Text":
+    """Return a sentence about an input without content as a line of a terminal."""
+    return marked("[yellow]without content:[/] {}; scores of its probes are no evidence", note)
 
 
 def _weights(extraction: "Extraction") -> str:
@@ -234,7 +243,9 @@ def print_sufficiency(extraction: "Extraction") -> None:
     if suite is None:
         groups = len({row.columns["group_id"] for row in plan.episodes})
         if groups < GROUPS_FOR_PROBES:
-            say(marked("[yellow]{} {}; probes need {} or more[/]", groups, source.groups, GROUPS_FOR_PROBES))
+            more = source.smaller_groups(plan.episodes) if len(plan.episodes) >= GROUPS_FOR_PROBES else ""
+            few = f"{groups} {source.groups}; probes need {GROUPS_FOR_PROBES} or more" + f". {more}" * bool(more)
+            say(marked("[yellow]{}[/]", few))
         return
     scored = not extraction.identity().get("capture_only")
     table = Table(show_header=False, title=f"enough for ({Smallest.of(suite).words})", box=None)
@@ -272,22 +283,25 @@ def _next_command(run: "Run") -> str:
 
 
 def print_input_notes(run: "Run") -> None:
-    """Print which inputs did not change the first output, in yellow."""
+    """Print which inputs have no content, and which did not change the first output, in yellow."""
     from probe_kit.runs.provenance import input_notes
+    from probe_kit.runs.run_inputs import notes_of_content
 
+    for note in notes_of_content(run):
+        say(content_warning(note))
     for note in input_notes(run.certificate):
         say(marked("[yellow]{}; [bold]probe-kit diagnose {}[/] says where it is lost[/]", note, run.location))
 
 
 def _print_outcomes(run: "Run") -> None:
-    from probe_kit.runs.layout import AT_END, ONCE
+    from probe_kit.runs.environment_success import EnvironmentSuccess
 
     counts = run.episodes["outcome"].value_counts()
     text = ", ".join(f"{name} {count}" for name, count in counts.items())
     text = "captured without acting" if run.capture_only else text
     say(f"{counted(len(run.episodes), 'episode')}: {text}")
-    if ONCE in run.episodes and (lost := int((run.episodes[ONCE] & ~run.episodes[AT_END]).sum())):
-        say(f"{lost} of them had success before their end only; see the columns {ONCE} and {AT_END}")
+    if (success := EnvironmentSuccess.of(run.episodes)) is not None:
+        say(marked("[yellow]{}[/]" if success.stopped else "{}", success.sentence))
     print_input_notes(run)
     say(marked("next: [bold]{}[/]", _next_command(run)))
     out.print(str(run.location), soft_wrap=True)

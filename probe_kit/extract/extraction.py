@@ -30,11 +30,11 @@ from probe_kit.extract.sources.source import Source, raise_together
 from probe_kit.hashing import canonical_json, sha256_json
 from probe_kit.hooks.registry import find_family, get_family
 from probe_kit.runs.commits import failure_key
-from probe_kit.runs.layout import RUN_FILE, StoredStream
+from probe_kit.runs.layout import GROUP_FILE, RUN_FILE, StoredStream
 from probe_kit.runs.plan import Plan, Row, further_rows
 from probe_kit.runs.provenance import provenance_here
 from probe_kit.runs.root import find_continuable, label_run
-from probe_kit.runs.run import Run, open_run
+from probe_kit.runs.run import Run
 from probe_kit.runs.run_folders import check_if_full
 from probe_kit.runs.store import Location, check_exclusive, locate
 from probe_kit.runs.verify import seal
@@ -46,6 +46,8 @@ if TYPE_CHECKING:
 
 CheckCameras = Callable[[Sequence[str]], object]
 """A function that gets the names of the model's cameras that get a picture, and raises UsageError."""
+ChooseRows = Callable[[Sequence[Row]], Sequence[Row]]
+"""A function that returns some of the rows that a source has, or raises UsageError."""
 Progress = Callable[[int, int, str], None]
 # If this many episodes were given up and none succeeded, something is wrong with all of them.
 HOPELESS = 3
@@ -64,6 +66,7 @@ class Extraction:
         calibration: The measurement that chose the batch; None if it was not requested or is left to workers.
         declared: The origin of the sizes of the streams, where no model was loaded and the run has no name yet.
             Empty where a model was loaded.
+        row_ids: The ids of the planned rows, where only some of the source's are planned; else None.
     """
 
     settings: Settings
@@ -73,6 +76,7 @@ class Extraction:
     controller: Controller | None
     calibration: Calibration | None = None
     declared: str = ""
+    row_ids: tuple[str, ...] | None = None
 
     def identity(self) -> dict[str, Any]:
         """Return everything that decides the numbers of an episode, without selection, machine and label.
@@ -139,7 +143,7 @@ class Extraction:
                 check_if_full(space_needed(addition, self.settings), location)
             writer = self.writer(location)
             with writer.owned():
-                check_exclusive(location, RUN_FILE)
+                check_exclusive(location, GROUP_FILE, writer.root.stored_metadata[GROUP_FILE])
                 if self.settings.label is not None:
                     label_run(location, run_label(self.settings))
                 remaining = writer.remaining()
@@ -147,7 +151,7 @@ class Extraction:
                     writer.begin(self.settings.machine.allow_mixed)
                     self._play(writer, remaining, progress or notebook_progress("episodes"))
                 seal(location)
-        return open_run(location)
+            return writer.opened()
 
     def further_plan(self, location: Location) -> Plan:
         """Return the plan of the episodes that the run at `location` does not plan yet; all if there is none.
@@ -189,6 +193,7 @@ def load(
     model: "Model | None" = None,
     fetch: bool = True,
     check_cameras: CheckCameras | None = None,
+    choose_rows: ChooseRows | None = None,
 ) -> Extraction:
     """Open the source, load the model and plan the rows.
 
@@ -202,6 +207,7 @@ def load(
             GPU. A family that declares none is loaded.
         check_cameras: Called once the cameras are known, before weights are loaded where the checkpoint's files
             name them, and again with those of the loaded model.
+        choose_rows: Called before weights are loaded; only the rows that it returns are planned. None for all.
 
     Raises:
         UsageError: For a policy of another family or with other weights than the settings name.
@@ -215,7 +221,7 @@ def load(
     """
     settings, source = open_checked(settings, location, model is not None, fetch)
     task = task_of(settings)
-    rows = task.rows(settings, source)
+    rows = _select_rows(task.rows(settings, source), choose_rows)
     if not rehearsed:
         source.rehearse(rows)
     if model is not None:
@@ -231,15 +237,33 @@ def load(
         card = {"model": requested.family, "random_weights": requested.random_weights, "weights_sha256": None}
         declared = {"dtype": requested.dtype, "execute": settings.task.execute}
         card |= {name: value for name, value in declared.items() if value is not None}
-        return Extraction(settings, source, plan, card, None, declared=sizes.source)
+        return Extraction(settings, source, plan, card, None, None, sizes.source, _ids(rows, choose_rows))
     settings, source, controller, calibration = task.fit(
         settings, source, task.load(settings) if model is None else model
     )
     if check_cameras is not None and (cameras := source.shown_cameras()) is not None:
         check_cameras(cameras)
-    rows = task.rows(settings, source)  # of the source as the model is shown it
+    rows = _select_rows(task.rows(settings, source), choose_rows)  # of the source as the model is shown it
     plan = _plan(settings, source, rows, controller.streams, controller.execute)
-    return Extraction(settings, source, plan, controller.identity, controller, calibration)
+    row_ids = _ids(rows, choose_rows)
+    return Extraction(settings, source, plan, controller.identity, controller, calibration, row_ids=row_ids)
+
+
+def _select_rows(rows: tuple[Row, ...], choose: ChooseRows | None) -> tuple[Row, ...]:
+    """Return the chosen rows, numbered anew in their order; all without a choice."""
+    if choose is None:
+        return rows
+    return tuple(replace(row, index=number) for number, row in enumerate(choose(rows)))
+
+
+def _ids(rows: Sequence[Row], choose: ChooseRows | None) -> tuple[str, ...] | None:
+    return None if choose is None else tuple(row.episode_id for row in rows)
+
+
+def _rows_of(ids: Sequence[str], rows: Sequence[Row]) -> list[Row]:
+    """Return the rows with these ids, in their order."""
+    by_id = {row.episode_id: row for row in rows}
+    return [by_id[name] for name in ids]
 
 
 def open_checked(
@@ -412,7 +436,7 @@ def play(prepared: Extraction, writer: RunWriter, numbers: list[int]) -> Generat
     queue = TaskQueue(((number, number) for number in numbers), "episode")
     settings = prepared.settings
     if settings.machine.ray or settings.machine.workers:
-        events = work_off(_pool(settings, writer.location.address), queue)
+        events = work_off(_pool(prepared, writer.location.address), queue)
     else:
         events = _played_here(prepared, writer, queue, len(numbers))
     for slot, event in events:
@@ -426,7 +450,9 @@ def play(prepared: Extraction, writer: RunWriter, numbers: list[int]) -> Generat
 
 
 def play_episodes(
-    setup: tuple[Settings, str], take: Callable[[], int | None], report: Callable[[Event], None]
+    setup: tuple[Settings, str, tuple[str, ...] | None],
+    take: Callable[[], int | None],
+    report: Callable[[Event], None],
 ) -> None:
     """Do the work of a worker elsewhere: load the model, then play the episodes that are handed out.
 
@@ -435,8 +461,8 @@ def play_episodes(
     Raises:
         SettingsMismatchError: If this machine has other settings or gives other numbers than those before it.
     """
-    settings, run = setup
-    prepared = load(settings, rehearsed=True)
+    settings, run, row_ids = setup
+    prepared = load(settings, rehearsed=True, choose_rows=None if row_ids is None else partial(_rows_of, row_ids))
     writer = prepared.writer(locate(run))
     with writer.joined():
         writer.begin(settings.machine.allow_mixed)
@@ -454,15 +480,17 @@ def _played_here(
             yield from ((0, event) for event in worker.run(lambda: queue.take(0)))
 
 
-def _pool(settings: Settings, run: str) -> Pool:
+def _pool(prepared: Extraction, run: str) -> Pool:
+    settings = prepared.settings
+    setup = settings, run, prepared.row_ids
     if settings.machine.ray:
-        return RayPool(play_episodes, (settings, run), settings.machine.ray, partial(_gpus, settings))
+        return RayPool(play_episodes, setup, settings.machine.ray, partial(_gpus, settings))
     share = partial(share_of_machine, size=settings.machine.workers, device=settings.machine.device)
     limit = settings.machine.inference_limit
     exits = {
         -SIGALRM: f"was ended, because a call of its model took longer than --inference-limit {limit:g} s"
     } if limit is not None else None  # fmt: skip
-    return ProcessPool(play_episodes, (settings, run), settings.machine.workers, share, exits)
+    return ProcessPool(play_episodes, setup, settings.machine.workers, share, exits)
 
 
 def _gpus(settings: Settings, resources: Mapping[str, Any]) -> list[int]:
@@ -491,6 +519,7 @@ def prepare(
     model: "Model | None" = None,
     fetch: bool = True,
     check_cameras: CheckCameras | None = None,
+    choose_rows: ChooseRows | None = None,
 ) -> Extraction:
     """Find the suite, load the model and plan the episodes. Raises as `load`.
 
@@ -502,6 +531,7 @@ def prepare(
         fetch: False plans with the streams that the family declares, without weights, network or GPU; such an
             extraction cannot be run.
         check_cameras: Called with the cameras that get a picture, see `load`.
+        choose_rows: Returns the rows that are planned, see `load`.
 
     Raises:
         UnknownModelError: For an unknown family.
@@ -510,7 +540,9 @@ def prepare(
         WeightsError: For weights that do not fit.
     """
     location = None if out is None else locate(out)
-    load_with = partial(load, location=location, model=model, fetch=fetch, check_cameras=check_cameras)
+    load_with = partial(
+        load, location=location, model=model, fetch=fetch, check_cameras=check_cameras, choose_rows=choose_rows
+    )
     if not settings.machine.elsewhere:
         return load_with(settings)
     # This process only plans: the GPUs belong to the workers, and each of them calibrates on its own device.

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -51,7 +52,7 @@ def models(
         return
     rows = _model_rows(name)
     if as_json:
-        print_json(rows)
+        print_json([_row_json(row) for row in rows])
         return
     if name is None:
         out.print(_listed(rows))
@@ -168,6 +169,20 @@ def _model_rows(name: str | None) -> list[dict[str, Any]]:
     return rows
 
 
+def _row_json(row: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a model's row with the numbers of its streams and weights in place of their words."""
+    from probe_kit.extract.sizes import weights_bytes_needed
+    from probe_kit.hooks.registry import own_families
+
+    family = own_families().get(row["model"])
+    numbers: dict[str, Any] = {} if family is None else {
+        "streams": family.streams_json(), "weights": weights_bytes_needed(family.name),
+    }  # fmt: skip
+    # A family that declares no shapes, as an embedded one, says them in words alone.
+    words = {} if numbers.get("streams") or not row["streams"] else {"streams_in_words": row["streams"]}
+    return {**row, "streams": {}, "weights": {}, **numbers, **words}
+
+
 # -- runs --------------------------------------------------------------------------------------------------------
 
 
@@ -189,7 +204,7 @@ def verify(
     from probe_kit.runs import seal, verify_run
 
     if build:
-        say("sealed" if seal(run) else "nothing to seal")
+        say("sealed" if seal(run, deep=True) else "nothing to seal")
     audit = verify_run(run, deep)
     if as_json:
         print_json({**asdict(audit), "ok": audit.ok, "finished": audit.finished})
@@ -318,6 +333,7 @@ def show_dataset(
     """  # noqa: D301 - click reads the \b
     from rich.table import Table
 
+    from probe_kit.extract.commands import content_warning
     from probe_kit.extract.extraction import load
     from probe_kit.extract.sources.recording_source import RecordingSource
 
@@ -338,6 +354,8 @@ def show_dataset(
     for name, value in facts.items():
         table.add_row(name, marked("{}", terminal_safe(value)))
     out.print(table)
+    for note in recording.content_notes():
+        out.print(content_warning(note), soft_wrap=True)
     if model is not None:
         recording.check_recorded_units(policy, settings.machine.accept_units)
 
@@ -348,12 +366,23 @@ def check_environment(
         typer.Argument(metavar="MODULE:CLASS", help="Your environment, or lerobot:TYPE such as lerobot:libero."),
     ],
     env_options: EnvOptions = None,
+    rotate: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--rotate", metavar="[CAMERA=]DEGREES", help="Rotate pictures, as extract does with the same option."
+        ),
+    ] = None,
+    picture: Annotated[
+        Path | None,
+        typer.Option("--picture", metavar="FILE", help="Write the first picture of every camera, side by side."),
+    ] = None,
     as_json: common.AsJson = False,
 ) -> None:
     """Check an environment of your own against its contract, without a model.
 
-    Two episodes of five actions are played, twice. Each check is one line: passed or failed, and the promise that
-    is checked. A failure says what was seen and what was expected.
+    Two episodes of five actions are played, twice, and once in another process. Each check is one line: passed or
+    failed, and the promise that is checked. A failure says what was seen and what was expected. Look at the file
+    of --picture: where it stands on its head, give --rotate 180 here and to extract.
 
     Example: `probe-kit check-environment kitchen:Kitchen`
 
@@ -361,16 +390,20 @@ def check_environment(
     """
     from probe_kit.extract import EnvSource
     from probe_kit.extract import check_environment as checks_of
+    from probe_kit.extract.sources.environment_check import STEPS
 
-    source = EnvSource(environment, options=env_options or ())
+    source = EnvSource(environment, options=env_options or (), rotations=rotate or ())
     checks = []
-    for check in checks_of(source):
+    for check in checks_of(source, picture):
         checks.append(check)
         if not as_json:
             state, colour = ("passed", "green") if check.passed else ("failed", "bold red")
             out.print(marked(f"[{colour}]{{}}[/] {{}}", f"{state:8}", check.sentence), soft_wrap=True)
-            if check.problem:
-                out.print(marked("         [dim]seen[/] {}", terminal_safe(check.problem)), soft_wrap=True)
+            if evidence := check.problem or check.facts:
+                out.print(marked("         [dim]seen[/] {}", terminal_safe(evidence)), soft_wrap=True)
+            for note in check.notes:
+                moved = f", with {STEPS} small actions per episode"
+                out.print(marked("         [yellow]without content[/] {}", note + moved), soft_wrap=True)
     failed = sum(not check.passed for check in checks)
     if as_json:
         listed = [{**asdict(check), "passed": check.passed} for check in checks]
@@ -379,5 +412,10 @@ def check_environment(
         out.print(f"{len(checks) - failed} passed, {failed} failed")
     else:
         out.print(f"{len(checks)} passed")
-        say(marked("next: [bold]probe-kit extract --model NAME --env {}[/] --out runs/own", environment))
+        options = [
+            *(f"--env-option {quote(text)}" for text in env_options or ()),
+            *(f"--rotate {turn}" for turn in rotate or ()),
+        ]
+        command = " ".join(["probe-kit extract --model NAME --env", environment, *options, "--out runs/own"])
+        say(marked("next: [bold]{}[/]", command))
     raise typer.Exit(FAILED if failed else 0)

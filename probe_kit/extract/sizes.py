@@ -147,6 +147,23 @@ def _parameters(
     return None if outline is None or outline.model is None else outline.model.card.parameters
 
 
+def weights_bytes_needed(model: str) -> dict[str, Any]:
+    """Return the bytes of a released model's weights in memory by dtype, and of its download.
+
+    Empty for a model that declares no size; see `weights_needed`. A download that no index counts is missing.
+    """
+    from probe_kit.hooks.registry import get_family
+
+    family = get_family(model)
+    if family is None or family.weights_bytes({}) is None:
+        return {}
+    names = DTYPES[:1] if family.always_float32 else DTYPES
+    count = _parameters(family, None, {}, None)
+    fetched = 0 if family.is_here(None, {}) else family.bytes_to_fetch(None, {})
+    download = {} if fetched is None else {"download_bytes": fetched}
+    return {"memory_bytes": {name: family.memory_bytes({}, name, count) for name in names}, **download}
+
+
 def weights_needed(
     model: str,
     checkpoint: str | None,

@@ -315,6 +315,11 @@ class Family:
         text = ", ".join(map(str, declared)) or self.streams
         return f"{text} ({size})" if size else text
 
+    def streams_json(self) -> dict[str, dict[str, int]]:
+        """Return the shapes of the streams of the default size by name; empty for a family that declares none."""
+        declared = next(iter(self.declared.values()), ())
+        return {part.stream.name: {**part.stream.shape_json(), "tokens": part.tokens} for part in declared}
+
     def weights_bytes(
         self, options: Mapping[str, Any], dtype: Dtype = "float32", parameters: int | None = None
     ) -> int | None:

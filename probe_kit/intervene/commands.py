@@ -3,7 +3,7 @@
 The meaning of an option for a kind is in the kind's file.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -32,6 +32,7 @@ from probe_kit.suite.categories import category_of
 if TYPE_CHECKING:
     import pandas as pd
 
+    from probe_kit.hooks.contract.sites import Stream
     from probe_kit.intervene.kinds.base import Intervention
     from probe_kit.intervene.results import InterventionResult
     from probe_kit.intervene.sessions import ReplaySource
@@ -109,7 +110,7 @@ Coefficients = Annotated[
         "--coefficients",
         parser=Numbers.parse,
         metavar="1,2,…",
-        help="Coefficients, comma-separated, in half class-mean differences.",
+        help="Coefficients, comma-separated: half class-mean differences, or lengths of a file's vector.",
     ),
 ]
 TargetSide = Annotated[
@@ -133,6 +134,15 @@ PairTable = Annotated[
         "--pairs",
         metavar="FILE",
         help="Table of pairs of your own, with the columns episode, frame, donor_episode, donor_frame.",
+    ),
+]
+Instructions = Annotated[
+    Path | None,
+    _pairs_option(
+        "--instructions",
+        metavar="FILE",
+        help="Words of other tasks, where the data set has one task: a line each, or a table with a column "
+        "instruction.",
     ),
 ]
 ReadoutName = Annotated[
@@ -194,6 +204,7 @@ def intervene(
     vary: Vary = None,
     frames: FramesEach = None,
     pairs: PairTable = None,
+    instructions: Instructions = None,
     wording: common.Wording = None,
     device: common.Device = "cpu",
     style: Format = "table",
@@ -209,6 +220,7 @@ def intervene(
     probe-kit intervene runs/mine --kind interchange --sites "backbone.*"
     """  # noqa: D301 - click reads the \b
     from probe_kit.intervene import ReplaySource
+    from probe_kit.intervene.further_instructions import read_instructions
     from probe_kit.intervene.pairs import read_pairs
     from probe_kit.runs import open_run
 
@@ -216,6 +228,7 @@ def intervene(
     of_every_kind: dict[str, Any] = {
         "categories": categories, "items": items, "readout": readout, "vary": vary or "", "frames": frames,
         "pairs": () if pairs is None else read_pairs(pairs),
+        "instructions": () if instructions is None else read_instructions(instructions),
     }  # fmt: skip
     inside: dict[str, Any] = {
         "sites": sites, "roles": roles, "direction": direction, "controls": controls,
@@ -231,9 +244,10 @@ def intervene(
     result = _run(opened, intervention, source)
     print_result(result, style, details)
     if style == "table":
-        following = "retention {}[/]  use beside probes and success"
-        following = following if result.outcomes.has_sides else "run show {}[/]  what the run stores"
-        say(marked(f"next: [bold]probe-kit {following}", run))
+        has_sides = result.outcomes.has_sides
+        following = f"retention {run}" if has_sides else f"run show {run}"
+        what = "use beside probes and success" if has_sides else "what the run stores"
+        say(marked("next: [bold]probe-kit {}[/]  {}", following, what))
     say(marked("stored as {}", result.key))
 
 
@@ -387,8 +401,8 @@ def show(
     from probe_kit.intervene.inventory import listed_interventions
     from probe_kit.runs import label_run, open_run
     from probe_kit.runs.layout import INTERVENTIONS
-    from probe_kit.runs.provenance import input_notes
     from probe_kit.runs.results import unfinished_bundles
+    from probe_kit.runs.run_inputs import notes_of_inputs
     from probe_kit.train.commands import facts_table
     from probe_kit.train.results.inventory import inventory
     from probe_kit.train.results.store import how_to_probe
@@ -403,12 +417,14 @@ def show(
     opened = open_run(run, allow_partial=True)
     facts, interventions = inventory(opened), listed_interventions(opened)
     unfinished = unfinished_bundles(opened.location, INTERVENTIONS)
-    notes = input_notes(opened.certificate) if facts.episodes else []
+    notes = notes_of_inputs(opened) if facts.episodes else []
     if as_json:
         listed = [asdict(intervention) for intervention in interventions]
         print_json(
             {
                 **asdict(facts),
+                "success": None if facts.success is None else facts.success.to_json(),
+                "streams": {name: _shape(stream, opened.views(name)) for name, stream in opened.streams.items()},
                 "interventions": listed,
                 "unfinished_interventions": unfinished,
                 "input_notes": notes,
@@ -426,6 +442,11 @@ def show(
     if not facts.probes:
         why = f". {how_to_probe(opened)}" if facts.streams else ": a policy without streams has none"
         out.print(f"no probes{why}", soft_wrap=True)
+
+
+def _shape(stream: "Stream", views: Sequence[str]) -> dict[str, Any]:
+    """Return the numbers of a stream that a run stores, and the names of its views."""
+    return {**stream.shape_json(), "views": list(views)}
 
 
 def _show_action_errors(run: str, partial: bool, as_json: bool) -> None:

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._tables.numbers import whole_percent
 from probe_kit.statistics.bootstrap import draw_groups, units_seed
 from probe_kit.statistics.paired_tests import max_t, paired_greater_p
 from probe_kit.statistics.significance import SIGNIFICANCE
@@ -18,6 +19,47 @@ CARRIES, NOTHING = 0.5, 0.1
 
 Both are choices. The second is `SMALLEST_SHARE_OF_INTEREST` of the image swap.
 """
+INPUTS_DECIDE = 0.25
+"""Share of the variance of the actions below which the seed decides and no input does.
+
+It applies to the change by all inputs together. A choice: half of the spread, which is a quarter of the variance.
+"""
+TRACE = 0.01
+"""Share of the variance below which an effect does not matter: a tenth of the actions' spread, squared."""
+
+
+def share_of_variance(size: Values) -> Values:
+    """Return the share of the actions' variance of changes (E,) in root mean squares of spreads.
+
+    It is half the mean squared change, by Jansen's estimator (Computer Physics Communications 117, 1999): two
+    actions that have nothing in common differ by twice the variance.
+    """
+    return np.asarray(size, np.float64) ** 2 / 2
+
+
+def does_seed_decide(every: float, seed: float = np.nan) -> bool:
+    """Return whether all inputs together change so small a share of the variance that none of them decides.
+
+    Donors that are near their frames change little in a policy without noise as well, where no seed decides.
+
+    Args:
+        every: Share of the variance that all inputs together change.
+        seed: Share of the variance that another seed changes; NaN where that was not measured.
+    """
+    return every < INPUTS_DECIDE and not seed < every
+
+
+def describe_seed(every: float) -> str:
+    """Return a sentence, without its stop, on actions that all inputs together hardly change."""
+    return f"all inputs together change {whole_percent(every)} % of the action: the seed decides it"
+
+
+def describe_trace(exchange: str, share: float) -> str:
+    """Return a sentence, without its stop, on an exchange of inputs that changes less than `TRACE`."""
+    return (
+        f"the {exchange} changes {100 * share:.1g} % of the action's variance, less than "
+        f"{whole_percent(TRACE)} %: shares of it are shares of next to nothing"
+    )
 
 
 class SwapShare(NamedTuple):

@@ -21,8 +21,11 @@ from probe_kit.extract.sources.inputs import (
     PICTURE,
     STATE,
     Frame,
+    InputComparison,
     draw_donors,
     hardly_changed,
+    normal_form,
+    why_not_varied,
     with_input,
 )
 from probe_kit.hashing import derive_seed
@@ -75,20 +78,29 @@ class Frames:
 
     @cached_property
     def by_name(self) -> dict[tuple[str, int], Frame]:
-        """The frames by number and episode, or item: a table of pairs may name either."""
+        """The frames by number and episode, item or recorded episode: a table of pairs may name any of them."""
         # Episodes come last, so that a name which is both is an episode's.
-        names = {(frame.item, frame.number): frame for frame in self.index}
+        sources = self.run.episodes["source_episode"].tolist() if self.run.recorded else []
+        names = {(str(sources[frame.row]), frame.number): frame for frame in self.index if sources}
+        names |= {(frame.item, frame.number): frame for frame in self.index}
         return names | {(frame.episode, frame.number): frame for frame in self.index}
 
-    def check_varied(self, vary: str) -> None:
-        """Refuse an input that the frames do not have, such as a mistyped camera.
+    def check_varied(self, vary: str, task_words: Sequence[str] = ()) -> None:
+        """Refuse an input that the frames do not have, such as a mistyped camera, and a single instruction.
+
+        Args:
+            vary: The input.
+            task_words: Words of other tasks.
 
         Raises:
-            UsageError: For an input that the frames do not have.
+            UsageError: For an input that the frames do not have, or an instruction that they all share.
         """
         inputs = (INSTRUCTION, PICTURE, *(f"{PICTURE}.{name}" for name in self.cameras), STATE)
         if vary not in inputs:
             raise UsageError(f"vary is {vary!r}; expected one of {', '.join(inputs)}")
+        instructions = [frame.instruction for frame in self.index]
+        if vary == INSTRUCTION and not task_words and len(set(map(normal_form, instructions))) == 1:
+            raise UsageError(why_not_varied(instructions, vary))
 
     def observe(self, frame: Frame) -> Observation:
         """Show a frame.
@@ -157,6 +169,10 @@ evidence.
 """
 
 
+REWORDED = 100
+"""The most frames that donors with further instructions are made of: each text with pictures of many groups."""
+
+
 class FrameSession(ReplaySession):
     """A policy and frames of recordings, or first observations of an environment.
 
@@ -182,12 +198,14 @@ class FrameSession(ReplaySession):
         self.frames = frames
         self.vary, self.frames_each = PICTURE, FRAMES
         self.table: tuple[PairRow, ...] = ()
+        self.instructions: tuple[str, ...] = ()
         self.items: Sequence[str] = tuple(dict.fromkeys(frame.item for frame in frames.index))
         self._ends: dict[tuple[int, int, str], tuple[Chunk, NDArray[np.float64]]] = {}
         self._spread = _state_spread(frames.index)
         if choice is not None:
             self.vary, self.frames_each = choice.varied, choice.frames or FRAMES
             self.table, self.items = choice.pairs, choice.items_in(run)
+            self.instructions = choice.instructions
             self._check_vary()
 
     def close(self) -> None:
@@ -222,15 +240,33 @@ class FrameSession(ReplaySession):
         """Return frames of an item with the donor of each: of the table, or drawn."""
         if self.table:
             return [(frame, donor) for frame, donor in self._tabled if frame.item == item]
-        index = self.frames.index
-        rows = [at for at, frame in enumerate(index) if frame.item == item]
+        index = self._candidates
+        rows = [at for at, frame in enumerate(self.frames.index) if frame.item == item]
         spaced = np.linspace(0, len(rows) - 1, min(self.frames_each, len(rows))).round().astype(int)
         donors = []
         for row in (rows[at] for at in np.unique(spaced)):
             # A draw of its own for every frame: items are replayed one by one, and resumed at any of them.
             rng = np.random.default_rng(derive_seed("donor", self.vary, index[row].name))
-            donors += [(index[row], index[donor]) for _, donor in draw_donors(index, self.vary, rng, of=[row])]
+            drawn = draw_donors(index, self.vary, rng, of=[row], compared=self._compared())
+            donors += [(index[row], index[donor]) for _, donor in drawn]
         return donors
+
+    @cached_property
+    def _candidates(self) -> list[Frame]:
+        """All frames, and behind them some with every further instruction, which are donors alone."""
+        index = self.frames.index
+        if self.vary != INSTRUCTION or not self.instructions:
+            return index
+        spaced = np.unique(np.linspace(0, len(index) - 1, min(REWORDED, len(index))).round().astype(int))
+        return [*index, *(index[at].with_instruction(text) for text in self.instructions for at in spaced)]
+
+    def _compared(self) -> InputComparison | None:
+        """Return the comparison of instructions, once; that of pictures would keep all of a data set."""
+        return self._compared_instructions if self.vary == INSTRUCTION else None
+
+    @cached_property
+    def _compared_instructions(self) -> InputComparison:
+        return InputComparison.of(self._candidates, INSTRUCTION)
 
     @cached_property
     def _tabled(self) -> list[tuple[Frame, Frame]]:
@@ -245,10 +281,7 @@ class FrameSession(ReplaySession):
             UsageError: If no frame of another group varies the input.
         """
         if not any(self._donors(item) for item in self.items):
-            raise UsageError(
-                f"no frame of another group has another {self.vary}; extract more episodes, or choose another "
-                "--vary"
-            )
+            raise UsageError(why_not_varied([frame.instruction for frame in self.frames.index], self.vary))
 
     # -- actions and readout -----------------------------------------------------------------------------
 

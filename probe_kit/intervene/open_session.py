@@ -3,8 +3,9 @@
 from collections.abc import Collection, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from probe_kit._system.table_cells import similar_name
 from probe_kit.errors import SettingsMismatchError, UsageError
 from probe_kit.hooks.checkpoints.checkpoint import cached_folder, pinned_commits
 from probe_kit.hooks.contract.card import EMBEDDED
@@ -29,13 +30,7 @@ def load_policy_of(run: Run, source: ReplaySource) -> "Policy":
     from probe_kit.hooks import load_policy
 
     origin = origin_of(run)
-    checkpoint = source.checkpoint or None
-    if checkpoint is None:
-        # Where the run had it, if its folder, or its commit of the hub, is here: none is fetched.
-        before = origin.checkpoint
-        is_folder = before not in ("", EMBEDDED) and Path(before).expanduser().is_dir()
-        checkpoint = before if is_folder or cached_folder(before) is not None else None
-    options = {name: value for name, value in origin.options.items() if checkpoint is None or name != SIZE}
+    checkpoint, options = checkpoint_of(run, source)
     # Branches of its vision-language model or tokenizer may have gone on since the run was made.
     with pinned_commits(origin.repositories):
         return load_policy(
@@ -45,8 +40,31 @@ def load_policy_of(run: Run, source: ReplaySource) -> "Policy":
             run.settings["dtype"],
             origin.random_weights,
             origin.weights_seed if source.weights_seed is None else source.weights_seed,
-            **{**options, **source.options},
+            **options,
         )
+
+
+def checkpoint_of(run: Run, source: ReplaySource) -> tuple[str | None, dict[str, Any]]:
+    """Return the checkpoint of a run's policy on this machine, None for its family's own, and the options."""
+    origin = origin_of(run)
+    checkpoint = source.checkpoint or None
+    if checkpoint is None:
+        # Where the run had it, if its folder, or its commit of the hub, is here: none is fetched.
+        before = origin.checkpoint
+        is_folder = before not in ("", EMBEDDED) and Path(before).expanduser().is_dir()
+        checkpoint = before if is_folder or cached_folder(before) is not None else None
+    options = {name: value for name, value in origin.options.items() if checkpoint is None or name != SIZE}
+    return checkpoint, {**options, **source.options}
+
+
+def check_readable(run: Run, source: ReplaySource, instructions: Sequence[str]) -> None:
+    """Raise InstructionError for further instructions that the policy cannot read in full; no weights are read."""
+    from probe_kit.hooks.registry import get_family
+
+    if instructions and (family := get_family(run.model)) is not None:
+        checkpoint, options = checkpoint_of(run, source)
+        family.check_words(instructions, checkpoint)
+        family.check_instructions(checkpoint, instructions, options, fetch=False)
 
 
 def check_policy(run: Run, policy: "Policy") -> None:
@@ -88,7 +106,8 @@ def check_pairs(table: Sequence[PairRow], frames: Collection[tuple[str, int]]) -
             numbers = sorted(frame for name, frame in frames if name == episode)
             first = next(iter(frames), ("none", 0))[0]
             some = ", ".join(map(str, numbers[:MOST_FRAMES])) + ", …" * (len(numbers) > MOST_FRAMES)
-            its = f"of that episode {some}" if numbers else f"episodes such as {first!r}"
+            similar = similar_name(episode, dict.fromkeys(name for name, _ in frames))
+            its = f"of that episode {some}" if numbers else f"episodes such as {similar or first!r}"
             raise UsageError(
                 f"the run has no frame {number} of {episode!r}, which the table of pairs names; it has {its}"
             )
@@ -100,6 +119,7 @@ def open_session(
     load: LoadPolicy | None = None,
     choice: Choice | None = None,
     table: Sequence[PairRow] = (),
+    instructions: Sequence[str] = (),
 ) -> ReplaySession:
     """Load the run's policy and set up its observations.
 
@@ -110,9 +130,11 @@ def open_session(
         choice: Settings that choose pairs of a run without sides; None for the defaults.
         table: Pairs of the user's own; empty for those of the choice. The frames that it names are looked up
             before the policy is loaded.
+        instructions: Words of other tasks, which the policy must be able to read; empty for those of the choice.
 
     Raises:
         UsageError: For a table with a frame that the run lacks.
+        InstructionError: For instructions that the policy cannot read in full.
         SettingsMismatchError: For another policy than the run's.
         SuiteError: For another suite.
         SuiteNotFoundError: For a suite that is neither given nor can be drawn again.
@@ -123,6 +145,7 @@ def open_session(
         return (load or load_policy_of)(run, source)
 
     table = table or (() if choice is None else choice.pairs)
+    check_readable(run, source, instructions or (() if choice is None else choice.instructions))
     with ExitStack() as on_failure:
         session: ReplaySession
         if has_sides(run):
@@ -134,7 +157,7 @@ def open_session(
             on_failure.callback(frames.close)
             check_pairs(table, frames.by_name)
             if choice is not None:
-                frames.check_varied(choice.varied)
+                frames.check_varied(choice.varied, choice.instructions)
             session = FrameSession(run, policy().with_cameras(list(frames.cameras)), frames, choice)
         check_policy(run, session.policy)
         on_failure.pop_all()

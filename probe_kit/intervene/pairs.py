@@ -82,6 +82,9 @@ PAIR_COLUMNS = ("episode", "frame", "donor_episode", "donor_frame")
 def read_pairs(path: Path) -> tuple[PairRow, ...]:
     """Return the rows of a table with the columns episode, frame, donor_episode, donor_frame.
 
+    Names of episodes are texts as they are written. A recorded episode may be called by its number; only
+    the run can tell that from a name such as `007`.
+
     Raises:
         UsageError: For a table without one of the columns, without a row, or with a frame that is no number.
     """
@@ -91,13 +94,11 @@ def read_pairs(path: Path) -> tuple[PairRow, ...]:
     rows = []
     for line, cells in table.rows(PAIR_COLUMNS):
         for column in PAIR_COLUMNS[1::2]:
-            if not (text := cells[column] or "").isdecimal():
+            if not ((text := cells[column] or "").isascii() and text.isdecimal()):
                 raise UsageError(
                     f"{table.where(line, column)} is {text!r}; expected the number of a frame, from 0"
                 )
         clean, frame, donor, donor_frame = (cells[name] or "" for name in PAIR_COLUMNS)
-        # A recorded episode may be called by its number.
-        clean, donor = (f"episode-{int(name):06d}" if name.isdecimal() else name for name in (clean, donor))
         rows.append((clean, int(frame), donor, int(donor_frame)))
     if not rows:
         raise UsageError(f"{path} names no pair; expected a line per pair")

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit.hashing import derive_seed
 from probe_kit.hooks.capturing.edits import LOG_FIELDS, EditLog
 from probe_kit.hooks.contract.sites import Site
-from probe_kit.intervene.outcomes import CLEAN, CONTROL_INPUT, DONOR, IMAGE_SWAP, ConditionOutcomes
+from probe_kit.intervene.outcomes import CLEAN, CONTROL_INPUT, DONOR, IMAGE_SWAP, NOISE, ConditionOutcomes
 from probe_kit.intervene.pairs import Chunk, Given, Pair
 from probe_kit.intervene.patching.patch import Cell, patched
 from probe_kit.intervene.tokens import PairTokens
@@ -109,6 +110,15 @@ DONOR_RUN = _of_input(DONOR, "donor")
 """Condition of the donor's inference: all inputs are its own."""
 CONTROL_RUN = _of_input(CONTROL_INPUT, "control")
 """Condition of the clean inference after a meaningless change of the varied input."""
+
+
+def _resample_noise(context: ConditionContext) -> ConditionResult:
+    """Infer with noise drawn anew; the same action again where a policy draws none."""
+    return ConditionResult(context.session.act(context.pair.clean, derive_seed(context.pair.seed, NOISE, 0)))
+
+
+NOISE_RUN = Condition(NOISE, _resample_noise)
+"""Condition of the clean inference with another seed."""
 
 
 def patched_run(

@@ -14,10 +14,11 @@ from probe_kit._system.counting import counted
 from probe_kit._system.escaping import csv_of_frame
 from probe_kit.errors import NoProbesError
 from probe_kit.intervene.evidence import StoredEvidence, which_layer
+from probe_kit.intervene.exchange import TRACE, describe_trace, share_of_variance
 from probe_kit.intervene.kinds import kind_of
 from probe_kit.intervene.kinds.base import Intervention, frame_of
 from probe_kit.intervene.kinds.image_swap import ImageSwapEffect
-from probe_kit.intervene.outcomes import ConditionOutcomes, Effect
+from probe_kit.intervene.outcomes import DONOR, IMAGE_SWAP, ConditionOutcomes, Effect
 from probe_kit.intervene.places import unread_note
 from probe_kit.intervene.settings import PER_STEP, key_of
 from probe_kit.intervene.stored import (
@@ -97,7 +98,7 @@ class InterventionResult(Measurement):
         if passed := certificate.get("passed_over", {}):
             reason = next(iter(passed.values()))
             notes.append(f"passed over, because an answer has no direction there: {', '.join(passed)} ({reason}).")
-        tests = () if self._kind.is_descriptive else (*self._few_groups(), *self._one_step())
+        tests = () if self._kind.is_descriptive else (*self._few_groups(), *self._trace(), *self._one_step())
         return *notes, *tests, *self._kind.notes(self.effects)
 
     def _few_groups(self) -> list[str]:
@@ -108,6 +109,16 @@ class InterventionResult(Measurement):
             for category, count in counts.items()
             if smallest_flip_p(count) >= SIGNIFICANCE
         ]
+
+    def _trace(self) -> list[str]:
+        """Return a note where the exchange, of which effects are shares, changes next to nothing."""
+        outcomes = self.outcomes
+        # Swaps of an input play all of the donor's inputs as well, and have their own floor.
+        is_part = IMAGE_SWAP in outcomes.conditions and DONOR not in outcomes.conditions
+        if outcomes.has_sides or outcomes.size is None or not is_part:
+            return []
+        share = float(share_of_variance(outcomes.size[outcomes.conditions.index(IMAGE_SWAP)]).mean())
+        return [f"{describe_trace(self.exchange, share)}."] if share < TRACE else []
 
     def _one_step(self) -> list[str]:
         if not self.outcomes.has_sides:

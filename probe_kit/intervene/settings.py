@@ -12,7 +12,7 @@ from probe_kit.runs.reader import SIDE
 from probe_kit.runs.run import Run
 
 FORMAT = 2  # raise when stored numbers would be others; with the settings it is hashed into the key
-DONORS = 2  # the rule of `draw_donors`; raise when it gives other donors
+DONORS = 3  # the rule of `draw_donors`; raise when it gives other donors
 FIRST_CHUNK: Readout = "first-chunk"
 PER_STEP: Readout = "per-step"
 
@@ -38,6 +38,7 @@ class Choice:
     vary: str = ""
     frames: int | None = None
     pairs: tuple[PairRow, ...] = ()
+    instructions: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.items is not None and self.items < 1:
@@ -104,6 +105,7 @@ def settings_of(intervention: Choice, run: Run) -> dict[str, Any]:
         pairs = {"vary": intervention.varied, "frames": intervention.frames}
         pairs["pairs"] = [list(row) for row in intervention.pairs]
         pairs |= {} if intervention.pairs else {"donors": DONORS}
+        pairs |= {"instructions": list(intervention.instructions)} if intervention.instructions else {}
     return {
         "format": FORMAT,
         "kind": intervention.kind,

@@ -34,7 +34,7 @@ from probe_kit.intervene.outcomes import (
 from probe_kit.intervene.settings import FIRST_CHUNK, FORMAT, PER_STEP, key_of
 from probe_kit.runs.layout import INTERVENTIONS
 from probe_kit.runs.reader import RunReader, full_name
-from probe_kit.runs.results import HEAD, Bundle, advice_for, complete_key, fields_problem, read_bundles
+from probe_kit.runs.results import Bundle, advice_for, complete_key, fields_problem, is_complete, read_bundles
 from probe_kit.runs.store import Location
 
 EPISODES, EFFECTS, CERTIFICATE = "episodes.npz", "effects.csv", "certificate.json"
@@ -161,7 +161,7 @@ class Measurement:
 
 def is_stored(run: Location, key: str) -> bool:
     """Whether the run has complete results with this key."""
-    return run.exists(f"{INTERVENTIONS}/{key}/{HEAD}")
+    return is_complete(run, INTERVENTIONS, key)
 
 
 def read_interventions(run: Location) -> dict[str, Bundle]:

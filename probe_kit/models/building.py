@@ -12,6 +12,8 @@ import torch
 from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
+from probe_kit.errors import CheckpointError
+
 _SIZES_ONLY = ContextVar("sizes_only", default=False)
 
 
@@ -169,14 +171,27 @@ def fill_decoder_rotary(decoder: Any) -> None:
     decoder.rotary_emb = type(decoder.rotary_emb)(config=decoder.config)
 
 
+_VISION_THETA = 10000.0
+"""The base of the rotary frequencies in the vision towers of Qwen, a constant of the installed transformers."""
+
+
 def fill_rotary(vlm: Any) -> None:
     """Compute the rotary frequencies of a `Qwen…VLForConditionalGeneration`; see `fill_decoder_rotary`.
 
     Tied output weights are tied again.
+
+    Raises:
+        CheckpointError: For a tower with other frequencies, which newer transformers than the installed one read.
     """
     fill_decoder_rotary(vlm.model.language_model)
     visual = vlm.model.visual
     vision = vlm.config.vision_config
+    stored = (getattr(vision, "rope_parameters", None) or {}).get("rope_theta", _VISION_THETA)
+    if stored != _VISION_THETA:
+        raise CheckpointError(
+            f"the configuration has rope_theta {stored} in vision_config.rope_parameters; the installed "
+            f"transformers runs this tower with {_VISION_THETA:g} alone. Take a checkpoint with that"
+        )
     visual.rotary_pos_emb = type(visual.rotary_pos_emb)(vision.hidden_size // vision.num_heads // 2)
     vlm.tie_weights()
 

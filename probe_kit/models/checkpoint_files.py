@@ -1,23 +1,35 @@
 """Small files of checkpoints: names of tensors, processors, statistics. Importing them loads no torch."""
 
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from probe_kit._system.bounded_files import load_json, read_json_object
-from probe_kit.errors import CheckpointError, UsageError
+from probe_kit._system.bounded_files import read_json_object
+from probe_kit.errors import CheckpointError, UsageError, WeightsError
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 Renames = tuple[tuple[str, str], ...]
 """Patterns and replacements, applied in this order."""
 
 LANGUAGE_FIRST: Renames = (
-    (r"^language_model\.lm_head\.", "lm_head."),
-    (r"^language_model\.model\.", "model.language_model."),
-    (r"^(vision_tower|multi_modal_projector)\.", r"model.\1."),
+    (r"^(?:model\.)?language_model\.lm_head\.", "lm_head."),
+    (r"^(?:model\.)?language_model\.(?:model\.)?", "model.language_model."),
+    (r"^(?:model\.)?(vision_tower|multi_modal_projector)\.", r"model.\1."),
 )
-"""Renames for files that hold a whole language model; files saved by today's transformers stay as they are."""
+"""Renames of a vision-language model with a whole language model inside.
+
+Released files call its layers `language_model.model.…`, transformers 5.5 saves `model.language_model.model.…`, and
+a module has `model.language_model.…`.
+"""
+
+SIGLIP_TOWER: Renames = (
+    (r"(^|\.)vision_tower\.(?=(?:embeddings|encoder|post_layernorm|head)\.)", r"\1vision_tower.vision_model."),
+)
+"""Renames of a SigLIP tower inside a network: newer transformers than the installed one have one level less."""
 
 
 def renamed(name: str, renames: Sequence[tuple[str, str]]) -> str:
@@ -27,42 +39,151 @@ def renamed(name: str, renames: Sequence[tuple[str, str]]) -> str:
     return name
 
 
-# -- processors -----------------------------------------------------------------------------------------------
+def renamed_tensors(
+    tensors: "Mapping[str, Tensor]", name_in_module: Callable[[str], str], source: str = "the checkpoint"
+) -> "dict[str, Tensor]":
+    """Return the tensors of a file under the names of the module.
 
-PROCESSOR_FILE = "preprocessor_config.json"
-
-
-def processor_settings(folder: Path, needed: Sequence[str], optional: Sequence[str] = ()) -> dict[str, Any]:
-    """Return the named values of `preprocessor_config.json` in `folder`; `optional` ones only where they are set.
+    Args:
+        tensors: The content of the file.
+        name_in_module: The module's name of a tensor in the file.
+        source: The name of the file, for messages.
 
     Raises:
-        CheckpointError: If the file is missing, is not JSON or lacks a needed value.
+        WeightsError: For two tensors of one name with different numbers: a folder into which two layouts were
+            saved.
     """
-    file = folder / PROCESSOR_FILE
-    if not file.is_file():
+    stored_names: dict[str, str] = {}
+    for name, tensor in tensors.items():
+        other = stored_names.setdefault(name_in_module(name), name)
+        if other is not name and not _are_equal(tensor, tensors[other]):
+            raise WeightsError(
+                f"weights in {source}: {other} and {name} are two names of one tensor, and hold different "
+                "numbers. Two models were saved into one folder: save the one that is meant into a new folder"
+            )
+    return {module_name: tensors[name] for module_name, name in stored_names.items()}
+
+
+def _are_equal(tensor: "Tensor", other: "Tensor") -> bool:
+    return tensor.dtype == other.dtype and tensor.equal(other)
+
+
+# -- processors -----------------------------------------------------------------------------------------------
+
+PROCESSOR_FILE, PICTURES_FILE = "processor_config.json", "preprocessor_config.json"
+PICTURES = "image_processor"
+"""The part of a processor's file that says how pictures are prepared."""
+_NAMING = ("processor_class", "image_processor_type", "feature_extractor_type", "auto_map", "_processor_class")
+
+
+class PictureValues(NamedTuple):
+    """What a checkpoint says about the preparation of pictures.
+
+    Attributes:
+        values: The settings by name.
+        source: The file that has them, and its part, for messages.
+    """
+
+    values: dict[str, Any]
+    source: str
+
+
+_SAVE_AGAIN = "Save the processor of the training there, with its save_pretrained, or download the file again"
+
+
+def processor_files(folder: Path) -> dict[str, dict[str, Any]]:
+    """Return what the files of a processor in `folder` say, by their names for messages.
+
+    The part for pictures comes first, then the file that it is in, then the file of pictures alone.
+
+    Raises:
+        CheckpointError: For a file that cannot be read.
+    """
+    files = {}
+    for name in (PROCESSOR_FILE, PICTURES_FILE):
+        if (file := folder / name).is_file():
+            files[str(file)] = values = read_json_object(file, CheckpointError, _SAVE_AGAIN)
+            pictures = values.get(PICTURES) if name == PROCESSOR_FILE else None
+            if pictures is not None and not isinstance(pictures, dict):
+                raise CheckpointError(f"{file} has {PICTURES} {pictures!r}; expected named values. {_SAVE_AGAIN}")
+            files = {f"{file} ({PICTURES})": pictures, **files} if pictures is not None else files
+    return files
+
+
+def _picture_sources(folder: Path) -> list[PictureValues]:
+    """Return what files of `folder` say about pictures; the first one counts."""
+    names = (f"{folder / PROCESSOR_FILE} ({PICTURES})", str(folder / PICTURES_FILE))
+    files = processor_files(folder)
+    return [PictureValues(files[name], name) for name in names if name in files]
+
+
+def picture_values(folders: Path | Sequence[Path]) -> PictureValues | None:
+    """Return what the first of `folders` with such a file says about pictures; None where none has one.
+
+    transformers 5 saves one file, `processor_config.json` with a part `image_processor`; before, pictures had
+    `preprocessor_config.json`. Where a folder has both, the part counts, as in transformers.
+
+    Raises:
+        CheckpointError: For a file that cannot be read.
+    """
+    for folder in (folders,) if isinstance(folders, Path) else folders:
+        if sources := _picture_sources(folder):
+            return sources[0]
+    return None
+
+
+def describe_picture_conflict(folder: Path) -> str:
+    """Return which settings of pictures two files of a folder give different values; empty where they agree.
+
+    Where an adapter is joined with its base, the adapter's file counts and the base's is no conflict.
+
+    Raises:
+        CheckpointError: For a file that cannot be read.
+    """
+    sources = _picture_sources(folder)
+    origins = {(folder / name).resolve().parent for name in (PROCESSOR_FILE, PICTURES_FILE)}
+    if len(sources) < len((PROCESSOR_FILE, PICTURES_FILE)) or len(origins) > 1:
+        return ""
+    inside, apart = sources
+    both = sorted((inside.values.keys() & apart.values.keys()) - {*_NAMING})
+    if not (different := [name for name in both if inside.values[name] != apart.values[name]]):
+        return ""
+    return (
+        f"pictures are prepared as {PICTURES} in {PROCESSOR_FILE} says, as in transformers; {PICTURES_FILE} "
+        f"beside it has another {', '.join(different)}"
+    )
+
+
+def processor_settings(folder: Path, needed: Sequence[str], optional: Sequence[str] = ()) -> PictureValues:
+    """Return the named settings of pictures in `folder`; `optional` ones only where they are set.
+
+    Raises:
+        CheckpointError: If no file has them, one cannot be read, or a needed value is missing.
+    """
+    stored = picture_values(folder)
+    if stored is None:
         raise CheckpointError(
-            f"{file} is missing; it defines how pictures are prepared for this checkpoint. "
-            "Copy it from the model's page"
+            f"{folder / PICTURES_FILE} is missing, and so is {PICTURES} in {PROCESSOR_FILE}; one of the two "
+            "defines how pictures are prepared for this checkpoint. Save the processor that it was trained with "
+            "there, with its save_pretrained; the base's file is right only if training prepared pictures alike"
         )
-    try:
-        values = load_json(file)
-    except ValueError as error:
-        raise CheckpointError(f"{file} is not JSON ({error}); download the checkpoint again") from error
-    if not isinstance(values, dict) or (missing := [name for name in needed if values.get(name) is None]):
-        raise CheckpointError(f"{file} lacks {', '.join(missing) if isinstance(values, dict) else 'named values'}")
-    return {name: values[name] for name in (*needed, *optional) if values.get(name) is not None}
+    values = stored.values
+    if missing := [name for name in needed if values.get(name) is None]:
+        raise CheckpointError(f"{stored.source} lacks {', '.join(missing)}. {_SAVE_AGAIN}")
+    named = {name: values[name] for name in (*needed, *optional) if values.get(name) is not None}
+    return PictureValues(named, stored.source)
 
 
-def square_side(values: dict[str, Any], folder: Path) -> int:
+def square_side(settings: PictureValues) -> int:
     """Return the side in pixels of the square that `size` names.
 
     Raises:
         CheckpointError: If it names none.
     """
-    size = values["size"]
+    size = settings.values["size"]
     height, width = (size.get(side) if isinstance(size, dict) else size for side in ("height", "width"))
     if not isinstance(height, int) or height != width:
-        raise CheckpointError(f"{folder / PROCESSOR_FILE} has size {size}; expected a square of so many pixels")
+        raise CheckpointError(f"{settings.source} has size {size}; expected a square of so many pixels")
     return height
 
 

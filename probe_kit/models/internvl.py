@@ -72,7 +72,7 @@ class TiledPictures:
 
     @classmethod
     def from_folder(cls, folder: Path, side: int, tiled: bool = True) -> "TiledPictures":
-        """Read `preprocessor_config.json`.
+        """Read the settings of pictures; see `picture_values`.
 
         Args:
             folder: Folder of the checkpoint.
@@ -82,10 +82,12 @@ class TiledPictures:
         Raises:
             CheckpointError: If the file is missing, lacks a value, or makes tiles of another side.
         """
-        values = processor_settings(folder, _NEEDED, _OPTIONAL)
-        if (stored_side := square_side(values, folder)) != side:
-            raise CheckpointError(f"{folder} makes tiles of {stored_side} pixels; config.json expects {side}")
-        return cls(values, tiled)
+        stored = processor_settings(folder, _NEEDED, _OPTIONAL)
+        if (stored_side := square_side(stored)) != side:
+            raise CheckpointError(
+                f"{stored.source} makes tiles of {stored_side} pixels; config.json expects {side}"
+            )
+        return cls(stored.values, tiled)
 
     @property
     def _processor(self) -> Any:

@@ -541,6 +541,9 @@ def _added_noise(steps: int) -> NDArray[np.float64]:
 
 # -- the network ----------------------------------------------------------------------------------------------
 
+VLM_PREFIX = "qwen_vl_interface.model."
+"""The beginning of the names of the vision-language model's tensors."""
+
 
 class _Qwen(nn.Module):
     def __init__(self, config: Qwen2_5_VLConfig) -> None:

@@ -35,6 +35,7 @@ from probe_kit._system.bounded_files import load_json
 from probe_kit._system.imports import require
 from probe_kit.errors import CheckpointError
 from probe_kit.models.building import build_empty, fill_decoder_rotary
+from probe_kit.models.checkpoint_files import picture_values
 from probe_kit.models.config_file import STORED_TYPE, ConfigFile, Count, Index, part
 from probe_kit.models.decoding import Choose, Decoded, PromptKV, TokenNetwork, greedy, last_logits, packed
 
@@ -171,17 +172,17 @@ class PictureSettings:
 
     @classmethod
     def of(cls, vision: VisionConfig, folder: Path) -> "PictureSettings":
-        """Read `folder/preprocessor_config.json`, or where there is none the configuration.
+        """Read the settings of pictures, see `picture_values`; without any take those of the configuration.
 
         Recorded references hold the same fields in `action_config.json`.
 
         Raises:
             CheckpointError: For a file that lacks a field.
         """
-        for name, section in (("preprocessor_config.json", None), ("action_config.json", "preprocessor")):
-            if (folder / name).is_file():
-                values = load_json(folder / name)
-                return cls.from_json(values if section is None else values.get(section, {}), str(folder / name))
+        if (stored := picture_values(folder)) is not None:
+            return cls.from_json(stored.values, stored.source)
+        if (file := folder / "action_config.json").is_file():
+            return cls.from_json(load_json(file).get("preprocessor", {}), str(file))
         return cls(vision.base, vision.crops)
 
     @classmethod

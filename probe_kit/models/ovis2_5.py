@@ -371,7 +371,7 @@ class OvisPictures:
     """The processor of pictures into patches.
 
     Attributes:
-        settings: Values of `preprocessor_config.json`.
+        settings: Values of the checkpoint's file.
         patch: Pixels of a patch's side.
         stride: Patches of a visual word's side.
     """
@@ -382,12 +382,12 @@ class OvisPictures:
 
     @classmethod
     def from_folder(cls, folder: Path, vision: VisionConfig) -> "OvisPictures":
-        """Read `preprocessor_config.json`.
+        """Read the settings of pictures; see `picture_values`.
 
         Raises:
             CheckpointError: If the file is missing or lacks a value.
         """
-        return cls(processor_settings(folder, _NEEDED), vision.patch, vision.stride)
+        return cls(processor_settings(folder, _NEEDED).values, vision.patch, vision.stride)
 
     def grid(self, height: int, width: int) -> tuple[int, int]:
         """Return the rows and columns of patches of a picture of that size.

@@ -1,6 +1,5 @@
 """The network PaliGemma as transformers implements it: construction and pictures."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,9 +13,15 @@ from transformers.models.siglip.image_processing_siglip import SiglipImageProces
 
 from probe_kit.errors import CheckpointError
 from probe_kit.models.building import build_empty, fill_decoder_rotary
-from probe_kit.models.checkpoint_files import LANGUAGE_FIRST, PROCESSOR_FILE, processor_settings, square_side
+from probe_kit.models.checkpoint_files import (
+    LANGUAGE_FIRST,
+    SIGLIP_TOWER,
+    PictureValues,
+    processor_settings,
+    square_side,
+)
 
-FILE_NAMES = LANGUAGE_FIRST
+FILE_NAMES = (*LANGUAGE_FIRST, *SIGLIP_TOWER)
 
 
 def build_paligemma(config: Any, dtype: torch.dtype, device: str = "meta") -> Any:
@@ -84,7 +89,7 @@ class SquarePictures:
 
     @classmethod
     def from_folder(cls, folder: Path, side: int) -> "SquarePictures":
-        """Read `preprocessor_config.json`.
+        """Read the settings of pictures; see `picture_values`.
 
         Args:
             folder: Folder of the checkpoint.
@@ -93,10 +98,12 @@ class SquarePictures:
         Raises:
             CheckpointError: If the file is missing, lacks a value, or makes pictures of another side.
         """
-        values = processor_settings(folder, _NEEDED, (*_OPTIONAL, CROP))
-        if (stored_side := square_side(values, folder)) != side:
-            raise CheckpointError(f"{folder} makes pictures of {stored_side} pixels; config.json expects {side}")
-        return cls({name: value for name, value in values.items() if name != CROP}, _crop(values, folder))
+        stored = processor_settings(folder, _NEEDED, (*_OPTIONAL, CROP))
+        if (stored_side := square_side(stored)) != side:
+            raise CheckpointError(
+                f"{stored.source} makes pictures of {stored_side} pixels; config.json expects {side}"
+            )
+        return cls({name: value for name, value in stored.values.items() if name != CROP}, _crop(stored))
 
     def pixels(self, pictures: list[NDArray[np.uint8]]) -> Tensor:
         """Return (H, W, 3) uint8 pictures as (B, 3, S, S) float32."""
@@ -116,13 +123,13 @@ class SquarePictures:
         return picture[top : top + max(1, height), column : column + max(1, width)]
 
 
-def _crop(values: Mapping[str, Any], folder: Path) -> tuple[float, float, float, float] | None:
+def _crop(settings: PictureValues) -> tuple[float, float, float, float] | None:
     """Return the part of the picture that is used, None for all of it.
 
     Raises:
         CheckpointError: For numbers that are no part of a picture.
     """
-    stored = values.get(CROP)
+    stored = settings.values.get(CROP)
     if stored is None:
         return None
     try:
@@ -131,7 +138,7 @@ def _crop(values: Mapping[str, Any], folder: Path) -> tuple[float, float, float,
         top = column = height = width = float("nan")
     if not (0 <= top < top + height <= 1 and 0 <= column < column + width <= 1):
         raise CheckpointError(
-            f"{folder / PROCESSOR_FILE} has {CROP} {stored}; expected top, left, height and width of the part "
+            f"{settings.source} has {CROP} {stored}; expected top, left, height and width of the part "
             "that is looked at, as shares of the picture between 0 and 1"
         )
     return top, column, height, width

@@ -25,6 +25,7 @@ from torch import Tensor, nn
 
 from probe_kit._system.bounded_files import load_json
 from probe_kit.models.building import Gate, building_device, replaced
+from probe_kit.models.checkpoint_files import SIGLIP_TOWER, renamed, renamed_tensors
 from probe_kit.models.config_file import ConfigFile, Count
 
 _VLM = "paligemma_with_expert.paligemma"
@@ -44,8 +45,13 @@ EMBEDDING = f"model.{_VLM}.model.language_model.embed_tokens.weight"
 
 
 def current_keys(tensors: Mapping[str, Tensor], names: Sequence[tuple[str, str]] = _MOVED) -> dict[str, Tensor]:
-    """Return the same tensors under the names lerobot 0.6 uses; by default those of a pi0-FAST."""
-    return {_current(name, names): tensor for name, tensor in tensors.items() if not name.startswith(STATISTICS)}
+    """Return the same tensors under the names lerobot 0.6 uses; by default those of a pi0-FAST.
+
+    Raises:
+        WeightsError: For two different tensors of one name.
+    """
+    stored = {name: tensor for name, tensor in tensors.items() if not name.startswith(STATISTICS)}
+    return renamed_tensors(stored, partial(_current, names=names))
 
 
 current_pi0_keys = partial(current_keys, names=(*_MOVED, *_TIME_OF_PI0))
@@ -53,7 +59,7 @@ current_pi05_keys = partial(current_keys, names=(*_MOVED, *_TIME_OF_PI05))
 
 
 def _current(name: str, names: Sequence[tuple[str, str]]) -> str:
-    bare = name.removeprefix("model.")
+    bare = renamed(name.removeprefix("model."), SIGLIP_TOWER)
     for old, new in names:
         if bare.startswith(old):
             return f"model.{new}{bare.removeprefix(old)}"

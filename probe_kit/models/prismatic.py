@@ -16,7 +16,7 @@ B batch, P patches, T text tokens, S = P + T positions, D width of the language 
 patches follow the first token.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -30,10 +30,10 @@ from torch import Tensor, nn
 from torchvision.transforms.v2 import InterpolationMode, functional
 from transformers import CONFIG_MAPPING, AutoModelForCausalLM
 
-from probe_kit._system.bounded_files import load_json
 from probe_kit._system.imports import require
 from probe_kit.errors import CheckpointError
 from probe_kit.models.building import build_empty, fill_decoder_rotary
+from probe_kit.models.checkpoint_files import PictureValues, picture_values
 from probe_kit.models.config_file import ConfigFile, Count, Index
 from probe_kit.models.decoding import Choose, Decoded, PromptKV, TokenNetwork, greedy
 
@@ -433,24 +433,30 @@ class PictureSettings:
     resampling: tuple[str, ...]
 
     @classmethod
-    def of(cls, config: PrismaticConfig, folder: Path) -> "PictureSettings":
-        """Read `folder/preprocessor_config.json`, or where there is none the settings of timm's towers.
+    def of(cls, config: PrismaticConfig, folders: Path | Sequence[Path]) -> "PictureSettings":
+        """Read the settings of pictures in the first of `folders` that has any; without, those of timm's towers.
 
         Raises:
             CheckpointError: For a preparation that is not known here, or that contradicts the configuration.
         """
-        file = folder / "preprocessor_config.json"
-        settings = cls._from_file(file) if file.is_file() else cls._from_timm(config)
+        stored = picture_values(folders)
+        settings = cls._from_timm(config) if stored is None else cls._from_values(stored)
+        source = "timm" if stored is None else stored.source
         unknown = {*settings.resampling} - {*_RESAMPLING} | {settings.strategy} - {*RESIZE_STRATEGIES}
         if unknown:
-            raise CheckpointError(f"{file}: pictures are prepared with {', '.join(sorted(unknown))}, unknown here")
+            raise CheckpointError(
+                f"{source}: pictures are prepared with {', '.join(sorted(unknown))}, unknown here"
+            )
         if settings.sides != (sides := tuple(tower.image_size for tower in config.towers)):
-            raise CheckpointError(f"{file} makes pictures of side {settings.sides}; config.json expects {sides}")
+            raise CheckpointError(f"{source} makes pictures of side {settings.sides}; config.json expects {sides}")
         return settings
 
     @classmethod
-    def _from_file(cls, file: Path) -> "PictureSettings":
-        values = load_json(file)
+    def _from_values(cls, stored: PictureValues) -> "PictureSettings":
+        values = stored.values
+        needed = ("image_resize_strategy", "input_sizes", "means", "stds", "interpolations")
+        if missing := [name for name in needed if values.get(name) is None]:
+            raise CheckpointError(f"{stored.source} lacks {', '.join(missing)}; it does not belong to Prismatic")
         return cls(
             values["image_resize_strategy"],
             tuple(int(size[-1]) for size in values["input_sizes"]),

@@ -25,7 +25,7 @@ from transformers.models.qwen2_vl.image_processing_qwen2_vl import Qwen2VLImageP
 
 from probe_kit.errors import CheckpointError, ObservationError
 from probe_kit.models.building import build_empty, fill_rotary
-from probe_kit.models.checkpoint_files import PROCESSOR_FILE, Renames, processor_settings
+from probe_kit.models.checkpoint_files import PictureValues, Renames, processor_settings
 
 QWEN2_5_NAMES: Renames = (
     (r"^visual\.", "model.visual."),
@@ -267,7 +267,7 @@ class QwenPictures:
     def from_folder(
         cls, folder: Path, patch: int, temporal: int, merge: int, fast: bool = False
     ) -> "QwenPictures":
-        """Read `preprocessor_config.json`.
+        """Read the settings of pictures; see `picture_values`.
 
         Args:
             folder: Folder of the checkpoint.
@@ -279,16 +279,16 @@ class QwenPictures:
         Raises:
             CheckpointError: If the file is missing, lacks a number, or was made for another network.
         """
-        values = processor_settings(folder, _NEEDED, (*_OPTIONAL, "size", "min_pixels", "max_pixels"))
-        file = folder / PROCESSOR_FILE
+        stored = processor_settings(folder, _NEEDED, (*_OPTIONAL, "size", "min_pixels", "max_pixels"))
+        values = stored.values
         stored_sizes = tuple(int(values[name]) for name in _NEEDED[:3])
         if stored_sizes != (patch, temporal, merge):
             raise CheckpointError(
-                f"{file} cuts pictures with patch_size, temporal_patch_size, merge_size {stored_sizes}; "
+                f"{stored.source} cuts pictures with patch_size, temporal_patch_size, merge_size {stored_sizes}; "
                 f"config.json expects {(patch, temporal, merge)}"
             )
         settings = {name: values[name] for name in (*_NEEDED, *_OPTIONAL) if name in values}
-        return cls({**settings, "size": _size(values, file)}, patch, merge, fast)
+        return cls({**settings, "size": _size(stored)}, patch, merge, fast)
 
     def grid(self, height: int, width: int) -> tuple[int, int]:
         """Return the rows and columns of patches of a picture of that size."""
@@ -319,11 +319,14 @@ def merged_tokens(grid: tuple[int, int], merge: int) -> int:
     return grid[0] * grid[1] // merge**2
 
 
-def _size(values: dict[str, Any], file: Path) -> dict[str, int]:
+def _size(settings: PictureValues) -> dict[str, int]:
     """Return the smallest and largest number of pixels; the older files name them apart."""
+    values = settings.values
     size = values.get("size") or {}
     low = values.get("min_pixels") or size.get("shortest_edge") or size.get("min_pixels")
     high = values.get("max_pixels") or size.get("longest_edge") or size.get("max_pixels")
     if not low or not high:
-        raise CheckpointError(f"{file} has neither size.shortest_edge and longest_edge nor min_pixels, max_pixels")
+        raise CheckpointError(
+            f"{settings.source} has neither size.shortest_edge and longest_edge nor min_pixels, max_pixels"
+        )
     return {"shortest_edge": int(low), "longest_edge": int(high)}

@@ -29,9 +29,9 @@ from transformers import (
     ZoeDepthForDepthEstimation,
 )
 
-from probe_kit._system.bounded_files import load_json
 from probe_kit.errors import CheckpointError, UsageError, WeightsError
 from probe_kit.models.building import build_empty, builds_sizes_only, fill_decoder_rotary
+from probe_kit.models.checkpoint_files import picture_values
 from probe_kit.models.config_file import STORED_TYPE, ConfigFile, Count, Index, part
 from probe_kit.models.decoding import Decoded, PromptKV, TokenNetwork, greedy
 
@@ -514,7 +514,6 @@ def full_size_spatialvla() -> SpatialVLANetwork:
 
 # -- pictures -------------------------------------------------------------------------------------------------
 
-PREPROCESSOR_FILE = "preprocessor_config.json"
 Colour = tuple[float, float, float]
 
 
@@ -538,20 +537,23 @@ class PictureSettings:
 
     @classmethod
     def of(cls, config: SpatialVLAConfig, folder: Path) -> "PictureSettings":
-        """Read `folder/preprocessor_config.json`, or where there is none take the released models' settings.
+        """Read the settings of pictures, see `picture_values`; without any take the released models'.
 
         Raises:
             CheckpointError: For a setting that contradicts the model or is not known here.
         """
-        file = folder / PREPROCESSOR_FILE
-        values = load_json(file) if file.is_file() else None
-        settings = cls(config.side) if values is None else cls._from_json(values, config.side)
+        stored = picture_values(folder)
+        if stored is None:
+            return cls(config.side)
+        settings = cls._from_json(stored.values, config.side)
         if settings.side != config.side:
             raise CheckpointError(
-                f"{file} makes pictures of side {settings.side}; config.json expects {config.side}"
+                f"{stored.source} makes pictures of side {settings.side}; config.json expects {config.side}"
             )
         if settings.resampling not in {int(resampling) for resampling in Image.Resampling}:
-            raise CheckpointError(f"{file}: resample is {settings.resampling}, which PIL does not support")
+            raise CheckpointError(
+                f"{stored.source}: resample is {settings.resampling}, which PIL does not support"
+            )
         return settings
 
     @classmethod

@@ -24,12 +24,11 @@ from torch.nn import functional
 from transformers import Qwen3VLConfig, Qwen3VLForConditionalGeneration
 from transformers.models.qwen3_vl.modeling_qwen3_vl import Qwen3VLTextRMSNorm, apply_rotary_pos_emb, repeat_kv
 
-from probe_kit._system.bounded_files import load_json
 from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.hashing import sha256_json
 from probe_kit.models.bounds import check_deviations
 from probe_kit.models.building import Gate, TimeEmbedder, build_empty, fill_rotary, without_precision
-from probe_kit.models.checkpoint_files import chosen_name
+from probe_kit.models.checkpoint_files import chosen_name, processor_files
 from probe_kit.models.config_file import STORED_TYPE, ConfigFile, Count, part
 from probe_kit.models.decoding import PromptKV
 from probe_kit.models.qwen import IMAGE, QwenInputs, qwen3_vl_config
@@ -387,7 +386,10 @@ class ActionUnits:
 
 
 def read_units(folder: Path, robot: str | None, numbers: int) -> ActionUnits:
-    """Return the statistics of one robot from `preprocessor_config.json`; without a name, of the only one.
+    """Return the statistics of one robot in a checkpoint's processor; without a name, of the only one.
+
+    They are `action_config` of `preprocessor_config.json`, or of `processor_config.json` and its part
+    `image_processor`, into which transformers 5 saves the same values.
 
     Args:
         folder: Folder of the checkpoint.
@@ -395,17 +397,11 @@ def read_units(folder: Path, robot: str | None, numbers: int) -> ActionUnits:
         numbers: Numbers per action, as config.json has it.
 
     Raises:
-        CheckpointError: If there are none or they do not fit.
+        CheckpointError: If there are none, they do not fit, or two files have different ones.
         UsageError: For an unknown robot, and for several without a choice.
     """
-    file = folder / STATISTICS_FILE
-    by_robot: Mapping[str, Any] = (load_json(file) if file.is_file() else {}).get("action_config") or {}
-    if not by_robot:
-        raise CheckpointError(
-            f"{file} has no action_config: the actions have no physical unit and no length. "
-            "Take the file that the checkpoint was released with"
-        )
-    name = _choose(robot, by_robot, str(file))
+    by_robot, file = _action_config(folder)
+    name = _choose(robot, by_robot, file)
     mean, deviation = (np.asarray(by_robot[name].get(part, []), np.float64) for part in ("mean", "std"))
     mean, deviation = (part[0] if part.ndim == 3 and len(part) == 1 else part for part in (mean, deviation))
     if mean.ndim != 2 or mean.shape != deviation.shape or mean.shape[1] != numbers:
@@ -416,6 +412,27 @@ def read_units(folder: Path, robot: str | None, numbers: int) -> ActionUnits:
         raise CheckpointError(f"{file}: the statistics of {name} are not finite")
     check_deviations(mean, deviation, f"{file}, {name}")
     return ActionUnits(name, mean, deviation)
+
+
+def _action_config(folder: Path) -> tuple[Mapping[str, Any], str]:
+    """Return the statistics by robot, and the name of the file that has them.
+
+    Raises:
+        CheckpointError: For files without any, or with different ones.
+    """
+    stored = {source: values.get("action_config") for source, values in processor_files(folder).items()}
+    places = [source for source, by_robot in stored.items() if by_robot]
+    if not places:
+        raise CheckpointError(
+            f"{folder / STATISTICS_FILE} has no action_config: the actions have no physical unit and no length. "
+            "Take the file that the checkpoint was released with"
+        )
+    if different := [place for place in places[1:] if stored[place] != stored[places[0]]]:
+        raise CheckpointError(
+            f"{places[0]} and {different[0]} have different statistics in action_config. Remove the one that does "
+            "not belong to these weights"
+        )
+    return stored[places[0]] or {}, places[0]
 
 
 def _choose(robot: str | None, by_robot: Mapping[str, Any], source: str) -> str:

@@ -16,6 +16,7 @@ from probe_kit.errors import UsageError
 from probe_kit.retention.estimators import Limits, limits
 from probe_kit.runs.layout import CAPTURE_ONLY
 from probe_kit.runs.reader import RunReader, check_several_wordings, full_name
+from probe_kit.runs.run_inputs import notes_of_content
 from probe_kit.statistics.intervals import Share
 from probe_kit.statistics.paired_tests import heads_p
 from probe_kit.statistics.significance import chance_margin
@@ -457,6 +458,15 @@ _COMPARED: Mapping[str, Callable[[ProbeSettings], str]] = {
     "seeds": lambda settings: str(settings.seed),
     "categories": lambda settings: ", ".join(settings.categories),
 }
+
+
+def without_content(runs: Sequence[RunReader]) -> list[str]:
+    """Return a sentence for every input of some runs without content, such as a black camera."""
+    return [
+        f"{run.label}: {note}. Scores of its probes are no evidence."
+        for run in runs
+        for note in notes_of_content(run)
+    ]
 
 
 def mixed_episodes(runs: Sequence[RunReader]) -> list[str]:

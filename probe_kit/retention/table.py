@@ -19,6 +19,7 @@ from probe_kit.retention.behaviour import (
     mixed_episodes,
     mixed_settings,
     scored,
+    without_content,
 )
 from probe_kit.retention.choices import Family, Iterations, Section
 from probe_kit.retention.columns.columns import averaged_fields
@@ -41,6 +42,7 @@ from probe_kit.retention.rows.build import (
     with_holm_of_targets,
 )
 from probe_kit.retention.rows.row import RetentionRow
+from probe_kit.runs.environment_success import EnvironmentSuccess
 from probe_kit.runs.reader import RunReader, check_sides
 from probe_kit.runs.store import Location
 from probe_kit.statistics.sufficiency import ABSENT_BELOW
@@ -422,7 +424,8 @@ def retention_table(
     }
     if targets is not None:
         rows = with_holm_of_targets(rows, results) if family == "table" else rows
-        notes += [*_label_notes(table_runs, rows, family), *mixed_episodes(every)]
+        notes += [*_label_notes(table_runs, rows, family), *mixed_episodes(every), *_success_notes(table_runs)]
+        notes += without_content(every)
         return RetentionTable(
             rows, [], results=results, iterations=iterations, notes=tuple(notes), runs=tuple(table_runs)
         )
@@ -455,7 +458,7 @@ def retention_table(
         if run.is_captured_only
     ]
     notes += [*unjudged, *captured_only, *mixed_settings(results, views)]
-    notes += [*mixed_episodes(every), *chosen_wordings(every), *left_out(every)]
+    notes += [*mixed_episodes(every), *chosen_wordings(every), *left_out(every), *without_content(every)]
     return RetentionTable(
         rows,
         [mean for of_run in rows_of_runs for mean in _means(of_run)],
@@ -613,6 +616,13 @@ def _label_notes(runs: Sequence[TableRun], rows: Sequence[RetentionRow], family:
         tried = stored_targets(table_run.run)
         if sum(tried.values()) > 1:
             yield f"{table_run.name} has probes of {_in_words(tried)}; p is {corrected}."
+
+
+def _success_notes(runs: Sequence[TableRun]) -> Iterator[str]:
+    """Yield the success rates of runs in environments, which have no rows of their own."""
+    for table_run in runs:
+        if (success := EnvironmentSuccess.of(table_run.run.episodes)) is not None:
+            yield f"{table_run.name}: {success.sentence}."
 
 
 def _in_words(tried: Mapping[str, int]) -> str:

@@ -8,6 +8,7 @@ from zarr.abc.store import ByteRequest, OffsetByteRequest, RangeByteRequest, Sto
 from zarr.core.buffer import Buffer, BufferPrototype
 
 from probe_kit.errors import RunDamagedError
+from probe_kit.runs.array_lengths import is_metadata, without_length
 from probe_kit.runs.arrays import chunk_slices, index_bytes, inner_chunks
 from probe_kit.runs.records import BLOCK_BYTES, Checksum, block_digest, digest
 from probe_kit.runs.store import Location
@@ -110,7 +111,9 @@ class ArrayStore(Store):
         try:
             if byte_range is None:
                 content = self._location.read(self._key(key), most=stored.length + _SPARE)
-                problem = stored.problem(content)
+                if (problem := stored.problem(content)) and is_metadata(key):
+                    content = without_length(content)
+                    problem = stored.problem(content)
             else:
                 part = _range_of(byte_range, stored.length)
                 content = self._location.read(self._key(key), part)

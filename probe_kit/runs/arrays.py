@@ -35,7 +35,7 @@ from probe_kit._system.table_cells import Cell
 from probe_kit.errors import RunDamagedError
 from probe_kit.hooks.contract.sites import PADDING, plays
 from probe_kit.runs.folder import MOST_OBJECT_BYTES
-from probe_kit.runs.layout import CLASSES, INPUTS, LATER, MEAN_VIEW, TRUTHS, LaterViews, StoredStream
+from probe_kit.runs.layout import CLASSES, INPUTS, LATER, MEAN_VIEW, ROOM, TRUTHS, LaterViews, StoredStream
 
 ENTRY, CHECKSUM = 16, 4
 """The bytes of offset and length of a chunk as two uint64, and of the crc32c after all entries.
@@ -50,8 +50,6 @@ _BLOSC_SIZE = slice(4, 8)
 """The place of the unpacked size in the header of a chunk that blosc wrote."""
 _ABSENT = (1 << 64) - 1
 """The offset and the length of an inner chunk that was never written, as Zarr's sharding stores them."""
-ROOM = 1_000_000
-"""The episodes an array has room for; one chunk holds one episode, and no chunk exists before its episode."""
 NOT_A_NUMBER = 0x7FC0
 """The bits of bfloat16 where nothing was captured."""
 # Zarr's default leaves out chunks that equal the fill value (and compares every chunk with it to find out), but
@@ -63,7 +61,9 @@ def create_arrays(
     store: Store, streams: list[StoredStream], calls: int, with_tokens: bool, codec: str,
     later_views: LaterViews = "all",
 ) -> None:  # fmt: skip
-    """Create every array with `ROOM` for episodes, so that metadata never changes; afterwards chunks are written.
+    """Create every array with `ROOM` for episodes; afterwards chunks are written.
+
+    `array_lengths` tells other tools how many episodes there are.
 
     Pooled rows are float32 (episode, call, [iteration,] layer, view, feature), one chunk per episode, NaN where
     nothing was captured. Tokens are uint16, one shard per episode, with inner chunks of one layer x 128 tokens.
@@ -85,7 +85,8 @@ def create_arrays(
             later = (calls - 1, *stream.lead, stream.width)
             create_array(
                 group, LATER, (ROOM, *later), (1, *later), "uint16", NOT_A_NUMBER, codec,
-                ("episode", "call", *stream.dimensions, "feature"),
+                # Not `call`: names are of one length in a group, or xarray refuses all of it.
+                ("episode", "later_call", *stream.dimensions, "feature"),
                 {"probe_kit:dtype": "bfloat16", "view": MEAN_VIEW},
             )  # fmt: skip
         if with_tokens:
@@ -338,6 +339,8 @@ _TYPES = {"columns": "float64", "pixels": "uint8"}
 
 Columns hold timestamps and indices, for which float32 has too few digits.
 """
+_DIMENSIONS = {"columns": ("column",), "pixels": ("camera", "y", "x", "colour")}
+"""The names of the axes of the inputs that are no vectors of numbers."""
 
 
 def create_inputs(store: Store, calls: int, shapes: Mapping[str, list[int]], codec: str) -> None:
@@ -346,7 +349,14 @@ def create_inputs(store: Store, calls: int, shapes: Mapping[str, list[int]], cod
     for name, shape in shapes.items():
         dtype = np.dtype(_TYPES.get(name, "float32"))
         fill_value = 0 if dtype.kind == "u" else np.nan
-        create_array(group, name, (ROOM, calls, *shape), (1, calls, *shape), dtype, fill_value, codec)
+        dimensions = ("episode", "call", *_dimensions_of(name, len(shape)))
+        create_array(group, name, (ROOM, calls, *shape), (1, calls, *shape), dtype, fill_value, codec, dimensions)
+
+
+def _dimensions_of(name: str, axes: int) -> Sequence[str]:
+    """Return names of the axes of one inference, which no other input shares: their lengths differ."""
+    names = _DIMENSIONS.get(name, (f"{name}_step", f"{name}_number")[-axes:])
+    return names if len(names) == axes else [f"{name}_{axis}" for axis in range(axes)]
 
 
 class StoredInputs:

@@ -26,7 +26,7 @@ from probe_kit.hooks.contract.sites import Site
 from probe_kit.runs.array_store import ArrayStore
 from probe_kit.runs.arrays import bounded_codecs, open_array
 from probe_kit.runs.commits import Commit, commit_key, stamp_of
-from probe_kit.runs.layout import COLUMNS, LATER, SEALED
+from probe_kit.runs.layout import COLUMNS, LATER, METADATA, SEALED
 from probe_kit.runs.records import NAME_DIGITS, Checksum, Record, Sums, named_by_hash
 from probe_kit.runs.root import Root
 from probe_kit.runs.store import Location
@@ -34,10 +34,6 @@ from probe_kit.runs.store import Location
 if TYPE_CHECKING:
     import xarray as xr
     import zarr
-
-
-METADATA = "zarr.json"
-"""The name of the metadata of a group or array in Zarr v3."""
 
 
 class Seal(Record):
@@ -65,10 +61,7 @@ class Columns:
     def __init__(self, location: Location, folder: str, sums: Mapping[str, Checksum]) -> None:
         self.folder, self.sums = folder, sums
         self._location = location
-        self.advice = (
-            f"Delete {folder}; the rows are not concerned, and `probe-kit run verify {location} --seal` builds "
-            "it again"
-        )
+        self.advice = f"The rows are not concerned: {_sealing(location)}"
 
     @property
     def store(self) -> ArrayStore:
@@ -102,19 +95,30 @@ class Columns:
         return dataset["pooled"].drop_attrs()
 
 
-def find_columns(root: Root, commits: Mapping[int, Commit]) -> Columns | None:
+def _sealing(location: Location) -> str:
+    return f"`probe-kit run verify {location} --seal` builds the columns again"
+
+
+def find_columns(root: Root, commits: Mapping[int, Commit], skip_damaged: bool = False) -> Columns | None:
     """Return the columns of a run if they were sealed from exactly these commits, None otherwise.
+
+    Args:
+        root: The root of the run.
+        commits: The commits of the run.
+        skip_damaged: Take damaged seals for none, and do not look whether the columns are there: for who writes
+            them again.
 
     Raises:
         RunDamagedError: If the seal was changed, or names commits that are gone or others, or if a part of the
             columns is gone.
     """
     location, stamp = root.location, stamp_of(commits)
-    seal = next((seal for seal in _read_seals(root, commits) if seal.stamp == stamp), None)
+    seals = _read_seals(root, commits, skip_damaged)
+    seal = next((seal for seal in seals if seal.stamp == stamp), None)
     if seal is None:
         return None
     columns = Columns(location, columns_folder(stamp), seal.objects)
-    if not location.exists(f"{columns.folder}/{METADATA}"):
+    if not (skip_damaged or location.exists(f"{columns.folder}/{METADATA}")):
         if not (location.keys(columns.folder) and location.exists(seal_key(stamp))):
             return None  # all of them were removed, as is allowed, or are being built again
         raise RunDamagedError(f"{location}/{columns.folder}/{METADATA} is missing. {columns.advice}")
@@ -138,21 +142,33 @@ def write_seal(root: Root, commits: Mapping[int, Commit], sums: Mapping[str, Che
     root.location.write(seal_key(seal.stamp), seal.to_bytes())
 
 
-def _read_seals(root: Root, commits: Mapping[int, Commit]) -> list[Seal]:
-    """Return all seals, each checked."""
+def _read_seals(root: Root, commits: Mapping[int, Commit], skip_damaged: bool) -> list[Seal]:
+    """Return all seals, each checked; a seal that names commits which are gone is damage of the run."""
     seals = []
-    advice = f"Delete it; `probe-kit run verify {root.location} --seal` builds the columns again"
     for _, key, raw in named_by_hash(root.location, SEALED):
-        name = f"{root.location}/{key}"
-        seal = Seal.parse(raw, name, advice, run=root.identity)
-        if seal_key(seal.stamp) != key:
-            raise RunDamagedError(f"{name} belongs to other episodes. {advice}")
-        # What a seal does not name does not exist for `ArrayStore`: the array would seem never written.
-        if lost := _metadata(root) - {*seal.objects}:
-            raise RunDamagedError(f"{name} names no hash of {min(lost)}. {advice}")
-        _check_lost(root, commits, seal, name, advice)
-        seals.append(seal)
+        try:
+            seal = _read_seal(root, key, raw)
+        except RunDamagedError:
+            if skip_damaged:
+                continue
+            raise
+        _check_lost(root, commits, seal, f"{root.location}/{key}")
+        if (problem := _stale_problem(root, commits, seal, key)) and not skip_damaged:
+            raise RunDamagedError(problem)
+        if not problem:
+            seals.append(seal)
     return seals
+
+
+def _read_seal(root: Root, key: str, raw: bytes) -> Seal:
+    name, advice = f"{root.location}/{key}", _sealing(root.location)
+    seal = Seal.parse(raw, name, advice, run=root.identity)
+    if seal_key(seal.stamp) != key:
+        raise RunDamagedError(f"{name} belongs to other episodes. {advice}")
+    # What a seal does not name does not exist for `ArrayStore`: the array would seem never written.
+    if lost := _metadata(root) - {*seal.objects}:
+        raise RunDamagedError(f"{name} names no hash of {min(lost)}. {advice}")
+    return seal
 
 
 def _metadata(root: Root) -> set[str]:
@@ -161,8 +177,8 @@ def _metadata(root: Root) -> set[str]:
     return {METADATA, *(f"{array}/{METADATA}" for array in arrays)}
 
 
-def _check_lost(root: Root, commits: Mapping[int, Commit], seal: Seal, name: str, advice: str) -> None:
-    """Raise RunDamagedError if a seal was made of commits that are gone, or that are others by now."""
+def _check_lost(root: Root, commits: Mapping[int, Commit], seal: Seal, name: str) -> None:
+    """Raise RunDamagedError if a seal was made of commits that are gone."""
     absent = [number for number in seal.episodes if number not in commits]
     if lost := [number for number in absent if not root.location.exists(commit_key(number))]:
         raise RunDamagedError(
@@ -170,5 +186,12 @@ def _check_lost(root: Root, commits: Mapping[int, Commit], seal: Seal, name: str
             f"of which {len(lost)} are gone. Restore the commits, or run the same `probe-kit extract` again to "
             f"redo them; to continue without them, delete {SEALED} and {COLUMNS}"
         )
-    if not absent and stamp_of({number: commits[number] for number in seal.episodes}) != seal.stamp:
-        raise RunDamagedError(f"{name} was made of other commits than the run has. {advice}")
+
+
+def _stale_problem(root: Root, commits: Mapping[int, Commit], seal: Seal, key: str) -> str | None:
+    """Return the fault in a seal whose commits are others by now; None where some are only not read yet."""
+    if not {*seal.episodes} <= {*commits}:
+        return None
+    if stamp_of({number: commits[number] for number in seal.episodes}) == seal.stamp:
+        return None
+    return f"{root.location}/{key} was made of other commits than the run has. {_sealing(root.location)}"

@@ -27,7 +27,7 @@ from probe_kit.runs.layout import (
 )
 from probe_kit.runs.plan import plan_key
 from probe_kit.runs.provenance import certificate_keys
-from probe_kit.runs.records import RESTORE, Checksum
+from probe_kit.runs.records import Checksum
 from probe_kit.runs.results import BUNDLES, HEAD, PARTIAL, TIMES, advice_for, bundle_keys, read_bundle
 from probe_kit.runs.root import LeftOut, Root, is_left_out
 from probe_kit.runs.run import Run, open_run
@@ -60,8 +60,8 @@ class StoredObject:
 
 
 def record_keys(root: Root, commits: Mapping[int, Commit], columns: Columns | None) -> Iterator[str]:
-    """Yield the keys of the records of a run, which carry their own hash."""
-    yield from (RUN_FILE, LABEL_FILE, LEFT_OUT_FILE)
+    """Yield the keys of the records of a run, which carry their own hash, and of the arrays' metadata."""
+    yield from (RUN_FILE, LABEL_FILE, LEFT_OUT_FILE, *root.card.objects)
     yield from (plan_key(record) for record in range(len(root.stored_plan.extents)))
     for number, commit in commits.items():
         yield commit_key(number)
@@ -77,9 +77,7 @@ def record_keys(root: Root, commits: Mapping[int, Commit], columns: Columns | No
 
 
 def stored_objects(root: Root, commits: Mapping[int, Commit], columns: Columns | None) -> Iterator[StoredObject]:
-    """Yield all objects whose hash a record holds. Results with a damaged head are left out."""
-    for key, expected in root.card.objects.items():
-        yield StoredObject(key, expected, RESTORE)
+    """Yield all objects whose hash a record holds, without metadata. Results with a damaged head are left out."""
     pictures = {folder for folder in ILLUSTRATIONS if root.location.keys(folder)}
     for number, commit in commits.items():
         owner = f" of episode {commit.episode_id}"

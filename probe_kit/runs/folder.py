@@ -115,7 +115,7 @@ class Folder:
 
     def exists(self, key: str) -> bool:
         """Whether there is an object of that key."""
-        return _inside(key) and (self._path / key).is_file()
+        return is_inside(key) and (self._path / key).is_file()
 
     def read(self, key: str, part: slice | None = None, most: int | None = None) -> bytes:
         """Return one object, or a part of its bytes; `check_size` explains `most`. Raises FileNotFoundError."""
@@ -157,7 +157,7 @@ class Folder:
 
     def sizes(self, folder: str, keys: Iterable[str]) -> dict[str, int]:
         """Return the bytes of the objects `keys` below `folder`, as far as they exist."""
-        paths = {key: self._path / folder / key for key in keys if _inside(key)}
+        paths = {key: self._path / folder / key for key in keys if is_inside(key)}
         return {key: path.stat().st_size for key, path in paths.items() if path.is_file()}
 
     def flush(self, keys: Iterable[str]) -> None:
@@ -210,17 +210,13 @@ class Folder:
         Foreign records may name a device, a pipe, which never ends, or a file outside the run.
         """
         path = self._path / key
-        if not (_inside(key) and path.is_file()):
+        if not (is_inside(key) and path.is_file()):
             raise FileNotFoundError(errno.ENOENT, "no file of the run", str(path))
         return path
 
     def _inner(self, key: str) -> Path:
         """Return the path to write or remove. Raises RunDamagedError for a key that leads out of the folder."""
-        if not _inside(key):
-            raise RunDamagedError(
-                f"{self}: a record of this run names {key!r}, which leads out of its folder; probe_kit writes no "
-                "such name. Take the run from where it was made"
-            )
+        check_inside(key, self)
         return self._path / key
 
     # -- runs ------------------------------------------------------------------------------------------
@@ -263,9 +259,19 @@ class Folder:
             os.close(handle)
 
 
-def _inside(key: str) -> bool:
-    """Whether a key stays below the folder it is read in."""
-    return not key.startswith("/") and ".." not in key.split("/")
+def is_inside(key: str) -> bool:
+    """Whether a key stays below the folder it is read in, and names one object in folders and buckets alike."""
+    controls = any(ord(character) < ord(" ") for character in key)
+    return not controls and not {"", ".", ".."} & {*key.split("/")}
+
+
+def check_inside(key: str, where: object) -> None:
+    """Raise RunDamagedError for a key that leads out of the run `where`, as only foreign records name it."""
+    if not is_inside(key):
+        raise RunDamagedError(
+            f"{where}: a record of this run names {key!r}, which leads out of its folder; probe_kit writes no "
+            "such name. Take the run from where it was made"
+        )
 
 
 def _alone(file: IO[bytes]) -> bool:

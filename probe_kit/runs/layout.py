@@ -34,6 +34,12 @@ from pydantic.dataclasses import dataclass
 
 from probe_kit.hooks.contract.sites import QUANTITIES, Part, Site, Stream
 
+METADATA = "zarr.json"
+"""The name of the metadata of a group or array in Zarr v3."""
+GROUP_FILE = "data.zarr/zarr.json"
+"""The metadata of the group of all arrays, which never changes."""
+ROOM = 1_000_000
+"""The episodes an array has room for; one chunk holds one episode, and no chunk exists before its episode."""
 SCHEMA_VERSION = 6
 """The only schema version that is written and read."""
 TOKEN_BLOCK = 128
@@ -84,6 +90,12 @@ SaeDtype = Literal["bfloat16", "float16"]
 """The numbers in a memory map to train sparse autoencoders on."""
 ONCE, AT_END = "success_once", "success_at_end"
 """The columns of episodes with whether `success` was true after any action, and after the last one."""
+LIMIT, START = "limit", "start_blake2b"
+"""Columns of episodes of environments.
+
+They hold the number of actions after which the benchmark ends an episode, where it declares one, and the hash of
+the first observation.
+"""
 CAPTURE_ONLY = "capture_only"
 """The outcome of an episode whose model was captured and did not act: there is no success rate."""
 DATASET = "dataset"

@@ -4,13 +4,17 @@
     certificate.json              the first process's record, with its provenance
     certificates/<digits>.json    a record per process, named by the sha256 of its content
 
+Each of the three follows from the others as far as a run of one process goes. What is missing and follows is read
+as if it were there, and written again where a command may write.
+
 Settings say what was requested; provenance says which machine and libraries computed it. Numbers of another kind
 of device or of other libraries are not the same numbers. So a run is continued there only on request, and says so.
 """
 
 import json
 import platform
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -36,6 +40,9 @@ DECISIVE = (
     *(f"versions.{name}" for name in ("probe-kit", *_LIBRARIES[:3], "pybullet")),  # torch, lerobot, transformers
 )
 """The parts that change numbers. Cores, workers and threads, the interpreter and the writer's libraries do not."""
+
+_PARTS = frozenset(("device", "device_name", "dtype", "python", "machine", "versions", "code_sha256", "decoder"))
+"""The parts of a provenance, as `provenance_here` and extractions make it."""
 
 
 def provenance_here(device: str = "cpu", dtype: str | None = None) -> dict[str, Any]:
@@ -92,8 +99,11 @@ def name_of(provenance: Provenance) -> str:
 
 def keep_provenance(location: Location, provenance: Provenance) -> None:
     """Store a provenance in the run, unless another process did."""
-    record = ProvenanceRecord.model_validate(dict(provenance))
-    location.create(f"{PROVENANCE}/{name_of(provenance)}.json", record.to_bytes())
+    location.create(provenance_key(name_of(provenance)), _provenance_bytes(provenance))
+
+
+def _provenance_bytes(provenance: Provenance) -> bytes:
+    return ProvenanceRecord.model_validate(dict(provenance)).to_bytes()
 
 
 def read_provenances(root: Root) -> dict[str, Provenance]:
@@ -108,13 +118,9 @@ def read_provenances(root: Root) -> dict[str, Provenance]:
     return provenances
 
 
-def check_provenances(stored: Mapping[str, Provenance], names: Iterable[str], location: Location) -> None:
-    """Raise RunDamagedError unless all provenances that commits name are stored."""
-    if missing := sorted({*names} - {*stored}):
-        raise RunDamagedError(
-            f"{location}/{PROVENANCE}/{missing[0]}.json is missing, though episodes name it; it was there when "
-            f"they were committed. {RESTORE}"
-        )
+def provenance_key(name: str) -> str:
+    """Return the key of the provenance of this name."""
+    return f"{PROVENANCE}/{name}.json"
 
 
 def differences(provenances: Iterable[Provenance]) -> tuple[str, ...]:
@@ -148,6 +154,10 @@ def check_other_provenance(stored: Iterable[Provenance], current: Provenance, wh
 
 INPUT_CHECK = "input_check"
 """An entry of a certificate: by input, the last thing that changed with it at the first inference of a process."""
+
+
+INPUT_CONTENT = "input_content"
+"""An entry of a certificate: inputs without content, in the frames at which a process looked before it played."""
 
 
 class Certificate(Record):
@@ -185,37 +195,106 @@ def write_certificate(root: Root, parts: Mapping[str, Any], provenance: Provenan
     record = json.loads(
         json.dumps({**parts, "provenance": name_of(provenance), "run": root.identity}, default=list)
     )
-    key = f"{CERTIFICATES}/{sha256_json(record)[:NAME_DIGITS]}.json"
-    root.location.create(key, Certificate.model_validate(record).to_bytes())
+    root.location.create(_record_key(record), Certificate.model_validate(record).to_bytes())
     # `create` never writes over: of several processes that begin at once, the first one's stays.
     if not root.location.exists(CERTIFICATE_FILE):
         root.location.create(CERTIFICATE_FILE, Certificate.model_validate({**record, **provenance}).to_bytes())
 
 
-def read_certificate(root: Root) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """Return the content of the first process's record, and those of the records of all processes.
+def _record_key(record: Mapping[str, Any]) -> str:
+    return f"{CERTIFICATES}/{sha256_json(record)[:NAME_DIGITS]}.json"
+
+
+@dataclass(frozen=True)
+class Processes:
+    """The records of the processes that played a run.
+
+    Attributes:
+        provenances: The provenances by name.
+        first: The content of the first process's certificate; empty for a run without episodes.
+        records: The contents of the records of all processes.
+        remade: The records that are not stored and follow from the others, as they were written, by key.
+    """
+
+    provenances: Mapping[str, Provenance]
+    first: Mapping[str, Any]
+    records: Sequence[Mapping[str, Any]]
+    remade: Mapping[str, bytes]
+
+
+def read_processes(root: Root, names: Collection[str]) -> Processes:
+    """Read who played a run. A record that is missing and follows from the others is made again in memory.
+
+    Args:
+        root: The root of the run.
+        names: The names of the provenances that commits name; without any, the run has no certificate yet.
 
     Raises:
-        RunDamagedError: If one is missing, was changed, or is another run's.
+        RunDamagedError: If a record was changed or is another run's, or is missing and does not follow.
     """
-    first = Certificate.read(root.location, CERTIFICATE_FILE, RESTORE, run=root.identity).content
-    records = []
-    for digits, key, raw in named_by_hash(root.location, CERTIFICATES):
-        name = f"{root.location}/{key}"
-        record = Certificate.parse(raw, name, RESTORE, run=root.identity).content
-        if sha256_json(record)[:NAME_DIGITS] != digits:
-            raise RunDamagedError(f"{name} is another process's. {RESTORE}")
-        records.append(record)
+    provenances, remade = read_provenances(root), dict[str, bytes]()
+    if not names:
+        return Processes(provenances, {}, (), remade)
+    first, records = _read_first(root), _read_records(root)
+    if first and first["provenance"] not in provenances and (lost := _provenance_in(first, records)):
+        provenances[name_of(lost)] = lost
+        remade[provenance_key(name_of(lost))] = _provenance_bytes(lost)
+    if missing := sorted({*names} - {*provenances}):
+        raise RunDamagedError(
+            f"{root.location}/{provenance_key(missing[0])} is missing, though episodes name it; it was there when "
+            "they were committed. Restore it from a copy, or run the same `probe-kit extract` again where they "
+            "were played: it writes the record again"
+        )
+    if not first and records:
+        complete = [{**record, **provenances.get(record["provenance"], {})} for record in records]
+        first = next((certificate for certificate in complete if "versions" in certificate), {})
+        if first:
+            remade[CERTIFICATE_FILE] = Certificate.model_validate(first).to_bytes()
+    if not first:
+        raise RunDamagedError(f"{root.location}/{CERTIFICATE_FILE} is missing. {RESTORE}")
     if not records:
-        raise RunDamagedError(f"{root.location}/{CERTIFICATES} holds no record of who played. {RESTORE}")
+        parts = provenances.get(first["provenance"], {})
+        record = {part: value for part, value in first.items() if part not in parts}
+        records = [record]
+        remade[_record_key(record)] = Certificate.model_validate(record).to_bytes()
     if not any(_repeats(first, record) for record in records):
         raise RunDamagedError(
             f"{root.location}/{CERTIFICATE_FILE} says what none of the records in {CERTIFICATES} says. {RESTORE}"
         )
-    return first, records
+    return Processes(provenances, first, records, remade)
 
 
-def _repeats(first: dict[str, Any], record: dict[str, Any]) -> bool:
+def _read_first(root: Root) -> dict[str, Any]:
+    """Return the content of the first process's certificate; empty if it is missing."""
+    try:
+        raw = root.location.read(CERTIFICATE_FILE)
+    except FileNotFoundError:
+        return {}
+    name = f"{root.location}/{CERTIFICATE_FILE}"
+    return Certificate.parse(raw, name, RESTORE, run=root.identity).content
+
+
+def _read_records(root: Root) -> list[dict[str, Any]]:
+    records = []
+    for _, key, raw in named_by_hash(root.location, CERTIFICATES):
+        name = f"{root.location}/{key}"
+        record = Certificate.parse(raw, name, RESTORE, run=root.identity).content
+        if _record_key(record) != key:
+            raise RunDamagedError(f"{name} is another process's. {RESTORE}")
+        records.append(record)
+    return records
+
+
+def _provenance_in(first: Mapping[str, Any], records: Iterable[Mapping[str, Any]]) -> Provenance | None:
+    """Return the provenance that the first process's certificate repeats, if its hash shows that it is whole."""
+    of_records = ({part: first[part] for part in first if part not in record} for record in records)
+    for parts in (*of_records, {part: first[part] for part in first if part in _PARTS}):
+        if name_of(parts) == first["provenance"]:
+            return parts
+    return None
+
+
+def _repeats(first: Mapping[str, Any], record: Mapping[str, Any]) -> bool:
     """Whether the certificate is this process's record with the provenance that the record names."""
     provenance = {part: value for part, value in first.items() if part not in record}
     same = all(first.get(part) == value for part, value in record.items())

@@ -178,7 +178,7 @@ def write_bundle(
     """
     with location.tended(f"{home}/{key}"):
         folder, run = f"{home}/{key}", _identity(location)
-        before = read_bundle(location, home, key) if location.exists(f"{folder}/{HEAD}") else None
+        before = read_bundle(location, home, key) if is_complete(location, home, key) else None
         former = dict(before.files) if before else {}
         files_now = dict(former)
         for name, content in files.items():
@@ -197,6 +197,24 @@ def write_bundle(
         for name, (actual, _) in former.items():
             if files_now[name][0] != actual:
                 location.delete(f"{folder}/{actual}")
+
+
+def is_complete(location: Location, home: str, key: str) -> bool:
+    """Whether the bundle `key` is stored with all its files. One that lost a file is made again, not refused.
+
+    Raises:
+        RunDamagedError: If its head was changed.
+    """
+    folder = f"{home}/{key}"
+    if not location.exists(f"{folder}/{HEAD}"):
+        return False
+    head = Head.read(location, f"{folder}/{HEAD}", advice_for(folder))
+    names = {actual: name for name, (actual, _) in head.files.items()}
+    missing = {TIMES, *names} - {*location.sizes(folder, (TIMES, *names))}
+    if not missing:
+        return True
+    root = find_root(location)  # of a copy without activations, files may be missing on purpose
+    return root is not None and {names.get(actual) for actual in missing} <= root.left_out
 
 
 def tidy_bundle(location: Location, home: str, key: str) -> None:

@@ -8,6 +8,7 @@ runs of other items have one identity.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -17,6 +18,7 @@ from pydantic import ConfigDict, field_serializer, field_validator
 
 from probe_kit.errors import ActivationsLeftOutError, RunDamagedError, RunNotFoundError, UsageError
 from probe_kit.hashing import sha256_json
+from probe_kit.runs.array_lengths import with_length, without_length
 from probe_kit.runs.layout import (
     DATA,
     DATASET,
@@ -185,19 +187,33 @@ class Root:
 
     def check(self) -> None:
         """Raise RunDamagedError unless the plan and all metadata are what was written."""
-        _ = self.plan
-        for key in self.card.objects:
-            self.check_metadata(key)
+        _ = self.plan, self.stored_metadata
 
-    def check_metadata(self, key: str) -> None:
-        """Raise RunDamagedError if the metadata of an array is missing or was changed."""
-        name = f"{self.location}/{key}"
+    @cached_property
+    def stored_metadata(self) -> dict[str, bytes]:
+        """The metadata of all arrays as it is stored now, by key; see `array_lengths`. Raises RunDamagedError."""
+        return {key: self.read_metadata(key) for key in self.card.objects}
+
+    def read_metadata(self, key: str) -> bytes:
+        """Return the stored metadata of an array or group. Raises RunDamagedError if it is missing or changed."""
+        expected = self.card.objects[key]
         try:
-            problem = self.card.objects[key].problem(self.location.read(key))
+            stored = self.location.read(key)
         except FileNotFoundError:
-            problem = "is missing"
-        if problem:
-            raise RunDamagedError(f"{name} {problem}. {RESTORE}")
+            raise RunDamagedError(f"{self.location}/{key} is missing. {RESTORE}") from None
+        problem = expected.problem(stored)
+        if problem and expected.problem(without_length(stored)):
+            raise RunDamagedError(f"{self.location}/{key} {problem}. {RESTORE}")
+        return stored
+
+    def set_lengths(self) -> None:
+        """Make the arrays as long as the plan for other tools, wherever they are not."""
+        episodes = len(self.plan)
+        sized = {key: with_length(without_length(raw), episodes) for key, raw in self.stored_metadata.items()}
+        changed = [key for key, content in sized.items() if content != self.stored_metadata[key]]
+        with ThreadPoolExecutor(max(1, len(changed))) as writers:  # each takes a round trip
+            list(writers.map(lambda key: self.location.write(key, sized[key]), changed))
+        self.stored_metadata.update(sized)
 
     # -- the plan --------------------------------------------------------------------------------------
 

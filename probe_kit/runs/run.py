@@ -57,11 +57,10 @@ from probe_kit.runs.layout import (
 )
 from probe_kit.runs.plan import RowColumns, while_growing
 from probe_kit.runs.provenance import (
+    Processes,
     Provenance,
-    check_provenances,
     differences,
-    read_certificate,
-    read_provenances,
+    read_processes,
 )
 from probe_kit.runs.records import RESTORE, Checksum
 from probe_kit.runs.root import read_label, read_root
@@ -161,9 +160,7 @@ class Run:
         Checks label, commits, seconds, provenance, certificates, seal and failures; results stored with the run
         are checked when read.
         """
-        _ = self.label, self._seconds, self.failed, self.provenances, self.columns
-        if self._commits:
-            _ = self._certificates
+        _ = self.label, self._seconds, self.failed, self._processes, self.columns
 
     def __repr__(self) -> str:
         random = ", RANDOM WEIGHTS" if self.random_weights else ""
@@ -299,8 +296,13 @@ class Run:
         return pd.DataFrame(list(rows.values()), columns=list(names.values()))
 
     @cached_property
-    def _certificates(self) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-        return read_certificate(self.root)
+    def _processes(self) -> Processes:
+        return read_processes(self.root, {commit.provenance for commit in self._commits.values()})
+
+    def restore_records(self) -> None:
+        """Write the records of processes that are missing and follow from the others."""
+        for key, content in self._processes.remade.items():
+            self.location.create(key, content)
 
     @cached_property
     def certificate(self) -> dict[str, Any]:
@@ -310,8 +312,8 @@ class Run:
         in each process the actions or answers with and without capture have one hash. The entry `mixed` has what
         changes numbers and was not the same for all episodes.
         """
-        first, processes = self._certificates
-        certificate = dict(first)
+        processes = list(self._processes.records)
+        certificate = dict(self._processes.first)
         checks = [process["capture_check"] for process in processes if process.get("capture_check")]
         if checks:
             certificate["hooks_on_equals_hooks_off"] = all(
@@ -327,9 +329,8 @@ class Run:
         """The origins of the processes that played it, the first process first; empty before the first episode."""
         if not self._commits:
             return ()
-        certificate, processes = self._certificates
         origins: list[Origin] = []
-        for record in (certificate, *processes):
+        for record in (self._processes.first, *self._processes.records):
             if (origin := Origin.of_record(record)) not in origins:
                 origins.append(origin)
         return tuple(origins)
@@ -341,10 +342,8 @@ class Run:
         Raises:
             RunDamagedError: If a commit names a provenance that is not stored.
         """
-        stored = read_provenances(self.root)
         names = sorted({commit.provenance for commit in self.commits()})
-        check_provenances(stored, names, self.location)
-        return {name: stored[name] for name in names}
+        return {name: self._processes.provenances[name] for name in names}
 
     @property
     def mixed(self) -> tuple[str, ...]:

@@ -19,8 +19,8 @@ from zarr.abc.store import Store
 from probe_kit.env.scoring import CHANNELS, RULES, Trajectory, behaviour_of, judge, rule_of
 from probe_kit.env.spec import SceneSpec
 from probe_kit.errors import RunDamagedError
-from probe_kit.runs.arrays import ROOM, Rows, create_array
-from probe_kit.runs.layout import TRAJECTORY
+from probe_kit.runs.arrays import Rows, create_array
+from probe_kit.runs.layout import ROOM, TRAJECTORY
 from probe_kit.suite.items import Side, other_side
 
 

@@ -22,12 +22,12 @@ from probe_kit.hooks.contract.sites import PADDING
 from probe_kit.hooks.family import imported
 from probe_kit.runs.array_store import ArrayStore
 from probe_kit.runs.arrays import Rows, create_array, open_array
-from probe_kit.runs.columns import columns_folder, find_columns, seal_key, write_seal
+from probe_kit.runs.columns import Columns, columns_folder, find_columns, seal_key, write_seal
 from probe_kit.runs.commits import Commit, numbered, read_commit, read_failures, read_seconds
 from probe_kit.runs.contents import StoredObject, sizes_of, stored_objects, stray_keys
 from probe_kit.runs.layout import COLUMNS, COMMITS, DATA, SEALED, StoredStream, VectorKind
 from probe_kit.runs.plan import count_plans
-from probe_kit.runs.provenance import check_provenances, read_certificate, read_provenances
+from probe_kit.runs.provenance import read_processes
 from probe_kit.runs.records import RESTORE, digest_of, is_hash_name
 from probe_kit.runs.results import BUNDLES, bundle_keys, read_bundle
 from probe_kit.runs.root import Root, read_label, read_root
@@ -40,23 +40,34 @@ SLAB_BYTES = 1 << 30
 """The bytes that are held in memory at a time; all rows are read once more for every further slab."""
 
 
-def seal(path: Path | str | Location) -> bool:
-    """Write the columns of the run at `path` unless they are up to date; return whether this call wrote them.
+def seal(path: Path | str | Location, deep: bool = False) -> bool:
+    """Write the columns of the run at `path` unless they are there; return whether this call wrote them.
 
     Equal commits give equal bytes. A crash leaves the old columns or none. Processes that seal one folder at once
-    take turns, and all but the first find it done.
+    take turns, and all but the first find it done. Damaged columns are written anew.
+
+    Args:
+        path: The folder or address of the run.
+        deep: Compare every byte of columns that are there, and write again what else of the run follows from its
+            other records. By default only sizes are compared.
     """
     location = Run(locate(path)).location
     with location.locked(lambda: None), location.tended(DATA):  # a folder that is never exchanged
-        return _seal(read_run(location))
+        run = read_run(location)
+        if deep and not run.root.left_out:
+            run.restore_records()
+        return _seal(run, deep)
 
 
-def _seal(run: Run) -> bool:
+def _seal(run: Run, deep: bool = False) -> bool:
+    if not run.root.left_out:
+        run.root.set_lengths()  # once more: of two processes that made it grow, the first may have written last
     if not run.streams or run.episodes.empty:
         return False
     if run.root.left_out:
         run.root.refuse_left_out("there is nothing to seal")
-    if run.sealed:
+    commits = {commit.episode: commit for commit in run.commits()}
+    if _are_whole(run.location, find_columns(run.root, commits, skip_damaged=True), deep):
         _remove_former(run)
         return False
     run.location.remove(SEALED)  # nothing counts that is not whole
@@ -69,10 +80,20 @@ def _seal(run: Run) -> bool:
         _write_roles(run, name, group)
     group.attrs["stamp"] = run.stamp
     run.location.flush(f"{folder}/{key}" for key in store.written)
-    commits = {commit.episode: commit for commit in run.commits()}
     write_seal(run.root, commits, store.written)  # what makes them count, so last
     _remove_former(run)
     return True
+
+
+def _are_whole(location: Location, columns: Columns | None, deep: bool) -> bool:
+    """Whether there are columns with all objects, each of its size, and with `deep` of its bytes."""
+    if columns is None:
+        return False
+    sizes = location.sizes(columns.folder, columns.sums)
+    if any(expected.size_problem(sizes.get(key)) for key, expected in columns.sums.items()):
+        return False
+    objects = (StoredObject(f"{columns.folder}/{key}", expected, "") for key, expected in columns.sums.items())
+    return not (deep and any(_content_problems(location, objects)))
 
 
 def _remove_former(run: Run) -> None:
@@ -93,7 +114,8 @@ def _write_vectors(run: "Run", name: str, kind: VectorKind, group: zarr.Group) -
     array = create_array(
         group, f"{name}/{kind}", (*lead, episodes, stored.width), (*(1 for _ in lead), block, stored.width),
         rows.array.dtype, rows.array.fill_value, run.settings["codec"],
-        ("call", *(["view"] * (kind == "pooled")), *stored.dimensions, "episode", "feature"),
+        ("call" if kind == "pooled" else "later_call", *(["view"] * (kind == "pooled")), *stored.dimensions,
+         "episode", "feature"),
         dict(rows.array.attrs),
     )  # fmt: skip
     for index, column in columns_of_rows(run, name, kind):
@@ -135,7 +157,8 @@ def _write_roles(run: "Run", name: str, group: zarr.Group) -> None:
     chunks = (1, min(len(spans), EPISODES_PER_CHUNK), codes.shape[2])
     array = create_array(
         group, f"{name}/role", codes.shape, chunks, "uint8", 0, run.settings["codec"],
-        ("call", "episode", "token"), {"roles": names},
+        # Another name where the pooled views are of the first inference alone, and so of another length.
+        ("call" if len(run.root.vector_kinds) == 1 else "captured_call", "episode", "token"), {"roles": names},
     )  # fmt: skip
     array[:] = codes
 
@@ -244,8 +267,8 @@ def _audit(location: Location, deep: bool) -> Audit:
     problems += filter(None, (stored.problem(sizes.get(stored.key)) for stored in objects))
     if deep:
         problems += _content_problems(location, objects)
-    for key in () if deep else root.card.objects:
-        checked(partial(root.check_metadata, key), None)
+    for key in root.card.objects:
+        checked(partial(root.read_metadata, key), b"")
     if deep and not problems and planned:  # readers of a damaged run would only repeat what is known
         run = Run(location)
         problems += _differences(run) if columns is not None else ()
@@ -266,9 +289,12 @@ def _audit(location: Location, deep: bool) -> Audit:
 def _check_records(root: Root, commits: Mapping[int, Commit]) -> None:
     """Raise RunDamagedError if label, provenances or certificates were changed or are lost."""
     read_label(root)
-    check_provenances(read_provenances(root), {commit.provenance for commit in commits.values()}, root.location)
-    if commits:
-        read_certificate(root)
+    processes = read_processes(root, {commit.provenance for commit in commits.values()})
+    if remade := sorted(processes.remade):
+        raise RunDamagedError(
+            f"{root.location}/{remade[0]} is missing. Other records say the same: `probe-kit run verify "
+            f"{root.location} --seal` writes it again"
+        )
 
 
 def _content_problems(location: Location, objects: Iterable[StoredObject]) -> Iterator[str]:

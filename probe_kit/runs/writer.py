@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from zarr.core.buffer import Buffer
 from zarr.storage import MemoryStore
 
-from probe_kit.errors import SettingsMismatchError
+from probe_kit.errors import RunDamagedError, SettingsMismatchError
 from probe_kit.hashing import canonical_json
 from probe_kit.runs.array_store import ArrayStore
-from probe_kit.runs.arrays import ROOM, WRITE_ALL, create_arrays, create_inputs, write_row
+from probe_kit.runs.arrays import WRITE_ALL, create_arrays, create_inputs, write_row
 from probe_kit.runs.commits import (
     Commit,
     Seconds,
@@ -34,6 +34,7 @@ from probe_kit.runs.layout import (
     INPUTS,
     LABEL_FILE,
     PLANS,
+    ROOM,
     RUN_FILE,
     TRAJECTORY,
     StoredStream,
@@ -52,6 +53,7 @@ from probe_kit.runs.provenance import (
 from probe_kit.runs.records import Checksum
 from probe_kit.runs.results import BUNDLES, bundle_keys
 from probe_kit.runs.root import Label, Root, find_continuable, new_card, read_root
+from probe_kit.runs.run import Run, open_run
 from probe_kit.runs.store import Location, begin
 from probe_kit.runs.trajectories import create_trajectories
 
@@ -206,6 +208,7 @@ class RunWriter:
             with self.location.locked(lambda: None), self.location.tended(PLANS):
                 root = self._grown()
         root.check()
+        root.set_lengths()
         return root
 
     def _lacks(self, root: Root) -> bool:
@@ -284,6 +287,23 @@ class RunWriter:
         if not self._begun:
             keep_provenance(self.location, self.provenance)
             self._begun = True
+
+    def opened(self) -> Run:
+        """Return the finished run; records of processes that are missing are written again, as far as they can be.
+
+        Raises:
+            RunDamagedError: If one is missing that neither follows from the others nor is this process's.
+        """
+        try:
+            run = open_run(self.location)
+        except RunDamagedError:
+            commits = read_commits(read_root(self.location)).values()
+            if name_of(self.provenance) not in {commit.provenance for commit in commits}:
+                raise
+            keep_provenance(self.location, self.provenance)
+            run = open_run(self.location)
+        run.restore_records()
+        return run
 
     def remaining(self) -> list[int]:
         """Return the numbers of the episodes that are not committed; objects of the committed ones are checked."""

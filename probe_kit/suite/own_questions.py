@@ -337,7 +337,7 @@ def read_rows(table: Path, category: str = DEFAULT_CATEGORY) -> list[Row]:
         raise UsageError(f"{table} has no line below its heading; expected one per question")
     _check_contradictions(rows, table)
     grouped = [row for row in rows if row.group]
-    names = group_names(  # one spelling of every group, such as 7 for 7.0
+    names = group_names(  # accents are composed, and two spellings of one group refused
         [row.group for row in grouped], lambda number: opened.where(grouped[number].line, "group"), UsageError
     )
     by_line = {row.line: name for row, name in zip(grouped, names, strict=True)}

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from probe_kit._system.table_cells import name_in
 from probe_kit.errors import UsageError
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.sites import Site
@@ -149,10 +150,10 @@ def probe(
         order = np.random.default_rng(derive_seed("array order", seed)).permutation(count)
     labels = _column(y, count, "y")
     columns: dict[str, list[Any]] = {"episode_id": names, "y": [labels[row] for row in order]}
-    group_of = names if groups is None else list(map(str, _column(groups, count, "groups")))
+    group_of = names if groups is None else list(map(name_in, _column(groups, count, "groups")))
     columns["group_id"] = [group_of[row] for row in order]
     if strata is not None:
-        texts = list(map(str, _column(strata, count, "strata")))
+        texts = list(map(name_in, _column(strata, count, "strata")))
         columns["strata"] = [texts[row] for row in order]
     table = pd.DataFrame(columns)
     episodes = table[["episode_id", "group_id"]].assign(category=EVERYWHERE)
@@ -179,9 +180,10 @@ def probe(
             )
             for model, site_arrays in networks.items()
         }
+        target = Target.read(table, "y", task, exchange_within=None if strata is None else "strata")
         results = train_probes(
             runs["arrays"],
-            target=Target.read(table, "y", task, exchange_within=None if strata is None else "strata"),
+            target=target,
             views=(VIEW,),
             permutations=permutations,
             controls=tuple(controls or ()),
@@ -189,8 +191,12 @@ def probe(
             seed=seed,
             jobs=jobs,
         )
-    classes = np.unique(np.asarray(y)) if results.curves[EVERYWHERE, VIEW].classes else np.empty(0)
-    return ArrayProbes(tuple(sites), results, order, classes)
+    values: NDArray[Any] = np.empty(0)
+    if target.coded.classes:
+        # Of each class the value in its first row: texts that spell numbers are sorted as numbers.
+        _, first = np.unique(target.coded.values, return_index=True)
+        values = np.asarray([labels[order[row]] for row in first])
+    return ArrayProbes(tuple(sites), results, order, values)
 
 
 def _sites(arrays: Sites, what: str, count: int | None = None) -> dict[str, NDArray[np.float32]]:
@@ -243,7 +249,9 @@ def _column(column: ArrayLike | Sequence[Any], count: int, what: str) -> list[An
     array = np.asarray(column)
     if array.shape != (count,):
         raise UsageError(f"{what} has the shape {array.shape}; expected ({count},), one value per row of X")
-    values: list[Any] = array.tolist()
+    # Not those of the array where it took numbers for texts: 7 and 7.5 beside each other become decimals.
+    values: list[Any] = list(column) if isinstance(column, Sequence) else array.tolist()
+    values = [value.item() if isinstance(value, np.generic) else value for value in values]
     if missing := [row for row, value in enumerate(values) if value is None or value != value]:
         raise UsageError(f"{what} has no value in row {missing[0]}; leave the sample out of X, y and groups")
     return values

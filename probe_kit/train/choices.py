@@ -9,9 +9,11 @@ Task = Literal["binary", "classes", "continuous"]
 
 CORRECT: Side = "side.correct"
 """The target of probes unless another is named."""
+CHOSEN: Side = "side.chosen"
+"""The target that only what a policy did or answered has."""
 SIDES: dict[str, str] = {
     CORRECT: "side of the correct picture",
-    "side.chosen": "side on which the cube was placed (rule disc), or that a VLM named; others are left out",
+    CHOSEN: "side on which the cube was placed (rule disc), or that a VLM named; others are left out",
     "side.shuffled": "control: side of the correct picture, flipped for a random half of the items",
 }
 """Targets that are sides of a picture."""

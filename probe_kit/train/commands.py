@@ -213,6 +213,7 @@ def facts_table(inventory: "Inventory", more_lines: Mapping[str, str]) -> "Table
         "wordings": ", ".join(f"{name} {count}" for name, count in inventory.wordings.items()),
         "failed": str(inventory.failed or ""),
         "outcomes": outcomes,
+        "success": "" if inventory.success is None else inventory.success.sentence,
         "categories": ", ".join(inventory.categories),
         **inventory.streams,
         **{f"probes {probes.key}": _probes_in_words(probes, inventory) for probes in inventory.probes},

@@ -30,33 +30,48 @@ EPISODE, INFERENCE = "episode_id", "inference"
 """Key columns of a table: one label per episode, or with both one per captured inference."""
 SOURCE, FRAME = "source_episode", "frame"
 """The key columns of recordings, by the numbers of the data set; read where a table has no `episode_id`."""
+SOURCES, FRAMES = (SOURCE, "episode_index"), (FRAME, "frame_index")
+"""The names of these two columns: ours, and those of a LeRobotDataset.
+
+Its column `index` is no key: it counts the frames of all episodes, of which a run may show a few, and a data frame
+whose index was reset has a column of that name.
+"""
 
 
-def read_table(table: "Path | str | pd.DataFrame", requested: Sequence[str]) -> LabelTable:
-    """Return the key columns and the columns `requested` of a table.
+def read_table(
+    table: "Path | str | pd.DataFrame | pd.Series[Any]", requested: Sequence[str], names: Sequence[str] = ()
+) -> LabelTable:
+    """Return the key columns and some other columns of a table.
 
     Args:
-        table: A CSV file (see `open_table`), a Parquet file (`.parquet`), or a DataFrame.
+        table: A CSV file (see `open_table`), a Parquet file (`.parquet`), a DataFrame, or a Series whose index has
+            the keys.
         requested: Names of columns; those that the table lacks are left out.
+        names: Names of further columns, whose cells are names.
 
     Raises:
-        UsageError: For a file that is no such table, or has no column `episode_id` or `source_episode`.
+        UsageError: For a file that is no such table, or has no column `episode_id`, `source_episode` or
+            `episode_index`.
         MissingExtraError: For Parquet without pyarrow.
     """
+    requested = [*requested, *names]
     if not isinstance(table, str | Path):
-        frame = table.reset_index() if any(name is not None for name in table.index.names) else table
-        names = tuple(str(name) for name in frame.columns)
-        position_of = _places(names, requested, "DataFrame")
+        import pandas as pd
+
+        columns: Any = table if isinstance(table, pd.DataFrame) else table.to_frame()
+        frame = columns.reset_index() if any(name is not None for name in table.index.names) else columns
+        headings = tuple(str(name) for name in frame.columns)
+        position_of = _places(headings, requested, "DataFrame")
         cells = {name: frame.iloc[:, number].tolist() for name, number in position_of.items()}
-        return _of_cells(cells, names, len(frame), "DataFrame")
+        return _of_cells(cells, headings, len(frame), "DataFrame", names)
     path = Path(table)
     if path.suffix.lower() in (".parquet", ".pq"):
         try:
             check_regular(path, MOST_BYTES)
         except OSError as error:
             raise UsageError(f"{path} cannot be read: {error.strerror}. Give a CSV or Parquet file") from error
-        return _of_parquet(path, requested)
-    opened = open_table(path, (EPISODE, SOURCE))
+        return _of_parquet(path, requested, names)
+    opened = open_table(path, (EPISODE, *SOURCES))
     read = list(_places(opened.names, requested, str(path), opened.line))
     return LabelTable.of_lines(opened, opened.rows(read), read)
 
@@ -67,14 +82,17 @@ def _places(names: Sequence[str], requested: Sequence[str], source: str, line: i
     Raises:
         UsageError: For a table without the key, a name used twice, and a control character in a name.
     """
-    if EPISODE not in names and SOURCE not in names:
+    if EPISODE not in names and not set(SOURCES) & set(names):
         listed = ", ".join(terminal_safe(name) for name in names[:12]) or "no column"
+        of_lerobot = "A frame of a data set has the keys 'episode_index' and 'frame_index'. " * bool(
+            {"index", *FRAMES} & set(names)
+        )
         raise UsageError(
             f"{source}, line {line} lacks the key column {EPISODE!r}; it has {listed}. "
-            f"{_other_delimiter(names)}`probe-kit labels RUN` writes a table with the keys of a run"
+            f"{_other_delimiter(names)}{of_lerobot}`probe-kit labels RUN` writes a table with the keys of a run"
         )
-    keys = (EPISODE, INFERENCE) if EPISODE in names else (SOURCE, FRAME)
-    read = [name for name in dict.fromkeys((*keys, *requested)) if name in names]
+    keys = [EPISODE, INFERENCE] if EPISODE in names else []
+    read = [name for name in dict.fromkeys((*keys, *SOURCES, *FRAMES, *requested)) if name in names]
     if unsafe := [character for name in read if (character := UNSAFE.search(name))]:
         raise UsageError(
             f"{source}, line {line}: the name of a column holds the control or direction character "
@@ -91,18 +109,18 @@ def _other_delimiter(names: Sequence[str]) -> str:
     """Return advice for a heading that holds the key and another delimiter than a comma; empty for others."""
     for delimiter, name in (("|", "bars"), (":", "colons")):
         fields = {field.strip().strip('"') for heading in names for field in heading.split(delimiter)}
-        if len(fields) > len(names) and fields & {EPISODE, SOURCE}:
+        if len(fields) > len(names) and fields & {EPISODE, *SOURCES}:
             return f"Its fields are separated by {name}; save it with commas, semicolons or tabs. "
     return ""
 
 
-def _of_parquet(path: Path, requested: Sequence[str]) -> LabelTable:
+def _of_parquet(path: Path, requested: Sequence[str], names: Sequence[str]) -> LabelTable:
     """Read the cells by arrow, because pandas rounds large integers beside empty cells."""
     require("pyarrow.parquet", "export")
     try:
         with open_parquet(path, "export") as file:
-            names = file.schema_arrow.names
-            position_of = _places(names, requested, str(path))
+            headings = file.schema_arrow.names
+            position_of = _places(headings, requested, str(path))
             read = read_parquet(file, list(position_of))
     except UsageError:
         raise
@@ -113,12 +131,16 @@ def _of_parquet(path: Path, requested: Sequence[str]) -> LabelTable:
         reason = str(error).rstrip(".")
         raise UsageError(f"{path} is no Parquet file: {reason}. Write it again, or give a CSV file") from error
     cells = {name: read.column(name).to_pylist() for name in position_of}
-    return _of_cells(cells, tuple(names), len(read), str(path))
+    return _of_cells(cells, tuple(headings), len(read), str(path), names)
 
 
-def _of_cells(cells: dict[str, list[Any]], names: tuple[str, ...], count: int, source: str) -> LabelTable:
-    table = LabelTable(source, "row", names, {}, list(range(1, count + 1)))
+def _of_cells(
+    cells: dict[str, list[Any]], headings: tuple[str, ...], count: int, source: str, names: Sequence[str]
+) -> LabelTable:
+    table = LabelTable(source, "row", headings, {}, list(range(1, count + 1)))
     for name, column in cells.items():
+        if name in (EPISODE, *names):  # a decimal number keeps its zeros as a text
+            column = [str(cell) if isinstance(cell, Decimal) else cell for cell in column]
         table.columns[name] = [_plain(cell, table, row, name) for row, cell in enumerate(column)]
     return table
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from probe_kit.errors import TooFewGroupsError, UnbalancedEpisodesError
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.sites import Site
+from probe_kit.runs.layout import START
 from probe_kit.runs.reader import RunReader
 from probe_kit.statistics.folds import OUTER_FOLDS, fold_numbers, fold_units, stratified_folds, sums_by_group
 from probe_kit.statistics.label_permutations import (
@@ -31,7 +32,7 @@ from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_results import ProbeSettings
 from probe_kit.train.samples import Samples
 from probe_kit.train.target import Target
-from probe_kit.train.target_samples import TargetSamples
+from probe_kit.train.target_samples import GROUP, TargetSamples, dependent_episodes
 
 # Choices, not measurements: stricter ones refuse runs with a few gaps, laxer ones give a p to few free labels.
 MOST_OF_ONE_SIDE = 0.75
@@ -285,7 +286,8 @@ def _block_folds_and_permutations(
         raise TooFewGroupsError(
             f"{name} has one class, {classes[0]!r}; expected two or more. Leave the category out"
         )
-    _check_groups(name, target, labels, classes, samples.groups)
+    _check_groups(name, run, target, labels, classes, samples)
+    warn_of_equal_starts(name, run, target, samples)
     scope = () if category == EVERYWHERE else (category,)
     seed = derive_seed("label folds", settings.seed, *scope)
     folds = nested_folds(samples.strata, samples.groups, seed, stratified_folds)
@@ -335,13 +337,18 @@ def _block_folds_and_permutations(
 
 
 def _check_groups(
-    name: str, target: Target, labels: Matrix, classes: tuple[str, ...], groups: NDArray[np.str_]
+    name: str, run: RunReader, target: Target, labels: Matrix, classes: tuple[str, ...], samples: TargetSamples
 ) -> None:
-    count, by = np.unique(groups).size, target.group_by or "group_id"
+    groups = samples.groups
+    count, by = np.unique(groups).size, target.group_by or GROUP
     if count < OUTER_FOLDS:
+        column, independent = dependent_episodes(run)
+        smaller = np.unique(independent[samples.rows]).size
+        advice = "Label episodes of other groups"
+        if smaller >= OUTER_FOLDS and column != by:
+            advice += f", or give --group-by {column}, which has {smaller} groups here"
         raise TooFewGroupsError(
-            f"{name}: {count} groups ({by}) have labels; expected at least {OUTER_FOLDS}. "
-            "Label more episodes, or give smaller groups (--group-by; `groups` in Python)"
+            f"{name}: {count} groups ({by}) have labels; expected at least {OUTER_FOLDS}. {advice}"
         )
     for number, of_class in enumerate(classes):
         having = np.unique(groups[labels == number]).size
@@ -351,6 +358,24 @@ def _check_groups(
                 f"expected at least {OUTER_FOLDS}. Label more episodes of it, merge it "
                 "with another class, or leave its cells empty"
             )
+
+
+def warn_of_equal_starts(name: str, run: RunReader, target: Target, samples: TargetSamples) -> None:
+    """Warn where groups of an environment hold episodes that start with the same observation."""
+    column, starts = dependent_episodes(run)
+    if column != START or target.group_by is not None:
+        return
+    by_start: dict[str, set[str]] = {}
+    for start, group in zip(starts[samples.rows].tolist(), samples.groups.tolist(), strict=True):
+        by_start.setdefault(start, set()).add(group)
+    shared = sum(len(groups) for groups in by_start.values() if len(groups) > 1)
+    if shared:
+        warnings.warn(
+            f"{name}: {shared} groups start with the same observation as another one, so that they depend on each "
+            f"other and p is too small. Give --group-by {START}: episodes of one start are then a group, "
+            f"{len(by_start)} in all",
+            stacklevel=4,
+        )
 
 
 def _blocks(

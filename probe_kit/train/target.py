@@ -7,8 +7,9 @@ A target is a side of a picture, another built-in column, or a column of a user'
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +24,17 @@ from probe_kit.runs.reader import RunReader, check_sides
 from probe_kit.statistics.label_permutations import flip_items
 from probe_kit.train.builtin_columns import BuiltinColumn, BuiltinColumns
 from probe_kit.train.choices import SIDES, Task
-from probe_kit.train.label_columns import EPISODE, FRAME, INFERENCE, SOURCE, LabelValues, code_labels, read_table
+from probe_kit.train.label_columns import (
+    EPISODE,
+    FRAME,
+    FRAMES,
+    INFERENCE,
+    SOURCE,
+    SOURCES,
+    LabelValues,
+    code_labels,
+    read_table,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -39,7 +50,11 @@ exchange_blocks: groups exchange their labels as blocks, inference by inference;
 _MOST_CLASSES = 20
 """Classes that a line about a target lists; probes take any number."""
 _CLASSES = "; or say that the texts are classes with --task classes or --task binary (task=…)"
-_COUNTED = {INFERENCE: "a captured inference", FRAME: "a frame", SOURCE: "an episode"}
+_COUNTED = {
+    INFERENCE: "a captured inference",
+    **dict.fromkeys(FRAMES, "a frame"),
+    **dict.fromkeys(SOURCES, "an episode"),
+}
 
 
 @dataclass(frozen=True)
@@ -81,20 +96,21 @@ class Target:
     @classmethod
     def read(
         cls,
-        table: "Path | str | pd.DataFrame",
+        table: "Path | str | pd.DataFrame | pd.Series[Any]",
         name: str,
         task: Task | None = None,
         group_by: str | None = None,
         exchange_within: str | None = None,
     ) -> "Target":
-        """Return the column `name` of a table: a CSV or Parquet file, or a DataFrame.
+        """Return the column `name` of a table: a CSV or Parquet file, a DataFrame or a Series.
 
         Key columns are `episode_id` and, for labels that change within an episode, `inference`, counted from 0. Of
-        recordings they may be `source_episode` and `frame`, by the numbers of the data set. Empty cells are left
-        out.
+        recordings they may be `source_episode` and `frame`, by the numbers of the data set, or `episode_index` and
+        `frame_index`, as LeRobot calls them. Empty cells are left out. Names of episodes and groups are texts as
+        they are written, never numbers.
 
         Args:
-            table: Path of the file, or the DataFrame.
+            table: Path of the file, the DataFrame, or a Series whose index has the keys.
             name: Column to decode.
             task: Binary, classes or continuous; None where the values leave no doubt.
             group_by: Column of the table or of the run's episodes whose values folds, intervals and nulls keep
@@ -108,22 +124,22 @@ class Target:
                 line.
         """
         group_columns = [column for column in (group_by, exchange_within) if column is not None]
-        label_table = read_table(table, [name, *group_columns])
+        label_table = read_table(table, [name], group_columns)
         of_source = EPISODE not in label_table.columns
-        episode_key, step_key = (SOURCE, FRAME) if of_source else (EPISODE, INFERENCE)
-        if name not in label_table.columns or name in (episode_key, step_key):
-            columns = (column for column in label_table.names if column not in (episode_key, step_key))
+        keys = (*SOURCES, *FRAMES) if of_source else (EPISODE, INFERENCE)
+        if name not in label_table.columns or name in keys:
+            columns = (column for column in label_table.names if column not in keys)
             listed = ", ".join(map(terminal_safe, columns))[:500] or "none"
             raise UsageError(f"{label_table.source} has no column {name!r} to decode; it has: {listed}")
         if not label_table.lines:
             raise UsageError(
                 f"{label_table.source} has no {label_table.unit} below its heading; expected one per label"
             )
-        inferences = _numbers(label_table, step_key)
         if of_source:  # numbers as a spreadsheet or a merge may leave them, such as 3.0
-            episodes = tuple(map(str, _numbers(label_table, episode_key) or ()))
+            episodes = tuple(map(str, _numbers_of_either(label_table, SOURCES) or ()))
+            inferences = _numbers_of_either(label_table, FRAMES)
         else:
-            episodes = tuple(label_table.texts(episode_key))
+            episodes, inferences = tuple(label_table.texts(EPISODE)), _numbers(label_table, INFERENCE)
         cells = label_table.values(name, task in ("classes", "binary"), _CLASSES)
         groups, strata = _names(label_table, group_by), _names(label_table, exchange_within)
         at = _once(label_table, episodes, inferences, [cells, *filter(None, (groups, strata))])
@@ -146,15 +162,17 @@ class Target:
         Labels that have its keys already are returned as they are.
 
         Raises:
-            UsageError: For a run of scenes, for frames or episodes that were never recorded, and if the run shows
-                none of the frames.
+            UsageError: For a run of scenes, for frames or episodes that were never recorded, if the run shows
+                none of the frames, and for a table with keys of both kinds that contradict each other.
         """
         if not self.of_source:
+            if run.recorded and not self.builtin:
+                _check_source_keys(run, self)
             return self
         if not run.recorded:
             raise UsageError(
-                f"{self.table.source} has the key {SOURCE!r} of recordings, and {run.location} is of scenes; "
-                f"expected {EPISODE!r}. `probe-kit labels RUN` writes the ids"
+                f"{self.table.source} has the key {_present(self.table, SOURCES)!r} of recordings, and "
+                f"{run.location} is of scenes; expected {EPISODE!r}. `probe-kit labels RUN` writes the ids"
             )
         run_keys = _source_frames(run, self.inferences is not None)
         frames: Sequence[int] = self.inferences or (-1,) * len(self.episodes)
@@ -291,18 +309,27 @@ class Target:
         return f"{terminal_safe(self.name)} ({self.task}), {self.values_in_words}"
 
     @property
-    def values_in_words(self) -> str:
-        """The classes with their counts, or the range of a quantity, and how many labels are missing."""
+    def value_counts(self) -> dict[str, Any]:
+        """The counts by class, or the range of a quantity, with how many labels there are and are missing."""
         values = self.coded.values
         present = values[np.isfinite(values)]
-        if self.coded.classes:
-            counts = np.bincount(present.astype(np.int64), minlength=len(self.coded.classes)).tolist()
-            counted = [f"{terminal_safe(name)} {n}" for name, n in zip(self.coded.classes, counts, strict=True)]
+        counts: dict[str, Any] = {"labels": int(present.size), "missing": int(np.isnan(values).sum())}
+        if not self.coded.classes:
+            return {**counts, "minimum": float(present.min()), "maximum": float(present.max())}
+        of_classes = np.bincount(present.astype(np.int64), minlength=len(self.coded.classes)).tolist()
+        return {**counts, "classes": dict(zip(map(str, self.coded.classes), of_classes, strict=True))}
+
+    @property
+    def values_in_words(self) -> str:
+        """The classes with their counts, or the range of a quantity, and how many labels are missing."""
+        counts = self.value_counts
+        if "classes" in counts:
+            counted = [f"{terminal_safe(name)} {n}" for name, n in counts["classes"].items()]
             more = f", and {len(counted) - _MOST_CLASSES} more" if len(counted) > _MOST_CLASSES else ""
             text = f"{len(counted)} classes: {', '.join(counted[:_MOST_CLASSES])}{more}"
         else:
-            text = f"{present.size} numbers from {present.min():g} to {present.max():g}"
-        missing = int(np.isnan(values).sum())
+            text = f"{counts['labels']} numbers from {counts['minimum']:g} to {counts['maximum']:g}"
+        missing: int = counts["missing"]
         return text + f"; {missing} missing" * (missing > 0)
 
     def __repr__(self) -> str:
@@ -373,13 +400,13 @@ def _check_recorded(
     for row, episode in enumerate(episodes):
         if int(episode) >= count:
             raise UsageError(
-                f"{table.where(row, SOURCE)} is {episode}; the data set of {run.location} has {count} episodes, "
-                "counted from 0. Correct the numbers of the episodes"
+                f"{table.where(row, _present(table, SOURCES))} is {episode}; the data set of {run.location} has "
+                f"{count} episodes, counted from 0. Correct the numbers of the episodes"
             )
         if frames is not None and frames[row] >= lengths.get(episode, frames[row] + 1):
             raise UsageError(
-                f"{table.where(row, FRAME)} is {frames[row]}; episode {episode} of the data set of "
-                f"{run.location} has {lengths[episode]} frames, counted from 0 in each episode. Correct the "
+                f"{table.where(row, _present(table, FRAMES))} is {frames[row]}; episode {episode} of the data set "
+                f"of {run.location} has {lengths[episode]} frames, counted from 0 in each episode. Correct the "
                 "table, which may count from 1, or by the column `index` of the data set"
             )
 
@@ -403,6 +430,55 @@ def _numbers(table: LabelTable, column: str) -> tuple[int, ...] | None:
     return tuple(int(cell) for cell in cells if cell is not None)
 
 
+def _present(table: LabelTable, names: Sequence[str]) -> str | None:
+    """Return the first of two names of a key that a table has as a column; None where it has none."""
+    return next((name for name in names if name in table.columns), None)
+
+
+def _numbers_of_either(table: LabelTable, names: Sequence[str]) -> tuple[int, ...] | None:
+    """Return a key column by one of its names; None where the table lacks it.
+
+    Raises:
+        UsageError: For two columns that contradict each other, and as `_numbers`.
+    """
+    read = {name: numbers for name in names if (numbers := _numbers(table, name)) is not None}
+    for (first, numbers), (second, other_numbers) in pairwise(read.items()):
+        for row, (number, other) in enumerate(zip(numbers, other_numbers, strict=True)):
+            if number != other:
+                raise UsageError(
+                    f"{table.where(row)}: {first!r} is {number} and {second!r} is {other}; expected the same "
+                    "number. Leave one of the two columns out"
+                )
+    return next(iter(read.values()), None)
+
+
+def _check_source_keys(run: RunReader, target: Target) -> None:
+    """Raise UsageError where a table with the ids of a run also has numbers of its data set, and others.
+
+    Numbers of frames are compared where labels are of single inferences; elsewhere a table may have kept any.
+    """
+    table, steps = target.table, run.control_steps
+    row_of = {str(name): row for row, name in enumerate(run.episodes[EPISODE])}
+    due_sources = run.episodes[SOURCE].tolist()
+    for names, is_frame in ((SOURCES, False), (FRAMES, True)):
+        key = _present(table, names)
+        if key is None or (is_frame and (target.inferences is None or _present(table, SOURCES) is None)):
+            continue
+        for number, (episode, cell) in enumerate(zip(target.episodes, table.numbers(key), strict=True)):
+            row = row_of.get(episode)
+            call = 0 if target.inferences is None else target.inferences[number]
+            if row is None or cell is None or call >= steps.shape[1]:
+                continue  # an episode that the run lacks is refused where labels find their samples
+            due = int(steps[row, call]) if is_frame else int(due_sources[row])
+            if cell != due and due >= 0:
+                due_key = f"{'frame' if is_frame else 'episode'} {due} of the data set"
+                label = f"{EPISODE} {episode!r}" + (f", {INFERENCE} {call}," if is_frame else "")
+                raise UsageError(
+                    f"{table.where(number, key)} is {cell!r}, and {label} is {due_key}; expected keys of the same "
+                    "label. Leave one of the two columns out"
+                )
+
+
 def _once(
     table: LabelTable, episodes: Sequence[str], inferences: Sequence[int] | None, columns: Sequence[Sequence[Cell]]
 ) -> list[int]:
@@ -416,10 +492,11 @@ def _once(
         key = episode, -1 if inferences is None else inferences[row]
         if (before := first.setdefault(key, row)) == row or all(cells[before] == cells[row] for cells in columns):
             continue
-        described = f"episode {episode!r}" + ("" if inferences is None else f", inference {key[1]}")
+        step = INFERENCE if EPISODE in table.columns else _present(table, FRAMES) or FRAME
+        described = f"episode {episode!r}" + ("" if inferences is None else f", {step} {key[1]}")
         raise UsageError(
             f"{table.where(row)}: {described} has a label in {table.unit} {table.lines[before]} already. Leave "
-            f"one out{'' if inferences is not None else f', or add a column {INFERENCE!r}'}"
+            f"one out{'' if inferences is not None else f', or add a column {step!r}'}"
         )
     return list(first.values())
 

@@ -1,8 +1,10 @@
 """The commands `probe-kit targets` and `probe-kit labels`: what can be probed in a run, and a table to add to."""
 
-from collections.abc import Iterator, Sequence
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 from warnings import catch_warnings, simplefilter
 
 import typer
@@ -37,7 +39,7 @@ def targets(
     every = list(listed_targets(opened))
     listed = [row for row in every if row.task != CONSTANT]
     rows = [(row.target, row.task, row.per, row.values) for row in listed]
-    columns, numbers = ("target", "task", "per", "values"), tuple(row._asdict() for row in every)
+    columns, numbers = ("target", "task", "per", "values"), tuple(row.to_json(str(run)) for row in every)
     print_table(
         Table.of(f"{opened.label}: what can be decoded", columns, rows, numbers=numbers, overflow="wrap"), style
     )
@@ -51,12 +53,17 @@ def targets(
         say(marked("[yellow]train refuses {}:[/] {}", ", ".join(names), reason))
     # Those that need no further option come first, and what is refused is never the next step.
     possible = sorted(
-        (row.options for row in listed if row.options is not None), key=lambda text: "--task" in text
+        (row.options for row in listed if row.options is not None), key=lambda options: "--task" in options
     )
     if not possible:
         say(marked("next: [bold]probe-kit labels {}[/]  writes a table to which you add labels of your own", run))
         return
-    say(marked("next: [bold]probe-kit train {}{}[/]", run, possible[0]))
+    say(marked("next: [bold]{}[/]", _command(str(run), possible[0])))
+
+
+def _command(run: str, options: Sequence[str]) -> str:
+    """Return the command that trains probes, as it is typed."""
+    return shlex.join(["probe-kit", "train", run, *options])
 
 
 DOUBTFUL = "classes or continuous"
@@ -66,7 +73,7 @@ CONSTANT = "one value"
 
 
 class ListedTarget(NamedTuple):
-    """A target in words.
+    """A target in words, and its numbers.
 
     Attributes:
         task: `CONSTANT` for a column with a single value.
@@ -74,14 +81,28 @@ class ListedTarget(NamedTuple):
         values: Classes or range, or why the run has none.
         options: Options of the command that trains probes on it; None where `train` refuses every one.
         refused: Reason why `train` refuses every one; empty where it does not.
+        counts: Counts by class or the range, see `Target.value_counts`; empty where the run has none.
     """
 
     target: str
     task: str
     per: str
     values: str
-    options: str | None = None
+    options: tuple[str, ...] | None = None
     refused: str = ""
+    counts: Mapping[str, Any] = MappingProxyType({})
+
+    def to_json(self, run: str) -> dict[str, Any]:
+        """Return plain values: tasks that fit, counts, and the command or why there is none; no empty ones."""
+        tasks = {DOUBTFUL: ["classes", "continuous"], CONSTANT: [], NONE: []}.get(self.task, [self.task])
+        reason = self.refused or ("" if self.counts else self.values if self.values != NONE else self.task)
+        return {
+            "target": self.target,
+            "tasks": tasks,
+            **({"per": self.per, "values": dict(self.counts)} if self.counts else {}),
+            **({} if self.options is None else {"command": _command(run, self.options)}),
+            **({"refused": reason} if reason else {}),
+        }
 
 
 def listed_targets(run: "RunReader") -> Iterator[ListedTarget]:
@@ -104,10 +125,10 @@ def listed_targets(run: "RunReader") -> Iterator[ListedTarget]:
         options = next((options for options, reason in reasons.items() if not reason), None)
         refused = "" if options is not None else next(iter(reasons.values()))
         per = "inference" if target.per_step else "episode"
-        yield ListedTarget(name, task, per, target.values_in_words, options, refused)
+        yield ListedTarget(name, task, per, target.values_in_words, options, refused, target.value_counts)
 
 
-Trials = tuple["Target", str, dict[str, tuple["Target", Sequence[str] | None]]]
+Trials = tuple["Target", str, dict[tuple[str, ...], tuple["Target", Sequence[str] | None]]]
 """A target, its task in words, and by the options of `train` the target and categories that these give."""
 
 
@@ -116,12 +137,12 @@ def _trials_of_a_side(run: "RunReader", name: str) -> Trials:
     from probe_kit.statistics.sufficiency import GROUPS_FOR_PROBES
     from probe_kit.train.target import Target
 
-    target, option = Target.of_run(run, name), "" if name == CORRECT else f" --target {name}"
-    trials: dict[str, tuple[Target, Sequence[str] | None]] = {option: (target, None)}
+    target, option = Target.of_run(run, name), () if name == CORRECT else ("--target", name)
+    trials: dict[tuple[str, ...], tuple[Target, Sequence[str] | None]] = {option: (target, None)}
     groups = run.episodes.groupby("category", sort=False)["group_id"].nunique()
     enough = [str(category) for category, count in groups.items() if count >= GROUPS_FOR_PROBES]
     if enough and len(enough) < len(groups):
-        trials[f" --categories {','.join(enough)}{option}"] = target, enough
+        trials["--categories", ",".join(enough), *option] = target, enough
     return target, "binary", trials
 
 
@@ -136,13 +157,13 @@ def _trials_of_a_column(name: str, column: "BuiltinColumn") -> Trials:
             classes = Target.of_column(name, column, "classes")
         except UsageError:
             raise error from None
-        quantities, option = Target.of_column(name, column, "continuous"), f" --target {name} --task"
+        quantities, option = Target.of_column(name, column, "continuous"), ("--target", name, "--task")
         return (
             classes,
             DOUBTFUL,
-            {f"{option} classes": (classes, None), f"{option} continuous": (quantities, None)},
+            {(*option, "classes"): (classes, None), (*option, "continuous"): (quantities, None)},
         )
-    return target, target.task, {f" --target {name}": (target, None)}
+    return target, target.task, {("--target", name): (target, None)}
 
 
 def _refusal(run: "RunReader", target: "Target", categories: Sequence[str] | None) -> str:

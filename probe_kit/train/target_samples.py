@@ -7,11 +7,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._system.table_cells import similar_name
 from probe_kit.errors import UsageError
+from probe_kit.runs.layout import START
 from probe_kit.runs.reader import RunReader, check_call, reached_calls
 from probe_kit.train.choices import EVERYWHERE, Incomplete
 from probe_kit.train.label_columns import EPISODE, INFERENCE
 from probe_kit.train.target import Target
+
+GROUP = "group_id"
+"""The column of episodes with the groups of their run."""
 
 REACHED = 0.9
 """Share of the episodes that reach the last inference of the default window.
@@ -143,10 +148,24 @@ def target_samples(
 def groups_of(run: RunReader, target: Target) -> tuple[NDArray[np.str_], NDArray[np.str_]]:
     """Return group and stratum of every episode, each (E,): those of the run, unless the target names columns."""
     if target.group_by is None:
-        groups: NDArray[np.str_] = run.episodes["group_id"].to_numpy(dtype=str)
+        groups: NDArray[np.str_] = run.episodes[GROUP].to_numpy(dtype=str)
     else:
         groups = _column(run, target, target.group_by, target.groups)
     return groups, _column(run, target, target.exchange_within, target.strata)
+
+
+def dependent_episodes(run: RunReader) -> tuple[str, NDArray[np.str_]]:
+    """Return the column (E,) whose equal values depend on each other, and its name.
+
+    Of an environment these are episodes that start with the same observation, whatever groups it names: another
+    seed is another start. Of scenes and recordings they are the run's groups.
+    """
+    episodes = run.episodes
+    if START in episodes:
+        starts = episodes[START].where(episodes[START].notna(), episodes[EPISODE])
+        return START, starts.to_numpy(dtype=str)
+    column = EPISODE if getattr(run, "in_own_environment", False) or GROUP not in episodes else GROUP
+    return column, episodes[column].to_numpy(dtype=str)
 
 
 def _complete(run: RunReader, reached: NDArray[np.bool_], incomplete: Incomplete) -> NDArray[np.bool_]:
@@ -220,7 +239,7 @@ def _label_grid(run: RunReader, target: Target) -> NDArray[np.float64]:
                 continue
             raise UsageError(
                 f"{target.table.where(number)}: {run.location} has no episode {name!r}; it has {len(row_of)}, "
-                f"such as {next(iter(row_of), 'none')!r}. `probe-kit labels RUN` writes the ids"
+                f"such as {next(iter(row_of), 'none')!r}. {_reason(name, [*row_of, *planned])}"
             )
         inference = 0 if target.inferences is None else target.inferences[number]
         if target.per_step and not (inference < reached.shape[1] and reached[row, inference]):
@@ -231,6 +250,16 @@ def _label_grid(run: RunReader, target: Target) -> NDArray[np.float64]:
             )
         grid[row, inference] = target.coded.values[number]
     return grid
+
+
+def _reason(name: str, ids: Sequence[str]) -> str:
+    """Return why an id is perhaps not that of a run, and what to do."""
+    if (similar := similar_name(name, ids)) is None:
+        return "`probe-kit labels RUN` writes the ids"
+    return (
+        f"It has {similar!r}, which a program that takes names for numbers writes so. Read the ids as text, "
+        f"in pandas with dtype={{{EPISODE!r}: str}}"
+    )
 
 
 def _column(run: RunReader, target: Target, name: str | None, cells: Sequence[str] | None) -> NDArray[np.str_]:
@@ -262,17 +291,27 @@ def _column(run: RunReader, target: Target, name: str | None, cells: Sequence[st
 def _check_groups(
     run: RunReader, target: Target, groups: NDArray[np.str_], strata: NDArray[np.str_], rows: NDArray[np.intp]
 ) -> None:
-    """Raise UsageError for groups that separate items with a shared picture, and strata that split a group."""
-    run_groups = run.episodes["group_id"].to_numpy(dtype=str) if "group_id" in run.episodes else groups
-    for inner, outer, problem in (
-        (run_groups, groups, f"--group-by {target.group_by} separates items that share a picture"),
-        (groups, strata, f"--exchange-within {target.exchange_within} splits a group"),
-    ):
+    """Raise UsageError for groups that separate what depends on each other, and strata that split a group."""
+    column, dependent = dependent_episodes(run)
+    same, remedy = (
+        "items that share a picture",
+        "Give a column that is the same within a group, or leave the option out",
+    )
+    if column == START:
+        same, remedy = "episodes that start with the same observation", f"Give --group-by {START}"
+        if target.group_by is None:
+            dependent = groups  # the environment's own groups stay; a sweep warns of equal starts
+    for inner, outer, problem, advice in (
+        (dependent, groups, f"--group-by {target.group_by} separates {same}", remedy),
+        (
+            groups, strata, f"--exchange-within {target.exchange_within} splits a group",
+            "Give a column that is the same within a group, or leave the option out",
+        ),
+    ):  # fmt: skip
         first: dict[str, str] = {}
         for name, other in zip(inner[rows].tolist(), outer[rows].tolist(), strict=True):
             if first.setdefault(name, other) != other:
                 raise UsageError(
                     f"{problem}: group {name!r} is in {first[name]!r} and in {other!r}. Its episodes depend on "
-                    "each other, so no p would be right. Give a column that is the same within a group, or leave "
-                    "the option out"
+                    f"each other, so no p would be right. {advice}"
                 )

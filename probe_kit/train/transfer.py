@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit._system.counting import counted
+from probe_kit._system.table_cells import alike
 from probe_kit._tables.numbers import p_text
 from probe_kit._tables.table import Table
 from probe_kit._terminal.notebook import notebook_progress
@@ -261,6 +262,8 @@ def shared_groups(
     """
     names = np.unique(other_samples.groups)
     in_both = np.zeros(names.size, bool)
+    if group_by is not None:
+        _check_spelled_alike(run, np.unique(samples.groups).tolist(), other, names.tolist(), group_by)
     if group_by is not None or _sources(run) & _sources(other):
         in_both |= np.isin(names, samples.groups)
     contents, other_contents = _contents(run, samples), _contents(other, other_samples)
@@ -269,6 +272,19 @@ def shared_groups(
     in_both |= np.isin(names, [group_of[row] for row, content in other_contents.items() if content in both])
     shared: NDArray[np.str_] = names[in_both]
     return shared
+
+
+def _check_spelled_alike(
+    run: RunReader, groups: Sequence[str], other: RunReader, other_groups: Sequence[str], group_by: str
+) -> None:
+    """Raise UsageError for a group of two runs in two spellings, which would be in both and not be left out."""
+    of_likeness = {alike(name): name for name in groups}
+    for name in other_groups:
+        if (spelled := of_likeness.get(alike(name), name)) != name:
+            raise UsageError(
+                f"--group-by {group_by}: {other.location} has the group {name!r}, and {run.location} {spelled!r}; "
+                "expected one spelling of one name. Write both alike, or other names if they differ"
+            )
 
 
 def _sources(run: RunReader) -> set[str]:

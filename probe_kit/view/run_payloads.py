@@ -36,6 +36,7 @@ from probe_kit.retention.columns.columns import (
 from probe_kit.retention.estimators import Limits
 from probe_kit.retention.rows.row import StreamPart
 from probe_kit.runs.action_errors import action_error_table, compare_actions, why_not_compared
+from probe_kit.runs.environment_success import EnvironmentSuccess
 from probe_kit.runs.layout import DIAGNOSES, INTERVENTIONS, PROBES
 from probe_kit.runs.results import bundle_keys
 from probe_kit.runs.writer import flat_settings
@@ -143,11 +144,13 @@ def run_payload(viewed: ViewedRun, page_runs: Sequence[ViewedRun] = ()) -> dict[
     """
     run, results = viewed.run, viewed.results
     certificate = run.certificate if len(run.episodes) else {}
+    success = EnvironmentSuccess.of(run.episodes)
     return {
         "key": viewed.key,
         "label": run.label,
         "model": run.model,
         "suite": run.suite,
+        "success": None if success is None else {**success.to_json(), "sentence": success.sentence},
         "wording": run.wording,
         "random_weights": run.random_weights,
         "weights": run.weights_sha256,

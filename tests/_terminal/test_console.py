@@ -1,5 +1,6 @@
 """The consoles: text from elsewhere is shown, never obeyed."""
 
+import ast
 import io
 import json
 import os
@@ -222,3 +223,29 @@ def test_no_command_ends_in_a_traceback(little_runs: Path, words: tuple[str, ...
 )
 def test_a_table_without_a_reader_ends_without_a_traceback(little_runs: Path, redirection: str) -> None:
     test_no_command_ends_in_a_traceback(little_runs, ("retention", "{run}"), redirection)
+
+
+STYLE = re.compile(r"\[(?:/|/?(?:bold|dim|italic|underline|red|green|yellow|cyan|magenta|blue|white)\b[^\[\]]*)\]")
+"""A mark of rich's markup, which the consoles print as it is."""
+
+
+def unread_marks(source: str) -> list[str]:
+    """The texts with marks that `marked` does not read; docstrings are no output."""
+    tree = ast.parse(source)
+    read: set[int] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "marked":
+            read |= {id(part) for argument in node.args[:1] for part in ast.walk(argument)}
+        if isinstance(node, ast.Expr):
+            read.add(id(node.value))
+    texts = (node for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str))
+    return [node.value for node in texts if id(node) not in read and STYLE.search(node.value)]
+
+
+def test_every_style_of_a_printed_line_is_read_as_one_and_no_values_styles_are() -> None:
+    package = Path(probe_kit.__file__).parent
+    sources = {file.name: file.read_text(encoding="utf-8") for file in package.rglob("*.py")}
+    unread = {name: unread_marks(source) for name, source in sources.items() if STYLE.search(source)}
+    assert {name: texts for name, texts in unread.items() if texts} == {}
+    assert unread_marks('say("next: [bold]probe-kit demo[/]")') == ["next: [bold]probe-kit demo[/]"]
+    assert marked("[bold]{}[/]", "[red]mine[/]").plain == "[red]mine[/]"

@@ -131,6 +131,32 @@ def test_an_input_that_no_model_has_is_refused_before_anything_is_played(tmp_pat
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (("--items", 6), "frames of 3 groups; a diagnosis needs at least 6"),
+        (("--target", "sim.tool_y"), "Diagnose a run of `probe-kit extract` that acted"),
+        (("--target", "side.chosen"), "Diagnose a run of `probe-kit extract` that acted"),
+        (("--target", "dataset.x"), "built-in columns here are called item.NAME"),
+        (("--html", "."), "is a folder"),
+    ],
+)
+@pytest.mark.parametrize("plan", [(), ("--dry-run",)], ids=["run", "plan"])
+def test_what_no_weights_can_change_is_refused_before_them_and_by_the_plan(
+    options: tuple[object, ...], named: str, plan: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("probe_kit.hooks.load_policy", never)
+    answer = run_command("pi0-tiny", "--categories", "color", "--out", tmp_path / "run", *options, *plan)
+    assert (answer.exit_code, named in " ".join(answer.output.split())) == (2, True), answer.output
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_scripted_model_is_refused_before_it_plays(tmp_path: Path) -> None:
+    answer = run_command("expert", "--categories", "color", "--out", tmp_path / "run")
+    assert (answer.exit_code, "is scripted and has no network" in answer.output) == (2, True)
+    assert not (tmp_path / "run").exists()
+
+
 def test_a_camera_that_a_run_has_not_is_refused_before_its_model_is_loaded(folder: Path) -> None:
     answer = run_command(folder / "run", "--require", "picture.wrist", "--base", "no/such-model")
     assert (answer.exit_code, "there are instruction, picture, state" in answer.output) == (2, True)

@@ -1,17 +1,22 @@
 """A diagnosis of a network that is shown two cameras: each is an input of its own."""
 
+import re
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import pytest
 from typer.testing import CliRunner
 
 from probe_kit.cli import app
-from probe_kit.diagnose.diagnosis import check_base_files, diagnose_run
+from probe_kit.diagnose.diagnosis import check_base, check_base_files, diagnose_run
 from probe_kit.diagnose.inputs import names_of
 from probe_kit.errors import UsageError
 from probe_kit.extract import EnvSource, ExtractSettings, extract_run
 from probe_kit.hooks.contract.card import shown_cameras
+from probe_kit.intervene.sessions import ReplaySource
 from probe_kit.runs import Run
+from probe_kit.runs.run_source import Origin
 from probe_kit.suite import Suite
 from tests.support.acting_checkpoints import FAMILIES
 from tests.support.organisms import ORGANISMS, edited
@@ -82,3 +87,17 @@ def test_a_base_of_other_cameras_is_refused_by_its_configuration_alone(tmp_path:
     check_base_files("smolvla", tuned, same, {}, ("top", "wrist"))
     with pytest.raises(UsageError, match=r"other inputs: its cameras are .*front.*, those of .*tuned .*top"):
         check_base_files("smolvla", tuned, other, {}, ("top", "wrist"))
+    # A run names its own checkpoint, and no --checkpoint is given: the run's is the one that is compared.
+    run = cast(
+        "Run",
+        SimpleNamespace(
+            model="smolvla",
+            origins=(Origin(checkpoint=tuned),),
+            certificate={"policy": {"cameras": ["top", "wrist"], "needs": ["camera.wrist"]}},
+        ),
+    )
+    check_base(run, ReplaySource(), same)
+    with pytest.raises(UsageError, match=r"other inputs: its cameras are .*front.*, those of .*tuned .*top"):
+        check_base(run, ReplaySource(), other)
+    with pytest.raises(UsageError, match=f"those of {re.escape(same)} "):
+        check_base(run, ReplaySource(checkpoint=same), other)  # where a checkpoint is given, it is that one

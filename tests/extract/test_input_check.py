@@ -191,6 +191,11 @@ def test_a_blank_picture_changes_nothing_but_the_picture() -> None:
     assert (blank.instruction, blank.state.tolist()) == (clean.instruction, clean.state.tolist())
 
 
+def test_another_spelling_of_an_instruction_is_no_other_instruction() -> None:
+    (words, *_) = varied(observation("lift it"), ["Lift it.", "LIFT  IT", "push it"], letters)["instruction"]
+    assert words.instruction == "push it"
+
+
 GROUPS = 12
 
 
@@ -201,7 +206,7 @@ def frames(count: int = 24, spread: Sequence[float] = (1.0, 100.0)) -> list[Fram
         Frame.of(
             f"frame {number}",
             Observation(
-                np.full((2, 2, 3), rng.integers(2), np.uint8),
+                np.full((2, 2, 3), 200 * rng.integers(2), np.uint8),
                 (rng.normal(size=2) * spread).astype(np.float32),
                 str(rng.choice(["lift", "push"])),
             ),
@@ -219,7 +224,8 @@ def drawn(frames: Sequence[Frame], draws: int) -> set[int]:
 
 
 def plain(colour: int) -> Observation:
-    return Observation(np.full((2, 2, 3), colour, np.uint8), np.zeros(1, np.float32), "go")
+    shade = (10 * (colour % 25), 10 * (colour // 25), 0)  # far enough apart to be two pictures
+    return Observation(np.full((2, 2, 3), shade, np.uint8), np.zeros(1, np.float32), "go")
 
 
 @pytest.mark.parametrize("vary", ["instruction", "picture", "state"])

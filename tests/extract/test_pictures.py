@@ -141,7 +141,7 @@ def test_a_table_of_a_spreadsheet_is_read_by_the_rules_of_all_tables(folder: Pat
     table = tmp_path / "table.csv"
     table.write_bytes("sep=;\r\npicture;instruction;group;red\r\n0.png;gehe;7.0;−2\r\n".encode("utf-16"))
     (row,) = source(tmp_path).open().rows(0)
-    assert (row.columns["group_id"], row.content.numbers) == ("7", (-2.0,))
+    assert (row.columns["group_id"], row.content.numbers) == ("7.0", (-2.0,)), "a name is no number"
     table.write_text("picture,instruction,group\n0.png,go,Red\n0.png,go,red\n", encoding="utf-8")
     with pytest.raises(UsageError, match="expected one spelling"):
         source(tmp_path).open()

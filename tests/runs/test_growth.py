@@ -79,8 +79,10 @@ def extracted(where: Path, suite: Suite, selections: Sequence[Selection]) -> Run
 
 
 def stored_files(run: Path) -> dict[str, bytes]:
-    """All that is not derived of other files."""
-    return {name: raw for name, raw in files_of(run).items() if not name.startswith(("columns.zarr/", "sealed/"))}
+    """All that is not derived of other files; the arrays' metadata says for other tools how long the plan is."""
+    derived = ("columns.zarr/", "sealed/")
+    files = files_of(run).items()
+    return {name: raw for name, raw in files if not (name.startswith(derived) or name.endswith("/zarr.json"))}
 
 
 def files_of(run: Path) -> dict[str, bytes]:
@@ -135,9 +137,15 @@ def test_plain_zarr_reads_the_episodes_of_a_grown_run(small_suite: Suite, tmp_pa
     arrays = [
         zarr.open_array(run.path / "data.zarr" / name, mode="r") for name in ("backbone/pooled", "trajectory")
     ]
-    assert not np.isnan(arrays[0][:12]).any()
-    assert np.isnan(arrays[0][12:20]).all()
-    assert arrays[1][:12].shape[0] == 12
+    assert [array.shape[0] for array in arrays] == [array.attrs["episodes"] for array in arrays] == [12, 12]
+    assert not np.isnan(arrays[0][:]).any()
+    identity = run.root.identity
+    writer_of(run.path, plan_of(small_suite, (["color"], 8, None)))
+    longer = zarr.open_array(run.path / "data.zarr/backbone/pooled", mode="r")
+    assert (longer.shape[0], longer.attrs["episodes"], open_run(run.path, allow_partial=True).root.identity) == (
+        16, 16, identity,
+    )  # fmt: skip
+    assert np.isnan(longer[12:]).all()
 
 
 @pytest.mark.parametrize("query", QUERIES)

@@ -204,17 +204,91 @@ class TestBucket(LocationContract):
             _ = location.path
 
 
+class TestOtherStores(LocationContract):
+    """Stores that say of an object that is gone that it is not found, as those of Google and Azure do."""
+
+    @pytest.fixture(params=["gs", "az"])
+    def location(
+        self, request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> Location:
+        stores = pytest.importorskip("obstore.store", reason="obstore is not installed (extra `remote`)")
+        (tmp_path / "objects").mkdir()
+        stored = stores.MemoryStore() if request.param == "gs" else stores.LocalStore(tmp_path / "objects")
+        monkeypatch.setattr(buckets.Bucket, "_objects", stored)
+        return locate(f"{request.param}://bucket/prefix/run")
+
+    def test_what_is_gone_is_removed(self, location: Location) -> None:
+        for key in ("c/1.json", "c/3.json"):
+            location.write(key, b"")
+        location._delete(["c/1.json", "c/2.json", "c/3.json"])
+        location.delete("c/1.json")
+        assert location.keys("") == []
+
+
 def test_what_is_no_location_is_refused_and_says_why() -> None:
     for where, why in {
         "https://host/run": "s3://",
         "s3://bucket": "names no run",
         "s3:///run": "names no run",
+        "s3://bucket/": "names no run",
+        "s3://bucket//run": "two slashes in a row",
+        "s3://bucket/a//run": "two slashes in a row",
+        "s3://bucket/run//": "two slashes in a row",
+        "s3://bucket/a/../run": r"has the part '\.\.'",
+        "s3://bucket/./run": r"has the part '\.'",
+        "s3://bucket/a\nb": r"has the part 'a\\nb'",
+        "s3://somebody@bucket/run": "'somebody@bucket' is no name of a bucket",
+        "s3://bucket:80/run": "'bucket:80' is no name of a bucket",
     }.items():
         with pytest.raises(UsageError, match=why):
             locate(where)
     with pytest.raises(UsageError, match="give it as text"):
         locate(Path("s3://bucket/run"))
     assert isinstance(locate(Path("s3-results")), Folder)
+
+
+TYPED = (
+    "run",
+    "run#2",
+    "run?2",
+    "run?x=2#y",
+    "run%202",
+    "run 2",
+    "run%2F2",
+    "run+2",
+    "rún",
+    "run;2",
+    "run@2",
+    "~run",
+)
+
+
+@pytest.mark.parametrize("scheme", ["s3", "gs", "az"])
+def test_an_address_is_a_place_as_it_is_typed(scheme: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("AZURE_STORAGE_ACCOUNT_NAME", "account")
+    for typed in TYPED:
+        location = locate(f"{scheme}://bucket/a/{typed}")
+        assert location._objects.prefix == f"a/{typed}"
+        assert (str(location), location.name) == (location.address, typed)
+        assert str(locate(f"{location}/")) == location.address == f"{scheme}://bucket/a/{typed}"
+
+
+def test_two_addresses_are_two_runs(bucket: str) -> None:
+    for typed in TYPED:
+        locate(f"{bucket}/{typed}").write("run.json", typed.encode())
+    assert [locate(f"{bucket}/{typed}").read("run.json").decode() for typed in TYPED] == list(TYPED)
+    assert [locate(f"{bucket}/{typed}").keys("") for typed in TYPED] == [["run.json"]] * len(TYPED)
+
+
+def test_a_key_that_leads_out_of_a_run_is_read_nowhere(tmp_path: Path, bucket: str) -> None:
+    for location in (locate(tmp_path / "run"), locate(f"{bucket}/run")):
+        for key in ("../other", "/etc/hostname", "a//b", "a/./b", "a\nb", ""):
+            assert not location.exists(key)
+            with pytest.raises(FileNotFoundError):
+                location.read(key)
+            for change in (partial(location.write, key, b""), partial(location.delete, key)):
+                with pytest.raises(RunDamagedError, match="leads out of its folder"):
+                    change()
 
 
 def test_without_obstore_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -21,7 +22,8 @@ from typer.testing import CliRunner
 from probe_kit.cli import app
 from probe_kit.errors import DiskSpaceError, RunDamagedError
 from probe_kit.hooks.contract.sites import Site
-from probe_kit.runs import Run, open_run, root, seal
+from probe_kit.runs import Run, open_run, root, seal, verify_run
+from probe_kit.runs.array_lengths import without_length
 from probe_kit.runs.layout import INTERVENTIONS
 from probe_kit.runs.records import HASH, Checksum, Record, Sums, as_record, read_record
 from probe_kit.runs.results import PARTIAL, bundle_keys, read_bundles, write_bundle
@@ -272,6 +274,84 @@ def test_a_flipped_bit_in_a_column_is_an_error_that_says_how_to_rebuild(copy: Pa
     chunk.write_bytes(content)
     with pytest.raises(RunDamagedError, match=r"run verify .* --seal"):
         open_run(copy).column(SITES[0])
+
+
+DERIVED = ("provenance/*", "certificates/*", "certificate.json")
+
+
+@pytest.mark.parametrize("lost", DERIVED)
+def test_a_record_that_follows_from_the_others_is_made_again(copy: Path, lost: str) -> None:
+    before, files = hashes(copy), list(copy.glob(lost))
+    run = open_run(copy)
+    said = (run.certificate, run.provenances, run.origins)
+    for file in files:
+        file.unlink()
+    again = open_run(copy)
+    assert (again.certificate, again.provenances, again.origins) == said
+    assert re.search(rf"{re.escape(files[0].name)} is missing.*--seal", verify_run(copy).problems[0])
+    again.restore_records()
+    assert hashes(copy) == before
+    files[0].unlink()
+    answer = CliRunner().invoke(app, ["run", "verify", str(copy), "--seal"])
+    assert (answer.exit_code, hashes(copy)) == (0, before), answer.output
+
+
+def test_records_that_follow_from_nothing_are_damage_by_name(copy: Path) -> None:
+    for lost in (("certificates", "certificate.json"), ("provenance", "certificate.json")):
+        run = Path(shutil.copytree(copy, copy.with_name("-".join(lost))))
+        for name in lost:
+            shutil.rmtree(run / name) if (run / name).is_dir() else (run / name).unlink()
+        with pytest.raises(RunDamagedError, match=rf"({'|'.join(lost)}).* is missing"):
+            open_run(run)
+
+
+@pytest.mark.parametrize("damage", ["a bit", "cut", "an object", "the metadata", "the seal", "the seal's bit"])
+def test_damaged_columns_are_built_again_by_the_command_that_the_error_names(copy: Path, damage: str) -> None:
+    before = hashes(copy)
+    chunk = next(path for path in copy.glob("columns.zarr/*/backbone/pooled/c/**/*") if path.is_file())
+    (sealed,) = (copy / "sealed").iterdir()
+    if damage in ("a bit", "cut"):
+        chunk.write_bytes(
+            chunk.read_bytes()[: -1 if damage == "cut" else None].translate(bytes(range(255, -1, -1)))
+        )
+    elif damage == "the seal's bit":
+        sealed.write_bytes(sealed.read_bytes().replace(b'"seal', b'"sead').replace(b'"stamp"', b'"stamq"'))
+    else:
+        metadata = next(copy.glob("columns.zarr/*/zarr.json"))
+        {"an object": chunk, "the metadata": metadata, "the seal": sealed}[damage].unlink()
+    assert damage == "the seal" or not verify_run(copy, deep=True).ok
+    answer = CliRunner().invoke(app, ["run", "verify", str(copy), "--seal", "--deep"])
+    assert (answer.exit_code, hashes(copy)) == (0, before), answer.output
+
+
+def test_arrays_of_an_earlier_run_are_read_and_shortened_by_its_seal(copy: Path, recorded_run: Run) -> None:
+    identity, before = recorded_run.root.identity, hashes(copy)
+    for path in (copy / "data.zarr").rglob("zarr.json"):
+        path.write_bytes(without_length(path.read_bytes()))
+    earlier = open_run(copy)
+    assert (earlier.root.identity, earlier.stamp) == (identity, recorded_run.stamp)
+    assert zarr.open_array(copy / "data.zarr/backbone/pooled", mode="r").shape[0] == 1_000_000
+    assert verify_run(copy, deep=True).ok
+    assert not seal(copy)
+    assert hashes(copy) == before
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        (b"\n    24,", b"\n    25,"),
+        (b'"episodes": 24', b'"episodes": 25'),
+        (b"24", b"0"),
+        (b'"float32"', b'"uint32"'),
+    ],
+)
+def test_metadata_that_differs_in_more_than_its_length_is_damage(copy: Path, old: bytes, new: bytes) -> None:
+    path = copy / "data.zarr/backbone/pooled/zarr.json"
+    content = path.read_bytes()
+    assert old in content
+    path.write_bytes(content.replace(old, new))
+    with pytest.raises(RunDamagedError, match=r"backbone/pooled/zarr\.json has"):
+        open_run(copy)
 
 
 def test_role_codes_name_every_token_position(recorded_run: Run) -> None:

@@ -2,6 +2,9 @@
 
 import json
 import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -31,7 +34,7 @@ from probe_kit.hooks.contract.sites import Site
 from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.retention import retention_table
 from probe_kit.runs import ActionErrors, Run, arrays, compare_actions, copy_run, export_run, open_run, verify_run
-from probe_kit.runs.arrays import Rows, decode_bfloat16, role_mask, token_blocks
+from probe_kit.runs.arrays import Rows, decode_bfloat16, open_array, role_mask, token_blocks
 from probe_kit.runs.layout import DATASET, OTHER_ACTIONS
 from probe_kit.runs.run_folders import find_runs, runs_in
 from probe_kit.runs.store import locate
@@ -103,6 +106,48 @@ def test_the_page_reads_a_run_with_plain_zarr_and_json(recorded_run: Run) -> Non
     np.testing.assert_array_equal(column, recorded_run.column(Site("backbone", 3)))
     dataset = xr.open_zarr(recorded_run.path / "data.zarr", group="backbone", consolidated=False, chunks=None)
     assert dataset["pooled"].dims == ("episode", "call", "layer", "view", "feature")
+
+
+def every_array(run: Run) -> Iterator[tuple[str, Path]]:
+    for path in sorted((run.path / "data.zarr").rglob("zarr.json")):
+        if json.loads(path.read_bytes())["node_type"] == "array":
+            yield path.parent.relative_to(run.path / "data.zarr").as_posix(), path.parent
+
+
+@pytest.mark.parametrize("kind", ["recorded_run", "shown_run"])
+def test_other_tools_read_all_of_a_finished_run_at_once(kind: str, request: pytest.FixtureRequest) -> None:
+    run: Run = request.getfixturevalue(kind)
+    tree = xr.open_datatree(run.path / "data.zarr", engine="zarr", consolidated=False, chunks=None)
+    names = []
+    for name, path in every_array(run):
+        array = zarr.open_array(path, mode="r")
+        assert (array.shape[0], array.attrs["episodes"]) == (len(run.episodes),) * 2
+        whole, rows = array[:], Rows(open_array(run.data, name), run.episodes["episode"].tolist())
+        np.testing.assert_array_equal(whole[run.episodes["episode"]], np.stack(list(rows)))
+        np.testing.assert_array_equal(tree[name].load().values, whole)
+        names.append(name)
+    assert {*run.root.arrays} <= {*names}
+    for columns in (run.path / "columns.zarr").iterdir():
+        xr.open_datatree(columns, engine="zarr", consolidated=False, chunks=None).load()
+
+
+@pytest.mark.slow
+def test_tensorstore_reads_all_of_a_finished_run_at_once(recorded_run: Run, tmp_path: Path) -> None:
+    """In an environment of its own: it is none of probe_kit's."""
+    python = tmp_path / "env/bin/python"
+    subprocess.run([sys.executable, "-m", "venv", tmp_path / "env"], check=True)
+    made = subprocess.run([python, "-m", "pip", "install", "-q", "tensorstore==0.1.86"], check=False)
+    if made.returncode:
+        pytest.skip("tensorstore cannot be installed here")
+    code = "import sys, tensorstore as ts, numpy as np\n" + (
+        "array = ts.open({'driver': 'zarr3', 'kvstore': f'file://{sys.argv[1]}/'}).result()\n"
+        "np.save(sys.argv[2], np.asarray(array.read().result()))\n"
+    )
+    for name, path in every_array(recorded_run):
+        subprocess.run([python, "-c", code, path.resolve(), tmp_path / "whole.npy"], check=True)
+        np.testing.assert_array_equal(
+            np.load(tmp_path / "whole.npy"), zarr.open_array(path, mode="r")[:], err_msg=name
+        )
 
 
 def test_the_labelled_dataset_selects_by_name(recorded_run: Run) -> None:

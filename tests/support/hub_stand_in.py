@@ -16,14 +16,15 @@ _PULL_REQUEST = {
     "isPullRequest": True, "changes": {"base": "refs/heads/main"}, "filesWithConflicts": [],
     "repo": {"name": "lab/study", "type": "dataset"},
 }  # fmt: skip
+_API = ("/api/models/", "/api/datasets/")
 
 
 @dataclass
 class Hub:
     """failures: first answers to commits, a status or 0 for a cut connection. files: of commits, by path.
 
-    models: files of a model's commits, by repository and commit. names: commits of branches and tags. refusals: of
-    a repository, the status and the code of an error.
+    models: files of commits of a model or a data set, by repository and commit. names: commits of branches and
+    tags. refusals: of a repository, the status and the code of an error.
     """
 
     failures: list[int] = field(default_factory=list)
@@ -36,9 +37,11 @@ class Hub:
     refusals: dict[str, tuple[int, str]] = field(default_factory=dict)
 
     def download(self, path: str) -> tuple[int, dict[str, str], bytes]:
-        """Status, headers and body of what is asked of a model."""
-        api = path.startswith("/api/models/")
-        parts = unquote(path.removeprefix("/api/models")).strip("/").split("/")
+        """Status, headers and body of what is asked of a model or a data set."""
+        api = path.startswith(_API)
+        for prefix in (*_API, "/datasets/"):
+            path = path.removeprefix(prefix)
+        parts = unquote(path).strip("/").split("/")
         repository, asked = "/".join(parts[:2]), parts[3] if len(parts) > 3 else "main"
         if repository in self.refusals and not (api and self.refusals[repository][1] == "GatedRepo"):
             status, code = self.refusals[repository]
@@ -117,7 +120,10 @@ def hub() -> Iterator[Hub]:
             self.wfile.write(content)
 
         def do_GET(self) -> None:
-            if not self.path.startswith("/api/models/") and "/resolve/" not in self.path:
+            served = self.path.startswith("/api/models/") or any(
+                f"/datasets/{name}" in self.path for name in found.models
+            )
+            if not served and "/resolve/" not in self.path:
                 self.do_POST()
                 return
             found.requests.append((self.command, self.path, str(self.headers.get("authorization"))))

@@ -14,7 +14,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from random import Random
 from threading import Event, Thread
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
+from urllib.parse import unquote
 from urllib.request import Request, urlopen
 
 import pytest
@@ -110,20 +111,53 @@ def without_conditions(app: App) -> App:
     return deaf
 
 
+class Call(NamedTuple):
+    """A request as a client means it.
+
+    call: one of `CALLS`. key: of the object, without the bucket; of a listing or bulk deletion empty.
+    """
+
+    call: str
+    key: str
+
+    @classmethod
+    def of(cls, environ: dict[str, Any]) -> "Call":
+        method, query = environ["REQUEST_METHOD"], environ.get("QUERY_STRING", "")
+        # What the client sent: decoded paths have no %20 and no question mark.
+        key = unquote(environ["REQUEST_URI"].partition("?")[0]).removeprefix(f"/{BUCKET}").lstrip("/")
+        if method == "PUT":
+            conditional = "HTTP_IF_NONE_MATCH" in environ
+            return cls("part" if "partNumber" in query else "create" if conditional else "put", key)
+        if method == "POST":
+            return cls("delete" if not key else "complete" if "uploadId" in query else "begin", key)
+        if method == "GET":
+            return cls("list" if not key else "get", key)
+        return cls("abort" if method == "DELETE" else method.lower(), key)
+
+
+CALLS = ("put", "create", "begin", "part", "complete", "get", "head", "list", "delete")
+ANSWERS = ("conflict", "failed", "hurried", "broken", "busy", "unanswered", "cut")
+"""What `Unreliable` does to a request: 409, 412, 429, 500, 503, done and no reply, done and half a reply."""
+
+
 class Unreliable:
     """The same server on a bad day: `ail` says of every request what happens to it, None for nothing.
 
-    Every other answer is the name of a method here. seen: how often each happened.
+    Every other answer is the name of a method here. seen: how often each happened. attack: the same as `ail`, of
+    the call that the client made.
     """
 
     def __init__(self, app: App) -> None:
         self._app = app
         self.ail: Callable[[str, str], str | None] = lambda _method, _path: None
+        self.attack: Callable[[Call], str | None] = lambda _call: None
         self.seen: Counter[str] = Counter()
         self.over = Event()
 
     def __call__(self, environ: dict[str, Any], start_response: Callable[..., Any]) -> Iterable[bytes]:
-        ill = None if "HTTP_X_TRUSTED" in environ else self.ail(environ["REQUEST_METHOD"], environ["PATH_INFO"])
+        trusted = "HTTP_X_TRUSTED" in environ
+        ill = None if trusted else self.ail(environ["REQUEST_METHOD"], environ["PATH_INFO"])
+        ill = ill or (None if trusted else self.attack(Call.of(environ)))
         if ill is None:
             return self._app(environ, start_response)
         self.seen[ill] += 1
@@ -132,9 +166,23 @@ class Unreliable:
 
     def busy(self, environ: dict[str, Any], start_response: Callable[..., Any]) -> Iterable[bytes]:
         """It asks to slow down."""
-        environ["wsgi.input"].read(_length(environ))
-        start_response("503 Slow Down", [("Content-Type", "application/xml")])
-        return [b"<Error><Code>SlowDown</Code><Message>Please reduce your request rate.</Message></Error>"]
+        return _refuse(environ, start_response, "503 Slow Down", "SlowDown")
+
+    def conflict(self, environ: dict[str, Any], start_response: Callable[..., Any]) -> Iterable[bytes]:
+        """Another request for the same key is under way."""
+        return _refuse(environ, start_response, "409 Conflict", "OperationAborted")
+
+    def failed(self, environ: dict[str, Any], start_response: Callable[..., Any]) -> Iterable[bytes]:
+        """A condition does not hold, whether or not there was one."""
+        return _refuse(environ, start_response, "412 Precondition Failed", "PreconditionFailed")
+
+    def hurried(self, environ: dict[str, Any], start_response: Callable[..., Any]) -> Iterable[bytes]:
+        """There were too many requests."""
+        return _refuse(environ, start_response, "429 Too Many Requests", "TooManyRequests")
+
+    def broken(self, environ: dict[str, Any], start_response: Callable[..., Any]) -> Iterable[bytes]:
+        """It made a mistake of its own."""
+        return _refuse(environ, start_response, "500 Internal Server Error", "InternalError")
 
     def torn(self, environ: dict[str, Any], _start_response: Callable[..., Any]) -> Iterable[bytes]:
         """It is gone when half of an upload has arrived, and keeps nothing."""
@@ -179,6 +227,14 @@ class BadServer(S3Server):
 
 def _length(environ: dict[str, Any]) -> int:
     return int(environ.get("CONTENT_LENGTH") or 0)
+
+
+def _refuse(
+    environ: dict[str, Any], start_response: Callable[..., Any], status: str, code: str
+) -> Iterable[bytes]:
+    environ["wsgi.input"].read(_length(environ))
+    start_response(status, [("Content-Type", "application/xml")])
+    return [f"<Error><Code>{code}</Code><Message>Try again.</Message></Error>".encode()]
 
 
 def _hang_up(environ: dict[str, Any]) -> NoReturn:

@@ -101,14 +101,14 @@ def write_internvl(folder: Path, seed: int = 1, large: bool = False, **fields: A
 
 
 @written_once
-def write_paligemma(folder: Path, seed: int = 1, **fields: Any) -> Path:
+def write_paligemma(folder: Path, seed: int = 1, vocabulary: int = VOCABULARY, **fields: Any) -> Path:
     """Pictures of 28 pixels; output weights tied."""
     vision = {
         "model_type": "siglip_vision_model", "hidden_size": 24, "intermediate_size": 44, "num_hidden_layers": 2,
         "num_attention_heads": 2, "patch_size": 14, "image_size": 28, "projection_dim": 32,
         "vision_use_head": False,
     }  # fmt: skip
-    text = {**_TEXT, "model_type": "gemma", "num_key_value_heads": 1, "head_dim": 8}
+    text = {**_TEXT, "model_type": "gemma", "num_key_value_heads": 1, "head_dim": 8, "vocab_size": vocabulary}
     number = 256 + PALIGEMMA_SPECIAL.index("<image>")
     values = {
         "model_type": "paligemma", "vision_config": vision, "text_config": text, "image_token_index": number,

@@ -1,5 +1,6 @@
 """One family of probes: what a side can, a column of labels can, and where not the message says why."""
 
+import json
 import shutil
 from pathlib import Path
 from typing import Any
@@ -203,3 +204,15 @@ def test_the_command_lists_every_target_with_its_values_or_the_reason_why_not(st
     assert f"2 classes: right {counts['right']}, left {counts['left']}" in lines["side.correct"]
     assert "continuous" in lines["sim.tool_y"]
     assert "numbers from" in lines["sim.tool_y"]
+    listed = CliRunner().invoke(app, ["targets", str(stored.path), "--format", "json"])
+    rows = {row["target"]: row for row in json.loads(listed.stdout)}
+    side, quantity = rows["side.correct"], rows["sim.tool_y"]
+    assert side["values"] == {"labels": len(stored.episodes), "missing": 0, "classes": counts.to_dict()}
+    assert quantity["tasks"] == ["continuous"]
+    assert quantity["values"]["minimum"] < quantity["values"]["maximum"]
+    assert quantity["command"] == f"probe-kit train {stored.path} --target sim.tool_y"
+    texts = [text for row in rows.values() for text in row.values() if isinstance(text, str)]
+    assert all(text == text.strip() for text in texts)
+    assert not any("classes:" in text or "numbers from" in text for text in texts)
+    csv_rows = CliRunner().invoke(app, ["targets", str(stored.path), "--format", "csv"]).stdout
+    assert '""labels""' in csv_rows, "a cell that is a table itself is JSON"

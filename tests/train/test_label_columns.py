@@ -411,7 +411,7 @@ def test_spellings_that_may_be_one_class_are_refused(
 
 def test_equal_rows_count_once_and_contradicting_ones_are_refused(tmp_path: Path) -> None:
     file = tmp_path / "labels.csv"
-    file.write_text("episode_id,y,scene\na,yes,7\nb,no,8\na,Yes,7.0\nb,no,8\n", encoding="utf-8")
+    file.write_text("episode_id,y,scene\na,yes,7\nb,no,8\na,Yes,7\nb,no,8\n", encoding="utf-8")
     labels = Target.read(file, "y", group_by="scene")
     assert (labels.episodes, labels.groups, labels.table.lines) == (("a", "b"), ("7", "8"), [2, 3])
     assert labels.coded.values.tolist() == [1, 0]
@@ -493,12 +493,12 @@ def test_a_target_has_options_exactly_where_train_accepts_it(labelled_run: Path,
     shutil.copytree(labelled_run, tmp_path / "run")
     run = open_run(tmp_path / "run")
     rows = {row.target: row for row in listed_targets(run) if row.options is not None or row.refused}
-    assert rows["side.correct"].options == ""
-    assert rows["sim.held"].options == " --target sim.held"
+    assert rows["side.correct"].options == ()
+    assert rows["sim.held"].options == ("--target", "sim.held")
     assert rows["side.chosen"].options is None
     assert "0 independent groups" in rows["side.chosen"].refused
     for name, row in rows.items():
-        target = Target.of_run(run, name, task="classes" if "--task classes" in (row.options or "") else None)
+        target = Target.of_run(run, name, task="classes" if "classes" in (row.options or ()) else None)
         if row.options is None:
             with pytest.raises(ProbeKitError) as refusal:
                 train_probes(run, target=target, permutations=0, controls=())
@@ -515,7 +515,7 @@ def test_a_category_with_too_few_groups_is_left_out_of_the_command(labelled_run:
         shutil.rmtree(tmp_path / "run" / sealed)
     run = open_run(tmp_path / "run", allow_partial=True)
     assert run.episodes.groupby("category")["group_id"].nunique().to_dict() == {"color": 6, "shape": 3}
-    assert next(iter(listed_targets(run))).options == " --categories color"
+    assert next(iter(listed_targets(run))).options == ("--categories", "color")
 
 
 def test_a_run_that_did_not_act_has_no_chosen_side(labelled_run: Path) -> None:

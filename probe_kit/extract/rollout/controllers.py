@@ -21,7 +21,7 @@ from probe_kit.env.rotations import from_rpy, to_vector
 from probe_kit.errors import IgnoredInputsError, InstructionError, PolicyFailedError, ProbeKitError
 from probe_kit.extract.rollout.capturing import FEWEST_FOR_THREADS, Capturer, stored_streams
 from probe_kit.extract.settings import ExtractSettings
-from probe_kit.extract.sources.inputs import INSTRUCTION, PICTURE, blank_of, same_input, with_input
+from probe_kit.extract.sources.inputs import INSTRUCTION, PICTURE, blank_of, normal_form, same_input, with_input
 from probe_kit.extract.sources.source import Source, check_predictions
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.checkpoints.third_party import begin_randomness, copied, while_acting
@@ -142,7 +142,9 @@ def _with_other_words(clean: Observation, texts: Iterable[str], ids: Ids) -> Ite
     A model that reads no word still notices how many there are.
     """
     words = clean.instruction
-    candidates = dict.fromkeys([*islice(texts, MOST_TEXTS), " ".join(reversed(words.split()))])
+    # Another spelling may be the same tokens: a model that reads every word would be called one that reads none.
+    other_texts = (text for text in texts if normal_form(text) != normal_form(words))
+    candidates = dict.fromkeys([*islice(other_texts, MOST_TEXTS), " ".join(reversed(words.split()))])
     candidates.pop(words, None)
     length = _length(words, ids)
     for text in sorted(candidates, key=lambda text: _length(text, ids) != length):

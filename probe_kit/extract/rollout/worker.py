@@ -38,6 +38,7 @@ from probe_kit.hooks.contract.observation import Observation
 from probe_kit.runs.commits import Seconds
 from probe_kit.runs.layout import VIDEOS
 from probe_kit.runs.plan import Row
+from probe_kit.runs.provenance import INPUT_CONTENT
 from probe_kit.runs.run_source import ORIGIN
 from probe_kit.runs.thumbnails import as_thumbnail, thumbnail_key
 from probe_kit.runs.writer import RunWriter
@@ -256,6 +257,8 @@ class Worker:
         self._episodes = episodes
         played = Played(settings.machine.frames, settings.capture.calls, controller.script)
         self._opens = source.play(played)
+        # Once, and not on the writing thread: recordings decode a few pictures for it.
+        self._content = list(source.content_notes())
         self._pending: deque[Future[Done]] = deque()
 
     def __enter__(self) -> Self:
@@ -337,9 +340,11 @@ class Worker:
         return Done(playing.planned.index, outcome)
 
     def _certificate(self) -> dict[str, Any]:
-        """Return the controller's certificate, and the origin of this process."""
+        """Return the controller's certificate, inputs without content, and the origin of this process."""
         certificate = self._controller.certificate()
-        return {**certificate, ORIGIN: origin_of_process(self._settings, certificate["policy"]).to_json()}
+        content = {INPUT_CONTENT: self._content} if self._content else {}
+        origin = origin_of_process(self._settings, certificate["policy"]).to_json()
+        return {**certificate, **content, ORIGIN: origin}
 
     def _pictures(self, planned: Row, outcome: Mapping[str, Any], ending: Ending) -> dict[str, bytes]:
         """Return the pictures that are kept for people, as content by key."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field
 
 from probe_kit.extract.parts import read_options
-from probe_kit.extract.sources.recording import Episodes, Pixels
+from probe_kit.extract.sources.recording import Episodes, Pixels, Rotations
 from probe_kit.extract.sources.source import SourceSettings
 from probe_kit.hooks.contract.observation import Observation
 
@@ -30,12 +30,14 @@ class EnvEpisode:
         seed: The seed that decides everything that is random.
         instruction: The words that the model reads.
         group: Episodes of one group share a scene; folds and nulls keep it together. None for a group of its own.
+        max_steps: The number of actions after which the benchmark ends this episode; None for the environment's.
     """
 
     id: str
     seed: int
     instruction: str
     group: str | None = None
+    max_steps: int | None = None
 
 
 @dataclass(frozen=True)
@@ -56,6 +58,9 @@ class Step:
 
 class OwnEnvironment(Protocol):
     """An environment that `extract --env MODULE:CLASS` plays; equal seeds give equal episodes.
+
+    It may also have `max_steps`, the number of actions after which its benchmark ends an episode. Without, it is
+    that of the simulator that it holds, see `probe_kit.extract.sources.step_limits`.
 
     Attributes:
         revision: A text that changes with whatever its numbers depend on, such as versions; part of a run's
@@ -81,6 +86,7 @@ class OwnEnvironment(Protocol):
 
 LEROBOT = "lerobot"
 MAX_STEPS = 200
+"""The actions of an episode of an environment that declares no limit."""
 MOST_STEPS = 10_000
 _option = partial(typer.Option, rich_help_panel="Own environments")
 
@@ -98,8 +104,13 @@ class EnvSource(SourceSettings):
             or the name of an entry point of the group `probe_kit.environments`.
         options: Keyword arguments of the class.
         episodes: Indices among its episodes; None for all.
-        max_steps: The number of actions after which an episode ends.
+        max_steps: The number of actions after which an episode ends; None for the environment's own limit, or 200
+            where it declares none.
+        rotations: The degrees by camera, counterclockwise; `*` names all cameras.
+        accept_nondeterminism: Whether an environment is played in which one seed starts differently each time.
         pixels: Whether pictures at 32 × 32 are stored for controls.
+        limit: The largest of the environment's own limits in actions, which is read when it is opened. None
+            before, and where it declares none.
 
     Raises:
         UsageError: For what no environment can have.
@@ -120,9 +131,19 @@ class EnvSource(SourceSettings):
     )
     episodes: Episodes = None
     max_steps: Annotated[
-        int, Field(ge=1, le=MOST_STEPS), typer.Option("--max-steps", help="Number of actions per episode.")
-    ] = MAX_STEPS
+        Annotated[int, Field(ge=1, le=MOST_STEPS)] | None,
+        typer.Option("--max-steps", help="Number of actions per episode."),
+    ] = None
+    rotations: Rotations = ()
+    accept_nondeterminism: Annotated[
+        bool,
+        _option(
+            "--accept-nondeterminism",
+            help="Play an environment in which an episode does not repeat, such as a real robot.",
+        ),
+    ] = False
     pixels: Pixels = True
+    limit: Annotated[int | None, Field(exclude=True)] = None
 
     command: ClassVar[str] = "--env MODULE:CLASS"
     opens: ClassVar[str] = "probe_kit.extract.sources.environment_source:EnvironmentSource"
@@ -174,4 +195,4 @@ class EnvSource(SourceSettings):
 
     def steps(self) -> int:
         """Count the actions that an episode can have."""
-        return self.max_steps
+        return self.max_steps or min(self.limit or MAX_STEPS, MOST_STEPS)

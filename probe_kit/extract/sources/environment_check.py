@@ -1,22 +1,31 @@
 """The check of an environment of the user's own against what probe_kit relies on, promise by promise."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
+from probe_kit._execution.process_pool import Child
+from probe_kit._system.counting import counted
 from probe_kit.errors import MissingExtraError, ProbeKitError, UsageError
 from probe_kit.extract.sources.environment import EnvEpisode, EnvSource, OwnEnvironment, Step
 from probe_kit.extract.sources.environment_source import (
     checked_step,
     fact_values,
+    frames_of_steps,
     listed_episodes,
     naming_environment,
     open_environment,
     started,
 )
+from probe_kit.extract.sources.environment_starts import compare_steps
+from probe_kit.extract.sources.step_limits import declared_limit
+from probe_kit.runs.input_content import content_notes
 
 STEPS = 5
 """The actions per episode that the check executes."""
@@ -31,11 +40,15 @@ class EnvironmentCheck:
 
     Attributes:
         problem: The text of what was seen and expected; empty where the promise holds.
+        facts: What the environment declares or shows, such as its limit and the sizes of its pictures.
+        notes: Sentences about inputs without content, such as a black camera; the promise holds with them.
     """
 
     name: str
     sentence: str
     problem: str = ""
+    facts: str = ""
+    notes: tuple[str, ...] = ()
 
     @property
     def passed(self) -> bool:
@@ -50,33 +63,50 @@ class _Trial:
     episodes: list[EnvEpisode]
     steps: list[list[Step]]
 
-    def __init__(self, source: EnvSource) -> None:
-        self.source = source
+    def __init__(self, source: EnvSource, picture: Path | None = None) -> None:
+        self.source, self.picture = source, picture
+        self.notes: tuple[str, ...] = ()
 
     def __getattr__(self, name: str) -> NoReturn:
         raise _BrokenError(f"there is no {name} to check, see above")
 
-    def open(self) -> None:
+    def open(self) -> str:
         self.environment = open_environment(self.source)
+        return f"{self.environment.revision}; actions {', '.join(map(str, self.environment.action_names))}"
 
-    def list_episodes(self) -> None:
+    def list_episodes(self) -> str:
         first, second = (listed_episodes(self.environment, self.source) for _ in range(2))
         if first != second:
             raise _BrokenError(
                 "episodes() gave another list the second time; expected the same, in the same order"
             )
         self.episodes = [episode for _, episode in first[:EPISODES]]
+        groups = {episode.group or episode.id for _, episode in first}
+        return f"{counted(len(first), 'episode')} in {counted(len(groups), 'group')}"
 
-    def play(self) -> None:
+    def play(self) -> str:
+        """Play the episodes, write their first picture, and say where the environment ends them."""
         self.steps = [self._play(self.environment, episode) for episode in self.episodes]
+        names = ["the first camera", *(f"the camera {name!r}" for name in self.steps[0][0].observation.cameras)]
+        pairs = zip(self.episodes, self.steps, strict=True)
+        frames = [frames_of_steps(episode.id, steps) for episode, steps in pairs]
+        self.notes = tuple(content_notes(frames, names))
+        start = self.steps[0][0].observation
+        if self.picture is not None:
+            Image.fromarray(np.hstack(_of_one_height([start.image, *start.cameras.values()]))).save(self.picture)
+        limits = [episode.max_steps for episode in self.episodes if episode.max_steps is not None]
+        limit = max(limits, default=None) or declared_limit(self.environment, self.source.name)
+        end = "the environment declares no limit" if limit is None else f"an episode ends after {limit} actions"
+        return f"{', '.join(f'{name} {_by(shape)}' for name, shape in _shapes(self.steps[0][0]).items())}; {end}"
 
-    def facts_are_constant(self) -> None:
+    def facts_are_constant(self) -> str:
         after = [step for steps in self.steps for step in steps[1:]]
         names = sorted(after[0].facts) if after else []
         for steps in self.steps:
             for number, step in enumerate(steps):
                 if number or step.facts:
                     fact_values(step.facts, names, f"{self.source.name}, step() {number}")
+        return ", ".join(names) or "there are no facts"
 
     def repeats(self) -> None:
         """Repeat the first episode, after the other one."""
@@ -84,13 +114,28 @@ class _Trial:
         _check_equal(self.steps[0], again, "the same episode, played again behind another one")
 
     def repeats_elsewhere(self) -> None:
-        """Repeat the first episode in a new environment, as each process opens its own."""
-        other = open_environment(self.source)
+        """Repeat the first episode in a new environment, here and in a process that opens its own."""
+        first = self.steps[0]
+        _check_equal(first, self.play_anew(self.episodes[0]), "the same episode in a second environment")
+        child = Child(f"{__name__}:serve")
         try:
-            again = self._play(other, self.episodes[0])
+            child.connection.send((self.source, self.episodes[0]))
+            again = child.connection.recv()
+        except (EOFError, ConnectionResetError, BrokenPipeError):
+            again = _BrokenError("a process that opens the environment ended; look above for its last words")
         finally:
-            self._close(other)
-        _check_equal(self.steps[0], again, "the same episode in a second environment")
+            child.close()
+        if isinstance(again, ProbeKitError):
+            raise _BrokenError(f"in another process: {again}")
+        _check_equal(first, again, "the same episode in another process")
+
+    def play_anew(self, episode: EnvEpisode) -> list[Step]:
+        """Play an episode in a new environment."""
+        environment = open_environment(self.source)
+        try:
+            return self._play(environment, episode)
+        finally:
+            self._close(environment)
 
     def close(self) -> None:
         if "environment" in vars(self):
@@ -129,7 +174,16 @@ class _BrokenError(ProbeKitError):
     """The error of a broken promise."""
 
 
-_CHECKS: Sequence[tuple[str, str, Callable[[_Trial], None]]] = (
+def serve(connection: Connection) -> None:
+    """Play one episode in this process, and send its steps or its error."""
+    source, episode = connection.recv()
+    try:
+        connection.send(_Trial(source).play_anew(episode))
+    except ProbeKitError as error:
+        connection.send(error)
+
+
+_CHECKS: Sequence[tuple[str, str, Callable[[_Trial], str | None]]] = (
     (
         "it_opens",
         "It opens, with a revision, names of its actions, and the methods episodes, reset, step and close.",
@@ -146,33 +200,36 @@ _CHECKS: Sequence[tuple[str, str, Callable[[_Trial], None]]] = (
     ("equal_seeds_give_equal_frames", "An episode repeats, frame for frame, behind another one.", _Trial.repeats),
     (
         "a_second_environment_is_equal",
-        "A second environment shows the same frames, because each process opens its own.",
+        "A second environment shows the same frames, here and in another process, because each opens its own.",
         _Trial.repeats_elsewhere,
     ),
     ("it_closes", "It closes.", _Trial.close),
 )
 
 
-def check_environment(source: EnvSource | str) -> Iterator[EnvironmentCheck]:
+def check_environment(source: EnvSource | str, picture: Path | str | None = None) -> Iterator[EnvironmentCheck]:
     """Check the promises of the contract, each on the first two episodes; an error is a failure.
 
     Args:
         source: An `EnvSource`, or MODULE:CLASS.
+        picture: A file for the first pictures of all cameras, side by side, as a model gets them; None for none.
 
     Raises:
         UsageError: If there is no such class.
         MissingExtraError: If a simulator is not installed; the message names it.
     """
-    trial = _Trial(EnvSource(source) if isinstance(source, str) else source)
+    file = None if picture is None else Path(picture)
+    trial = _Trial(EnvSource(source) if isinstance(source, str) else source, file)
     for name, sentence, check in _CHECKS:
         try:
-            check(trial)
+            facts = check(trial)
         except (UsageError, MissingExtraError):
             raise
         except ProbeKitError as error:
             yield EnvironmentCheck(name, sentence, str(error))
         else:
-            yield EnvironmentCheck(name, sentence)
+            notes = trial.notes if check is _Trial.play else ()
+            yield EnvironmentCheck(name, sentence, facts=facts or "", notes=notes)
 
 
 def _shapes(step: Step) -> dict[str, tuple[int, ...]]:
@@ -181,28 +238,24 @@ def _shapes(step: Step) -> dict[str, tuple[int, ...]]:
     return {"the picture": observation.image.shape, "the state": observation.state.shape, **cameras}
 
 
+def _by(shape: Sequence[int]) -> str:
+    return " × ".join(map(str, shape))
+
+
+def _of_one_height(pictures: Sequence[NDArray[np.uint8]]) -> list[NDArray[np.uint8]]:
+    """Return pictures (H, W, 3), with black below those that are less high than the highest."""
+    height = max(len(picture) for picture in pictures)
+    return [np.pad(picture, ((0, height - len(picture)), (0, 0), (0, 0))) for picture in pictures]
+
+
 def _check_equal(first: list[Step], again: list[Step], which: str) -> None:
     if len(first) != len(again):
         raise _BrokenError(f"{which} ended after {len(again) - 1} actions, before after {len(first) - 1}")
     for number, (was, now) in enumerate(zip(first, again, strict=True)):
-        before, after = was.observation, now.observation
-        different = [
-            name
-            for name, equal in (
-                ("the picture", np.array_equal(before.image, after.image)),
-                ("the state", np.array_equal(before.state, after.state)),
-                ("a further camera", _equal_pictures(before.cameras, after.cameras)),
-                ("a fact", dict(was.facts) == dict(now.facts)),
-                ("done", was.done == now.done),
-            )
-            if not equal
-        ]
+        different, equal = compare_steps(was, now)
         if different:
+            repeats = f"; equal: {', '.join(equal)}" if equal else ""
             raise _BrokenError(
-                f"{which} differs after {number} actions: {', '.join(different)}. Take all randomness from the "
-                "episode's seed, and set everything up in reset()"
+                f"{which} differs after {number} actions: {', '.join(different)}{repeats}. Take all randomness "
+                "from the episode's seed, and set everything up in reset()"
             )
-
-
-def _equal_pictures(before: Mapping[str, NDArray[np.uint8]], after: Mapping[str, NDArray[np.uint8]]) -> bool:
-    return before.keys() == after.keys() and all(np.array_equal(before[name], after[name]) for name in before)

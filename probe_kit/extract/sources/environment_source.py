@@ -4,11 +4,12 @@ Every error of an environment's code becomes an OwnEnvironmentError.
 """
 
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from importlib import import_module
+from inspect import signature
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -16,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._system.counting import counted, spanned
 from probe_kit._system.escaping import UNSAFE, terminal_safe
 from probe_kit._system.imports import entry_points
 from probe_kit.errors import (
@@ -26,8 +28,18 @@ from probe_kit.errors import (
     ProbeKitError,
     UsageError,
 )
-from probe_kit.extract.sources.environment import LEROBOT, SUCCESS, EnvEpisode, EnvSource, OwnEnvironment, Step
-from probe_kit.extract.sources.player import SIDE, Answer, Ending, InputsPlayer, Opens
+from probe_kit.extract.sources.environment import (
+    LEROBOT,
+    MOST_STEPS,
+    SUCCESS,
+    EnvEpisode,
+    EnvSource,
+    OwnEnvironment,
+    Step,
+)
+from probe_kit.extract.sources.environment_starts import compare_steps, start_digest
+from probe_kit.extract.sources.player import SIDE, Answer, Ending, InputsPlayer, Opens, frames_of_episode
+from probe_kit.extract.sources.recording import EVERY_CAMERA, degrees_of
 from probe_kit.extract.sources.source import (
     FIRST_EPISODES,
     Played,
@@ -37,9 +49,11 @@ from probe_kit.extract.sources.source import (
     predicted_once,
     unusual_shares,
 )
+from probe_kit.extract.sources.step_limits import checked_limit, declared_limit
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.observation import Observation, checked_picture
-from probe_kit.runs.layout import AT_END, ENVIRONMENT, ONCE, TRUTHS
+from probe_kit.runs.input_content import EpisodeFrames, content_notes
+from probe_kit.runs.layout import AT_END, ENVIRONMENT, LIMIT, ONCE, START, TRUTHS
 from probe_kit.runs.plan import Row
 from probe_kit.runs.small_frames import SmallFrames, shrink
 
@@ -55,15 +69,26 @@ LONGEST = 200
 
 
 @contextmanager
-def naming_environment(name: str, doing: str) -> Iterator[None]:
-    """Replace errors of an environment's code in the body by OwnEnvironmentError; those of probe_kit stay."""
+def naming_environment(name: str, doing: str, remedy: Callable[[], str] | None = None) -> Iterator[None]:
+    """Replace errors of an environment's code in the body by OwnEnvironmentError; those of probe_kit stay.
+
+    Args:
+        name: The environment as the user named it.
+        doing: The method that is called.
+        remedy: Returns what the user can do; by default it is to correct the environment, or for one of lerobot's
+            to check its simulator.
+    """
     try:
         yield
     except ProbeKitError:
         raise
     except (Exception, SystemExit) as error:
-        reason = f"{type(error).__name__}: {str(error)[:500]}"
-        raise OwnEnvironmentError(f"{name} failed in {doing}: {reason}. Correct the environment") from error
+        reason = f"{type(error).__name__}: {str(error)[:500].rstrip('.')}"
+        usual = "Correct the environment"
+        if name.startswith(f"{LEROBOT}:"):
+            usual = "Check the simulator's installation and files, or give other options (--env-option)"
+        advice = usual if remedy is None else remedy()
+        raise OwnEnvironmentError(f"{name} failed in {doing}: {reason}. {advice}") from error
 
 
 def factory_of(name: str) -> Callable[..., Any]:
@@ -110,10 +135,72 @@ def factory_of(name: str) -> Callable[..., Any]:
 def open_environment(source: EnvSource) -> OwnEnvironment:
     """Open a new environment. Raises OwnEnvironmentError if it breaks its contract, and as `factory_of`."""
     factory = factory_of(source.environment)
-    with naming_environment(source.environment, "its constructor"):
+    with naming_environment(source.environment, "its constructor", partial(_options_of, factory)):
         environment: OwnEnvironment = factory(**dict(source.options))
     check_members(environment, source.environment)
-    return environment
+    return RotatedEnvironment(environment, source.rotations) if source.rotations else environment
+
+
+def _options_of(factory: Callable[..., Any]) -> str:
+    """Return what the user can do where a class cannot be made: its options with their defaults, if it has any."""
+    try:
+        parameters = [str(parameter) for parameter in signature(factory).parameters.values()]
+    except (TypeError, ValueError):  # of a class that is no Python code
+        parameters = []
+    options = f"Its options are {', '.join(parameters)}: give" if parameters else "It takes no options: give none"
+    return f"{options} with --env-option NAME=VALUE, or correct the environment"
+
+
+class RotatedEnvironment:
+    """An environment whose pictures are rotated, as its user asked for.
+
+    Args:
+        environment: The environment, all of whose other parts stay as they are.
+        rotations: Pairs of a camera and degrees, counterclockwise. `*` is every camera, and a name that
+            `Observation.cameras` lacks the first picture.
+    """
+
+    def __init__(self, environment: OwnEnvironment, rotations: Sequence[tuple[str, int]]) -> None:
+        self._environment, self._rotations = environment, tuple(rotations)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._environment, name)
+
+    @property
+    def max_steps(self) -> int | None:
+        """The limit that the environment or its simulator declares."""
+        return declared_limit(self._environment, type(self._environment).__name__)
+
+    def reset(self, episode: EnvEpisode) -> Observation | Step:
+        """Set an episode up, and return its beginning with rotated pictures."""
+        answer = self._environment.reset(episode)
+        return self._rotated(answer) if isinstance(answer, Observation) else self._rotated_step(answer)
+
+    def step(self, action: NDArray[np.float32]) -> Step:
+        """Execute one action, and return the state after it with rotated pictures."""
+        return self._rotated_step(self._environment.step(action))
+
+    def _rotated_step(self, step: Step) -> Step:
+        is_step = isinstance(step, Step) and isinstance(step.observation, Observation)
+        return replace(step, observation=self._rotated(step.observation)) if is_step else step
+
+    def _rotated(self, observation: Observation) -> Observation:
+        further_cameras = observation.cameras
+        first = next(
+            (camera for camera, _ in self._rotations if camera not in (*further_cameras, EVERY_CAMERA)), ""
+        )
+        cameras = {
+            name: _turned(picture, degrees_of(self._rotations, name)) for name, picture in further_cameras.items()
+        }
+        image = _turned(observation.image, degrees_of(self._rotations, first))
+        return replace(observation, image=image, cameras=cameras)
+
+
+def _turned(picture: NDArray[np.uint8], degrees: int) -> NDArray[np.uint8]:
+    """Return a picture that is rotated counterclockwise; what is no picture stays, and is refused later."""
+    if not (isinstance(picture, np.ndarray) and picture.ndim == 3):
+        return picture
+    return np.ascontiguousarray(np.rot90(picture, degrees // 90))
 
 
 def check_members(environment: object, name: str) -> None:
@@ -171,6 +258,8 @@ def _check_episode(episode: object, where: str) -> None:
         raise OwnEnvironmentError(f"{where} has an id or group of more than {LONGEST} characters; shorten it")
     if isinstance(episode.seed, bool) or not isinstance(episode.seed, int) or episode.seed < 0:
         raise OwnEnvironmentError(f"{where} has the seed {episode.seed!r}; expected a whole number from 0 on")
+    if episode.max_steps is not None:
+        checked_limit(episode.max_steps, where)
 
 
 def started(environment: OwnEnvironment, episode: EnvEpisode, where: str) -> Step:
@@ -257,6 +346,16 @@ SUCCEEDED, FAILED, ENDED = "success", "failure", "ended"
 """The outcomes: whether the fact `success` is true at the last step; the last one where there is no such fact."""
 
 
+def limit_in(settings: EnvSource, episode: EnvEpisode) -> int | None:
+    """Return the actions after which the benchmark ends an episode; None where nothing declares a number."""
+    return episode.max_steps or settings.limit
+
+
+def most_steps(settings: EnvSource, episode: EnvEpisode) -> int:
+    """Return the actions after which an episode ends: those that were typed, else the benchmark's."""
+    return settings.max_steps or min(episode.max_steps or settings.steps(), MOST_STEPS)
+
+
 class EnvironmentSource(Source[EnvSource]):
     """The names and chosen episodes of an environment, read once.
 
@@ -266,6 +365,8 @@ class EnvironmentSource(Source[EnvSource]):
         columns: The facts; empty before.
         truths: The facts that are truth values; empty before.
         chunk: The number of actions that the policy predicts at a time; 0 before.
+        starts: The hashes of the first observations of the first episodes; empty before they were set up, and
+            where they need not repeat.
     """
 
     def __init__(
@@ -278,17 +379,105 @@ class EnvironmentSource(Source[EnvSource]):
         self.cameras: list[str] = []
         self.truths: list[str] = []
         self.chunk = 0
+        self.starts: dict[str, str] = {}
+        is_typed = settings.max_steps is not None
+        self._has_limits_of_episodes = not is_typed and any(
+            episode.max_steps is not None for _, episode in self.episodes
+        )
+        self._frames: list[EpisodeFrames] = []
 
     @classmethod
     def open(cls, settings: EnvSource, selects_only: bool) -> Self:
-        """Open the environment once, and list its episodes. Raises as `open_environment` and `listed_episodes`."""
+        """Open the environment once, list its episodes, and read after how many actions it ends them.
+
+        An environment that declares no limit before its first episode may hold its simulator from then on.
+
+        Raises:
+            OwnEnvironmentError: As `open_environment` and `listed_episodes` raise it.
+        """
         del selects_only
-        environment = open_environment(settings)
+        environment, name = open_environment(settings), settings.name
         try:
             listed = listed_episodes(environment, settings)
+            limits = {episode.max_steps for _, episode in listed} or {None}
+            if None in limits:
+                limit = declared_limit(environment, name)
+                if limit is None:
+                    started(environment, listed[0][1], name)
+                    limit = declared_limit(environment, name)
+                limits = (limits - {None}) | ({limit} if limit is not None else set())
+            settings = settings.changed(limit=max((limit for limit in limits if limit is not None), default=None))
             return cls(settings, environment.revision, [str(name) for name in environment.action_names], listed)
         finally:
             environment.close()
+
+    def decided(self) -> dict[str, Any]:
+        """Return the settings of the environment, with the limit that it declares."""
+        return {"source": self.settings}
+
+    def rehearse(self, rows: "Iterable[Row]") -> None:
+        """Set the first episode up twice, with another one in between, before anything is played.
+
+        Raises:
+            OwnEnvironmentError: If it starts otherwise the second time, unless that is accepted.
+        """
+        del rows
+        episodes = [episode for _, episode in self.episodes[:2]]
+        environment, name = open_environment(self.settings), self.name
+        try:
+            first, *later_starts = (started(environment, episode, name) for episode in episodes)
+            again = started(environment, episodes[0], name)
+        finally:
+            environment.close()
+        if not self.settings.accept_nondeterminism:
+            self._check_repeats(first, again)
+            self.starts = {
+                episode.id: start_digest(step)
+                for episode, step in zip(episodes, (first, *later_starts), strict=True)
+            }
+
+    def _check_repeats(self, first: Step, again: Step) -> None:
+        different, equal = compare_steps(first, again)
+        if not different:
+            return
+        episode, name = self.episodes[0][1], self.name
+        environment = open_environment(self.settings)
+        try:
+            elsewhere = started(environment, episode, name)
+        finally:
+            environment.close()
+        repeats = (
+            "The first reset of a new environment does repeat: its constructor and the number of resets decide "
+            "the start, not the episode's seed"
+            if not compare_steps(first, elsewhere)[0]
+            else "The first reset of a new environment does not repeat either"
+        )
+        raise OwnEnvironmentError(
+            f"{name}, episode {episode.id!r}: set up twice with the seed {episode.seed}, it starts otherwise the "
+            f"second time: {', '.join(different)}; equal: {', '.join(equal) or 'nothing'}. {repeats}. Take all "
+            "randomness from the episode's seed in reset(), or make the simulator anew there; what cannot repeat, "
+            "such as a robot, is played with --accept-nondeterminism"
+        )
+
+    @property
+    def starts_are_equal(self) -> bool:
+        """Whether the first two episodes, of different seeds and groups, start with the same observation."""
+        episodes = [episode for _, episode in self.episodes[:2]]
+        return (
+            len(self.starts) > 1
+            and len(set(self.starts.values())) == 1
+            and len({episode.group or episode.id for episode in episodes}) > 1
+        )
+
+    def smaller_groups(self, rows: Sequence[Row]) -> str:
+        """Return the option by which each start is a group; empty where seeds are seen to start equally."""
+        has_names = any(row.content.group is not None for row in rows)
+        same = len(set(self.starts.values())) < len(self.starts)
+        return f"train --group-by {START} makes a group of each start" if has_names and not same else ""
+
+    def most_steps(self, episode: EnvEpisode) -> int:
+        """Return the number of actions after which an episode ends."""
+        return most_steps(self.settings, episode)
 
     def rows(self, seed: int) -> tuple[Row, ...]:
         """Return a row per episode."""
@@ -304,6 +493,7 @@ class EnvironmentSource(Source[EnvSource]):
                     "env_episode": number,
                     "env_seed": episode.seed,
                     "policy_seed": derive_seed(seed, "policy", episode.id),
+                    **({"max_steps": self.most_steps(episode)} if self._has_limits_of_episodes else {}),
                 },
                 episode,
             )
@@ -320,8 +510,14 @@ class EnvironmentSource(Source[EnvSource]):
         finally:
             environment.close()
         self.seen, self.cameras = first.observation, [*cameras[:1], *first.observation.cameras]
+        self._frames = [frames_of_steps(self.episodes[0][1].id, [first])]
         self._note_facts(first)
         return self
+
+    def content_notes(self) -> tuple[str, ...]:
+        """Return a sentence for every camera of one colour or under two names, in the first frames of episodes."""
+        names = self.cameras or ["picture"]
+        return tuple(content_notes(self._frames, names))
 
     def check(self, policy: "Policy", accept_units: bool) -> "tuple[Self, Policy]":
         """Set up the first chosen episodes, let the policy predict once, and execute one action of the first.
@@ -350,12 +546,16 @@ class EnvironmentSource(Source[EnvSource]):
             chunk = self._predicted(policy, first.observation)
             with naming_environment(name, "step()"):
                 second = environment.step(np.array(chunk[0]))
-            self._note_facts(checked_step(second, self.episodes[0][1], f"{name}, step() 1"))
+            second = checked_step(second, self.episodes[0][1], f"{name}, step() 1")
+            self._note_facts(second)
             later = [episode for _, episode in self.episodes[1:FIRST_EPISODES]]
             later = later if policy.state_numbers is not None else []
             begins = [first, *(started(environment, episode, name) for episode in later)]
             for begin in begins:
                 self._check_state(policy, begin.observation)
+            ids = [episode.id for _, episode in self.episodes]
+            steps = [[first, second], *([begin] for begin in begins[1:])]
+            self._frames = [frames_of_steps(*pair) for pair in zip(ids, steps, strict=False)]
             unusual = unusual_shares(policy, np.stack([begin.observation.state for begin in begins]))
         finally:
             environment.close()
@@ -378,6 +578,11 @@ class EnvironmentSource(Source[EnvSource]):
 
     def _with_cameras(self, policy: "Policy", observation: Observation) -> "Policy":
         self.cameras = [*policy.card.cameras[:1], *observation.cameras]
+        turned = [camera for camera, _ in self.settings.rotations if camera != EVERY_CAMERA]
+        if strange := [camera for camera in turned if camera not in self.cameras]:
+            raise UsageError(
+                f"--rotate {strange[0]}=…: {self.name} has no such camera; it shows {', '.join(self.cameras)}"
+            )
         try:
             return policy.with_cameras(self.cameras)
         except ObservationError as error:
@@ -415,7 +620,7 @@ class EnvironmentSource(Source[EnvSource]):
 
     def play(self, played: Played) -> Opens:
         """Open a player, with an environment of its own."""
-        return partial(EnvironmentPlayer, self.settings, self.columns, played)
+        return partial(EnvironmentPlayer, self.settings, self.columns, played, self.starts)
 
     # -- what a run says of it -----------------------------------------------------------------------
 
@@ -439,7 +644,8 @@ class EnvironmentSource(Source[EnvSource]):
             "environment": settings.environment,
             "options": dict(settings.options),
             "revision": self.revision,
-            "max_steps": settings.max_steps,
+            "max_steps": None if self._has_limits_of_episodes else settings.steps(),
+            **({"rotations": [list(turn) for turn in settings.rotations]} if settings.rotations else {}),
             "cameras": self.cameras,
             "inputs": shapes,
             "columns": list(self.columns),
@@ -467,17 +673,61 @@ class EnvironmentSource(Source[EnvSource]):
         return tuple(f"env.{name}" for name in self.columns)
 
     def describe(self, rows: Sequence[Row]) -> dict[str, str]:
-        """Return environment, cameras, actions, facts and episodes."""
-        groups = f"{len(rows)} in {len({row.columns['group_id'] for row in rows})} groups"
+        """Return environment, cameras, actions, facts, episodes with their limit, and what a group is."""
+        groups = {row.columns["group_id"] for row in rows}
+        described = {
+            "environment": terminal_safe(self.name),
+            "episodes": f"{len(rows)} in {counted(len(groups), 'group')}, {self._limit_words(rows)}",
+            "groups": self._group_words(rows),
+            "starts": self._start_words,
+        }
         if self.seen is None:
-            return {"environment": terminal_safe(self.name), "episodes": groups}
+            return described
+        turned = self.settings.rotations
+        cameras = [
+            f"{camera}, rotated by {degrees}°" if (degrees := degrees_of(turned, camera)) else camera
+            for camera in self.cameras
+        ]
         return {
             "environment": terminal_safe(f"{self.name} ({self.revision})"),
-            "cameras": terminal_safe(", ".join(self.cameras)),
+            "cameras": terminal_safe(", ".join(cameras)),
             "actions": terminal_safe(", ".join(self.actions)),
             "facts": terminal_safe(", ".join(self.columns)) or "none",
-            "episodes": f"{groups}, at most {self.settings.max_steps} actions each",
+            **{name: words for name, words in described.items() if name != "environment"},
         }
+
+    def _limit_words(self, rows: Sequence[Row]) -> str:
+        settings, most = self.settings, sorted({self.most_steps(row.content) for row in rows})
+        limits = sorted({limit for row in rows if (limit := limit_in(settings, row.content)) is not None})
+        actions = f"at most {spanned(most)} actions each"
+        if settings.max_steps is None:
+            if not limits:
+                return f"{actions}: the environment declares no limit of its own, --max-steps gives another"
+            bounded = " up to" if limits[-1] > most[-1] else ""
+            return f"{actions}:{bounded} the environment's own limit{f' of {limits[-1]}' if bounded else ''}"
+        if not limits:
+            return f"{actions}: --max-steps; the environment declares no limit of its own"
+        shorter = "; rates are not the benchmark's" if most[-1] < limits[-1] else ""
+        return f"{actions}: --max-steps; the environment's own limit is {spanned(limits)}{shorter}"
+
+    def _group_words(self, rows: Sequence[Row]) -> str:
+        groups: list[str | None] = [row.content.group for row in rows]
+        if all(group is None for group in groups):
+            return "every episode is one, because its seed starts it anew"
+        words = "the environment names them"
+        return words if None not in groups else f"{words}; an episode without one is its own"
+
+    @property
+    def _start_words(self) -> str:
+        if self.settings.accept_nondeterminism:
+            return "not checked: --accept-nondeterminism; episodes may not repeat"
+        if self.starts_are_equal:
+            first, second = (terminal_safe(episode.id) for _, episode in self.episodes[:2])
+            return (
+                f"{first} and {second} start with the same observation, though they are two groups: "
+                f"train with --group-by {START}"
+            )
+        return "one seed, set up twice, starts equally" if self.starts else ""
 
 
 class EnvironmentPlayer(InputsPlayer):
@@ -487,32 +737,43 @@ class EnvironmentPlayer(InputsPlayer):
         settings: The settings of the environment, of which the player opens its own.
         facts: The names of the facts, in stored order.
         played: The frames and inferences to keep.
+        starts: The hashes of first observations by episode, as another process saw them.
     """
 
-    def __init__(self, settings: EnvSource, facts: Sequence[str], played: Played) -> None:
+    def __init__(
+        self, settings: EnvSource, facts: Sequence[str], played: Played, starts: Mapping[str, str] | None = None
+    ) -> None:
         self._settings, self._facts, self._played = settings, tuple(facts), played
+        self._starts = dict(starts or {})
         self._environment = open_environment(settings)
 
     def begin(self, row: Row, film: bool) -> Answer:
-        """Set an episode up."""
+        """Set an episode up. Raises OtherFramesError if it starts otherwise than in another process."""
         del film
         self.row, self._steps, self._succeeded = row, 0, False
         self._clear()
         step = started(self._environment, row.content, self._settings.name)
+        self._start = start_digest(step)
+        if self._starts.get(row.content.id, self._start) != self._start:
+            raise OtherFramesError(
+                f"{self._settings.name}: the episode {row.content.id!r} starts otherwise than it did when the run "
+                "was prepared, in the process that plays it. Take all randomness from the episode's seed, or play "
+                "it with --accept-nondeterminism"
+            )
         self._first = _pictures(step)
         return self._see(step)
 
     def advance(self, actions: NDArray[np.float32]) -> Answer:
         """Execute actions (n, D) until they or the episode end."""
         self._keep("action", actions, self._played.calls)
-        name = self._settings.name
+        name, most = self._settings.name, most_steps(self._settings, self.row.content)
         for action in actions:
             with naming_environment(name, "step()"):
                 answer = self._environment.step(action.copy())
             self._steps += 1
             step = checked_step(answer, self.row.content, f"{name}, step() {self._steps}")
             self._succeeded |= _succeeds(step)
-            if step.done or self._steps >= self._settings.max_steps:
+            if step.done or self._steps >= most:
                 return self._end(step)
         return self._see(step)
 
@@ -540,12 +801,20 @@ class EnvironmentPlayer(InputsPlayer):
             **({ONCE: self._succeeded, AT_END: at_end} if has_success else {}),
             "steps": self._steps,
             "done": bool(step.done),
+            **({} if (limit := limit_in(self._settings, self.row.content)) is None else {LIMIT: limit}),
+            START: self._start,
         }
         return self._ending(outcome, self._small_frames(_pictures(step)))
 
     def _small_frames(self, last: list[NDArray[np.uint8]]) -> SmallFrames:
         """Return the first and the last frame of all cameras side by side, in small."""
         return () if self._played.frames == "none" else (shrink(*self._first), shrink(*last))
+
+
+def frames_of_steps(name: str, steps: Sequence[Step]) -> EpisodeFrames:
+    """Return pictures and states of some steps of an episode, to look for inputs without content."""
+    states = np.stack([step.observation.state for step in steps]).astype(np.float64)
+    return frames_of_episode(name, [_pictures(step) for step in steps], states)
 
 
 def _pictures(step: Step) -> list[NDArray[np.uint8]]:

@@ -3,10 +3,13 @@
 The simulators are packages of their own; without one, an error names it and nothing is played.
 """
 
+import dataclasses
 import json
 import sys
-from collections.abc import Iterator, Mapping
+import traceback
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
+from difflib import get_close_matches
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
@@ -14,8 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit._system.imports import require
-from probe_kit.errors import MissingExtraError, OwnEnvironmentError, UsageError
+from probe_kit.errors import MissingExtraError, OwnEnvironmentError, ProbeKitError, UsageError
 from probe_kit.extract.sources.environment import SUCCESS, EnvEpisode, Step
+from probe_kit.extract.sources.step_limits import limit_of
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.families.shared.kinds import IMAGES, STATE
 
@@ -34,14 +38,16 @@ class LeRobotEnvironment:
         **options: Fields of the configuration, as text or values.
 
     Raises:
-        UsageError: For an unknown name or field, and for one whose code is fetched from the hub.
+        UsageError: For an unknown name or field, for one whose code is fetched from the hub, and for a task or
+            field that the installed simulator refuses.
         MissingExtraError: Without the simulator.
     """
 
     def __init__(
         self, kind: str, per_task: int | str = PER_TASK, instruction: str | None = None, **options: Any
     ) -> None:
-        self._kind, self._per_task, self._instruction = kind, int(per_task), instruction
+        self._kind, self._per_task, self._instruction = kind, _count(per_task), instruction
+        self._typed = tuple(options)
         self._config = _configuration(kind, {name: _value(value) for name, value in options.items()})
         self._before, self._after = self._config.get_env_processors()
         self._tasks = self._created()
@@ -54,8 +60,13 @@ class LeRobotEnvironment:
 
     def _created(self) -> dict[str, Any]:
         """Return the only environment of every task, not vectorized."""
-        with _naming_simulator(self._kind):
-            suites = self._config.create_envs(n_envs=1, use_async_envs=False)
+        try:
+            with _naming_simulator(self._kind):
+                suites = self._config.create_envs(n_envs=1, use_async_envs=False)
+        except ProbeKitError:
+            raise
+        except Exception as error:
+            raise UsageError(_refused_options(self._kind, self._config, self._typed, error)) from error
         return {
             f"{suite}-{number}": vector.envs[0]
             for suite, tasks in suites.items()
@@ -63,7 +74,13 @@ class LeRobotEnvironment:
         }
 
     def episodes(self) -> Iterator[EnvEpisode]:
-        """Yield every task with the seeds 0, 1, 2 …; a task is a group."""
+        """Yield every task with the seeds 0, 1, 2 and so on.
+
+        Each is a group of its own, because a seed is another start. Where a task has stored initial states and
+        more seeds than these, the seeds of one initial state are a group.
+        """
+        limits = {task: limit_of(environment) for task, environment in self._tasks.items()}
+        differ = len(set(limits.values())) > 1
         for task, environment in self._tasks.items():
             text = self._instruction or _text(environment)
             if not text:
@@ -71,13 +88,16 @@ class LeRobotEnvironment:
                     f"lerobot:{self._kind} has no instruction for {task}; give one with "
                     "--env-option instruction=TEXT"
                 )
+            states = _count_initial_states(environment)
+            repeat = states is not None and self._per_task > states
             for seed in range(self._per_task):
-                yield EnvEpisode(f"{task}/{seed:04d}", seed, text, task)
+                group = f"{task}/state-{seed % states:04d}" if repeat and states else None
+                yield EnvEpisode(f"{task}/{seed:04d}", seed, text, group, limits[task] if differ else None)
 
     def reset(self, episode: EnvEpisode) -> Step:
         """Set a task up from the episode's seed; where a task has stored beginnings, seed n chooses the n-th."""
         self._episode = episode
-        self._environment = self._tasks[str(episode.group)]
+        self._environment = self._tasks[episode.id.rpartition("/")[0]]
         inner = self._environment.unwrapped
         if hasattr(inner, "init_state_id"):
             inner.init_state_id = episode.seed
@@ -130,6 +150,79 @@ def _naming_simulator(kind: str) -> Iterator[None]:
             f"lerobot:{kind} needs a simulator that is not installed: {str(error).rstrip('.')}. Install it as "
             f"lerobot's page on {kind} says; where lerobot has an extra for it, that is lerobot[{kind}]"
         ) from error
+    except EOFError as error:
+        raise UsageError(
+            f"lerobot:{kind} asks a question when it is used first, which only a terminal can answer. Run once in "
+            f'one: python -c "import {_module_of(error)}"'
+        ) from error
+
+
+def _module_of(error: BaseException) -> str:
+    """Return the name of the module that raised an error."""
+    frames = list(traceback.walk_tb(error.__traceback__))
+    return str(frames[-1][0].f_globals.get("__name__", ""))
+
+
+MOST_LISTED = 12
+"""The most names of tasks that a message lists."""
+_INTERNAL = ("features", "features_map", "disable_env_checker", "max_parallel_tasks")
+"""The fields of a configuration that no user of `--env` changes."""
+
+
+def _refused_options(kind: str, config: Any, typed: Sequence[str], error: Exception) -> str:
+    """Return the message for a configuration that the installed simulator refuses: what it has in its place."""
+    reason = f"{type(error).__name__}: {str(error)[:300].rstrip('.')}"
+    names, task = _task_names(kind, config), str(config.task or "")
+    unknown = [part.strip() for part in task.split(",") if _bare_task(kind, part) not in names]
+    if names and unknown:
+        default = "" if "task" in typed else ", lerobot's default"
+        bare = _bare_task(kind, unknown[0])
+        nearest = get_close_matches(bare, names, len(names), 0)
+        more = f" … ({len(names)} in all)" if len(names) > MOST_LISTED else ""
+        return (
+            f"--env lerobot:{kind}: the installed simulator has no task {unknown[0]!r}{default} ({reason}). "
+            f"It has {', '.join(nearest[:MOST_LISTED])}{more}; give one with --env-option task={nearest[0]}"
+        )
+    fields = ", ".join(
+        f"{field.name}={getattr(config, field.name)!r}"
+        for field in dataclasses.fields(config)
+        if field.name not in _INTERNAL
+    )
+    return (
+        f"--env lerobot:{kind}: the installed simulator refuses lerobot's configuration ({reason}). It is "
+        f"{fields}; give another value with --env-option NAME=VALUE, or install the simulator that lerobot names"
+    )
+
+
+def _bare_task(kind: str, task: str) -> str:
+    return task.strip().removeprefix(f"{kind}-")
+
+
+def _task_names(kind: str, config: Any) -> list[str]:
+    """Return the tasks and suites that Gymnasium's registry or lerobot's module of an environment lists."""
+    import gymnasium
+
+    package = f"{config.package_name}/"
+    names = dict.fromkeys(name.removeprefix(package) for name in gymnasium.registry if name.startswith(package))
+    module = sys.modules.get(f"lerobot.envs.{kind}")
+    for constant, value in vars(module).items() if module is not None else ():
+        if "TASK" in constant and isinstance(value, Mapping | list | tuple):
+            names |= dict.fromkeys(name for name in value if isinstance(name, str))
+    return list(names)
+
+
+def _count_initial_states(environment: Any) -> int | None:
+    """Return the number of stored initial states that a task of LIBERO has; None for other environments."""
+    inner = environment.unwrapped
+    stored = getattr(inner, "_init_states", None)
+    return len(stored) if hasattr(inner, "init_state_id") and stored is not None else None
+
+
+def _count(per_task: int | str) -> int:
+    """Return the number of episodes of a task. Raises UsageError for what is none."""
+    if not str(per_task).isdecimal() or int(per_task) < 1:
+        raise UsageError(f"--env-option per_task={per_task}; expected a number of episodes from 1 on")
+    return int(per_task)
 
 
 def _configuration(kind: str, options: Mapping[str, Any]) -> Any:

@@ -5,11 +5,10 @@ file that meta does not name is never read.
 """
 
 import glob
-import logging
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from fractions import Fraction
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,8 @@ from numpy.typing import NDArray
 
 from probe_kit._system.parquet_files import read_parquet
 from probe_kit.errors import RecordingError, UsageError
+from probe_kit.extract.sources.frame_times import BY_FAR, NONE, Drift, TickTimes, nearest_by_far
+from probe_kit.extract.sources.lerobot_formats import EPISODES
 from probe_kit.extract.sources.lerobot_meta import (
     HALF,
     IMAGE,
@@ -27,9 +28,10 @@ from probe_kit.extract.sources.lerobot_meta import (
     EpisodeMeta,
     LeRobotMeta,
 )
-from probe_kit.extract.sources.recording import LeRobotSource
+from probe_kit.extract.sources.recorded_video import RecordedVideo, VideoError
+from probe_kit.extract.sources.recording import LeRobotSource, episodes_text
 from probe_kit.hooks.checkpoints.checkpoint import OFFLINE_WAY_OUT, hub_reason, unreachable, way_out
-from probe_kit.suite.pictures import LARGEST_PICTURE, decode_bytes
+from probe_kit.suite.pictures import decode_bytes
 
 MOST_FRAMES = 64
 """The most chosen frames that one row holds."""
@@ -89,6 +91,21 @@ class LeRobotFolder(LeRobotMeta):
         for episode in self.episodes:
             by_file.setdefault(self.path / episode.file, []).append(episode)
         return by_file
+
+    @cached_property
+    def frames_before(self) -> Mapping[tuple[str, int], tuple[int, int]]:
+        """The frames of earlier episodes, and of all, in the video file of a camera and an episode."""
+        totals: dict[tuple[str, Path], int] = {}
+        earlier: dict[tuple[str, int], int] = {}
+        for camera in filter(self.is_video, self.cameras):
+            for episode in sorted(self.episodes, key=lambda episode: episode.videos[camera].begin):
+                file = camera, episode.videos[camera].file
+                earlier[camera, episode.number] = totals.get(file, 0)
+                totals[file] = totals.get(file, 0) + episode.length
+        return {
+            (camera, number): (before, totals[camera, self.episodes[number].videos[camera].file])
+            for (camera, number), before in earlier.items()
+        }
 
     # -- files -----------------------------------------------------------------------------------------
 
@@ -212,12 +229,12 @@ def _download(repo: str, commit: str, patterns: list[str]) -> Path:
 # -- frames ------------------------------------------------------------------------------------------------------
 
 
-OFF_GRID_S = 1e-4
-"""The seconds by which a timestamp may differ from frame / fps, and a picture of a video from its timestamp."""
 MOST_AT_ONCE = 32_000_000
 """The bytes of columns that are read of a whole file, so that not every episode opens it."""
 OTHER_RATE = 0.05
 """The share by which the frame rate of a video may differ from the data set's."""
+_MOST_VIDEOS = 16
+"""The most open videos, such as one for each camera of a robot."""
 _EPISODE, _INDEX = "episode_index", "index"
 
 
@@ -237,12 +254,19 @@ class _DataFile:
 
 
 class LeRobotFrames:
-    """The frames and numbers of chosen episodes, decoded when they are asked for. Opened once per process."""
+    """The frames and numbers of chosen episodes, decoded when they are asked for. Opened once per process.
+
+    Attributes:
+        largest_drift: The largest distance of a time from its frame, of the episodes that were read; None before.
+    """
 
     def __init__(self, folder: LeRobotFolder) -> None:
         self.folder = folder
+        self.largest_drift: Drift | None = None
         self._data_file = lru_cache(maxsize=2)(self._scanned)
-        self._lengths: dict[Path, tuple[float, float]] = {}
+        self._video = lru_cache(maxsize=_MOST_VIDEOS)(self._opened_video)
+        self._video_times = lru_cache(maxsize=_MOST_VIDEOS)(self._named_times)
+        self._regular: set[int] = set()
 
     def pictures(self, episode: int, frame: int, cameras: Sequence[str]) -> dict[str, NDArray[np.uint8]]:
         """Return pictures (H, W, 3) uint8 by camera; of stored images the very bytes. Raises RecordingError."""
@@ -266,29 +290,42 @@ class LeRobotFrames:
         return values
 
     def check(self, episodes: Sequence[int], cameras: Sequence[str]) -> None:
-        """Raise RecordingError unless the numbers and files of these episodes can be shown.
+        """Raise RecordingError unless the numbers and pictures of these episodes can be shown.
 
-        Every video must be as long as its episodes say. Two pictures of the first episode are decoded.
+        Each time must name a frame of each video, which is read without decoding. The first and the last picture
+        of each episode are decoded. The error names the first episode with a fault, and the episodes without any.
         """
+        faults: dict[int, str] = {}
         for episode in episodes:
-            self.numbers(episode, ())
-            for camera in filter(self.folder.is_video, cameras):
-                self._check_video(self.folder.episodes[episode], camera)
-        for episode in episodes[:1]:
-            for frame in {0, self.folder.lengths[episode] - 1}:
-                self.pictures(episode, frame, cameras)
+            try:
+                self._check_episode(episode, cameras)
+            except RecordingError as error:
+                faults[episode] = str(error)
+        if faults:
+            raise RecordingError(_first_fault(faults, episodes))
+
+    def _check_episode(self, episode: int, cameras: Sequence[str]) -> None:
+        self.numbers(episode, ())
+        for camera in filter(self.folder.is_video, cameras):
+            self._check_video(self.folder.episodes[episode], camera)
+            self._video_times(episode, camera)
+        for frame in sorted({0, self.folder.lengths[episode] - 1}):
+            self.pictures(episode, frame, cameras)
 
     # -- rows ------------------------------------------------------------------------------------------
 
-    def _rows(self, episode: int, columns: Sequence[str]) -> Any:
-        """Return the table (T rows) of an episode. Row groups are kept until others of these columns are read."""
+    def _rows(self, episode: int, columns: Sequence[str], frame: int | None = None) -> Any:
+        """Return the table (T rows) of an episode, or (1 row) of a frame.
+
+        Row groups are kept until others of these columns are read.
+        """
         meta, key = self.folder.episodes[episode], tuple(columns)
         data = self._data_file(self.folder.path / meta.file)
-        first = data.first[episode]
+        first, count = data.first[episode] + (frame or 0), meta.length if frame is None else 1
         latest, begin = data.latest.get(key, (None, 0))
-        if latest is None or not begin <= first <= first + meta.length <= begin + latest.num_rows:
-            latest, begin = data.latest[key] = self._read(data.path, key, first, first + meta.length)
-        return latest.slice(first - begin, meta.length)
+        if latest is None or not begin <= first <= first + count <= begin + latest.num_rows:
+            latest, begin = data.latest[key] = self._read(data.path, key, first, first + count)
+        return latest.slice(first - begin, count)
 
     def _read(self, path: Path, columns: Sequence[str], first: int, end: int) -> tuple[Any, int]:
         """Return row groups with rows `first` to `end`, or all if small, and the number of their first row."""
@@ -364,22 +401,35 @@ class LeRobotFrames:
         )
 
     def _check_grid(self, episode: int, frames: NDArray[np.float64], timestamps: NDArray[np.float64]) -> None:
-        due = np.arange(len(frames))
-        off = np.flatnonzero(
-            ~((frames == due) & (np.abs(timestamps - due / self.folder.fps) <= OFF_GRID_S * (1 + due / 1e4)))
-        )
+        """Raise RecordingError unless every line is the next frame, and its timestamp names that frame."""
+        if episode in self._regular:
+            return
+        due, fps = np.arange(len(frames)), Fraction(self.folder.fps)
+        finite = np.where(np.isfinite(timestamps), timestamps, -1.0)
+        match = nearest_by_far(TickTimes.of(finite.tolist(), 0.0, 1 / fps), range(len(frames)), Fraction(1))
+        off = np.flatnonzero((frames != due) | (match.positions != due))
         if off.size:
             line = int(off[0])
             raise RecordingError(
                 f"{self.folder.path.name}, episode {episode}: line {line} is frame {frames[line]:g} at "
                 f"{timestamps[line]:.4f} s; expected frame {line} at {line / self.folder.fps:.4f} s "
-                f"({self.folder.fps:g} frames per second). Repair the timestamps, or leave the episode out"
+                f"({self.folder.fps:g} frames per second), {BY_FAR}"
+                + (f"; {off.size - 1} lines behind it are no better" if off.size > 1 else "")
+                + ". Repair the timestamps, or leave the episode out"
             )
+        self._note_drift(match.drifts, episode, None)
+        self._regular.add(episode)
+
+    def _note_drift(self, drifts: NDArray[np.float64], episode: int, camera: str | None) -> None:
+        frame = int(drifts.argmax())
+        steps = float(drifts[frame])
+        if self.largest_drift is None or steps > self.largest_drift.steps:
+            self.largest_drift = Drift(steps, steps / self.folder.fps, episode, frame, camera)
 
     # -- pictures --------------------------------------------------------------------------------------
 
     def _of_image(self, episode: int, frame: int, camera: str) -> NDArray[np.uint8]:
-        cell = self._rows(episode, [camera]).column(camera)[frame].as_py()
+        cell = self._rows(episode, [camera], frame).column(camera)[0].as_py()
         content = cell.get("bytes") if isinstance(cell, dict) else cell
         where = f"{self.folder.path.name}: the picture of {camera} at frame {frame} of episode {episode}"
         if not isinstance(content, bytes):
@@ -393,72 +443,85 @@ class LeRobotFrames:
         return np.asarray(decode_bytes(content, f"{where}:", RecordingError, "Copy the data set again.")).copy()
 
     def _of_video(self, episode: int, frame: int, camera: str) -> NDArray[np.uint8]:
-        meta = self.folder.episodes[episode]
-        part = meta.videos[camera]
+        part = self.folder.episodes[episode].videos[camera]
         path = self.folder.path / part.file
         self.folder.opened.check(path)
-        moment = part.begin + float(self.numbers(episode, ())["timestamp"][frame, 0])
+        time, video = int(self._video_times(episode, camera)[frame]), self._video(path)
         try:
-            with _quiet():
-                from lerobot.datasets.video_utils import decode_video_frames
-
-                decoded = decode_video_frames(path, [moment], OFF_GRID_S, "pyav", return_uint8=True)
-        except Exception as error:
+            return video.picture(time)
+        except VideoError as error:
+            moment = float(time * video.base)
             raise RecordingError(
-                f"{self.folder.path.name}: {part.file} shows no picture of {camera} at {moment:.4f} s, frame "
-                f"{frame} of episode {episode} ({type(error).__name__}: {str(error)[:300]}). Copy the data set "
-                "again"
+                f"{self._where(path)} shows no picture of {camera} at {moment:.4f} s, frame {frame} of episode "
+                f"{episode} ({error}). Copy the data set again, or leave the episode out"
             ) from error
-        return np.ascontiguousarray(decoded[0].numpy().transpose(1, 2, 0))
+
+    def _named_times(self, episode: int, camera: str) -> NDArray[np.int64]:
+        """Return the times (T,) in ticks of the video's frames that show an episode. Raises RecordingError."""
+        meta, fps = self.folder.episodes[episode], Fraction(self.folder.fps)
+        part = meta.videos[camera]
+        path = self.folder.path / part.file
+        video, timestamps = self._video(path), self.numbers(episode, ())["timestamp"][:, 0]
+        times = TickTimes.of(timestamps.tolist(), part.begin, video.base)
+        match = nearest_by_far(times, video.times, 1 / (fps * video.base))
+        repeated = np.r_[False, np.diff(match.positions) < 1]
+        if (off := np.flatnonzero((match.positions == NONE) | repeated)).size:
+            frame = int(off[0])
+            raise RecordingError(
+                f"{self._where(path)} shows no picture of {camera} for frames {_listed(off)} of episode "
+                f"{episode}: frame {frame} is at {part.begin + timestamps[frame]:.4f} s, "
+                + (
+                    "where the video shows the picture of the frame before it"
+                    if match.positions[frame] != NONE
+                    else f"{match.drifts[frame]:.2f} of a frame step from the nearest frame of the video"
+                )
+                + f"; expected a frame {BY_FAR}. Repair from_timestamp in {EPISODES} or the timestamps, or leave "
+                "the episode out"
+            )
+        self._check_place(meta, camera, int(match.positions[0]), len(video.times))
+        self._note_drift(match.drifts, episode, camera)
+        return np.asarray(video.times, np.int64)[match.positions]
+
+    def _check_place(self, episode: EpisodeMeta, camera: str, first: int, count: int) -> None:
+        """Raise RecordingError for an episode that begins at a wrong frame of a video that shows episodes only.
+
+        Args:
+            episode: The episode.
+            camera: Its camera.
+            first: The position in the video of its first frame.
+            count: The number of frames of the video.
+        """
+        part = episode.videos[camera]
+        due, total = self.folder.frames_before[camera, episode.number]
+        if count == total and first != due:
+            raise RecordingError(
+                f"{self._where(self.folder.path / part.file)}: {EPISODES} says that episode {episode.number} "
+                f"begins at {part.begin:.4f} s, where the video shows its frame {first}; expected frame {due}, "
+                f"because its {count} frames are those of its episodes one after another. Repair from_timestamp"
+            )
 
     def _check_video(self, episode: EpisodeMeta, camera: str) -> None:
         """Raise RecordingError for a video that ends before an episode, or has another rate than the data set."""
         part, fps = episode.videos[camera], self.folder.fps
-        duration, rate = self._length_of(self.folder.path / part.file)
-        if duration < part.end - HALF / fps or (rate and abs(rate - fps) > OTHER_RATE * fps):
+        path = self.folder.path / part.file
+        video = self._video(path)
+        ends = float(video.times[-1] * video.base) + 1 / fps
+        if ends < part.end - HALF / fps or (video.rate and abs(video.rate - fps) > OTHER_RATE * fps):
             raise RecordingError(
-                f"{self.folder.path.name}: {part.file} lasts {duration:.4f} s at {rate:g} frames per second; "
-                f"meta says {fps:g} frames per second, and that it shows episode {episode.number} until "
-                f"{part.end:.4f} s. Copy the data set again, or repair its meta"
+                f"{self._where(path)} ends at {ends:.4f} s and has {video.rate:g} frames per second; meta says "
+                f"{fps:g} frames per second, and that it shows episode {episode.number} until {part.end:.4f} s. "
+                "Copy the data set again, or repair its meta"
             )
 
-    def _length_of(self, path: Path) -> tuple[float, float]:
-        """Return seconds and frames per second of a video, by its header."""
-        import av
-
-        if path not in self._lengths:
-            self.folder.opened.check(path)
-            try:
-                with av.open(str(path)) as container:
-                    stream = container.streams.video[0]
-                    base = float(stream.time_base or 0)
-                    lasts = stream.duration * base if stream.duration else (container.duration or 0) / 1e6
-                    if max(stream.width, stream.height) > LARGEST_PICTURE:
-                        raise RecordingError(
-                            f"{self._where(path)} claims to be {stream.width}×{stream.height} pixels; at most "
-                            f"{LARGEST_PICTURE} are read. Make it smaller"
-                        )
-                    self._lengths[path] = lasts, float(stream.average_rate or 0)
-            except (av.error.FFmpegError, IndexError, OSError) as error:
-                raise RecordingError(
-                    f"{self._where(path)} is no video that PyAV opens ({str(error)[:200]}). Copy the data set "
-                    "again"
-                ) from error
-        return self._lengths[path]
+    def _opened_video(self, path: Path) -> RecordedVideo:
+        self.folder.opened.check(path)
+        try:
+            return RecordedVideo(path)
+        except VideoError as error:
+            raise RecordingError(f"{self._where(path)} {error}") from error
 
     def _where(self, path: Path) -> str:
         return f"{self.folder.path.name}: {path.relative_to(self.folder.path)}"
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Silence the log of lerobot, which warns about its other decoder once in each process."""
-    level = logging.root.manager.disable
-    logging.disable(logging.WARNING)
-    try:
-        yield
-    finally:
-        logging.disable(level)
 
 
 def _size_of(metadata: Any, columns: Sequence[str]) -> int:
@@ -472,5 +535,16 @@ def _size_of(metadata: Any, columns: Sequence[str]) -> int:
     )
 
 
-def _listed(numbers: Sequence[int]) -> str:
+def _first_fault(faults: Mapping[int, str], episodes: Sequence[int]) -> str:
+    """Return the fault of the first episode, with the option that chooses the episodes without one."""
+    text = next(iter(faults.values()))
+    sound = [episode for episode in episodes if episode not in faults]
+    if len(faults) > 1:
+        text += f". Of {len(episodes)} episodes, {len(faults)} are refused: {_listed(list(faults))}"
+    if sound:
+        text += f". Without {'it' if len(faults) == 1 else 'them'}: --episodes {episodes_text(sound)}"
+    return text
+
+
+def _listed(numbers: Sequence[int] | NDArray[np.int64]) -> str:
     return ", ".join(map(str, numbers[:5])) + (f" and {len(numbers) - 5} more" if len(numbers) > 5 else "")

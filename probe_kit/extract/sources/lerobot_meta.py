@@ -13,15 +13,24 @@ from pathlib import Path
 from typing import Any, BinaryIO, Self
 
 from probe_kit._system.bounded_files import open_regular, read_json_object
+from probe_kit._system.counting import ranges_of
 from probe_kit._system.imports import require
 from probe_kit._system.parquet_files import open_parquet, read_parquet
 from probe_kit.errors import RecordingError
+from probe_kit.extract.sources.lerobot_formats import (
+    EPISODES,
+    INFO,
+    TASKS,
+    check_complete,
+    check_continued,
+    check_format,
+    check_is_data_set,
+    check_recorded,
+    unfinished_files,
+)
 
-CONVERTER = "python -m lerobot.scripts.convert_dataset_v21_to_v30"
 EXTRA = "datasets"
 IMAGE, VIDEO = "image", "video"
-INFO, TASKS, EPISODES = "meta/info.json", "meta/tasks.parquet", "meta/episodes"
-PARQUET = "parquet"
 NUMERIC = ("float32", "float64", "int8", "int16", "int32", "int64", "uint8", "bool")
 KEYS = ("episode_index", "index", "task_index")
 """The features of one number that lead to other tables."""
@@ -180,7 +189,11 @@ class LeRobotMeta:
             MissingExtraError: Without the libraries that read it.
         """
         files = HashedFiles(root)
+        check_is_data_set(root)
         info = _read_info(root, files)
+        check_recorded(root, info)
+        check_format(root, info, repo, revision)
+        check_complete(root, info)
         require("pyarrow", EXTRA)
         require("av", EXTRA)
         _check_info(root, info)
@@ -225,20 +238,31 @@ class LeRobotMeta:
         names = _flat_names(self.features[feature].get("names"))
         return names if names is not None and (len(names),) == tuple(self.features[feature]["shape"]) else None
 
-    def task(self, number: int) -> str:
-        """Return the text of a task. Raises RecordingError for a number that is not named once, or has no text."""
+    def task(self, number: int, episodes: Sequence[int] = ()) -> str:
+        """Return the text of a task.
+
+        Args:
+            number: The number of the task.
+            episodes: The episodes whose frames name it, for the message; empty if they are unknown.
+
+        Raises:
+            RecordingError: For a number that is not named once, or has no text.
+        """
         texts = self._texts.get(number, [])
-        if len(texts) != 1:
-            raise RecordingError(
-                f"{self.name}: {TASKS} has {len(texts)} tasks of the number {number}, which a frame names; "
-                "expected one. Repair the data set, or give --instruction TEXT"
-            )
-        if not isinstance(texts[0], str) or not texts[0].strip():
-            raise RecordingError(
-                f"{self.name}: {TASKS} has {texts[0]!r} as the task {number}, which a frame names; expected a "
-                "text. Repair the data set, or give --instruction TEXT"
-            )
-        return texts[0]
+        if len(texts) == 1 and isinstance(texts[0], str) and texts[0].strip():
+            return texts[0]
+        content = (
+            f"{texts[0]!r} as the task {number}"
+            if len(texts) == 1
+            else f"{len(texts)} tasks of the number {number}"
+        )
+        expected = "a text" if len(texts) == 1 else "one"
+        naming = f"frames of {ranges_of(episodes, 'episode')} name" if episodes else "a frame names"
+        leave = ", leave these episodes out (--episodes)" * bool(episodes)
+        raise RecordingError(
+            f"{self.name}: {TASKS} has {content}, which {naming}; expected "
+            f"{expected}. Repair the data set{leave}, or give --instruction TEXT"
+        )
 
     @cached_property
     def _texts(self) -> dict[Any, list[Any]]:
@@ -257,6 +281,9 @@ class LeRobotMeta:
                 f"{self.name}: {EPISODES} has {numbers.count(twice[0])} lines of episode {twice[0]}; expected "
                 f"one. Remove the file that does not belong to the data set. {_AGAIN}"
             )
+        if numbers == list(range(len(numbers))):
+            data = [self.path / episode.file for episode in self.episodes]
+            check_continued(self.path, self.info, [episode.length for episode in self.episodes], data)
         total = self.info.get("total_episodes", len(numbers))
         if lacking := sorted(set(range(max((total, *numbers)) if numbers else total)) - set(numbers)):
             raise RecordingError(
@@ -351,25 +378,8 @@ def _flat_names(names: Any) -> tuple[str, ...] | None:
 
 def _read_info(root: Path, files: HashedFiles) -> Mapping[str, Any]:
     path = root / INFO
-    if not path.is_file():
-        raise RecordingError(
-            f"{root} is no LeRobotDataset: it has no {INFO}. Give the folder that holds meta, data and videos"
-        )
     files.check(path)
-    info = read_json_object(path, RecordingError, "Copy the data set again")
-    version = str(info.get("codebase_version"))
-    if not version.startswith("v3."):
-        raise RecordingError(
-            f"{root.name} has format {version}; this version reads v3.0. Convert it with `{CONVERTER} --repo-id=…`"
-        )
-    if (stored := info.get("storage_format", PARQUET)) != PARQUET:
-        raise RecordingError(
-            f"{root.name} has the storage_format {stored!r}; this version reads {PARQUET!r}. Convert it with "
-            "lerobot"
-        )
-    if missing := [name for name in (TASKS, EPISODES) if not (root / name).exists()]:
-        raise RecordingError(f"{root.name} has no {missing[0]}. Copy the data set again")
-    return info
+    return read_json_object(path, RecordingError, "Copy the data set again")
 
 
 def _check_info(root: Path, info: Mapping[str, Any]) -> None:
@@ -423,7 +433,9 @@ def _read_episodes(root: Path, files: HashedFiles, info: Mapping[str, Any]) -> I
     parts = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
     columns = [_NUMBER, _LENGTH, _FROM, _TO, _CHUNK, _FILE]
     columns += [f"videos/{camera}/{part}" for camera in cameras for part in parts]
-    paths = sorted(path for path in (root / EPISODES).rglob("*.parquet") if not path.name.startswith("."))
+    unfinished = unfinished_files(root)
+    paths = sorted(path for path in (root / EPISODES).rglob("*.parquet") if path.name[0] != ".")
+    paths = [path for path in paths if path not in unfinished]
     lines = [
         (path, line) for path in paths for line in _read_table(root, files, path, columns).to_pylist()
     ]  # fmt: skip

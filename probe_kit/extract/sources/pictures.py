@@ -2,8 +2,9 @@
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from hashlib import blake2b, sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
@@ -19,7 +20,7 @@ from probe_kit._system.table_cells import group_names
 from probe_kit._system.text_tables import MOST_BYTES, TextTable, open_table
 from probe_kit._tables.label_table import LabelTable
 from probe_kit.errors import RecordingError, UsageError
-from probe_kit.extract.sources.player import SIDE, Answer, InputsPlayer, Opens
+from probe_kit.extract.sources.player import SIDE, Answer, InputsPlayer, Opens, frames_of_episode
 from probe_kit.extract.sources.recording import Pixels
 from probe_kit.extract.sources.source import (
     REFUSED_WITHOUT_ACTING,
@@ -31,6 +32,7 @@ from probe_kit.extract.sources.source import (
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.observation import ARM_NUMBERS, Observation
 from probe_kit.hooks.contract.sites import CAMERA
+from probe_kit.runs.input_content import FILE, MOST_EPISODES, content_notes
 from probe_kit.runs.layout import CAPTURE_ONLY, CLASSES, DATASET, OTHER_ACTIONS, RECORDED_EPISODES, TRUTHS
 from probe_kit.runs.plan import Row
 from probe_kit.suite.pictures import decode_bytes
@@ -259,9 +261,23 @@ class PictureSource(Source[PictureFolder]):
         return {DATASET: data_set}
 
     def selection(self, rows: Sequence[Row]) -> dict[str, Any]:
-        """Return all lines of the table."""
-        selected = {"name": self.name, "episodes": list(range(len(rows))), RECORDED_EPISODES: len(rows)}
+        """Return the selected lines of the table."""
+        lines = [row.columns["source_episode"] for row in rows]
+        selected = {"name": self.name, "episodes": lines, RECORDED_EPISODES: len(self.lines)}
         return {"recording": {**selected, OTHER_ACTIONS: "pictures have no actions"}}
+
+    def content_notes(self) -> tuple[str, ...]:
+        """Return a sentence for pictures of one colour, and for files that are all alike, in some files."""
+        return self._content_notes
+
+    @cached_property
+    def _content_notes(self) -> tuple[str, ...]:
+        lines, frames = list({line.picture: line for _, line in self.lines}.values()), []
+        at = np.linspace(0, len(lines) - 1, min(len(lines), MOST_EPISODES)).round().astype(int)
+        for line in (lines[number] for number in at):
+            with suppress(RecordingError):  # a picture that cannot be read costs its own line when it is shown
+                frames.append(frames_of_episode(line.picture.name, [[read_picture(line)]]))
+        return tuple(content_notes(frames, self.cameras[:1] or [PICTURE], unit=FILE))
 
     def targets(self) -> tuple[str, ...]:
         """Return the columns of the table that become labels."""

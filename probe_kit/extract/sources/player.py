@@ -2,7 +2,7 @@
 
 import traceback
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from hashlib import blake2b
 from multiprocessing.connection import Connection
@@ -28,6 +28,7 @@ from probe_kit.errors import (
     StageDiedError,
 )
 from probe_kit.hooks.contract.observation import Observation
+from probe_kit.runs.input_content import EpisodeFrames
 from probe_kit.runs.layout import CAPTURE_ONLY
 from probe_kit.runs.plan import Row
 from probe_kit.runs.small_frames import SmallFrames
@@ -185,6 +186,23 @@ class InputsPlayer(Player):
 def small_picture(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return the picture (SIDE, SIDE, 3), in which each pixel is the mean of its part of the picture."""
     return np.asarray(Image.fromarray(picture).resize((SIDE, SIDE), Image.Resampling.BOX))
+
+
+def frames_of_episode(
+    name: str, frames: Sequence[Sequence[NDArray[np.uint8]]], state: NDArray[np.floating] | None = None
+) -> EpisodeFrames:
+    """Return pictures in small, and the hashes of the whole ones.
+
+    Args:
+        name: The episode.
+        frames: The pictures (H, W, 3) uint8 of all cameras, at some frames.
+        state: (n, D) at these frames; None without one.
+    """
+    small = np.stack([np.stack([small_picture(picture) for picture in pictures]) for pictures in frames])
+    hashes = [
+        [blake2b(np.ascontiguousarray(picture).tobytes()).digest() for picture in pictures] for pictures in frames
+    ]
+    return EpisodeFrames(name, small, state, hashes)
 
 
 # -- where a player works -------------------------------------------------------------------------------------

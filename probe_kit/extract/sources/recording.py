@@ -1,7 +1,7 @@
 """Frames of a LeRobotDataset as a source: settings of what is shown."""
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -52,6 +52,17 @@ def read_episodes(value: Any) -> Any:
     return tuple(sorted(set(several)))
 
 
+def episodes_text(episodes: Sequence[int]) -> str:
+    """Return ascending episodes as `read_episodes` reads them, such as `0:5,7`."""
+    runs: list[list[int]] = []
+    for episode in episodes:
+        if runs and episode == runs[-1][1]:
+            runs[-1][1] += 1
+        else:
+            runs.append([episode, episode + 1])
+    return ",".join(str(start) if stop == start + 1 else f"{start}:{stop}" for start, stop in runs)
+
+
 Episodes = Annotated[
     tuple[int, ...] | None,
     BeforeValidator(read_episodes),
@@ -95,17 +106,52 @@ def _pairs(option: str, example: str, value: Any) -> Any:
     return tuple(pairs)
 
 
+EVERY_CAMERA = "*"
+"""The camera of a rotation that names none: all of them."""
+
+
 def _turns(value: Any) -> Any:
     turns = []
-    for camera, degrees in _pairs("--rotate", "base=180", value):
+    several = [value] if isinstance(value, int | str) else value
+    if isinstance(several, Sequence):  # degrees without a camera
+        several = [
+            f"{EVERY_CAMERA}={text}"
+            if isinstance(text, int) or (isinstance(text, str) and "=" not in text)
+            else text
+            for text in several
+        ]
+    for camera, degrees in _pairs("--rotate", "base=180", several):
         if not str(degrees).isdecimal():
-            raise UsageError(f"--rotate {camera}={degrees}; expected degrees, such as {camera}=180")
+            which = "" if camera == EVERY_CAMERA else f"{camera}="
+            raise UsageError(f"--rotate {which}{degrees}; expected degrees, such as {which}180")
         turns.append((camera, int(degrees)))
     if wrong := [turn for _, turn in turns if turn not in TURNS]:
         raise UsageError(
             f"pictures are rotated by {wrong[0]} degrees; expected one of {', '.join(map(str, TURNS))}"
         )
+    names = [camera for camera, _ in turns]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise UsageError(f"--rotate gives {twice[0]} twice; give every camera once")
     return tuple(turns)
+
+
+Rotations = Annotated[
+    tuple[tuple[str, int], ...],
+    BeforeValidator(_turns),
+    typer.Option(
+        "--rotate",
+        metavar="[CAMERA=]DEGREES",
+        help="Rotate pictures by 90, 180 or 270 degrees, such as 180 where they stand on their heads. "
+        "CAMERA=DEGREES rotates those of one camera; repeatable.",
+        rich_help_panel="Recordings",
+    ),
+]
+
+
+def degrees_of(rotations: Iterable[tuple[str, int]], camera: str) -> int:
+    """Return the degrees by which the pictures of a camera are rotated, 0 for none; its own count before all."""
+    degrees = dict(rotations)
+    return degrees.get(camera, degrees.get(EVERY_CAMERA, 0))
 
 
 class LeRobotSource(SourceSettings):
@@ -117,9 +163,10 @@ class LeRobotSource(SourceSettings):
         every: The step between shown frames: of each episode frame 0 and each so many frames on.
         cameras: The feature of the data set by camera of the model; empty where both have one, or the names are
             equal.
-        rotations: The degrees by camera of the model, counterclockwise.
+        rotations: The degrees by camera of the model, counterclockwise; `*` names all cameras.
         instruction: The words that the model reads in place of the task of a frame; None for that task.
         pixels: Whether pictures at 32 × 32 are stored for controls.
+        single: Whether every frame is a row of its own, of which some can be chosen; no option gives it.
 
     Raises:
         UsageError: For what no data set can have.
@@ -158,19 +205,12 @@ class LeRobotSource(SourceSettings):
             help="Which picture of the data set a camera of the model gets; repeatable. Default: equal names.",
         ),
     ] = ()
-    rotations: Annotated[
-        tuple[tuple[str, int], ...],
-        BeforeValidator(_turns),
-        _option(
-            "--rotate",
-            metavar="CAMERA=DEGREES",
-            help="Rotate the pictures of a camera by 90, 180 or 270 degrees.",
-        ),
-    ] = ()
+    rotations: Rotations = ()
     instruction: Annotated[
         str | None, _option("--instruction", help="What the model reads. Default: the task of each frame.")
     ] = None
     pixels: Pixels = True
+    single: bool = False
 
     command: ClassVar[str] = "--dataset FOLDER"
     opens: ClassVar[str] = "probe_kit.extract.sources.recording_source:RecordingSource"

@@ -1,6 +1,7 @@
 """Opened recordings: chosen frames of a LeRobotDataset on this machine, and the player that shows them."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from functools import cached_property, partial
 from importlib.metadata import version
 from itertools import groupby
@@ -20,8 +21,8 @@ from probe_kit.extract.sources.lerobot_folder import (
     open_lerobot,
 )
 from probe_kit.extract.sources.lerobot_meta import IMAGE
-from probe_kit.extract.sources.player import SIDE, Answer, InputsPlayer, Opens
-from probe_kit.extract.sources.recording import LeRobotSource, Pairs
+from probe_kit.extract.sources.player import SIDE, Answer, InputsPlayer, Opens, frames_of_episode
+from probe_kit.extract.sources.recording import EVERY_CAMERA, LeRobotSource, Pairs, degrees_of
 from probe_kit.extract.sources.source import (
     MOST_UNUSUAL,
     Played,
@@ -35,6 +36,7 @@ from probe_kit.extract.sources.source import (
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.observation import ARM_NUMBERS, Observation
 from probe_kit.hooks.families.shared.kinds import ACTION, IMAGES, STATE
+from probe_kit.runs.input_content import EpisodeFrames, content_notes
 from probe_kit.runs.layout import CAPTURE_ONLY, DATASET, OTHER_ACTIONS, RECORDED_EPISODES, TRUTHS
 from probe_kit.runs.plan import Row
 
@@ -49,6 +51,8 @@ NAMED = 0.01
 """The share of unusual values of a number of the state, from which on it is named."""
 _LONGEST = 12
 """The most tasks and numbers that are listed."""
+LOOKED_AT = 4
+"""The episodes of which three pictures are decoded before a run, spread over the chosen ones."""
 _TASK = "task_index"
 
 
@@ -89,7 +93,7 @@ class RecordingSource(Source[LeRobotSource]):
         folder = open_lerobot(settings)
         if folder.repo is not None:
             settings = settings.changed(folder=f"{folder.repo}@{folder.revision}")
-        opened = cls(settings, folder)
+        opened = cls(settings, folder, 1 if settings.single else MOST_FRAMES)
         opened._check_features()
         fetched(opened.folder, opened.episodes, ())
         opened.folder.check_files(opened.episodes, ())
@@ -129,6 +133,23 @@ class RecordingSource(Source[LeRobotSource]):
         """The instructions, each once, in alphabetical order."""
         return tuple(sorted({text for episode in self.episodes for text in self._texts(episode)}))
 
+    def same_instructions(self) -> list[str]:
+        """Return a sentence, without its stop, for tasks of one text or of texts that differ in spelling alone."""
+        if self.settings.instruction is not None:
+            return []
+        numbers: dict[str, list[int]] = {}
+        for number, text in self.folder.tasks:
+            if text in self.instructions:
+                numbers.setdefault(text, []).append(number)
+        return [
+            *(
+                f"tasks {', '.join(map(str, sorted(of_text)))} of {self.name} have one text, {text!r}"
+                for text, of_text in numbers.items()
+                if len(of_text) > 1
+            ),
+            *super().same_instructions(),
+        ]
+
     def rows(self, seed: int) -> tuple[Row, ...]:
         """Return stretches of the chosen episodes, in order."""
         return tuple(row for row in self._rows(seed))
@@ -164,8 +185,20 @@ class RecordingSource(Source[LeRobotSource]):
         """Return the instruction at every frame of an episode."""
         if self.settings.instruction is not None:
             return [self.settings.instruction] * self.folder.lengths[episode]
-        numbers = self.reader.numbers(episode, [_TASK])[_TASK][:, 0].astype(int)
-        return [self.folder.task(number) for number in numbers]
+        return [self._task_texts[number] for number in self._task_numbers(episode)]
+
+    def _task_numbers(self, episode: int) -> list[int]:
+        """Return the number of the task at every frame of an episode."""
+        return self.reader.numbers(episode, [_TASK])[_TASK][:, 0].astype(int).tolist()  # type: ignore[no-any-return]
+
+    @cached_property
+    def _task_texts(self) -> dict[int, str]:
+        """The texts of the tasks of the chosen episodes, by number. Raises RecordingError for an empty one."""
+        episodes_of: dict[int, list[int]] = {}
+        for episode in self.episodes:
+            for number in dict.fromkeys(self._task_numbers(episode)):
+                episodes_of.setdefault(number, []).append(episode)
+        return {number: self.folder.task(number, episodes) for number, episodes in episodes_of.items()}
 
     # -- a model -------------------------------------------------------------------------------------
 
@@ -184,11 +217,13 @@ class RecordingSource(Source[LeRobotSource]):
         """Return the same recordings with a feature for the model's cameras. Raises RecordingError without."""
         pairs = mapped_cameras(self.settings.cameras, cameras, self.folder.cameras)
         names = [camera for camera, _ in pairs]
-        if strange := [camera for camera, _ in self.settings.rotations if camera not in names]:
+        rotations = self.settings.rotations
+        if strange := [camera for camera, _ in rotations if camera not in (*names, EVERY_CAMERA)]:
             raise RecordingError(
                 f"--rotate {strange[0]}=…: that camera gets no picture; those with one are {', '.join(names)}"
             )
-        return type(self)(self.settings.changed(cameras=pairs), self.folder, self.stretch)
+        turns = {camera: turn for camera in names if (turn := degrees_of(rotations, camera))}
+        return type(self)(self.settings.changed(cameras=pairs, rotations=turns), self.folder, self.stretch)
 
     def check_state_width(self, checkpoint: str, expected: int | None) -> None:
         """Raise RecordingError unless the recorded state has as many numbers as the model reads."""
@@ -301,6 +336,35 @@ class RecordingSource(Source[LeRobotSource]):
         del played
         return partial(RecordingPlayer, self.settings)
 
+    def content_notes(self) -> tuple[str, ...]:
+        """Return a sentence for every input without content, in frames that are spread over a few chosen episodes.
+
+        Pictures are those of the mapped cameras; before, those of all cameras of a data set on this machine.
+        """
+        return self._content_notes
+
+    @cached_property
+    def _content_notes(self) -> tuple[str, ...]:
+        every = [] if self.folder.repo is not None else [(name, name) for name in self.folder.cameras]
+        pairs, frames = self.settings.cameras or tuple(every), []
+        at = np.linspace(0, len(self.episodes) - 1, min(len(self.episodes), LOOKED_AT)).round().astype(int)
+        for episode in (self.episodes[number] for number in at):
+            # A picture that is not here yet, or cannot be read, costs its own episode when it is played.
+            with suppress(RecordingError):
+                frames.append(self._frames(episode, [feature for _, feature in pairs]))
+        lossy = [name for name, feature in pairs if self.folder.is_video(feature)]
+        return tuple(content_notes(frames, [name for name, _ in pairs], lossy))
+
+    def _frames(self, episode: int, features: Sequence[str]) -> EpisodeFrames:
+        """Return the first, the middle and the last chosen frame of an episode, and the states of all of them."""
+        selection = range(0, self.folder.lengths[episode], self.settings.every)
+        frames = [selection[number] for number in sorted({0, len(selection) // 2, len(selection) - 1})]
+        pictures = [list(self.reader.pictures(episode, frame, features).values()) for frame in frames]
+        state = None
+        if self.folder.width(STATE) is not None:
+            state = self.reader.numbers(episode, [STATE])[STATE][:: self.settings.every]
+        return frames_of_episode(str(episode), pictures, state)
+
     # -- what a run says of it -----------------------------------------------------------------------
 
     def identity(self, execute: int) -> dict[str, Any]:
@@ -387,10 +451,12 @@ class RecordingSource(Source[LeRobotSource]):
             "episodes": f"{len(lengths)} of {len(folder.lengths)}, {spanned(lengths)} frames each",
             "frames": f"{sum(-(-length // every) for length in lengths)} of {sum(lengths)} (every:{every})",
             "instructions": "; ".join(texts[:_LONGEST]) + more,
+            **({"same instruction": "; ".join(same)} if (same := self.same_instructions()) else {}),
             "cameras": "; ".join(map(self._camera, folder.cameras)) or "none",
             STATE: self._numbers(STATE),
             ACTION: self._numbers(ACTION),
             "columns": ", ".join(folder.columns) or "none",
+            **({} if (drift := self.reader.largest_drift) is None else {"largest time drift": str(drift)}),
             "data sha": f"meta {folder.meta_blake2b[:12]}",
         }
 

@@ -43,7 +43,12 @@ class SceneOptions(Part):
 
     scene: common.Scene = None
     max_steps: Annotated[
-        int | None, _option("--max-steps", help="Number of actions per episode; in the scene at 5 Hz.")
+        int | None,
+        _option(
+            "--max-steps",
+            help="Number of actions per episode; in the scene at 5 Hz. Default: that of the scene, or of the "
+            "environment.",
+        ),
     ] = None
     tile_side: Annotated[
         float | None,

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from probe_kit._terminal.field_options import FieldOption, Part, options_of
 from probe_kit.errors import InstructionError, PolicyFailedError, RecordingError, UnitsError, UsageError
+from probe_kit.extract.sources.inputs import describe_spellings
 from probe_kit.hooks.checkpoints.third_party import copied, while_acting
 from probe_kit.hooks.contract.observation import Observation
 
@@ -230,6 +231,10 @@ class Source[Chosen: SourceSettings](ABC):
         """The instructions, each once, in alphabetical order."""
         return tuple(sorted({row.instruction for row in self.rows(0)}))
 
+    def same_instructions(self) -> list[str]:
+        """Return a sentence, without its stop, for all tasks that are one instruction, by spelling or by text."""
+        return describe_spellings(self.instructions)
+
     def early_checks(
         self, cameras: Sequence[str], state: int | None, checkpoint: str
     ) -> list[Callable[[], object]]:
@@ -258,6 +263,11 @@ class Source[Chosen: SourceSettings](ABC):
         """Return the parts of a run's default name beside its identity."""
         return []
 
+    def smaller_groups(self, rows: "Sequence[Row]") -> str:
+        """Return how probes get more groups of these rows than their own, in words; empty where they cannot."""
+        del rows
+        return ""
+
     def rehearse(self, rows: "Iterable[Row]") -> None:
         """Set the first rows up. Raises an error if none can be."""
         del rows
@@ -271,6 +281,13 @@ class Source[Chosen: SourceSettings](ABC):
     def decoder(self) -> str | None:
         """The name and version of the decoder of stored videos on this machine; None where nothing is decoded."""
         return None
+
+    def content_notes(self) -> tuple[str, ...]:
+        """Return a sentence for every input without content, such as a black camera, in a few frames.
+
+        They are empty where the source has not shown anything yet.
+        """
+        return ()
 
     def targets(self) -> tuple[str, ...]:
         """Return the built-in targets of probes that the rows have, such as `side.correct` or `env.left`."""

@@ -1,6 +1,7 @@
 """Folders of checkpoints: LoRA adapters and their bases, checks of files, states. Imports no torch."""
 
 import atexit
+import json
 import shutil
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
@@ -21,6 +22,7 @@ from probe_kit.hooks.checkpoints.checkpoint import (
     missing_weights,
     plain_folder,
 )
+from probe_kit.models.checkpoint_files import PICTURES, PICTURES_FILE, PROCESSOR_FILE
 
 ADAPTER_WEIGHTS = ("adapter_model.safetensors", "adapter_model.bin")
 SCALING = ("r", "lora_alpha", "rank_pattern", "alpha_pattern", "use_rslora", "use_dora", "lora_bias")
@@ -30,7 +32,7 @@ _NAMING = ("peft_type", "base_model_name_or_path")
 _WITHOUT_EFFECT = (
     "task_type", "auto_mapping", "peft_version", "inference_mode", "target_modules", "exclude_modules",
     "lora_dropout", "layers_to_transform", "layers_pattern", "megatron_core", "qalora_group_size",
-    "runtime_config", "eva_config", "loftq_config", "velora_config",
+    "runtime_config", "eva_config", "loftq_config", "velora_config", "ensure_weight_tying",
 )  # fmt: skip
 """Fields of training, speed, and rules for choosing modules: the tensors themselves say which ones they change."""
 _INERT: Mapping[str, tuple[Any, ...]] = {
@@ -216,8 +218,8 @@ _DONE: dict[tuple[object, ...], Path] = {}
 def checkpoint_folder(checkpoint: str, patterns: Sequence[str] = PATTERNS) -> Path:
     """The folder of a checkpoint, by path or hub id; that of an adapter alone is joined with its base's files.
 
-    A file of the adapter replaces the base's, so its statistics win. The joined folder holds links and is removed
-    at the end of the process.
+    A file of the adapter replaces the base's, so its statistics win, and its settings of pictures do in whichever
+    file they are. The joined folder holds links and is removed at the end of the process.
 
     Args:
         checkpoint: Folder path or hub id.
@@ -286,11 +288,23 @@ def _join(folder: Path, base: Path) -> Path:
     for path in sorted(_existing(base)):
         if not _is_left_out(path) and not _is_replaced(path.name, adapter_names):
             (joined / path.name).symlink_to(path.resolve())
+    if PICTURES_FILE in adapter_names and PROCESSOR_FILE not in adapter_names:
+        _drop_pictures(joined / PROCESSOR_FILE)
     for name in _BESIDE:
         if (base.parent / name).exists() and not (root / name).exists():
             (root / name).symlink_to((base.parent / name).resolve())
     _JOINED[str(joined)] = folder
     return joined
+
+
+def _drop_pictures(processor: Path) -> None:
+    """Replace a base's file of a processor by one without the part for pictures, which would count first."""
+    if not processor.is_file():
+        return
+    values = read_json_object(processor, CheckpointError, "Download the base again")
+    if values.pop(PICTURES, None) is not None:
+        processor.unlink()
+        processor.write_text(json.dumps(values), encoding="utf-8")
 
 
 def _is_left_out(path: Path) -> bool:

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, replace
 from itertools import accumulate, takewhile
 from pathlib import Path
 from pickle import UnpicklingError
-from typing import Any
+from typing import Any, NamedTuple
 from zipfile import ZIP_STORED, BadZipFile, ZipFile
 
 import torch
@@ -22,10 +22,16 @@ from probe_kit.hooks.checkpoints.checkpoint import INDEX_FILE, WEIGHTS_FILE, che
 from probe_kit.hooks.checkpoints.folders import SCALING, AdapterFiles, adapter_in
 from probe_kit.models.building import builds_sizes_only
 
-_PREFIX, _COPY = "base_model.model.", "modules_to_save."
+_PREFIX, _COPY, _BASE = "base_model.model.", "modules_to_save.", ".base_layer."
+_EMBEDDINGS = ("embed_tokens", "lm_head")
+"""The modules that peft knows as embedding layers, its `EMBEDDING_LAYER_NAMES`."""
 _FACTORS = (
     ".lora_A.", ".lora_B.", ".lora_embedding_A", ".lora_embedding_B", ".lora_magnitude_vector",
 )  # fmt: skip
+
+
+_PATTERNS = ("rank_pattern", "alpha_pattern")
+"""The settings that give single modules other values, by regular expressions of their paths."""
 
 
 @dataclass(frozen=True)
@@ -47,8 +53,12 @@ class Adapter:
 
     def merged(
         self, module: nn.Module, tensors: Mapping[str, Tensor], name_in_module: Callable[[str], str] = str
-    ) -> dict[str, Tensor]:
+    ) -> "MergedTensors":
         """Return `tensors` with the adapter in them: W + s B A in float32, rounded once to the weight's own dtype.
+
+        The adapter of a layer changes that layer alone, as in training: of weights that are tied to each other,
+        the other one keeps its numbers. A base's own tensor that peft stored beside the factors replaces the
+        base's, as peft itself loads it, and with it what is tied to it.
 
         Args:
             module: The network that they belong to, on any device; it stays as it is.
@@ -60,45 +70,71 @@ class Adapter:
                 factors.
             MissingExtraError: Without peft.
         """
-        factors, copies = self._sorted()
-        merged = dict(tensors)
-        for name, tensor in copies.items():
-            target = self._target(name, merged, name_in_module)
-            if merged[target].shape != tensor.shape:
-                raise WeightsError(
-                    f"the LoRA adapter in {self.folder} replaces {name} of shape {tuple(merged[target].shape)} by "
-                    f"{tuple(tensor.shape)}; it belongs to another model"
-                )
-            merged[target] = tensor.to(merged[target].dtype)
-        for path, layer_factors in factors.items():
+        parts = self._sorted()
+        merged, notes = dict(tensors), []
+        tied = {double: original for double, original in doubles(module).items() if original in merged}
+        for double, original in tied.items():
+            merged.setdefault(double, merged[original])
+        for name, tensor in parts.bases.items():
+            target, stored = self._placed(name, tensor, merged, name_in_module)
+            if not torch.equal(stored, merged[target]):
+                largest = float((stored.float() - merged[target].float()).abs().max())
+                notes.append(f"its own {name} replaces the base's, from which it differs by up to {largest:.3g}")
+            for partner in _tied_to(target, tied):
+                merged[partner] = stored
+        for name, tensor in parts.copies.items():
+            target, stored = self._placed(name, tensor, merged, name_in_module)
+            merged[target] = stored
+        for path, layer_factors in parts.factors.items():
             weight = self._target(f"{path}.weight", merged, name_in_module)
             layer = module.get_submodule(weight.removesuffix(".weight"))
             bias = f"{weight.removesuffix('.weight')}.bias"
-            parts = {"weight": merged[weight], **({"bias": merged[bias]} if bias in merged else {})}
-            for name, tensor in self._merged_layer(path, layer, parts, layer_factors).items():
+            before = {"weight": merged[weight], **({"bias": merged[bias]} if bias in merged else {})}
+            for name, tensor in self._merged_layer(path, layer, before, layer_factors).items():
                 target = weight if name == "weight" else bias
                 merged[target] = tensor.to(merged[target].dtype)
-        return merged
+        for double, original in tied.items():
+            if torch.equal(merged[double], merged[original]) and double not in tensors:
+                del merged[double]
+            elif not torch.equal(merged[double], merged[original]):
+                notes.append(f"{double} is no longer tied to {original}")
+        return MergedTensors(merged, tuple(notes))
 
-    def _sorted(self) -> tuple[dict[str, dict[str, Tensor]], dict[str, Tensor]]:
-        """Return low-rank factors per module, and whole tensors that replace the base's.
+    def _placed(
+        self, name: str, tensor: Tensor, tensors: Mapping[str, Tensor], name_in_module: Callable[[str], str]
+    ) -> tuple[str, Tensor]:
+        """The network's name of a whole tensor, and the tensor in the dtype that the weight has there."""
+        target = self._target(name, tensors, name_in_module)
+        if tensors[target].shape != tensor.shape:
+            raise WeightsError(
+                f"the LoRA adapter in {self.folder} replaces {name} of shape {tuple(tensors[target].shape)} by "
+                f"{tuple(tensor.shape)}; it belongs to another model"
+            )
+        return target, tensor.to(tensors[target].dtype)
+
+    def _sorted(self) -> "_AdapterParts":
+        """Return low-rank factors, copies of the base's own tensors, and whole tensors that replace the base's.
 
         Raises:
-            WeightsError: For tensors that are neither, NaN or infinite ones, and ones that are missing.
+            WeightsError: For tensors that are none of these, NaN or infinite ones, and ones that are missing.
         """
         if damaged := [name for name, tensor in self.tensors.items() if not torch.isfinite(tensor).all()]:
             raise WeightsError(f"{self.folder}: NaN or infinite tensors in the adapter: {_few(damaged)}")
         factors: dict[str, dict[str, Tensor]] = {}
         copies: dict[str, Tensor] = {}
+        bases: dict[str, Tensor] = {}
+        replaced = tuple(self.files.settings.get("modules_to_save") or ())
         for name, tensor in self.tensors.items():
             bare = name.removeprefix(_PREFIX)
             if (part := next((part for part in _FACTORS if part in bare), None)) is not None:
                 factors.setdefault(bare.partition(part)[0], {})[name] = tensor
+            elif _BASE in bare or (_is_embedding(bare) and not _inside(bare, replaced)):
+                bases[bare.replace(_BASE, ".")] = tensor
             else:
                 copies[bare.replace(_COPY, "").replace(".default.", ".")] = tensor
-        replaced = tuple(self.files.settings.get("modules_to_save") or ())
         biases = self.files.settings.get("bias", "none") != "none"
         strange = [name for name in copies if not (_inside(name, replaced) or (biases and name.endswith(".bias")))]
+        strange += [name for name in bases if not (name.rpartition(".")[0] in factors or _is_embedding(name))]
         if strange or not self.tensors:
             raise WeightsError(
                 f"{self.folder} holds something else than low-rank factors: {_few(strange) or 'no tensors'}. "
@@ -109,7 +145,7 @@ class Adapter:
                 f"{self.folder} has no tensors of {_few(lost)}, which its modules_to_save name. Download the "
                 "adapter again"
             )
-        return factors, copies
+        return _AdapterParts(factors, bases, copies)
 
     def _target(self, name: str, tensors: Mapping[str, Tensor], name_in_module: Callable[[str], str]) -> str:
         """The network's name of a weight that the adapter changes."""
@@ -135,7 +171,10 @@ class Adapter:
             inner = inner.get_submodule(parent)
         inner.add_module(last, twin)
         # The tensors say which modules change; "all-linear" and patterns would be resolved by peft's own rules.
-        config = peft.LoraConfig(target_modules=[path], bias="none", inference_mode=True, **self.scaling)
+        scaling = {
+            name: _of_path(value, path) if name in _PATTERNS else value for name, value in self.scaling.items()
+        }
+        config = peft.LoraConfig(target_modules=[path], bias="none", inference_mode=True, **scaling)
         try:
             wrapped = peft.get_peft_model(tree, config)
         except (ValueError, TypeError) as error:
@@ -151,7 +190,64 @@ class Adapter:
                 f"shape: {_few(wrong)}"
             )
         peft.set_peft_model_state_dict(wrapped, {name: tensor.float() for name, tensor in factors.items()})
-        return dict(wrapped.merge_and_unload().get_submodule(path).state_dict())
+        try:
+            unloaded = wrapped.merge_and_unload()
+        except RuntimeError as error:  # a bias of factors beside a layer that has none
+            raise WeightsError(f"the LoRA adapter in {self.folder} cannot be merged at {path}: {error}") from error
+        return dict(unloaded.get_submodule(path).state_dict())
+
+
+@dataclass(frozen=True)
+class MergedTensors:
+    """The tensors of a base with an adapter in them.
+
+    Attributes:
+        tensors: Under the network's names. Of weights that the network ties, both are there where they differ.
+        notes: What else the adapter changed, in words.
+    """
+
+    tensors: dict[str, Tensor]
+    notes: tuple[str, ...]
+
+
+class _AdapterParts(NamedTuple):
+    """The tensors of an adapter.
+
+    Attributes:
+        factors: Low-rank factors by module, under the names that peft gave them.
+        bases: The base's own tensors, which peft stores where an embedding is among the targets or was resized.
+        copies: Tensors of modules that were trained whole, and biases.
+    """
+
+    factors: dict[str, dict[str, Tensor]]
+    bases: dict[str, Tensor]
+    copies: dict[str, Tensor]
+
+
+def _of_path(pattern: Mapping[str, Any], path: str) -> dict[str, Any]:
+    """The one entry of a pattern that is for a module, if any; peft warns about entries that match none."""
+    from peft.utils.other import get_pattern_key
+
+    key = get_pattern_key(tuple(pattern), path)
+    return {key: pattern[key]} if key in pattern else {}
+
+
+def _is_embedding(name: str) -> bool:
+    """Whether a tensor is of a module that peft saves as an embedding layer."""
+    return any(f".{name}".endswith(f".{module}.weight") for module in _EMBEDDINGS)
+
+
+def _tied_to(name: str, tied: Mapping[str, str]) -> set[str]:
+    """The names of one parameter, among the doubles of a network and their originals."""
+    original = tied.get(name, name)
+    return {original, *(double for double, other in tied.items() if other == original)}
+
+
+def doubles(network: nn.Module) -> dict[str, str]:
+    """Return the parameters that are another one's double, with the name of that one."""
+    names = {id(parameter): name for name, parameter in network.named_parameters()}
+    every = network.named_parameters(remove_duplicate=False)
+    return {name: names[id(parameter)] for name, parameter in every if names[id(parameter)] != name}
 
 
 def _inside(name: str, modules: Iterable[str]) -> bool:
@@ -411,8 +507,13 @@ def load_weights(
         if tensor.is_floating_point() != state[name].is_floating_point()
     ]
     _refuse(weights.source, "of another kind of number", kinds)
+    adapter = ""
     if weights.adapter is not None:
-        tensors = weights.adapter.merged(module, tensors, name_in_module)
+        merged = weights.adapter.merged(module, tensors, name_in_module)
+        tensors = merged.tensors
+        adapter = "; ".join([f"LoRA adapter merged into {weights.adapter.files.base}", *merged.notes])
+        if not assign:
+            _untie(module, tensors)
     damaged = [n for n, t in tensors.items() if t.is_floating_point() and not torch.isfinite(t).all()]
     _refuse(weights.source, "NaN or infinite", damaged)
     module.load_state_dict(dict(tensors), strict=not allowed, assign=assign)
@@ -425,8 +526,17 @@ def load_weights(
         len(tensors),
         sum(parameter.numel() for parameter in module.parameters()),
         tuple(sorted(allowed)),
-        "" if weights.adapter is None else f"LoRA adapter merged into {weights.adapter.files.base}",
+        adapter,
     )
+
+
+def _untie(module: nn.Module, tensors: Mapping[str, Tensor]) -> None:
+    """Give tied parameters memory of their own where they get different numbers."""
+    for double, original in doubles(module).items():
+        if double in tensors and original in tensors and not torch.equal(tensors[double], tensors[original]):
+            parent, _, name = double.rpartition(".")
+            weight = module.get_parameter(double)
+            setattr(module.get_submodule(parent), name, nn.Parameter(torch.empty_like(weight)))
 
 
 def _refuse_wrapped(weights: Weights, tensors: Mapping[str, Tensor], state: Mapping[str, Tensor]) -> None:

@@ -114,6 +114,11 @@ class Stream:
     sums: bool = True
     heads: int = field(default=0, compare=False)  # stored and declared streams do not say it
 
+    def shape_json(self) -> dict[str, int]:
+        """Return layers, width, and iterations where the stream runs several times, as plain values."""
+        iterations = {} if self.iterations is None else {"iterations": self.iterations}
+        return {"layers": self.layers, "width": self.width, **iterations}
+
     def __post_init__(self) -> None:
         part = self.part or _KNOWN_PARTS.get(self.name)
         if part not in PARTS:

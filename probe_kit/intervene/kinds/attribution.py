@@ -17,6 +17,7 @@ from probe_kit.intervene.kinds.base import (
     edits_by_category,
     effect_table,
     interval_text,
+    is_resolved,
     lines_of,
     p_of,
 )
@@ -233,7 +234,7 @@ _COLUMNS: Mapping[str, Any] = {
     "rank": lambda row: "–" if row.rank is None else str(row.rank),
     "estimate [95 %]": lambda row: interval_text(row.estimate, row.estimate_ci),
     "exact [95 %]": lambda row: interval_text(row.exact, row.exact_ci),
-    "p": lambda row: p_of(row.p_fwe),
+    "p": lambda row: p_of(row.p_fwe, is_resolved(row.exact)),
     "chosen": lambda row: (
         "anchor" if row.is_anchor else "drawn" if row.is_drawn else "top" if row.p_fwe is not None else ""
     ),

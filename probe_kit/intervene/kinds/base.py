@@ -15,10 +15,12 @@ from numpy.typing import NDArray
 
 from probe_kit._tables.numbers import number, signed
 from probe_kit.errors import UsageError
+from probe_kit.extract.sources.inputs import INSTRUCTION
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.capturing.edits import LOG_FIELDS
 from probe_kit.hooks.contract.declared import InterventionKind
 from probe_kit.hooks.contract.sites import KV_STREAM
+from probe_kit.intervene.further_instructions import check_further_instructions
 from probe_kit.intervene.outcomes import ConditionOutcomes, Effect
 from probe_kit.intervene.pairs import Pair
 from probe_kit.intervene.patching.patch import Cell
@@ -74,6 +76,7 @@ class Intervention(Choice, ABC):
         frames: In runs without sides, the number of frames of an episode, evenly spaced; None for 4.
         pairs: In runs without sides, pairs of the user's own: episode and frame of the clean inference and of its
             donor.
+        instructions: In runs without sides, words of other tasks for donors, beside the instructions of the run.
     """
 
     summary: ClassVar[str]
@@ -138,10 +141,10 @@ class Intervention(Choice, ABC):
         """
         categories_in(run, self.categories)
         if has_sides(run):
-            if self.vary or self.frames or self.pairs:
+            if self.vary or self.frames or self.pairs or self.instructions:
                 raise UsageError(
-                    "--vary, --frames and --pairs are for runs on recordings or in your own environment; in the "
-                    "scene the pictures are swapped. Leave them out"
+                    "--vary, --frames, --pairs and --instructions are for runs on recordings or in your own "
+                    "environment; in the scene the pictures are swapped. Leave them out"
                 )
         elif self.needs_sides or self.readout != FIRST_CHUNK:
             option = f"--kind {self.kind}" if self.needs_sides else f"--readout {self.readout}"
@@ -149,6 +152,21 @@ class Intervention(Choice, ABC):
                 f"{run.location} has no correct picture on a side, which {option} needs. Take --kind interchange, "
                 "or a run of the scene"
             )
+        elif self.instructions:
+            self._check_instructions(run)
+
+    def _check_instructions(self, run: Run) -> None:
+        """Raise UsageError for further instructions that nothing exchanges, or that the run has already."""
+        if self.varied != INSTRUCTION:
+            raise UsageError(
+                f"--instructions gives words, and the {self.varied} is exchanged; add --vary {INSTRUCTION}, or "
+                "leave it out"
+            )
+        if self.pairs:
+            raise UsageError(
+                "--instructions gives words of donors, and --pairs names donors; leave one of both out"
+            )
+        check_further_instructions(self.instructions, run.episodes[INSTRUCTION].astype(str))
 
     def eligible_items(self, session: "ReplaySession", items: Sequence[str]) -> list[str]:
         """Return the items to which the kind applies; the others are passed over, and counted."""
@@ -541,9 +559,25 @@ def edit_of(row: EffectRow) -> str:
     return f"{category_of(row.category).title}, {row.name}"
 
 
-def p_of(value: float | None) -> str:
-    """Return a p-value in two digits; a dash for None."""
-    if value is None:
+RESOLUTION = 0.005
+"""Half of the last digit that tables print of shares, rates and spreads, and of displacements in cm.
+
+A test of signs knows no size: an effect that is 0.00 in every episode can have the smallest p there is.
+"""
+
+
+def is_resolved(*effects: float | None) -> bool:
+    """Return whether any of some effects is as large as the resolution of its measure."""
+    return any(effect is not None and abs(effect) >= RESOLUTION for effect in effects)
+
+
+UNRESOLVED = f"p –: the effect is below {RESOLUTION}, the resolution of its measure, and significant of nothing"
+"""The entry of a legend for p-values that are not shown."""
+
+
+def p_of(value: float | None, is_printed: bool = True) -> str:
+    """Return a p-value in two digits; a dash for None, and for the p-value of an effect that is not resolved."""
+    if value is None or not is_printed:
         return "–"
     text = format(value, ".2g")
     return text.lstrip("-") if float(text) == 0 else text

@@ -27,6 +27,7 @@ from probe_kit.intervene.kinds.base import (
     count_edits,
     edit_of,
     effect_table,
+    is_resolved,
     lines_of,
     mean_of,
     p_of,
@@ -415,7 +416,7 @@ _ACTION: Mapping[str, Any] = {
     "kept": lambda row: "n/a" if row.share_left is None else number(row.share_left),
     "controls": lambda row: number(row.control_share_left),
     "displacement cm": lambda row: f"{-100 * row.mean_displacement:+.2f}",
-    "p": lambda row: p_of(row.p),
+    "p": lambda row: p_of(row.p, is_resolved(100 * row.mean_displacement, row.right_before - row.right)),
     "relative change": lambda row: f"{row.relative_change:.2f}",
 }
 _PROBE: Mapping[str, Any] = {"probe accuracy %": _accuracies, "finding": lambda row: row.finding}

@@ -17,22 +17,27 @@ from probe_kit._tables.numbers import number, percent
 from probe_kit.hooks.contract.declared import InterventionKind, Readout
 from probe_kit.intervene.exchange import (
     NOTHING,
+    TRACE,
     SwapShare,
     carries_nothing,
+    describe_seed,
+    does_seed_decide,
     share_fields,
+    share_of_variance,
     share_of_whole,
 )
 from probe_kit.intervene.kinds.base import (
     Intervention,
     effect_table,
     interval_text,
+    is_resolved,
     lines_of,
     net_interval,
     p_of,
     signed_interval,
 )
-from probe_kit.intervene.outcomes import CLEAN, CONTROL_INPUT, DONOR, IMAGE_SWAP, ConditionOutcomes, Effect
-from probe_kit.intervene.replay import CLEAN_RUN, CONTROL_RUN, DONOR_RUN, SOURCE_RUN, Condition
+from probe_kit.intervene.outcomes import CLEAN, CONTROL_INPUT, DONOR, IMAGE_SWAP, NOISE, ConditionOutcomes, Effect
+from probe_kit.intervene.replay import CLEAN_RUN, CONTROL_RUN, DONOR_RUN, NOISE_RUN, SOURCE_RUN, Condition
 from probe_kit.intervene.settings import FIRST_CHUNK, has_sides
 from probe_kit.intervene.stored import TILES_APART, Measurement, preferred_by_category
 from probe_kit.runs.reader import RunReader
@@ -97,6 +102,8 @@ class InputEffect(Effect):
         p: Exact one-sided p-value that the change is larger than the control's, by items and by groups, the larger
             one.
         finding: Verdict in a word: `decides`, `moves`, `no effect` within the bound, or `open`.
+        every: Share of the actions' variance that all of the donor's inputs change, as in `probe-kit diagnose`.
+        seed: Share of the variance that another seed changes; None where that was not played.
         key: Key of the intervention.
     """
 
@@ -112,7 +119,14 @@ class InputEffect(Effect):
     share_ci: tuple[float, float] | None
     p: float
     finding: Finding
+    every: float = 1.0
+    seed: float | None = None
     key: str = ""
+
+    @property
+    def is_of_the_seed(self) -> bool:
+        """Whether the seed decides the action, and all inputs together hardly do."""
+        return does_seed_decide(self.every, np.nan if self.seed is None else self.seed)
 
 
 def input_effect(outcomes: ConditionOutcomes, swapped: str, vary: str) -> InputEffect:
@@ -132,6 +146,11 @@ def input_effect(outcomes: ConditionOutcomes, swapped: str, vary: str) -> InputE
     )
     p = paired_greater_p(size - control_size, outcomes.items, outcomes.groups)
     ratio = float(size.sum() / full_size.sum()) if full_size.any() else 0.0
+    every, seed = float(share_of_variance(full_size).mean()), None
+    if NOISE in outcomes.conditions:
+        seed = float(share_of_variance(outcomes.size[outcomes.conditions.index(NOISE)]).mean())
+    above = share_of_variance(size) - share_of_variance(control_size)
+    is_trace = unbounded_student_interval(above, outcomes.groups)[1] < TRACE
     return InputEffect(
         **outcomes.counts,
         vary=vary,
@@ -141,21 +160,30 @@ def input_effect(outcomes: ConditionOutcomes, swapped: str, vary: str) -> InputE
         full_size=float(full_size.mean()),
         **share_fields("share", share),
         p=p,
-        finding=_finding(share, p, ratio),
+        finding=_finding(share, p, ratio, does_seed_decide(every, np.nan if seed is None else seed), is_trace),
+        every=every,
+        seed=seed,
     )
 
 
-def _finding(share: SwapShare | None, p: float, ratio: float) -> Finding:
+def _finding(share: SwapShare | None, p: float, ratio: float, by_seed: bool, is_trace: bool) -> Finding:
     """Return the verdict of an input.
+
+    Where the seed decides, a share of the exchange of all inputs is a share of nothing; the rules are then those
+    of `probe-kit diagnose`.
 
     Args:
         share: Share of the exchange of all inputs; None where that changes nothing.
         p: The p-value that the change is larger than the control's.
         ratio: Size of its change over that by all inputs.
+        by_seed: Whether the seed decides the action, see `does_seed_decide`.
+        is_trace: Whether its own share of the variance, beyond the control's, is shown to be a trace.
     """
     if share is None:
         return "open"
     beyond = p < SIGNIFICANCE
+    if by_seed:
+        return "no effect" if is_trace else "moves" if beyond else "open"
     if beyond and share.value >= DECIDES and share.low > NOTHING:
         return "decides"
     if carries_nothing(share.low, share.high) and (not beyond or ratio < NOTHING):
@@ -181,7 +209,7 @@ _INPUT_COLUMNS: Mapping[str, Any] = {
     "control": lambda row: number(row.control_size),
     "full": lambda row: number(row.full_size),
     "share [95 %]": lambda row: interval_text(row.share, row.share_ci),
-    "p": lambda row: p_of(row.p),
+    "p": lambda row: p_of(row.p, is_resolved(row.size)),
     "n (episodes)": lambda row: f"{row.n_episodes} ({row.n_items})",
     "finding": lambda row: row.finding,
 }
@@ -192,11 +220,13 @@ def _find_input(row: InputEffect) -> str:
     if not row.changed:
         return f"does not arrive: another {row.vary} changes no number of any action"
     share = "" if row.share is None else f", by {row.share:z.2f} of what all inputs do"
+    remark = f"; {describe_seed(row.every)}" if row.is_of_the_seed else ""
+    share = remark or share
     return {
         "decides": f"decides: the action follows the {row.vary}{share}",
         "moves": f"moves: the {row.vary} shifts the action without deciding it{share}",
-        "no effect": f"no effect: another {row.vary} leaves the action where it is",
-        "open": f"open: the items do not tell whether the {row.vary} matters",
+        "no effect": f"no effect: another {row.vary} leaves the action where it is{remark}",
+        "open": f"open: the items do not tell whether the {row.vary} matters{remark}",
     }[row.finding]
 
 
@@ -205,7 +235,8 @@ def _describe_input(row: InputEffect) -> str:
     if not row.changed:
         return f"the {row.vary} does not arrive: it changes no number of any action"
     share = "n/a" if row.share is None else f"{row.share:z.2f}"
-    return f"the {row.vary} {_VERBS[row.finding]} ({share} of the full exchange)"
+    what = describe_seed(row.every) if row.is_of_the_seed else f"{share} of the full exchange"
+    return f"the {row.vary} {_VERBS[row.finding]} ({what})"
 
 
 # -- effects of a swap ---------------------------------------------------------------------------------------
@@ -283,6 +314,11 @@ class ImageSwapEffect(Effect):
     right_reached: float
     readout: str = FIRST_CHUNK
     key: str = ""
+
+    @property
+    def is_resolved(self) -> bool:
+        """Whether it turns any episode, or moves the action by as much as the resolution of the measure."""
+        return is_resolved(self.follow_rate, self.reversal_rate, self.reach_share)
 
 
 def image_swap_effects(measurement: Measurement) -> list[ImageSwapEffect]:
@@ -378,7 +414,7 @@ SWAP_COLUMNS: Mapping[str, Any] = {
     "follow %": lambda row: percent(row.follow_rate),
     "reversal %": lambda row: percent(row.reversal_rate),
     "net [95 %]": lambda row: signed_interval(row.net_follow_rate, row.net_follow_rate_ci),
-    "p": lambda row: p_of(row.follow_p),
+    "p": lambda row: p_of(row.follow_p, row.is_resolved),
     "median displacement cm": lambda row: f"{100 * row.median_displacement:.2f}",
     "n (items)": lambda row: f"{row.n_episodes} ({row.n_items})",
 }
@@ -443,8 +479,8 @@ class ImageSwap(Swap):
     swapped: ClassVar[str] = IMAGE_SWAP
 
     def conditions(self, session: "ReplaySession") -> Sequence[Condition]:
-        """Return clean, and with swapped images; without sides also all of the donor's inputs, and the control."""
-        unpaired = () if has_sides(session.run) else (DONOR_RUN, CONTROL_RUN)
+        """Return clean, and with swapped images; without sides also the donor's inputs, the control and a seed."""
+        unpaired = () if has_sides(session.run) else (DONOR_RUN, CONTROL_RUN, NOISE_RUN)
         return CLEAN_RUN, SOURCE_RUN, *unpaired
 
     @classmethod

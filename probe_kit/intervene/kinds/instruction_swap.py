@@ -12,7 +12,6 @@ import numpy as np
 
 from probe_kit._tables.numbers import percent
 from probe_kit.errors import UsageError
-from probe_kit.hashing import derive_seed
 from probe_kit.intervene.kinds.base import effect_table
 from probe_kit.intervene.kinds.image_swap import (
     SWAP_COLUMNS,
@@ -27,6 +26,7 @@ from probe_kit.intervene.replay import (
     CLEAN_RUN,
     CONTROL_RUN,
     DONOR_RUN,
+    NOISE_RUN,
     SOURCE_RUN,
     Condition,
     ConditionContext,
@@ -104,11 +104,6 @@ def _ask_for_the_other(context: ConditionContext) -> ConditionResult:
     return ConditionResult(context.session.act(observation, context.pair.seed))
 
 
-def _resample_noise(context: ConditionContext) -> ConditionResult:
-    """Infer with noise drawn anew; the same action again where a policy draws none."""
-    return ConditionResult(context.session.act(context.pair.clean, derive_seed(context.pair.seed, NOISE, 0)))
-
-
 @dataclass(frozen=True, kw_only=True)
 class InstructionSwap(Swap):
     """Four inferences per episode: clean, other instruction, swapped images, other noise.
@@ -143,10 +138,10 @@ class InstructionSwap(Swap):
 
         Without sides, the images are those of a donor, and a control is added.
         """
-        swapped, noise = Condition(INSTRUCTION_SWAP, _ask_for_the_other), Condition(NOISE, _resample_noise)
+        swapped = Condition(INSTRUCTION_SWAP, _ask_for_the_other)
         if has_sides(session.run):
-            return CLEAN_RUN, swapped, SOURCE_RUN, noise
-        return CLEAN_RUN, swapped, DONOR_RUN, CONTROL_RUN, noise
+            return CLEAN_RUN, swapped, SOURCE_RUN, NOISE_RUN
+        return CLEAN_RUN, swapped, DONOR_RUN, CONTROL_RUN, NOISE_RUN
 
     @classmethod
     def effects(cls, measurement: Measurement) -> Sequence[Effect]:
@@ -183,8 +178,8 @@ class InstructionSwap(Swap):
         if context.lacks_sides:
             return super().finding(rows, context)
         (row,) = rows
-        follows = "followed" if row.follow_p < SIGNIFICANCE else "not shown"
-        verdict = "reversed" if row.reversal_p < SIGNIFICANCE else follows
+        follows = "followed" if row.is_resolved and row.follow_p < SIGNIFICANCE else "not shown"
+        verdict = "reversed" if row.is_resolved and row.reversal_p < SIGNIFICANCE else follows
         return (
             f"{verdict}: another instruction turns the action in {100 * row.follow_rate:.0f} % of the episodes, "
             f"and the other way in {100 * row.reversal_rate:.0f} %"

@@ -22,6 +22,7 @@ from probe_kit.hooks.contract.sites import KV_STREAM, Site
 from probe_kit.intervene.exchange import share_fields, share_of_whole
 from probe_kit.intervene.kinds.base import (
     NONE,
+    UNRESOLVED,
     AlongDirection,
     ConditionName,
     EffectRow,
@@ -30,6 +31,7 @@ from probe_kit.intervene.kinds.base import (
     compare_with_controls,
     count_edits,
     effect_table,
+    is_resolved,
     lines_of,
     mean_of,
     p_of,
@@ -102,16 +104,25 @@ class PatchEffect(EffectRow):
     action_share_ci: tuple[float, float] | None = None
 
     @property
+    def is_resolved(self) -> bool:
+        """Whether it turns any episode, or its effect is as large as the resolution of the measure."""
+        centimetres = 100 * self.mean_displacement if self.effect is None else None
+        return is_resolved(self.net, self.net_left, self.net_right, self.effect, centimetres)
+
+    @property
+    def is_significant(self) -> bool:
+        """Whether it has an effect beyond chance among all that was tried, and one that the measure resolves."""
+        return self.is_resolved and self.p_fwe is not None and self.p_fwe < SIGNIFICANCE
+
+    @property
     def is_localised(self) -> bool:
         """Whether it carries half of the effect, beyond chance among all that was tried."""
-        enough = self.effect is not None and self.effect >= LOCALISATION_SHARE
-        return enough and self.p_fwe is not None and self.p_fwe < SIGNIFICANCE
+        return self.is_significant and self.effect is not None and self.effect >= LOCALISATION_SHARE
 
     @property
     def moves_action(self) -> bool:
         """Whether it moves the action to the target side beyond chance, and by the smallest reach of a policy."""
-        beyond = self.p_fwe is not None and self.p_fwe < SIGNIFICANCE
-        return beyond and self.mean_displacement >= SMALLEST_REACH
+        return self.is_significant and self.mean_displacement >= SMALLEST_REACH
 
     @property
     def is_dose(self) -> bool:
@@ -200,6 +211,8 @@ def patch_effects(outcomes: ConditionOutcomes, target_side: str = IMAGE_SWAP) ->
 BACKBONE = "backbone"
 USUAL, WRONG = "mean-difference", "wrong"
 """Default settings of steering: the direction of the class means, and the side."""
+FOUND_DIRECTIONS = (USUAL, "probe")
+"""The directions that are found in a run, which may be followed by `:K`; all others are of files."""
 
 
 def stored_site_effects(run: RunReader) -> dict[str, list[PatchEffect]]:
@@ -463,7 +476,7 @@ class PatchKind(AlongDirection):
         edits = [row for row in rows if not row.is_control]
         return effect_table(
             f"Where is it used? {context.subject}, {context.kind}",
-            context.in_words(_LEGEND),
+            context.in_words("; ".join(filter(None, (_LEGEND, legend_of_doses(edits), legend_of_p(edits))))),
             ("category", "edit"),
             lines_of(edits, lambda row: f"{row.name}{' (unread)' * (row.sites in unread)}"),
             {"What the action does": _WITHOUT_SIDES if context.lacks_sides else _COLUMNS},
@@ -581,7 +594,7 @@ _COLUMNS: Mapping[str, Any] = {
     "controls cm": lambda row: signed(
         None if row.control_displacement is None else 100 * row.control_displacement
     ),
-    "p": lambda row: p_of(row.p_fwe),
+    "p": lambda row: p_of(row.p_fwe, row.is_resolved),
     "relative change": lambda row: f"{row.relative_change:.2f}",
 }
 
@@ -595,6 +608,27 @@ _WITHOUT_SIDES: Mapping[str, Any] = {
     "relative change": _COLUMNS["relative change"],
 }
 """Columns of a run without sides; displacements are in spreads of clean actions, toward the source's action."""
+
+
+HALF_DIFFERENCE, VECTOR = "half class-mean differences", "lengths of the file's vector"
+"""Units of coefficients of steering: of a direction that was found in the run, and of one of a file."""
+
+
+def unit_of_doses(direction: str) -> str:
+    """Return the unit of the coefficients along a direction, by its name in conditions."""
+    return HALF_DIFFERENCE if direction.partition(":")[0] in FOUND_DIRECTIONS else VECTOR
+
+
+def legend_of_doses(rows: Sequence[PatchEffect]) -> str:
+    """Return the entry of a legend on the unit of the coefficients; empty for edits without any."""
+    units = dict.fromkeys(unit_of_doses(row.direction) for row in rows if row.is_dose and not row.is_control)
+    return f"coefficient: in {' or '.join(units)}" if units else ""
+
+
+def legend_of_p(rows: Sequence[PatchEffect]) -> str:
+    """Return the entry of a legend on p-values that are not shown; empty if all are."""
+    hidden = any(row.p_fwe is not None and not row.is_resolved for row in rows)
+    return UNRESOLVED if hidden else ""
 
 
 def _carriers(rows: Sequence[PatchEffect]) -> tuple[list[PatchEffect], list[PatchEffect], int]:

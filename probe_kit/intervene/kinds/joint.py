@@ -16,7 +16,9 @@ from probe_kit.intervene.kinds.base import (
     Intervention,
     effect_table,
     interval_text,
+    is_resolved,
     lines_of,
+    p_of,
 )
 from probe_kit.intervene.kinds.interchange import cells_at, check_roles_apart
 from probe_kit.intervene.outcomes import CLEAN, ConditionOutcomes, Effect
@@ -238,7 +240,7 @@ KIND = JointPlaces
 _COLUMNS: Mapping[str, Any] = {
     "alone [95 %]": lambda row: interval_text(row.alone, row.alone_ci),
     "needed [95 %]": lambda row: interval_text(row.needed, row.needed_ci),
-    "p": lambda row: f"{row.p if row.p_fwe is None else row.p_fwe:.2g}",
+    "p": lambda row: p_of(row.p if row.p_fwe is None else row.p_fwe, row.alone is None or is_resolved(row.alone)),
     "groups": lambda row: str(row.n_groups),
     "finding": lambda row: row.finding,
 }

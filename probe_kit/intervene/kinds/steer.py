@@ -59,7 +59,8 @@ class Steering(PatchKind):
         direction: Name of the direction. `mean-difference` or `probe` is one vector found in the mean of these
             tokens and added to each. `mean-difference:K` is at each position the difference of the class means
             there, within the K directions that positions share.
-        coefficients: Sizes of the step, in half class-mean differences along the direction.
+        coefficients: Sizes of the step, in half class-mean differences along the direction, or in lengths of the
+            vector of a file.
         target_side: Side to steer to; `wrong` and `correct` are those of the clean images.
         controls: Number of orthogonal directions.
 
@@ -76,7 +77,7 @@ class Steering(PatchKind):
         "roles": "the one whose tokens are moved; required",
         "direction": "mean-difference (default), probe, mean-difference:K or FILE#NAME, whose vector is the unit",
         "controls": "random directions; default 5",
-        "coefficients": "in half class-mean differences; default 1,2,4",
+        "coefficients": "in half class-mean differences, or in lengths of a file's vector; default 1,2,4",
         "target_side": "wrong (default), correct, left or right",
         "seed": "of controls and folds; default 0",
     }

@@ -19,7 +19,14 @@ from probe_kit.intervene.kinds.attention import (
     stored_attention,
     stored_patch_attention,
 )
-from probe_kit.intervene.kinds.interchange import BACKBONE, PatchEffect, stored_site_effects, stored_steering
+from probe_kit.intervene.kinds.interchange import (
+    BACKBONE,
+    HALF_DIFFERENCE,
+    PatchEffect,
+    stored_site_effects,
+    stored_steering,
+    unit_of_doses,
+)
 from probe_kit.intervene.places import ALL, TILE_ROLES, PlaceName
 from probe_kit.retention.columns.text import title_of
 from probe_kit.retention.displays.display import (
@@ -186,7 +193,7 @@ def _points(rows: Sequence[PatchEffect]) -> Points:
     return Points(
         np.array([PlaceName.parse(row.sites).layer for row in rows], np.int64),
         np.array([100 * row.net for row in rows]),
-        np.array([row.p_fwe is not None and row.p_fwe < SIGNIFICANCE for row in rows], bool),
+        np.array([row.is_significant for row in rows], bool),
     )
 
 
@@ -413,7 +420,7 @@ class DoseResponseDisplay(Display):
 
     Attributes:
         position: The place that was steered, such as `backbone.02 image`.
-        coefficients: (K,) in half class-mean differences, ascending, 0 among them.
+        coefficients: (K,) in the unit of the direction, ascending, 0 among them.
         net: (K,) percent of all episodes.
         net_left: (K,) percent of episodes that are pushed to the left, which may be saturated.
         net_right: (K,) percent of episodes that are pushed to the right, which may be saturated.
@@ -421,7 +428,8 @@ class DoseResponseDisplay(Display):
             played.
         relative_change: (K,) distance by which tokens were moved, in their own norms; beyond two, an effect is
             little evidence.
-        significant: (K,) whether the effect is beyond the controls, family-wise.
+        significant: (K,) whether the effect is beyond the controls, family-wise, and as large as the resolution.
+        unit: The unit of the coefficients: half class-mean differences, or the vector of a file.
     """
 
     measure: str = "% of episodes that turn"
@@ -435,6 +443,7 @@ class DoseResponseDisplay(Display):
     controls: Percent
     relative_change: NDArray[np.float64]
     significant: NDArray[np.bool_]
+    unit: str = HALF_DIFFERENCE
 
     @classmethod
     def from_run(
@@ -481,7 +490,8 @@ class DoseResponseDisplay(Display):
                 [[nets.get((name, coefficient), np.nan) for coefficient in coefficients] for name in names]
             ).reshape(len(names), len(coefficients)),
             relative_change=np.array([row.relative_change for row in steered]),
-            significant=np.array([row.p_fwe is not None and row.p_fwe < SIGNIFICANCE for row in steered]),
+            significant=np.array([row.is_significant for row in steered], bool),
+            unit=next((unit_of_doses(row.direction) for row in steered if row.is_dose), HALF_DIFFERENCE),
             certificates=(ProvenanceLine.of_run(run),),
         )
 
@@ -506,7 +516,7 @@ class DoseResponseDisplay(Display):
         ticks = zip(self.coefficients, self.relative_change, strict=True)
         axes.set_xticks(self.coefficients, [f"{coefficient:g}\n{_share(ratio)}" for coefficient, ratio in ticks])
         axes.set_ylim(-108, 108)
-        axes.set_xlabel("half class-mean differences\n%: of the tokens' own norm", fontsize=7.5)
+        axes.set_xlabel(f"{self.unit}\n%: of the tokens' own norm", fontsize=7.5)
 
 
 def _share(ratio: float) -> str:

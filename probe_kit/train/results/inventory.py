@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
+from probe_kit.runs.environment_success import EnvironmentSuccess
 from probe_kit.runs.layout import PROBES
 from probe_kit.runs.reader import RunReader
 from probe_kit.runs.results import Bundle, unfinished_bundles
@@ -61,6 +62,7 @@ class Inventory:
         probes: Probe results, oldest first.
         unfinished: Finished sites of interrupted sweeps, by key.
         wordings: Episodes by the wording they were asked in, empty for the items' own words alone.
+        success: Success rates of a run in an environment; None for others and where no fact `success` is stored.
     """
 
     run: str
@@ -78,6 +80,7 @@ class Inventory:
     probes: tuple[StoredProbes, ...]
     unfinished: Mapping[str, int]
     wordings: Mapping[str, int] = field(default_factory=dict)
+    success: EnvironmentSuccess | None = None
 
 
 def inventory(run: Any) -> Inventory:
@@ -99,6 +102,7 @@ def inventory(run: Any) -> Inventory:
         probes=tuple(stored_probes(run)),
         unfinished=unfinished_bundles(run.location, PROBES),
         wordings={name: len(run.in_wording(name).episodes) for name in run.wordings},
+        success=EnvironmentSuccess.of(episodes),
     )
 
 

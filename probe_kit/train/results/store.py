@@ -22,11 +22,11 @@ from probe_kit.hooks.contract.sites import Site
 from probe_kit.runs.layout import PROBE_DIRECTIONS, PROBES
 from probe_kit.runs.reader import RunReader
 from probe_kit.runs.results import (
-    HEAD,
     Bundle,
     Pieces,
     bundle_keys,
     complete_key,
+    is_complete,
     read_bundle,
     read_bundles,
     tidy_bundle,
@@ -148,8 +148,8 @@ def _npz(write: Callable[[BytesIO], None]) -> bytes:
 
 
 def is_stored(run: Location, key: str) -> bool:
-    """Whether complete results called `key` exist."""
-    return run.exists(f"{PROBES}/{key}/{HEAD}")
+    """Whether complete results called `key` exist. Raises RunDamagedError if their head was changed."""
+    return is_complete(run, PROBES, key)
 
 
 def load_results(run: RunReader, key: str | None = None, target: str | None = None) -> ProbeResults:

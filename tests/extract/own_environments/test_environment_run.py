@@ -1,5 +1,6 @@
 """A Gymnasium environment from `extract --env` to a decoded label, with the embedded policy."""
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -7,7 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from probe_kit.errors import DiskSpaceError, OwnEnvironmentError, SettingsMismatchError, UnitsError, UsageError
+from probe_kit.errors import (
+    DiskSpaceError,
+    OwnEnvironmentError,
+    SettingsMismatchError,
+    TooFewGroupsError,
+    UnitsError,
+    UsageError,
+)
 from probe_kit.extract import EnvSource, ExtractSettings, Step, check_environment, prepare
 from probe_kit.extract.commands import check_size
 from probe_kit.extract.sources.environment import SUCCESS
@@ -17,11 +25,16 @@ from probe_kit.extract.sources.source import Played
 from probe_kit.hooks import Observation
 from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.retention import retention_table
+from probe_kit.retention.behaviour import TableRun
+from probe_kit.retention.table import _success_notes
 from probe_kit.runs import Run, open_run, verify_run
-from probe_kit.runs.layout import AT_END, ONCE
+from probe_kit.runs.environment_success import EnvironmentSuccess
+from probe_kit.runs.layout import AT_END, ONCE, START
 from probe_kit.runs.store import locate
 from probe_kit.train import Target, train_probes
 from probe_kit.train.builtin_columns import label_frame
+from probe_kit.train.problem import warn_of_equal_starts
+from probe_kit.train.target_samples import target_samples
 from tests.extract.own_environments.test_contract import EPISODE, SEEN, planned
 from tests.support.made_once import made_once
 from tests.support.reach_env import ReachEnv
@@ -90,6 +103,67 @@ def test_facts_of_a_run_that_captured_the_first_inference_alone_are_missed_with_
     first = prepare(late, model=pi0_tiny).run(tmp_path / "run")
     with pytest.raises(UsageError, match=r"first inferences were captured\. Return .* --captured-calls all"):
         Target.of_run(first, "env.left")
+
+
+def with_episodes(run: Run, monkeypatch: pytest.MonkeyPatch, **columns: Any) -> None:
+    monkeypatch.setitem(vars(run), "episodes", run.episodes.assign(**columns))
+
+
+def test_a_start_is_a_group_where_a_user_asks_for_it(played: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever groups the environment names; episodes that start equally stay together."""
+    left = Target.of_run(played, "env.left")
+    for column in ("episode_id", "env_seed", START):
+        by_column = Target.of_run(played, "env.left", group_by=column)
+        assert len(set(target_samples(played, by_column, None, 0, 1).groups)) == 12
+    with_episodes(played, monkeypatch, group_id="one")
+    with pytest.raises(
+        TooFewGroupsError, match=rf"1 groups \(group_id\) .* --group-by {START}, which has 12 groups"
+    ):
+        train_probes(played, target=left, permutations=9)
+    by_start = Target.of_run(played, "env.left", group_by=START)
+    assert len(set(target_samples(played, by_start, None, 0, 1).groups)) == 12
+    with_episodes(played, monkeypatch, **{START: [f"s{row // 4}" for row in range(12)]})
+    assert len(set(target_samples(played, by_start, None, 0, 1).groups)) == 3
+    by_episode = Target.of_run(played, "env.left", group_by="episode_id")
+    with pytest.raises(
+        UsageError, match=rf"episodes that start with the same observation.*Give --group-by {START}"
+    ):
+        target_samples(played, by_episode, None, 0, 1)
+    with pytest.raises(TooFewGroupsError, match=r"Label episodes of other groups$"):
+        train_probes(played, target=left, permutations=9)
+
+
+def test_groups_that_start_equally_are_named_before_probes_are_fitted(
+    played: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left = Target.of_run(played, "env.left")
+    with_episodes(played, monkeypatch, **{START: [f"s{row % 10}" for row in range(12)]})
+    samples = target_samples(played, left, None, 0, 1)
+    with pytest.warns(UserWarning, match=rf"4 groups start .* as another one.*--group-by {START}: .* 10 in all"):
+        warn_of_equal_starts("left", played, left, samples)
+
+
+@pytest.mark.parametrize("shown", ["table", "run show", "run show as JSON"])
+def test_both_rates_stand_where_a_rate_is_printed(
+    played: Run, shown: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from typer.testing import CliRunner
+
+    from probe_kit.cli import app
+
+    with_episodes(played, monkeypatch, limit=300)
+    sentence = EnvironmentSuccess.of(played.episodes)
+    assert sentence is not None
+    assert "the environment's own limit is 300: both rates may be too low" in sentence.sentence
+    if shown == "table":
+        notes = list(_success_notes([TableRun.of(played)]))
+        assert notes == [f"{played.label}: {sentence.sentence}."]
+    elif shown == "run show as JSON":
+        result = CliRunner().invoke(app, ["run", "show", str(played.path), "--json"])
+        assert json.loads(result.stdout)["success"]["success_once"] == sentence.success_once
+    else:
+        result = CliRunner().invoke(app, ["run", "show", str(played.path)])
+        assert "success_once" in result.stdout
 
 
 def check_equal(some: Run, played: Run, rows: list[int]) -> None:

@@ -25,6 +25,7 @@ from probe_kit.extract.sources.recording_source import RecordingSource
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.runs import Run, compare_actions, verify_run
+from probe_kit.runs.plan import Row
 from probe_kit.suite import Suite
 from tests.extract.recordings.conftest import STATE, observations
 from tests.support.lerobot_recordings import CAMERA, write_recording
@@ -119,9 +120,8 @@ def test_predictions_are_what_the_policy_acts_in_a_scene(run: Run, pi0_tiny: Pi0
     """Of the embedded policy, whose own units are those of the arm. A batch of three rounds otherwise than one."""
     assert run.inputs is not None
     seed = int(run.episodes["policy_seed"].iloc[0])
-    own = pi0_tiny.act(
-        [observations()[0][0]], [Turn(observations()[0][0], seed, 0, None).derived_seed("inference")]
-    )  # type: ignore[arg-type]
+    first, row = observations()[0][0], Row(0, {"policy_seed": seed}, frames=(0,))
+    own = pi0_tiny.act([first], [Turn(first, row, 0, None).derived_seed("inference")])  # type: ignore[arg-type]
     np.testing.assert_allclose(run.inputs.read("prediction")[0, 0], own[0], rtol=0, atol=1e-6)
 
 
@@ -264,7 +264,7 @@ def test_changed_data_of_an_episode_is_not_continued(recording: Path, pi0_tiny: 
     moved = shutil.copytree(recording, tmp_path / "rec")
     shown(moved, tmp_path / "run", pi0_tiny, episodes=(0,), every=4)
     rewrite(moved, lambda table: table.assign(**{"next.reward": np.float32(1) - table["next.reward"]}))
-    with pytest.raises(SettingsMismatchError, match=r"files of the data set that hold episode-\d+ have changed"):
+    with pytest.raises(SettingsMismatchError, match=r"the files that episode-\d+ shows have changed"):
         shown(moved, tmp_path / "run", pi0_tiny, episodes=(0,), every=4)
 
 

@@ -5,6 +5,7 @@ import shutil
 import sys
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from probe_kit.extract import ExtractSettings, LeRobotSource, prepare
 from probe_kit.extract.config_files import read_config
 from probe_kit.extract.extraction import check_meaningless
 from probe_kit.extract.sources.lerobot_folder import open_lerobot, resolved_commit
-from probe_kit.extract.sources.recording import read_episodes
+from probe_kit.extract.sources.recording import degrees_of, read_episodes
 from probe_kit.extract.sources.recording_source import mapped_cameras
 from probe_kit.hooks import load_model
 from probe_kit.hooks.contract.observation import Observation
@@ -69,11 +70,21 @@ def test_other_words_for_frames_are_refused(text: str) -> None:
         ({"cameras": ["base=a", "wrist=a"]}, "feature 'a' is mapped twice"),
         ({"rotations": ["base=45"]}, "rotated by 45 degrees; expected one of 90, 180, 270"),
         ({"rotations": ["base=up"]}, "expected degrees"),
+        ({"rotations": ["up"]}, "--rotate up; expected degrees, such as 180"),
+        ({"rotations": ["base=90", "base=180"]}, "--rotate gives base twice"),
     ],
 )
 def test_maps_that_cannot_be_meant_are_refused(given: dict[str, list[str]], message: str) -> None:
     with pytest.raises(UsageError, match=message):
         LeRobotSource("folder", **given)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("given", [["180"], ["180", "wrist=90"], {"*": 180}, [("*", 180)], 180])
+def test_degrees_without_a_camera_rotate_all_and_those_of_a_camera_count_before(given: Any) -> None:
+    rotations = LeRobotSource("folder", rotations=given).rotations
+    assert degrees_of(rotations, "base") == 180
+    assert degrees_of(rotations, "wrist") == (90 if len(rotations) > 1 else 180)
+    assert degrees_of((("base", 90),), "wrist") == 0
 
 
 # -- cameras --------------------------------------------------------------------------------------------------

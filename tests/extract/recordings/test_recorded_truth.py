@@ -162,9 +162,7 @@ def test_a_run_does_not_grow_after_a_file_was_replaced_with_its_old_time_stamp(
     run((0,))
     replace_same_size(copy / DATA, negated((copy / DATA).read_bytes(), float(WRITTEN[0, 1])))
     for episodes in ((0,), (0, 1)):
-        with pytest.raises(
-            SettingsMismatchError, match="files of the data set that hold episode-000000 have changed"
-        ):
+        with pytest.raises(SettingsMismatchError, match="the files that episode-000000 shows have changed"):
             run(episodes)
 
 
@@ -399,7 +397,10 @@ def test_texts_of_tasks_are_a_column_or_the_index_of_pandas(
         (lambda table: table.assign(task=[1, 2]), "expected task_index, and the texts of the tasks in one column"),
         (lambda table: table.rename(columns={"task": "words"}), "has the columns words, task_index; expected"),
         (lambda table: table[["task"]], "has the columns task; expected task_index"),
-        (lambda table: table.assign(task=["", None]), "as the task 0, which a frame names; expected a text"),
+        (
+            lambda table: table.assign(task=["", None]),
+            "as the task 0, which a frame names; expected a text",
+        ),
         (lambda table: table.assign(task_index=0), "has 2 tasks of the number 0"),
     ],
 )
@@ -409,6 +410,16 @@ def test_tasks_that_are_no_texts_are_refused(
     retask(copy, of)
     with pytest.raises(RecordingError, match=message):
         tasks(copy)
+
+
+def test_an_empty_task_names_its_episodes(copy: Path) -> None:
+    """Before a model is loaded, and only where a chosen episode has the task."""
+    retask(copy, lambda table: table.assign(task=["" if number == 0 else "go" for number in table["task_index"]]))
+    numbers = pd.read_parquet(copy / DATA)[["episode_index", "task_index"]]
+    empty = sorted(set(numbers[numbers["task_index"] == 0]["episode_index"].tolist()))
+    with pytest.raises(RecordingError, match=rf"'' as the task 0, which frames of episodes? {empty[0]}.* name"):
+        _ = LeRobotSource(str(copy)).open().instructions
+    assert LeRobotSource(str(copy), instruction="go").open().instructions == ("go",)
 
 
 # -- videos -------------------------------------------------------------------------------------------------------
@@ -458,7 +469,7 @@ VIDEOS: dict[str, tuple[Callable[[Path], None], str]] = {
             time(f, "from", lambda rows: [*rows[:2], rows[2] + 1]),
             time(f, "to", lambda rows: [*rows[:2], rows[2] + 1]),
         )[0],
-        r"lasts 3\.6000 s at 5 frames per second; meta says .* episode 2 until 4\.6000 s",
+        r"ends at 3\.6000 s and has 5 frames per second; meta says .* episode 2 until 4\.6000 s",
     ),
     "a range that is not a number": (
         lambda f: time(f, "from", lambda rows: [float("nan"), *rows[1:]]),

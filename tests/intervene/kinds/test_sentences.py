@@ -14,12 +14,12 @@ from probe_kit.intervene.kinds.attribution import AttributionPatching
 from probe_kit.intervene.kinds.base import Intervention
 from probe_kit.intervene.kinds.closed_loop import ClosedLoop, ClosedLoopEffect
 from probe_kit.intervene.kinds.erase import ConceptErasure, ErasureEffect
-from probe_kit.intervene.kinds.image_swap import Finding, ImageSwap, ImageSwapEffect, InputEffect
+from probe_kit.intervene.kinds.image_swap import Finding, ImageSwap, ImageSwapEffect, InputEffect, input_effect
 from probe_kit.intervene.kinds.instruction_swap import InstructionSwap
-from probe_kit.intervene.kinds.interchange import Interchange, PatchEffect
+from probe_kit.intervene.kinds.interchange import Interchange, PatchEffect, unit_of_doses
 from probe_kit.intervene.kinds.joint import EVERY, MINIMAL, JointEffect, JointPlaces
 from probe_kit.intervene.kinds.steer import Steering
-from probe_kit.intervene.outcomes import CLEAN, ConditionOutcomes
+from probe_kit.intervene.outcomes import CLEAN, CONTROL_INPUT, DONOR, IMAGE_SWAP, NOISE, ConditionOutcomes
 from probe_kit.intervene.patching.attribution import AttributionEffect
 from probe_kit.intervene.verdict import UseVerdict, classify_use
 from probe_kit.retention.columns.summary import MOST_NUMBERS, MOST_WORDS, count_words
@@ -59,7 +59,7 @@ def context(verdict: UseVerdict | None) -> InterventionResult:
     outcomes = ConditionOutcomes(
         (CLEAN,), names, names, names, names, np.array(["left"]), numbers, numbers, moved, numbers[0]
     )
-    return said_of(measured(outcomes, ""), verdicts)
+    return said_of(measured(outcomes, "", {"kind": Steering.kind}), verdicts)
 
 
 @pytest.mark.parametrize("response", SWAPS)
@@ -379,3 +379,62 @@ def test_the_last_line_about_an_input_of_a_run_without_sides_is_short(
 def test_every_kind_that_tests_something_says_what_it_found() -> None:
     for kind in every_kind():
         assert (kind.finding is not Intervention.finding) != kind.is_descriptive, kind.kind
+
+
+def test_an_effect_below_the_resolution_of_its_measure_is_significant_of_nothing() -> None:
+    """Signs that agree in every episode have the smallest p there is, however small the effect."""
+    small = replace(
+        patch("backbone.02", 0.003, 0.004), net=0.0, net_left=0.0, net_right=0.0, mean_displacement=1e-5
+    )
+    assert not small.is_resolved
+    assert not small.is_significant
+    assert replace(small, effect=0.6).is_localised
+    assert replace(small, net=0.02).is_significant, "an episode turns"
+    assert replace(small, effect=None, mean_displacement=0.03).moves_action
+    assert not replace(small, effect=None).is_significant
+    doses = [
+        replace(small, coefficient=dose, direction="color.mean.backbone.02-316f1fe4") for dose in ("0", "1", "2")
+    ]
+    table = Steering.table(doses, context(None))
+    assert [row[table.columns.index("p")] for row in table.texts] == ["–", "–", "–"]
+    assert "lengths of the file's vector" in table.notes[0]
+    assert "significant of nothing" in table.notes[0]
+    found = Steering.table([replace(patch("backbone.02", 0.6, 0.004), coefficient="1")], context(None))
+    assert "significant of nothing" not in found.notes[0]
+    assert unit_of_doses("mean-difference:1") == unit_of_doses("probe") == "half class-mean differences"
+
+
+def unsided() -> InterventionResult:
+    described = context(None)
+    return with_parts(described, replace(described.outcomes, sides=np.array([""])))
+
+
+@pytest.mark.parametrize("seed", [None, 1.0])
+def test_where_the_seed_decides_no_input_does_and_both_commands_say_so_in_one_sentence(seed: float | None) -> None:
+    row = replace(input_row(1.0, 0.94, "no effect"), every=0.005, seed=seed)
+    said = "all inputs together change 0 % of the action: the seed decides it"
+    (finding,) = ImageSwap.findings([row], unsided())
+    assert said in finding
+    assert said in ImageSwap.sentences([row], unsided())[0]
+    without_noise = replace(row, seed=0.0, finding="decides")
+    assert "the seed decides" not in ImageSwap.findings([without_noise], unsided())[0]
+
+
+def test_a_share_of_next_to_nothing_decides_nothing() -> None:
+    """Sizes as of an untrained network: all inputs change a tenth of the spread, the picture 0.94 of that."""
+    rng, groups = np.random.default_rng(0), np.array([f"g{number}" for number in range(8)])
+    sizes = np.zeros((5, 8))
+    sizes[1:4] = np.array([0.1, 0.06, 0.106])[:, None] * rng.uniform(0.9, 1.1, (3, 8))
+    sizes[4] = 1.4
+    displacement = np.where(np.arange(5)[:, None] == 2, 0.0, sizes)
+    names = (CLEAN, IMAGE_SWAP, CONTROL_INPUT, DONOR, NOISE)
+    outcomes = ConditionOutcomes(
+        names, groups, groups, groups, np.full(8, "all"), np.full(8, ""), displacement,
+        sizes, np.zeros((5, 8, 5)), np.zeros(8), size=sizes, seed_text="seed",
+    )  # fmt: skip
+    row = input_effect(outcomes, IMAGE_SWAP, "picture")
+    assert row.share is not None
+    assert row.share > 0.9
+    assert (row.finding, row.every < 0.01, row.seed) == ("no effect", True, pytest.approx(0.98))
+    large = replace(outcomes, size=10 * sizes, displacement=10 * displacement)
+    assert input_effect(large, IMAGE_SWAP, "picture").finding == "decides"

@@ -34,6 +34,7 @@ from probe_kit.hooks.families.shared.lerobot.normaliser import Normaliser
 from probe_kit.hooks.families.shared.qwen import merger_norm
 from probe_kit.hooks.families.shared.taps import TOWER, Stack
 from probe_kit.hooks.outputs import Produce, RecordedRun, numpy_of
+from probe_kit.models.checkpoint_files import renamed_tensors
 
 _MODEL = "_groot_model."
 _EMBEDDING = f"{_MODEL}backbone.model.model.language_model.embed_tokens.weight"
@@ -46,7 +47,7 @@ _DIFFUSERS = {"attention": "attn1", "heads": "attn1.to_out.0", "mlp": "ff"}
 
 def _lerobots_names(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Return tensors by lerobot's names, also of NVIDIA's files."""
-    return {name if name.startswith(_MODEL) else f"{_MODEL}{name}": tensor for name, tensor in tensors.items()}
+    return renamed_tensors(tensors, lambda name: name if name.startswith(_MODEL) else f"{_MODEL}{name}")
 
 
 class Groot(PackedPolicy):

@@ -35,8 +35,9 @@ from probe_kit.hooks.families.shared.qwen import BACKBONE_ROLES, QwenVLA, record
 from probe_kit.hooks.families.shared.taps import decoder_tap
 from probe_kit.hooks.families.shared.token_decoder import seeded_noise
 from probe_kit.hooks.outputs import Arrays, Outputs, Produce, numpy_of, stream_outputs, watch
-from probe_kit.models.checkpoint_files import STATISTICS_FILE
+from probe_kit.models.checkpoint_files import STATISTICS_FILE, renamed
 from probe_kit.models.internvla import (
+    VLM_PREFIX,
     InternVLANetwork,
     Schedule,
     build_internvla,
@@ -45,7 +46,7 @@ from probe_kit.models.internvla import (
     look,
     prompt,
 )
-from probe_kit.models.qwen import QwenInputs
+from probe_kit.models.qwen import QWEN2_5_NAMES, QwenInputs
 
 DEFAULT_CHECKPOINT = "InternRobotics/InternVLA-M1-Pretrain-RT-1-Bridge"
 STEPS, GUIDANCE = 10, 1.5
@@ -291,8 +292,15 @@ def load_internvla(
         dtype,
         random_weights,
         weights_seed,
+        name_in_module=_name_in_module,
     )
     return InternVLA(loaded, parts, unnorm_key, steps, guidance, tokenizer)
+
+
+def _name_in_module(name: str) -> str:
+    """The network's name of a tensor; runs on transformers before 4.52 have other ones of Qwen2.5-VL."""
+    inside = name.removeprefix(VLM_PREFIX)
+    return name if inside == name else f"{VLM_PREFIX}{renamed(inside, QWEN2_5_NAMES)}"
 
 
 # -- verification ---------------------------------------------------------------------------------------------

@@ -208,7 +208,7 @@ class PrismaticModel(TokenDecoder):
     @cached_property
     def pictures(self) -> PictureSettings:
         """The settings of resizing and normalising pictures."""
-        return PictureSettings.of(self.config, self.loaded.folders[-1])
+        return PictureSettings.of(self.config, self.loaded.folders)
 
     def pixel_values(self, images: Iterable[NDArray[np.uint8]]) -> Tensor:
         """Return (B, 3 per tower, S, S) float32 of (H, W, 3) uint8 pictures.

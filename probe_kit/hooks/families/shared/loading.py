@@ -14,10 +14,10 @@ from probe_kit._system.bounded_files import load_json
 from probe_kit.errors import CheckpointError, UsageError, WeightsError
 from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE, chosen_dtype, content_hashes, side_files
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
-from probe_kit.hooks.checkpoints.weights import Weights, WeightsAudit, load_weights, read_weights
+from probe_kit.hooks.checkpoints.weights import Weights, WeightsAudit, doubles, load_weights, read_weights
 from probe_kit.hooks.contract.card import ModelCard
 from probe_kit.models.building import initialise, without_precision
-from probe_kit.models.checkpoint_files import Renames, renamed
+from probe_kit.models.checkpoint_files import Renames, describe_picture_conflict, renamed, renamed_tensors
 
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 
@@ -74,6 +74,7 @@ class Loaded[Network: nn.Module]:
             **fields: Further fields of `ModelCard`.
         """
         read = side_files(self.folder) if files is None else dict(files)
+        conflict = describe_picture_conflict(self.folder)
         if tokenizer is not None and (other := Path(tokenizer).expanduser()) != self.folder and other.is_dir():
             read |= side_files(other, "tokenizer/")
         return ModelCard(
@@ -84,7 +85,7 @@ class Loaded[Network: nn.Module]:
             parameters=self.audit.parameters,
             dtype=self.dtype,
             device=self.device,
-            notes=(*self.notes, *notes),
+            notes=(*self.notes, *notes, *filter(None, [conflict])),
             audit=self.audit.to_json(),
             settings={**content_hashes(read), **settings},
             exact=self.exact,
@@ -146,7 +147,11 @@ def load_network[Network: nn.Module](
         # On the meta device, without memory: a parameter that no file fills stays empty and is found, and large
         # models are not held twice.
         network = build(DTYPES[name], "meta")
-        tensors = tensors_of(weights) if tensors_of else renamed_tensors(weights, name_in_module)
+        tensors = (
+            renamed_tensors(weights.tensors, name_in_module, weights.source)
+            if tensors_of is None
+            else tensors_of(weights)
+        )
         owned = as_dtype(tensors, DTYPES[name], in_memory=torch.device(device).type == "cpu")
         audit = assign_weights(network, weights, owned, name_in_module)
     network.requires_grad_(False)  # a gradient is asked for at activations only
@@ -154,18 +159,6 @@ def load_network[Network: nn.Module](
     seed = weights_seed if random_weights else None
     notes = (audit.adapter,) if audit.adapter else ()
     return Loaded(network.to(device), audit, name, device, checkpoint, folder, seed, notes)
-
-
-def renamed_tensors(weights: Weights, name_in_module: Callable[[str], str]) -> dict[str, Tensor]:
-    """Return the tensors of a file under the network's names.
-
-    Raises:
-        WeightsError: For two tensors of one name.
-    """
-    tensors = {name_in_module(name): value for name, value in weights.tensors.items()}
-    if len(tensors) < len(weights.tensors):
-        raise WeightsError(f"{weights.source}: two tensors have the same name here; nothing was run")
-    return tensors
 
 
 def assign_weights(
@@ -187,24 +180,20 @@ def assign_weights(
             raises.
     """
     tied = doubles(network)
-    audit = load_weights(network, weights, tensors, tied, assign=True, name_in_module=name_in_module)
     for double, original in tied.items():
-        module, _, name = double.rpartition(".")
-        setattr(network.get_submodule(module), name, network.get_parameter(original))
-        if double in tensors and not torch.equal(network.state_dict()[double], tensors[double]):
+        if double in tensors and original in tensors and not torch.equal(tensors[double], tensors[original]):
             raise WeightsError(
                 f"{weights.source}: {double} differs from the tensor that config.json ties it to "
                 "(tie_word_embeddings); one of the two files is another model's"
             )
+    audit = load_weights(network, weights, tensors, tied, assign=True, name_in_module=name_in_module)
+    for double, original in tied.items():
+        weight, loaded = network.get_parameter(original), network.get_parameter(double)
+        if loaded.is_meta or torch.equal(loaded, weight):  # an adapter may have set the two apart
+            module, _, name = double.rpartition(".")
+            setattr(network.get_submodule(module), name, weight)
     _check_filled(network, weights.source)
     return audit
-
-
-def doubles(network: nn.Module) -> dict[str, str]:
-    """Return the parameters that are another one's double, with the name of that one."""
-    names = {id(parameter): name for name, parameter in network.named_parameters()}
-    every = network.named_parameters(remove_duplicate=False)
-    return {name: names[id(parameter)] for name, parameter in every if names[id(parameter)] != name}
 
 
 def as_dtype(tensors: Mapping[str, Tensor], dtype: torch.dtype, in_memory: bool) -> dict[str, Tensor]:

@@ -39,9 +39,18 @@ class TokenizerFile:
                 "of: copy it from that model's page, or name a folder that has it with -M tokenizer=DIR"
             )
 
-    def check_vocabulary(self, vocabulary: int) -> None:
-        """Raise CheckpointError for ids that a model with `vocabulary` of them does not have."""
-        if (highest := max(self.tokenizer.get_vocab(with_added_tokens=True).values())) >= vocabulary:
+    def check_vocabulary(self, vocabulary: int, further: bool = False) -> None:
+        """Raise CheckpointError for ids that a model with `vocabulary` of them does not have.
+
+        Args:
+            vocabulary: Number of ids that the model has.
+            further: Whether words that were added to the tokenizer may have higher ids, because they are refused
+                where a text has one. The processor of PaliGemma adds words that small models never learn.
+        """
+        added = self.tokenizer.get_added_tokens_decoder()
+        left_out = {token.content for token in added.values() if further and not token.special}
+        ids = self.tokenizer.get_vocab(with_added_tokens=True)
+        if (highest := max(number for word, number in ids.items() if word not in left_out)) >= vocabulary:
             raise CheckpointError(
                 f"{self.file} has ids up to {highest}; this model has {vocabulary}. The tokenizer belongs to "
                 "another checkpoint"
@@ -219,8 +228,24 @@ class FramedText(TokenizerFile):
         """
         TokenizerFile(folder).check_present()
         text = cls(folder, frame, int(config.vocab_size), _ends(generation, config))
-        text.check_vocabulary(text.vocabulary)
+        text.check_vocabulary(text.vocabulary, further=True)
         return text
+
+    def encoding(self, text: str, special: bool = False) -> Any:
+        """Return the library's encoding of a text, as in `TokenizerFile`.
+
+        Raises:
+            InstructionError: For a word that tokenizer or model does not know.
+        """
+        encoding = super().encoding(text, special)
+        if beyond := [
+            word for word, number in zip(encoding.tokens, encoding.ids, strict=True) if number >= self.vocabulary
+        ]:
+            raise InstructionError(
+                f"{text!r} has {beyond[0]!r}, which was added to the tokenizer and is none of the "
+                f"{self.vocabulary} ids of this model; write it without"
+            )
+        return encoding
 
     @cached_property
     def padding(self) -> int:

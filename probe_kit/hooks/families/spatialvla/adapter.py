@@ -36,7 +36,7 @@ from probe_kit.hooks.families.shared.loading import DTYPES, Loaded, load_network
 from probe_kit.hooks.families.shared.taps import Note, decoder_tap, kept_prompt, of_decoder
 from probe_kit.hooks.families.shared.text import SLOT, template_of
 from probe_kit.hooks.families.shared.token_decoder import TokenDecoder, warn_of_unknown
-from probe_kit.models.checkpoint_files import stored_statistics
+from probe_kit.models.checkpoint_files import SIGLIP_TOWER, renamed, stored_statistics
 from probe_kit.models.decoding import Decoded, Packed
 from probe_kit.models.spatialvla import (
     Intrinsics,
@@ -115,6 +115,7 @@ def load_checkpoint(
         chosen_dtype(dtype, config.dtype, DTYPES),
         random_weights,
         weights_seed,
+        name_in_module=lambda name: renamed(name, SIGLIP_TOWER),
         finish=lambda network: network.embed_actions(),
     )
     return LoadedSpatialVLA(**vars(loaded), processor=processor)

@@ -1,0 +1,79 @@
+"""Success rates of runs in environments of the user's own, and what may have lowered them."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Self
+
+from probe_kit._system.counting import counted, spanned
+from probe_kit.runs.layout import AT_END, LIMIT, ONCE
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True)
+class EnvironmentSuccess:
+    """The success rates of the episodes of an environment; shares are 0 to 1.
+
+    Attributes:
+        sr: The share of episodes with success after the last action.
+        success_once: The share of episodes with success after any action, the rate that lerobot-eval prints.
+        stopped: The number of episodes that `--max-steps` ended before the environment's own limit.
+        steps: The actions after which they ended.
+        limits: The environment's own limits of these episodes, in actions.
+    """
+
+    n_episodes: int
+    sr: float
+    success_once: float
+    stopped: int = 0
+    steps: tuple[int, ...] = ()
+    limits: tuple[int, ...] = ()
+
+    @classmethod
+    def of(cls, episodes: "pd.DataFrame") -> Self | None:
+        """Return the rates of a run's episodes; None of episodes without the fact `success`."""
+        if not {ONCE, AT_END} <= set(episodes) or episodes.empty:
+            return None
+        rated = episodes.dropna(subset=[ONCE, AT_END])
+        stopped = rated.iloc[:0]
+        if {LIMIT, "steps", "done"} <= set(rated):
+            stopped = rated[~rated["done"].astype(bool) & (rated["steps"] < rated[LIMIT])]
+        return cls(
+            len(rated),
+            float(rated[AT_END].astype(bool).mean()),
+            float(rated[ONCE].astype(bool).mean()),
+            len(stopped),
+            tuple(sorted({int(steps) for steps in stopped["steps"]})) if len(stopped) else (),
+            tuple(sorted({int(limit) for limit in stopped[LIMIT]})) if len(stopped) else (),
+        )
+
+    def to_json(self) -> Mapping[str, Any]:
+        """Return the rates as plain values."""
+        return {
+            "n_episodes": self.n_episodes,
+            "sr": self.sr,
+            ONCE: self.success_once,
+            "stopped_below_limit": self.stopped,
+            "limits": list(self.limits),
+        }
+
+    @property
+    def sentence(self) -> str:
+        """Both rates, and that `--max-steps` lowered them where it may have."""
+        rates = (
+            f"success rate {self.sr:.0%} of {counted(self.n_episodes, 'episode')}, by their last action; "
+            f"{ONCE} {self.success_once:.0%}, by any action, as lerobot-eval counts"
+        )
+        if not self.stopped:
+            return rates
+        limit = f"limit is {spanned(self.limits)}" if self.limits else "limit is unknown"
+        return (
+            f"{rates}. --max-steps ended {self.stopped} of them after {counted_steps(self.steps)}, and the "
+            f"environment's own {limit}: both rates may be too low"
+        )
+
+
+def counted_steps(steps: tuple[int, ...]) -> str:
+    """Return numbers of actions in words: `1 action`, `200 actions`, `4 to 7 actions`."""
+    return counted(steps[0], "action") if len(steps) == 1 else f"{spanned(steps)} actions"
