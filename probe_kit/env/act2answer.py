@@ -285,8 +285,15 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
         info = self._info()
         return float(info["is_success"]), trial.stopped_early, trial.ending is not None, info
 
-    def observe(self) -> Observation:
-        """Return the observation now; draw the picture unless it was drawn since the last action."""
+    def observe(self, number: int | None = None) -> Observation:
+        """Return the observation now; draw the picture unless it was drawn since the last action.
+
+        Args:
+            number: The number of the observation in an episode that is played again, which decides the last bit of
+                some colours; None for the next one.
+        """
+        if number is not None:
+            self._frame, self._picture = self.scene.frame(number), None
         picture, size = self.render(), self.scene_spec.picture_size
         if size is not None:
             picture = np.array(Image.fromarray(picture).resize(size, Image.Resampling.LANCZOS))

@@ -203,15 +203,20 @@ class Scene:
         """Whether the cube touches a tile."""
         return any(self.touches_tile(side) for side in SIDES)
 
-    def frame(self) -> Frame:
+    def frame(self, number: int | None = None) -> Frame:
         """Draw robot, cube and tiles as the camera sees them, without the table.
 
         PyBullet normalises the normals of a mesh in place whenever it draws them. The last bit of some alternates,
         and with it a colour by 1 of 255. So frame n of an episode always has the same parity of drawings before
         it, whatever former episodes and small pictures drew.
+
+        Args:
+            number: The number that the frame has in an episode that is played again; None for the next one.
         """
         if self.spec.tile_mass > 0:
             self._lay_pictures()
+        if number is not None:
+            self._frames = number
         if (self._drawn - self._frames) % 2:
             self.camera.at_height(1).render(self.client, self.spec.light, self.spec.light_level)
             self._drawn += 1

@@ -250,8 +250,8 @@ def export(
         ExportFormat,
         typer.Option(
             "--format",
-            help="Format. lerobot and sae write a folder; lerobot needs a run with --frames all. directions: for "
-            "intervene --direction FILE#NAME.",
+            help="Format. lerobot and sae write a folder. lerobot: what the policy saw and did in a scene, played "
+            "again. directions: for intervene --direction FILE#NAME.",
         ),
     ],
     out_file: Annotated[
@@ -276,6 +276,15 @@ def export(
     ] = None,
     dtype: Annotated[SaeDtype, typer.Option("--dtype", help="Of sae: type of the memory maps.")] = "bfloat16",
     seed: Annotated[int, typer.Option("--seed", help="Of sae: seed of the order of rows.")] = 0,
+    suite: Annotated[
+        Path | None, typer.Option("--suite", help="Of lerobot: folder of the run's suite, if it was moved.")
+    ] = None,
+    arm_urdf: Annotated[
+        Path | None, typer.Option("--arm-urdf", help="Of lerobot: URDF file of the run's arm, if it was moved.")
+    ] = None,
+    background: Annotated[
+        Path | None, typer.Option("--background", help="Of lerobot: photo of the run's table, if it was moved.")
+    ] = None,
     partial: Partial = False,
 ) -> None:
     """Write a run for other tools: to a file, and its sha256 beside it, or to a folder."""
@@ -284,8 +293,13 @@ def export(
 
     location = locate(run)
     target = out_file or location.path_of_export(f"{location.name}.{DIRECTION_FILES.get(style, style)}")
-    with err.status("exporting"):
-        written = export_run(location, style, target, partial, sites=sites, view=view, dtype=dtype, seed=seed)
+    scene_files = {name: path for name, path in (("arm_urdf", arm_urdf), ("background", background)) if path}
+    with err.status("exporting") as status:
+        written = export_run(
+            location, style, target, partial, sites=sites, view=view, dtype=dtype, seed=seed, suite=suite,
+            scene_files=scene_files,
+            on_episode=lambda done, count: status.update(f"exporting: {done} of {count} episodes"),
+        )  # fmt: skip
     out.print(str(written), soft_wrap=True)
 
 

@@ -22,8 +22,8 @@ from probe_kit.runs.plan import Row
 from probe_kit.runs.reader import origin_of
 from probe_kit.runs.run import Run
 from probe_kit.runs.run_source import OF_SCENE
+from probe_kit.runs.run_suite import suite_of
 from probe_kit.suite.items import Episode, Item, Layout, check_wordings, counterparts_of, in_words
-from probe_kit.train.run_suite import suite_of
 
 if TYPE_CHECKING:
     from torch import Tensor

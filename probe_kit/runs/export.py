@@ -8,7 +8,8 @@ on the way. The sha256 of a file is written beside it, and those of a folder int
 import hashlib
 import io
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from importlib import import_module
 from math import prod
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -17,9 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit._system.drafts import draft_of, full_disk_in_words, write_whole
-from probe_kit._system.imports import require
-from probe_kit._system.machine import same_scheduling
-from probe_kit.env.scoring import MOTION, STATE
 from probe_kit.errors import UsageError
 from probe_kit.runs.arrays import Rows
 from probe_kit.runs.direction_files import about_direction, check_direction_file, write_directions
@@ -27,9 +25,7 @@ from probe_kit.runs.export_vectors import StreamChoice, choose, is_tokens, write
 from probe_kit.runs.layout import MEAN_VIEW, ArrayKind, ExportFormat, SaeDtype
 from probe_kit.runs.reader import SIDE, check_sides
 from probe_kit.runs.run import Run, open_run
-from probe_kit.runs.small_frames import SmallFrames
 from probe_kit.runs.store import Location
-from probe_kit.runs.thumbnails import decode_frames, read_sheet
 from probe_kit.version import __version__
 
 LARGEST_CHUNK = 2**30
@@ -50,13 +46,16 @@ def export_run(
     view: str | None = None,
     dtype: SaeDtype = "bfloat16",
     seed: int = 0,
+    suite: Path | None = None,
+    scene_files: Mapping[str, Path] | None = None,
+    on_episode: Callable[[int, int], None] | None = None,
 ) -> Path:
     """Write the run at `path` to `out`, whole or not at all, with sha256 of every file, and return `out`.
 
     The format `h5` has `<stream>/pooled`, `<stream>/later`, `<stream>/tokens`, and a dataset per column under
     `episodes`. The format `safetensors` has the same names with a dot, the last two arrays as true bfloat16, and
     episodes in the metadata. Axes of both are (episode, call, [iteration,] layer, view or token, feature). The
-    format `lerobot` is a LeRobotDataset, of a run with `--frames all`.
+    format `lerobot` is a LeRobotDataset of what the policy saw, for which every episode is played again.
 
     Three formats hold the vectors that `sites` and `view` choose, see `choose`. The format `parquet` has a row per
     vector with episode, group, inference, frame, site, view, role and token. The format `directions` has a vector
@@ -73,6 +72,9 @@ def export_run(
             matrices.
         dtype: The numbers of `sae`, which alone has this option.
         seed: The seed of the order of `sae`, which alone has this option.
+        suite: For `lerobot`: the folder of the run's suite. None: where the run had it, or the embedded one.
+        scene_files: For `lerobot`: files of the scene that were moved, `arm_urdf` and `background`.
+        on_episode: For `lerobot`: called with the number of written episodes and of all.
 
     Raises:
         UsageError: For another format, an option that a format does not have, or a file that exists.
@@ -80,6 +82,9 @@ def export_run(
         MissingExtraError: Without a library that the format needs.
         RunDamagedError: For damaged bytes.
         DiskSpaceError: If the disk takes no more.
+        NoTrajectoryError: For `lerobot`, of a run without trajectories.
+        OtherFramesError: For `lerobot`, if an episode that is played again differs from the stored one.
+        SuiteError: For `lerobot`, for another suite than the run's or none; and SceneError for its files.
     """
     check_format(style)
     if style not in OF_VECTORS and (sites is not None or view is not None):
@@ -89,6 +94,10 @@ def export_run(
         )
     if style != SAE and (dtype != "bfloat16" or seed):
         raise UsageError(f"--dtype or --seed with --format {style}; leave them out, or use --format sae")
+    if style != LEROBOT and (suite is not None or scene_files):
+        raise UsageError(
+            f"--suite or files of the scene with --format {style}, which draws no picture; leave them out"
+        )
     if style == DIRECTIONS:
         check_direction_file(out)
     if out.exists():
@@ -105,6 +114,8 @@ def export_run(
                 write_sae(run, choices, draft, _about(run, choices), dtype, seed)
             else:
                 write_parquet(run, choices, draft, _about(run, choices))
+        elif style == LEROBOT:
+            import_module(_LEROBOT_WRITER).write_lerobot(run, draft, suite, scene_files, on_episode)
         else:
             WHOLE[style](run, draft)
         if draft.is_dir():
@@ -300,95 +311,6 @@ def _write_header(file: BinaryIO, header: dict[str, Any]) -> None:
     file.write(len(text).to_bytes(8, "little") + text)
 
 
-# -- a LeRobotDataset --------------------------------------------------------------------------------------------
-
-
-CAMERA = "observation.images.scene"
-EPISODES = "probe_kit_episodes.csv"
-"""A file in `meta`: a row per episode of the data set with all that the run says of it; lerobot ignores it."""
-_STATE = [*STATE["tool"], "opening"]
-
-
-@same_scheduling()
-def write_lerobot(run: Run, folder: Path) -> None:
-    """Write the data set in `folder`: an episode of T steps has T rows, each with what the policy did next.
-
-    The feature `observation.state` is the measured tool, x, y, z, roll, pitch, yaw in metres and radians, and the
-    opening of the gripper. The feature `action` is the commanded action. The frame behind the last action is left
-    out.
-
-    Raises:
-        UsageError: For a run without all frames.
-        NoTrajectoryError: For a run without trajectories.
-        MissingExtraError: Without a library of the extra `datasets`.
-        RunDamagedError: For damaged bytes.
-    """
-    for needed in ("datasets", "av"):
-        require(needed, "datasets")
-    datasets = require("lerobot.datasets.lerobot_dataset", "datasets")
-    require("datasets", "datasets").disable_progress_bars()
-    trajectories, data = run.trajectories, None
-    for position, (row, frames) in enumerate(_filmed_episodes(run)):
-        trajectory = trajectories[position]
-        if data is None:
-            data = datasets.LeRobotDataset.create(
-                f"probe_kit/{run.location.name}", round(_control_rate(run)), _features(frames[0].shape),
-                root=folder, robot_type=str(run.settings["scene"]["arm"]),
-            )  # fmt: skip
-        for step in range(trajectory.steps):
-            state = np.append(trajectory.tool[step], trajectory.opening[step]).astype(np.float32)
-            data.add_frame(
-                {
-                    CAMERA: frames[step],
-                    "observation.state": state,
-                    "action": trajectory.commanded[step].astype(np.float32),
-                    "task": str(row["instruction"]),
-                }
-            )
-        data.save_episode()
-    if data is not None:
-        data.finalize()
-    table = run.episodes.rename_axis("episode_index")
-    table.to_csv(folder / "meta" / EPISODES)
-
-
-def _features(shape: tuple[int, ...]) -> dict[str, Any]:
-    return {
-        CAMERA: {"dtype": "video", "shape": shape, "names": ["height", "width", "channels"]},
-        "observation.state": {"dtype": "float32", "shape": (len(_STATE),), "names": _STATE},
-        "action": {"dtype": "float32", "shape": (len(MOTION),), "names": list(MOTION)},
-    }
-
-
-def _filmed_episodes(run: Run) -> Iterator[tuple[dict[str, Any], SmallFrames]]:
-    """Yield the row and the frames of every episode: one before the first action, one behind each.
-
-    Raises:
-        UsageError: Before the first row, if an episode was played without `--frames all`. Also if its frames were
-            deleted.
-    """
-    rows = run.episodes.to_dict("records")
-    for commit in run.commits():
-        if commit.frames is None:
-            raise UsageError(
-                f"{run.location} does not keep every frame of episode {commit.episode_id}. Extract it again to "
-                "another --out, with --frames all"
-            )
-    for row in rows:
-        sheet = read_sheet(run.location, int(row["episode"]))
-        if sheet is None or sheet.count is None:
-            raise UsageError(f"{run.location} has lost its frames; its folder of pictures was deleted")
-        yield {str(name): value for name, value in row.items()}, decode_frames(sheet.content, sheet.count)
-
-
-def _control_rate(run: Run) -> float:
-    """Return the actions per second of the run's scene. Raises UsageError for a run without a scene."""
-    scene = run.settings.get("scene")
-    if scene is None:
-        raise UsageError(f"{run.location} was not played in a scene")
-    return float(scene["physics"]["rate"] / scene["physics"]["substeps"])
-
-
 # -- directions --------------------------------------------------------------------------------------------------
 
 
@@ -430,15 +352,13 @@ def write_class_means(run: Run, choices: Sequence[StreamChoice], file: Path) -> 
 
 
 LEROBOT: ExportFormat = "lerobot"
-"""The format that holds frames and actions, and no activations."""
-WHOLE: dict[ExportFormat, Callable[[Run, Path], None]] = {
-    "h5": write_h5,
-    "safetensors": write_safetensors,
-    LEROBOT: write_lerobot,
-}
+"""The format that holds pictures and actions, and no activations; its writer plays episodes again."""
+_LEROBOT_WRITER = "probe_kit.extract.lerobot_export"
+"""The module of its writer, which knows the scene as a source; by name, because sources know runs."""
+WHOLE: dict[ExportFormat, Callable[[Run, Path], None]] = {"h5": write_h5, "safetensors": write_safetensors}
 """The formats that hold all that was stored."""
 SAE: ExportFormat = "sae"
 DIRECTIONS: ExportFormat = "directions"
 OF_VECTORS: tuple[ExportFormat, ...] = ("parquet", SAE, DIRECTIONS)
 """The formats that hold chosen vectors."""
-FORMATS: tuple[ExportFormat, ...] = (*WHOLE, *OF_VECTORS)
+FORMATS: tuple[ExportFormat, ...] = (*WHOLE, LEROBOT, *OF_VECTORS)

@@ -12,6 +12,7 @@ from probe_kit.errors import SuiteNotFoundError, UsageError
 from probe_kit.hashing import derive_seed
 from probe_kit.runs.layout import DATASET
 from probe_kit.runs.reader import RunReader, full_name
+from probe_kit.runs.run_suite import suite_of
 from probe_kit.statistics.intervals import Accuracy
 from probe_kit.statistics.label_permutations import p_value
 from probe_kit.statistics.paired_tests import better_than_best, better_than_reference
@@ -29,7 +30,6 @@ from probe_kit.train.results.control_scores import (
 )
 from probe_kit.train.results.probe_curve import Matrix, ProbeCurve
 from probe_kit.train.results.probe_results import ProbeResults
-from probe_kit.train.run_suite import suite_of
 from probe_kit.train.samples import Samples
 from probe_kit.train.target_samples import TargetSamples
 

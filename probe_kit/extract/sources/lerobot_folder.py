@@ -66,6 +66,28 @@ class LeRobotFolder(LeRobotMeta):
         """Return the names of the numbers of a feature; their positions where the data set names none."""
         return list(self.feature_names(feature) or map(str, range(self.width(feature) or 0)))
 
+    def intrinsics(self, feature: str) -> NDArray[np.float32] | None:
+        """Return the (3, 3) pinhole matrix of a camera in pixels of its picture; None where meta has none.
+
+        It stands as `intrinsics` in the `info` of the feature, where `run export --format lerobot` writes it.
+
+        Raises:
+            RecordingError: For another shape, and numbers that are not finite.
+        """
+        stored = (self.features[feature].get("info") or {}).get("intrinsics")
+        if stored is None:
+            return None
+        try:
+            matrix = np.asarray(stored, np.float32)
+        except (TypeError, ValueError):
+            matrix = np.empty(0, np.float32)
+        if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
+            raise RecordingError(
+                f"{self.name}: meta/info.json gives {feature} the intrinsics {str(stored)[:80]}; expected "
+                "3 × 3 numbers"
+            )
+        return matrix
+
     def picture_shape(self, feature: str) -> tuple[int, int]:
         """Return height and width of a camera's pictures."""
         shape, names = self.features[feature]["shape"], list(self.features[feature].get("names") or ())

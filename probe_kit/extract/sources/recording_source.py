@@ -329,7 +329,13 @@ class RecordingSource(Source[LeRobotSource]):
             pictures[camera] = np.zeros((*shape, 3), np.uint8)
         numbers = self.folder.width(STATE)
         state = NO_STATE if numbers is None else np.zeros(numbers, np.float32)
-        return observation_of(pictures, state, instruction)
+        return observation_of(pictures, state, instruction, self.intrinsics)
+
+    @cached_property
+    def intrinsics(self) -> NDArray[np.float32] | None:
+        """The (3, 3) matrix of the first camera, as the data set gives it; None where its pictures are turned."""
+        camera, feature = self.settings.cameras[0]
+        return None if camera in dict(self.settings.rotations) else self.folder.intrinsics(feature)
 
     def play(self, played: Played) -> Opens:
         """Open a player, which opens the data set again."""
@@ -556,7 +562,7 @@ class RecordingPlayer(InputsPlayer):
         if recording.folder.columns:
             self._keep("columns", [self._numbers[name][frame, 0] for name in recording.folder.columns])
         self._keep_pictures(list(pictures.values()), recording.settings.pixels)
-        return observation_of(pictures, state, self.row.instruction)
+        return observation_of(pictures, state, self.row.instruction, recording.intrinsics)
 
 
 def mapped_cameras(typed: Pairs, model: Sequence[str], recorded: Sequence[str]) -> Pairs:
@@ -592,11 +598,15 @@ def mapped_cameras(typed: Pairs, model: Sequence[str], recorded: Sequence[str]) 
 
 
 def observation_of(
-    pictures: Mapping[str, NDArray[np.uint8]], state: NDArray[np.float32], instruction: str
+    pictures: Mapping[str, NDArray[np.uint8]],
+    state: NDArray[np.float32],
+    instruction: str,
+    intrinsics: NDArray[np.float32] | None = None,
 ) -> Observation:
-    """Return the observation of pictures by camera, the first of which is the main one."""
+    """Return the observation of pictures by camera, the first of which is the main one and has the intrinsics."""
     first, *other_cameras = pictures
-    return Observation(pictures[first], state, instruction, None, {name: pictures[name] for name in other_cameras})
+    others = {name: pictures[name] for name in other_cameras}
+    return Observation(pictures[first], state, instruction, intrinsics, others)
 
 
 def _ahead(actions: NDArray[np.float64], frame: int, count: int) -> NDArray[np.float32]:

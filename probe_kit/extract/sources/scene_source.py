@@ -83,6 +83,28 @@ class ScenePlayer(Player):
         """End the episode without an action: its model was only captured. There is no outcome."""
         return Ending({"outcome": CAPTURE_ONLY, **self._facts}, self._frames, tuple(self._small_frames))
 
+    def play_again(
+        self, row: Row, actions: NDArray[np.float32], execute: int
+    ) -> Iterator[tuple[Observation, str]]:
+        """Set up an episode and execute stored actions.
+
+        Args:
+            row: The row of the episode.
+            actions: (T, 7) the actions that were commanded.
+            execute: The number of actions that were executed per inference.
+
+        Yields:
+            What was to be seen before each action, bit for bit where the policy inferred, and the hash of the
+            first frame.
+        """
+        observation, facts = self.look(row)
+        for step, action in enumerate(actions):
+            if step:
+                inference, is_between = divmod(step, execute)
+                observation = self._observed(self._env.observe(None if is_between else inference))
+            yield observation, str(facts[FIRST_FRAME])
+            self._env.advance(action)
+
     def tile_masks(self) -> dict[Side, NDArray[np.bool_]]:
         """Return masks (H, W) of where each tile's own picture is visible in the last picture."""
         return self._env.tile_masks()

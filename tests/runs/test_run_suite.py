@@ -17,13 +17,13 @@ from probe_kit.errors import SuiteError, SuiteNotFoundError
 from probe_kit.extract import ExtractSettings, extract_run
 from probe_kit.extract.extraction import open_checked
 from probe_kit.runs import Run, open_run, seal
+from probe_kit.runs.run_suite import suite_of
 from probe_kit.runs.store import locate
 from probe_kit.runs.writer import RunWriter
 from probe_kit.suite import Suite, build_suite
 from probe_kit.suite.build import default_folder
 from probe_kit.suite.items import Wording
 from probe_kit.train import ArrayRun, train_probes
-from probe_kit.train.run_suite import suite_of
 from tests.support.changed_suites import CHANGES, other_name, save_changed
 from tests.support.little_run import STREAMS, certify, episode, little_settings, suite_record
 from tests.support.plans import make_plan
