@@ -29,6 +29,7 @@ from probe_kit.extract.sources.lerobot_meta import (
 )
 from probe_kit.extract.sources.recording import LeRobotSource
 from probe_kit.hooks.checkpoints.checkpoint import OFFLINE_WAY_OUT, hub_reason, unreachable, way_out
+from probe_kit.hooks.families.shared.feature_names import read_names
 from probe_kit.suite.pictures import LARGEST_PICTURE, decode_bytes
 
 MOST_FRAMES = 64
@@ -66,7 +67,7 @@ class LeRobotFolder(LeRobotMeta):
 
     def picture_shape(self, feature: str) -> tuple[int, int]:
         """Return height and width of a camera's pictures."""
-        shape, names = self.features[feature]["shape"], list(self.features[feature].get("names") or ())
+        shape, names = self.features[feature]["shape"], read_names(self.features[feature].get("names"))
         if names and names[0].startswith("channel"):
             return int(shape[1]), int(shape[2])
         return int(shape[0]), int(shape[1])

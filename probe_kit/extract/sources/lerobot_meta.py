@@ -16,6 +16,7 @@ from probe_kit._system.bounded_files import open_regular, read_json_object
 from probe_kit._system.imports import require
 from probe_kit._system.parquet_files import open_parquet, read_parquet
 from probe_kit.errors import RecordingError
+from probe_kit.hooks.families.shared.feature_names import names_misfit, names_of
 
 CONVERTER = "python -m lerobot.scripts.convert_dataset_v21_to_v30"
 EXTRA = "datasets"
@@ -222,8 +223,13 @@ class LeRobotMeta:
 
     def feature_names(self, feature: str) -> tuple[str, ...] | None:
         """Return the names of the numbers of a feature; None where the data set names none, or not all."""
-        names = _flat_names(self.features[feature].get("names"))
-        return names if names is not None and (len(names),) == tuple(self.features[feature]["shape"]) else None
+        shape = tuple(self.features[feature]["shape"])
+        return names_of(self.features[feature].get("names"), shape[0]) if len(shape) == 1 else None
+
+    def names_misfit(self, feature: str) -> str:
+        """Return why the names of a feature's numbers are not used; empty where they are, or there are none."""
+        shape = tuple(self.features[feature]["shape"])
+        return names_misfit(self.features[feature].get("names"), shape[0]) if len(shape) == 1 else ""
 
     def task(self, number: int) -> str:
         """Return the text of a task. Raises RecordingError for a number that is not named once, or has no text."""
@@ -333,20 +339,6 @@ def _depth(feature: Mapping[str, Any]) -> bool:
     info, video = feature.get("info") or {}, feature.get("video_info") or {}
     flags = info.get("is_depth_map"), info.get("video.is_depth_map"), video.get("video.is_depth_map")
     return any(flags)
-
-
-def _flat_names(names: Any) -> tuple[str, ...] | None:
-    """Return names as a list, from {"motors": […]}, from groups of names, or from places by name."""
-    if isinstance(names, Mapping):
-        places = list(names.values())
-        if sorted(map(repr, places)) == sorted(map(repr, range(len(places)))):
-            return tuple(sorted(names, key=lambda name: names[name]))
-        if any(isinstance(part, str) or not isinstance(part, Sequence) for part in places):
-            return None
-        names = [name for part in places for name in part]
-    if isinstance(names, str) or not isinstance(names, Sequence):
-        return None
-    return tuple(map(str, names))
 
 
 def _read_info(root: Path, files: HashedFiles) -> Mapping[str, Any]:

@@ -34,6 +34,7 @@ from probe_kit.extract.sources.source import (
 )
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.observation import ARM_NUMBERS, Observation
+from probe_kit.hooks.families.shared.feature_names import read_names
 from probe_kit.hooks.families.shared.kinds import ACTION, IMAGES, STATE
 from probe_kit.runs.layout import CAPTURE_ONLY, DATASET, OTHER_ACTIONS, RECORDED_EPISODES, TRUTHS
 from probe_kit.runs.plan import Row
@@ -276,12 +277,15 @@ class RecordingSource(Source[LeRobotSource]):
             return "the policy predicts changes relative to the state (use_relative_actions)"
         if (reason := other_order(policy, self.folder.feature_names(ACTION) or ())) is not None:
             return reason
+        names, misfit = read_names(self.folder.features[ACTION].get("names")), self.folder.names_misfit(ACTION)
+        if policy.action_names is not None and misfit and (names is None or len(names) > 1):
+            return f"the checkpoint names its actions {', '.join(policy.action_names)}; of the data set, {misfit}"
         shares = policy.unusual_actions(actions).mean(axis=0)
         if not (shares > MOST_UNUSUAL).any():
             return None
-        names = self.folder.names(ACTION)
+        number_names = self.folder.names(ACTION)
         far = ", ".join(
-            f"{names[number]} {shares[number]:.0%}" for number in np.flatnonzero(shares > MOST_UNUSUAL)
+            f"{number_names[number]} {shares[number]:.0%}" for number in np.flatnonzero(shares > MOST_UNUSUAL)
         )
         return f"recorded actions lie outside the statistics of the checkpoint ({far}), so the units differ"
 
@@ -374,7 +378,14 @@ class RecordingSource(Source[LeRobotSource]):
             "data set": f"{terminal_safe(where)}, {folder.fps:g} frames per second",
             "cameras": terminal_safe("; ".join(cameras)) or "mapped when the model is loaded",
             "frames": f"{frames} of {len(episodes)} episodes (every:{settings.every}), in {len(rows)} rows",
+            **({"names not used": "; ".join(misfits)} if (misfits := self._name_misfits()) else {}),
         }
+
+    def _name_misfits(self) -> list[str]:
+        """Return why names of state or action are not used, by feature."""
+        folder = self.folder
+        features = (name for name in (STATE, ACTION) if name in folder.features)
+        return [terminal_safe(f"{name}: {misfit}") for name in features if (misfit := folder.names_misfit(name))]
 
     def facts(self) -> dict[str, str]:
         """Return format, episodes, frames, tasks and features of the data set, in words, for `dataset show`."""
@@ -427,7 +438,11 @@ class RecordingSource(Source[LeRobotSource]):
 
     def _numbers(self, feature: str) -> str:
         width = self.folder.width(feature)
-        return "none" if width is None else f"{width} numbers: {', '.join(self.folder.names(feature)[:_LONGEST])}"
+        if width is None:
+            return "none"
+        misfit = self.folder.names_misfit(feature)
+        listed = ", ".join(self.folder.names(feature)[:_LONGEST])
+        return f"{width} numbers: {listed}" + (f" ({misfit})" if misfit else "")
 
 
 class RecordingPlayer(InputsPlayer):

@@ -177,10 +177,6 @@ class Groot(PackedPolicy):
     def _head(self) -> Any:
         return self.network._groot_model.action_head
 
-    @property
-    def _action_numbers(self) -> int:
-        return int(self.config.output_features["action"].shape[0])
-
     def denoise(self, batch: Mapping[str, Tensor], noise: Tensor) -> Tensor:
         """Return the steps and numbers that this embodiment has."""
         return flow_actions(self.network, batch, noise)[:, : self.chunk, : self._action_numbers]

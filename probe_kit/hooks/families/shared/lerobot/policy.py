@@ -29,6 +29,7 @@ from probe_kit.hooks.contract.model import Policy, Tap
 from probe_kit.hooks.contract.observation import ARM_NUMBERS, Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import PADDING, Site
+from probe_kit.hooks.families.shared.feature_names import names_misfit, names_of, read_names
 from probe_kit.hooks.families.shared.kinds import IMAGES, STATE, Evaluation, cameras_of
 from probe_kit.hooks.families.shared.lerobot.normaliser import (
     Normaliser,
@@ -62,6 +63,7 @@ MOST_TOKENS = 1 << 16
 TOKENS, MASK = "observation.language.tokens", "observation.language.attention_mask"
 UNCOMPARED = ("IDENTITY", "EXCLUDED")
 """The modes of units without statistics: the state is read as it is, or not at all."""
+_ACTION_NAMES = "action_feature_names"
 _DIMENSIONS = 7
 """The count of numbers of the arm's actions."""
 TEXT_FILES = (*SMALL_FILES, "policy_*.safetensors")
@@ -308,6 +310,8 @@ class LerobotPolicy(Policy):
         if "rtc_config" in values:
             values["rtc_config"] = None  # real-time chunking mixes in actions of the chunk before
         # `from_pretrained` decodes in the same way, behind a command line with a help text for every field: 80 ms.
+        if values.get(_ACTION_NAMES) is not None:  # draccus would make one text of a list in a list
+            values[_ACTION_NAMES] = list(read_names(values[_ACTION_NAMES]) or ())
         return draccus.decode(config_class, {name: value for name, value in values.items() if name != "type"})
 
     @classmethod
@@ -337,7 +341,9 @@ class LerobotPolicy(Policy):
     def _notes(self) -> tuple[str, ...]:
         masked = self.cameras[len(self.shown_cameras) :]
         cameras = (f"cameras without a picture: {', '.join(masked)}",) if masked else ()
-        return (*cameras, f"units: {self._units()}")
+        misfit = names_misfit(getattr(self.config, _ACTION_NAMES, None), self._action_numbers)
+        names = (f"names of actions ({_ACTION_NAMES}) are not used: {misfit}",) if misfit else ()
+        return (*cameras, *names, f"units: {self._units()}")
 
     def _units(self) -> str:
         """The source of the statistics that turn actions into metres, or the reason why there are none."""
@@ -402,9 +408,12 @@ class LerobotPolicy(Policy):
     @property
     def action_names(self) -> tuple[str, ...] | None:
         """The names in the configuration (`action_feature_names`), if there is one for each number."""
-        names = getattr(self.config, "action_feature_names", None)
-        count = self.config.output_features["action"].shape[0]
-        return tuple(map(str, names)) if names and len(names) == count else None
+        return names_of(getattr(self.config, _ACTION_NAMES, None), self._action_numbers)
+
+    @property
+    def _action_numbers(self) -> int:
+        """The count of numbers of an action in the checkpoint's configuration."""
+        return int(self.config.output_features["action"].shape[0])
 
     def unusual_states(self, states: NDArray[np.float32]) -> NDArray[np.bool_]:
         """Return (n, D): more than five deviations from the mean, or outside the bounds of the statistics."""
@@ -440,7 +449,7 @@ class LerobotPolicy(Policy):
 
     def configured_mismatch(self) -> str | None:
         """Return a reason for other actions than an end-effector delta."""
-        dimensions = self.config.output_features["action"].shape[0]
+        dimensions = self._action_numbers
         if dimensions != _DIMENSIONS:
             return f"{self.checkpoint} acts in {dimensions} dimensions; the arm needs a 7-DoF end-effector delta"
         if self.predicts_relative:
@@ -629,7 +638,7 @@ class LerobotPolicy(Policy):
             units: Normaliser | None = read_normaliser(self.folder, pipeline, feature, kind)
         else:
             units = from_buffers(self._buffers, self.config.normalization_mapping, feature, kind, self.checkpoint)
-        numbers = self.state_numbers if kind == "STATE" else int(self.config.output_features["action"].shape[0])
+        numbers = self.state_numbers if kind == "STATE" else self._action_numbers
         if units is not None and units.mode != "IDENTITY" and units.low.shape != (numbers,):
             raise CheckpointError(
                 f"{self.checkpoint} has statistics of shape {units.low.shape} for its {feature}, which has "
