@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from probe_kit._system.bounded_files import load_json, read_json_object
+from probe_kit._system.foreign_files import while_reading
 from probe_kit.errors import CheckpointError, UsageError
 
 Renames = tuple[tuple[str, str], ...]
@@ -69,6 +70,20 @@ def square_side(values: dict[str, Any], folder: Path) -> int:
 # -- files that transformers reads ----------------------------------------------------------------------------
 
 _REMOTE_CODE = "trust_remote_code"
+_AGAIN = "Take the files that the authors released, or save them again with transformers"
+_TOKENIZER_NAMES = (
+    "tokenizer", "special_tokens_map", "added_tokens", "vocab", "merges", "spiece", "chat_template",
+)  # fmt: skip
+_PROCESSOR_NAMES = ("preprocessor_config", "processor_config", "video_preprocessor_config")
+
+
+def _files_of(loader: str) -> tuple[str, ...]:
+    """Return the beginnings of names of the files that a class of transformers reads, by the class's name."""
+    if "Config" in loader:
+        return ("config.json",)
+    pictures = _PROCESSOR_NAMES if "Processor" in loader else ()
+    words = () if "ImageProcessor" in loader or "VideoProcessor" in loader else _TOKENIZER_NAMES
+    return (*words, *pictures)
 
 
 def load_pretrained(loader: Any, source: Path | str, **options: Any) -> Any:
@@ -83,14 +98,14 @@ def load_pretrained(loader: Any, source: Path | str, **options: Any) -> Any:
         **options: Further keyword arguments of `from_pretrained`.
 
     Raises:
-        CheckpointError: If the object needs such code.
-        OSError: For missing files.
-        ValueError: For other files that transformers cannot read.
+        CheckpointError: If the object needs such code, or transformers cannot read its files.
+        LfsPointerError: For a Git LFS pointer among them.
     """
     try:
-        return loader.from_pretrained(str(source), trust_remote_code=False, **options)
-    except ValueError as error:
-        if _REMOTE_CODE not in str(error):
+        with while_reading(Path(source), advice=_AGAIN, names=_files_of(loader.__name__)):
+            return loader.from_pretrained(str(source), trust_remote_code=False, **options)
+    except CheckpointError as error:
+        if not isinstance(error.__cause__, ValueError) or _REMOTE_CODE not in str(error.__cause__):
             raise
         raise CheckpointError(
             f"{source}: its configuration names Python code (auto_map) for {loader.__name__}, and probe_kit runs "

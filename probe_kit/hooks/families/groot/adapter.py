@@ -22,6 +22,7 @@ from probe_kit.hooks.families.groot.network import (
     GrootChoice,
     Places,
     build_groot,
+    check_version,
     flow_actions,
     is_nvidias,
     network_config,
@@ -105,6 +106,16 @@ class Groot(PackedPolicy):
         config.resize, config.letterbox = evaluation.resize, evaluation.letterbox
         config.places = Places.of(folder, config.base_model_path, evaluation.vlm)
         return config
+
+    @classmethod
+    def current_values(cls, values: dict[str, Any], path: Path) -> dict[str, Any]:
+        """Return the fields as they are.
+
+        Raises:
+            CheckpointError: For a fine-tune of an older GR00T.
+        """
+        check_version(values, path)
+        return values
 
     @classmethod
     def build(cls, config: Any, folder: Path) -> Any:

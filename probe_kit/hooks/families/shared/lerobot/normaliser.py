@@ -9,10 +9,11 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from safetensors import SafetensorError, safe_open
+from safetensors import safe_open
 from safetensors.numpy import load_file
 
 from probe_kit._system.bounded_files import parse_json, read_regular
+from probe_kit._system.foreign_files import while_reading
 from probe_kit.errors import CheckpointError
 from probe_kit.hooks.checkpoints.checkpoint import shard_name
 from probe_kit.hooks.families.shared.lerobot.pipelines import (
@@ -173,11 +174,9 @@ def _statistics(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     if mode not in _NEEDED:
         raise CheckpointError(f"normalisation {mode!r} of {feature} is not one of {', '.join(_NEEDED)}, IDENTITY")
-    try:
+    with while_reading(folder / str(name), advice="Download it again"):
         path = folder / shard_name(name) if name else None
         arrays = load_file(path) if path is not None and path.is_file() else {}
-    except (SafetensorError, OSError, ValueError) as error:
-        raise CheckpointError(f"{folder / str(name)} cannot be read ({error}); download it again") from error
     keys = [f"{feature}.{statistic}" for statistic in _NEEDED[mode]]
     missing = [key for key in keys if key not in arrays]
     if missing:
@@ -196,12 +195,9 @@ def read_buffers(folder: Path) -> dict[str, NDArray[np.float32]]:
     """
     buffers: dict[str, NDArray[np.float32]] = {}
     for path in sorted(folder.glob("model*.safetensors")):
-        try:
-            with safe_open(path, "pt") as file:
-                names = [name for name in file.keys() if name.startswith(STATISTICS)]  # noqa: SIM118
-                buffers |= {name: file.get_tensor(name).float().numpy() for name in names}
-        except SafetensorError as error:
-            raise CheckpointError(f"{path} cannot be read ({error}); download the checkpoint again") from error
+        with while_reading(path, advice="Download the checkpoint again"), safe_open(path, "pt") as file:
+            names = [name for name in file.keys() if name.startswith(STATISTICS)]  # noqa: SIM118
+            buffers |= {name: file.get_tensor(name).float().numpy() for name in names}
     return buffers
 
 

@@ -6,9 +6,10 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from safetensors import SafetensorError, safe_open
+from safetensors import safe_open
 
 from probe_kit._system.bounded_files import read_json_object
+from probe_kit._system.foreign_files import while_reading
 from probe_kit.errors import CheckpointError
 from probe_kit.hooks.checkpoints.checkpoint import shard_name
 
@@ -289,11 +290,11 @@ def _normalised_pictures(folder: Path, step: SavedStep) -> list[str]:
     pictures = [
         name for name, feature in (step.config.get("features") or {}).items() if feature.get("type") == "VISUAL"
     ]
-    try:
-        with safe_open(folder / shard_name(step.state), "pt") as file:
-            stored = {name.rpartition(".")[0] for name in file.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError) as error:
-        raise CheckpointError(f"{folder / step.state} cannot be read ({error}); download it again") from error
+    with (
+        while_reading(folder / step.state, advice=_AGAIN),
+        safe_open(folder / shard_name(step.state), "pt") as file,
+    ):
+        stored = {name.rpartition(".")[0] for name in file.keys()}  # noqa: SIM118
     return [name for name in pictures if name in stored]
 
 

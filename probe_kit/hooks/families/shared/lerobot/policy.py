@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from probe_kit._system.bounded_files import read_json_object
+from probe_kit._system.foreign_files import while_reading
 from probe_kit.errors import CheckpointError, InstructionError, ObservationError
 from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE, SMALL_FILES, side_files
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
@@ -232,7 +233,7 @@ class LerobotPolicy(Policy):
         config = cls._read_config(folder, evaluation)
         if dtype is not None:
             config.dtype = dtype
-        with WithoutFilling():
+        with WithoutFilling(), while_reading(folder / CONFIG_FILE):
             network = cls.build(config, folder)
         if random_weights:
             initialise(network, weights_seed)
@@ -312,7 +313,8 @@ class LerobotPolicy(Policy):
         # `from_pretrained` decodes in the same way, behind a command line with a help text for every field: 80 ms.
         if values.get(_ACTION_NAMES) is not None:  # draccus would make one text of a list in a list
             values[_ACTION_NAMES] = list(read_names(values[_ACTION_NAMES]) or ())
-        return draccus.decode(config_class, {name: value for name, value in values.items() if name != "type"})
+        with while_reading(path):
+            return draccus.decode(config_class, {name: value for name, value in values.items() if name != "type"})
 
     @classmethod
     def current_values(cls, values: dict[str, Any], path: Path) -> dict[str, Any]:
