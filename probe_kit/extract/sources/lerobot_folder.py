@@ -152,10 +152,12 @@ def open_lerobot(source: LeRobotSource) -> LeRobotFolder:
         MissingExtraError: Without the extra of recordings.
     """
     if source.is_local:
-        return LeRobotFolder.read(Path(source.folder).expanduser().resolve())
+        root = Path(source.folder).expanduser().resolve()
+        return LeRobotFolder.read(root).with_features(source.features)
     repo, _, revision = source.folder.partition("@")
     commit = resolved_commit(repo, revision)
-    return LeRobotFolder.read(_download(repo, commit, ["meta/*", "meta/**/*"]), repo, commit)
+    root = _download(repo, commit, ["meta/*", "meta/**/*"])
+    return LeRobotFolder.read(root, repo, commit).with_features(source.features)
 
 
 def resolved_commit(repo: str, revision: str) -> str:
@@ -293,6 +295,7 @@ class LeRobotFrames:
 
     def _read(self, path: Path, columns: Sequence[str], first: int, end: int) -> tuple[Any, int]:
         """Return row groups with rows `first` to `end`, or all if small, and the number of their first row."""
+        names, columns = columns, [self.folder.stored_names.get(name, name) for name in columns]
         with self.folder.opened.parquet(path) as parquet:
             if missing := [name for name in columns if name not in parquet.schema_arrow.names]:
                 raise RecordingError(
@@ -304,7 +307,8 @@ class LeRobotFrames:
             groups = np.flatnonzero((ends > first) & (ends - sizes < end))
             if _size_of(parquet.metadata, columns) <= MOST_AT_ONCE:
                 groups = np.flatnonzero(sizes)
-            return read_parquet(parquet, columns, groups.tolist()), int((ends - sizes)[groups[0]])
+            table = read_parquet(parquet, columns, groups.tolist()).select(columns)
+            return table.rename_columns(list(names)), int((ends - sizes)[groups[0]])
 
     def _scanned(self, path: Path) -> _DataFile:
         """Return a data file whose rows are those that meta says. Raises RecordingError for others."""

@@ -4,7 +4,7 @@ import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from hashlib import blake2b, file_digest
 from itertools import pairwise
@@ -162,6 +162,7 @@ class LeRobotMeta:
         tasks: (number, text) of each line.
         repo: The name on the hub, None for a folder.
         revision: The commit on the hub, None for a folder.
+        stored_names: The names in the data set of features that are read under another one, by that one.
     """
 
     path: Path
@@ -171,6 +172,7 @@ class LeRobotMeta:
     episodes: tuple[EpisodeMeta, ...]
     repo: str | None = None
     revision: str | None = None
+    stored_names: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
     def read(cls, root: Path, repo: str | None = None, revision: str | None = None) -> Self:
@@ -202,11 +204,32 @@ class LeRobotMeta:
         """The frames per second."""
         return float(self.info["fps"])
 
-    @property
+    @cached_property
     def features(self) -> Mapping[str, Any]:
-        """The type, shape and names of numbers by feature."""
-        features: Mapping[str, Any] = self.info["features"]
-        return features
+        """The type, shape and names of numbers by feature, under the names by which they are read."""
+        stored: Mapping[str, Any] = self.info["features"]
+        if not self.stored_names:
+            return stored
+        unmapped = {name: feature for name, feature in stored.items() if name not in self.stored_names.values()}
+        return {**unmapped, **{name: stored[stored_name] for name, stored_name in self.stored_names.items()}}
+
+    def with_features(self, pairs: Iterable[tuple[str, str]]) -> Self:
+        """Return the same data set, some of whose features are read under another name: pairs of it and their own.
+
+        Raises:
+            RecordingError: For a feature that it lacks, or that is no list of numbers.
+        """
+        names = dict(pairs)
+        for name, stored in names.items():
+            feature = self.info["features"].get(stored)
+            if feature is None or feature["dtype"] not in NUMERIC:
+                has = "no such feature" if feature is None else f"it as {feature['dtype']}"
+                numeric = [other for other, entry in self.info["features"].items() if entry["dtype"] in NUMERIC]
+                raise RecordingError(
+                    f"--feature {name}={stored}: {self.name} has {has}; its features of numbers are "
+                    f"{', '.join(numeric) or 'none'}. Correct --feature"
+                )
+        return replace(self, stored_names=names) if names != self.stored_names else self
 
     @property
     def cameras(self) -> list[str]:

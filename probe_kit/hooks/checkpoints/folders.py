@@ -351,8 +351,8 @@ _MOST_FOLDERS = 2_000
 _OPENPI_STATISTICS = ("assets/norm_stats.json", "assets/*/norm_stats.json", "assets/*/*/norm_stats.json")
 _OPENPI_FIELDS = {"paligemma_variant", "action_expert_variant"}
 _NO_CONVERTER = (
-    "No release of openpi or lerobot converts it to lerobot's layout: take a checkpoint that lerobot-train saved, or "
-    "one of the hub in its layout"
+    "No release of openpi or lerobot converts it to lerobot's layout: take a checkpoint that lerobot-train saved, "
+    "or one of the hub in its layout"
 )
 
 
@@ -395,7 +395,7 @@ def _folders_below(folder: Path) -> list[Path]:
 
 
 def _step(folder: Path) -> list[tuple[float, str]]:
-    """The key by which later checkpoints come last: a number at a name's end is a step, and `last` is the latest."""
+    """The key by which later checkpoints come last: a number at a name's end is a step; `last` is the latest."""
     ends = [(part, part.rpartition("-")[2]) for part in folder.parts]
     return [
         (float("inf") if part == "last" else float(end) if end.isdecimal() else -1, part) for part, end in ends

@@ -30,8 +30,10 @@ from probe_kit.hooks.families.groot.network import (
 )
 from probe_kit.hooks.families.groot.packing import NvidiasPictures, Packing, Steps, lerobots_rule, read_steps
 from probe_kit.hooks.families.groot.units import action_units, state_units
+from probe_kit.hooks.families.shared.kinds import IMAGES
 from probe_kit.hooks.families.shared.lerobot.flow import PackedPolicy
 from probe_kit.hooks.families.shared.lerobot.normaliser import Normaliser
+from probe_kit.hooks.families.shared.lerobot.pipelines import PACKING_STEP, read_views, step_fields
 from probe_kit.hooks.families.shared.qwen import merger_norm
 from probe_kit.hooks.families.shared.taps import TOWER, Stack
 from probe_kit.hooks.outputs import Produce, RecordedRun, numpy_of
@@ -48,6 +50,15 @@ _DIFFUSERS = {"attention": "attn1", "heads": "attn1.to_out.0", "mlp": "ff"}
 def _lerobots_names(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Return tensors by lerobot's names, also of NVIDIA's files."""
     return {name if name.startswith(_MODEL) else f"{_MODEL}{name}": tensor for name, tensor in tensors.items()}
+
+
+def _without_unread_views(config: Any, folder: Path) -> tuple[str, ...]:
+    """Take the pictures that lerobot's packing leaves out from the configuration, and return their names."""
+    views = step_fields(folder).get(PACKING_STEP, {}).get("video_modality_keys")
+    packed = read_views(list(config.image_features), views) if views else list(config.image_features)
+    unread = tuple(name for name in config.image_features if name not in packed)
+    config.input_features = {name: entry for name, entry in config.input_features.items() if name not in unread}
+    return tuple(name.removeprefix(IMAGES) for name in unread)
 
 
 class Groot(PackedPolicy):
@@ -103,6 +114,7 @@ class Groot(PackedPolicy):
             )
         else:
             config = super().parse_config(folder, evaluation)
+            config.unread_pictures = _without_unread_views(config, folder)
         config.resize, config.letterbox = evaluation.resize, evaluation.letterbox
         config.places = Places.of(folder, config.base_model_path, evaluation.vlm)
         return config
@@ -172,7 +184,9 @@ class Groot(PackedPolicy):
         encode = self._steps.encode
         rule = encode.rule if isinstance(encode, NvidiasPictures) else lerobots_rule(encode)
         bars = "with black bars to a square first" if encode.letter_box_transform else "without letterbox"
-        return (*super()._notes(), *((video,) if frames > 1 else ()), f"pictures: {bars}, {rule}")
+        unread = getattr(self.config, "unread_pictures", ())
+        views = (f"lerobot leaves out {', '.join(unread)} (video_modality_keys)",) if unread else ()
+        return (*super()._notes(), *views, *((video,) if frames > 1 else ()), f"pictures: {bars}, {rule}")
 
     # -- acting ------------------------------------------------------------------------------------------
 

@@ -50,6 +50,7 @@ from probe_kit.hooks.families.shared.lerobot.pipelines import (
     check_one_frame,
     check_steps,
     known_values,
+    rename_map,
     text_length,
 )
 from probe_kit.hooks.families.shared.lerobot.window import PictureWindow, read_window
@@ -118,7 +119,8 @@ class LerobotPolicy(Policy):
         self.config, self.evaluation = network.config, network.config.evaluation
         self.stacks = self._stacks()
         self._read_streams()
-        self.cameras = cameras_of(self.config.image_features)
+        self.renames = rename_map(folder)
+        self.cameras = cameras_of(self.config.image_features, self.renames)
         self._show(self.cameras[:1])
 
     def with_cameras(self, cameras: Sequence[str]) -> Self:
@@ -253,6 +255,7 @@ class LerobotPolicy(Policy):
             notes=policy._notes(),
             embodiment=ARM,
             cameras=policy.cameras,
+            renames=policy.renames,
             chunk=config.chunk_size,
             execute=min(config.n_action_steps, config.chunk_size),
         )
@@ -583,7 +586,7 @@ class LerobotPolicy(Policy):
         text = cls.__new__(cls)
         text.folder, text.evaluation = checkpoint_folder(checkpoint, TEXT_FILES), cls.choice(**options)
         text.config = cls._read_config(text.folder, text.evaluation)
-        text.cameras = text.shown_cameras = cameras_of(text.config.image_features)[:1]
+        text.cameras = text.shown_cameras = cameras_of(text.config.image_features, rename_map(text.folder))[:1]
         return text
 
     def window(self, camera: str) -> PictureWindow:
