@@ -13,6 +13,9 @@ import re
 import stat
 import zlib
 from codecs import BOM_UTF8
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from io import BufferedReader, BytesIO
 from pathlib import Path
 from tokenize import TokenError
@@ -43,6 +46,20 @@ def check_regular(path: Path, most: int = MOST_BYTES) -> None:
     _check(path, path.stat(), most)
 
 
+_READ: ContextVar[list[Path] | None] = ContextVar("read", default=None)
+
+
+@contextmanager
+def recorded_files() -> Iterator[list[Path]]:
+    """A context whose value gets every file that `open_regular` opens inside, in order."""
+    files: list[Path] = []
+    token = _READ.set(files)
+    try:
+        yield files
+    finally:
+        _READ.reset(token)
+
+
 def open_regular(path: Path, most: int = MOST_BYTES, pointers: bool = False) -> BufferedReader:
     """Open a regular file of at most `most` bytes.
 
@@ -62,6 +79,8 @@ def open_regular(path: Path, most: int = MOST_BYTES, pointers: bool = False) -> 
         _check(path, os.fstat(handle), most)
         if not pointers:
             _check_beginning(path, os.pread(handle, _MOST_POINTER_BYTES, 0))
+        if (files := _READ.get()) is not None:
+            files.append(path)
         return os.fdopen(handle, "rb")
     except BaseException:
         os.close(handle)

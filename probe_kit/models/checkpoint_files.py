@@ -1,7 +1,8 @@
 """Small files of checkpoints: names of tensors, processors, statistics. Importing them loads no torch."""
 
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
@@ -86,6 +87,27 @@ def _files_of(loader: str) -> tuple[str, ...]:
     return (*words, *pictures)
 
 
+@contextmanager
+def while_reading_pretrained(folder: Path, loader: str) -> Iterator[None]:
+    """Turn errors of a class of transformers, of this name, in the body into one that names the files it reads.
+
+    Raises:
+        CheckpointError: For files that it cannot read; a damaged tokenizer.json is named alone, with its own fault.
+        LfsPointerError: For a Git LFS pointer among them.
+    """
+    names, tokenizer = _files_of(loader), folder / "tokenizer.json"
+    try:
+        with while_reading(folder, advice=_AGAIN, names=names):
+            yield
+    except CheckpointError:
+        if "tokenizer" in names and tokenizer.is_file():
+            from tokenizers import Tokenizer
+
+            with while_reading(tokenizer, advice=_AGAIN):
+                Tokenizer.from_file(str(tokenizer))
+        raise
+
+
 def load_pretrained(loader: Any, source: Path | str, **options: Any) -> Any:
     """Return `loader.from_pretrained(source, **options)` of a class of transformers.
 
@@ -102,7 +124,7 @@ def load_pretrained(loader: Any, source: Path | str, **options: Any) -> Any:
         LfsPointerError: For a Git LFS pointer among them.
     """
     try:
-        with while_reading(Path(source), advice=_AGAIN, names=_files_of(loader.__name__)):
+        with while_reading_pretrained(Path(source), loader.__name__):
             return loader.from_pretrained(str(source), trust_remote_code=False, **options)
     except CheckpointError as error:
         if not isinstance(error.__cause__, ValueError) or _REMOTE_CODE not in str(error.__cause__):

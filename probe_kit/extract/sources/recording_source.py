@@ -231,9 +231,9 @@ class RecordingSource(Source[LeRobotSource]):
         typed |= dict(self.settings.features)
         by_name = renamed_features(self.folder.info["features"], renames)
         unlike = [
-            f"{name.removeprefix(IMAGES)} is given {feature}, and the map says {by_name[name][0]}"
+            f"{name.removeprefix(IMAGES)} is given {feature}, and the map says {' or '.join(by_name[name])}"
             for name, feature in typed.items()
-            if renames and by_name.get(name, [feature]) != [feature]
+            if renames and feature not in by_name.get(name, [feature])
         ]
         actions = [name for name, renamed in renames.items() if ACTION in (name, renamed)]
         ignored = f"; not {actions[0]}: lerobot renames observations alone" if actions else ""

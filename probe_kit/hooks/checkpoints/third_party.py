@@ -23,6 +23,7 @@ from typing import Any, TextIO
 import numpy as np
 from rich.file_proxy import FileProxy
 
+from probe_kit._system.bounded_files import recorded_files
 from probe_kit._system.escaping import terminal_safe
 from probe_kit._system.foreign_files import check_no_pointers, reason_of
 from probe_kit.errors import CheckpointError, InstructionError, PolicyFailedError, ProbeKitError, WeightsError
@@ -243,6 +244,10 @@ def while_acting(model: str, location: str, limit: float | None = None) -> Itera
             ) from error
 
 
+_MOST_FILES = 8
+"""The most files that an error of loading names: those that were read last, because one of them may be damaged."""
+
+
 @contextmanager
 def while_loading(model: str, location: str) -> Iterator[None]:
     """Turn errors of a loader's code in the body into errors of ours.
@@ -256,7 +261,11 @@ def while_loading(model: str, location: str) -> Iterator[None]:
         PolicyFailedError: For a loader that ends the process.
     """
     try:
-        with _said_when_asked_for("bitsandbytes"), naming_checkpoint(model, location):
+        with (
+            _said_when_asked_for("bitsandbytes"),
+            naming_checkpoint(model, location),
+            recorded_files() as files,
+        ):
             yield
     except ProbeKitError:
         raise
@@ -264,9 +273,11 @@ def while_loading(model: str, location: str) -> Iterator[None]:
         raise PolicyFailedError(f"{model} cannot be loaded: its code called sys.exit({error.code!r})") from error
     except Exception as error:
         check_no_pointers(Path(location).expanduser())
+        latest = list(dict.fromkeys(path.name for path in reversed(files)))[:_MOST_FILES]
+        read = f" (it had read {', '.join(latest)})" if latest else ""
         raise CheckpointError(
-            f"{model} cannot be loaded from {location}: {in_words(error)}. A file of the checkpoint is damaged, "
-            "or was made for another version; download it again"
+            f"{model} cannot be loaded from {location}: {in_words(error)}. A file of the checkpoint is damaged"
+            f"{read}, or was made for another version; download it again"
         ) from error
 
 

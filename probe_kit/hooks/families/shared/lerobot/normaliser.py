@@ -20,6 +20,7 @@ from probe_kit.hooks.families.shared.lerobot.pipelines import (
     MASKED,
     NORMALISERS,
     reads_state_as_it_is,
+    rename_map,
     saved_steps,
 )
 from probe_kit.models.bounds import check_bounds, check_deviations
@@ -165,7 +166,9 @@ def read_normaliser(folder: Path, pipeline: str, feature: str, kind: str) -> Nor
             if mode == "IDENTITY" or (kind == "STATE" and reads_state_as_it_is(step, feature)):
                 return Normaliser("IDENTITY", np.zeros(0, np.float32), np.zeros(0, np.float32), 0.0, path.name)
             low, high = _statistics(folder, step.state, feature, mode)
-            return Normaliser(mode, low, high, float(step.config.get("eps", _EPS)), str(step.state))
+            with while_reading(path):
+                eps = float(step.config.get("eps", _EPS))
+            return Normaliser(mode, low, high, eps, str(step.state))
     raise CheckpointError(f"{path} has no normaliser step: the units of {feature} are unknown")
 
 
@@ -180,6 +183,13 @@ def _statistics(
     keys = [f"{feature}.{statistic}" for statistic in _NEEDED[mode]]
     missing = [key for key in keys if key not in arrays]
     if missing:
+        sources = [name for name, renamed in rename_map(folder).items() if renamed == feature]
+        if stored := next((source for source in sources if f"{source}.{_NEEDED[mode][0]}" in arrays), None):
+            raise CheckpointError(
+                f"{path} has the statistics of {stored}, which the preprocessor's rename map calls {feature}: "
+                f"lerobot looks them up as {feature}, and so leaves that feature as it is. Fine-tune it on a data "
+                f"set whose feature is called {feature}"
+            )
         raise CheckpointError(
             f"{folder} has no statistics {', '.join(missing)} (looked in {name}): its {feature} has no physical "
             "unit. Take the statistics of the data set it was trained on"
