@@ -92,7 +92,7 @@ def while_reading_pretrained(folder: Path, loader: str) -> Iterator[None]:
     """Turn errors of a class of transformers, of this name, in the body into one that names the files it reads.
 
     Raises:
-        CheckpointError: For files that it cannot read; a damaged tokenizer.json is named alone, with its own fault.
+        CheckpointError: For files that it cannot read; of a damaged tokenizer.json with its own fault.
         LfsPointerError: For a Git LFS pointer among them.
     """
     names, tokenizer = _files_of(loader), folder / "tokenizer.json"
