@@ -76,8 +76,9 @@ def open_regular(path: Path, most: int = MOST_BYTES, pointers: bool = False) -> 
     # The file may have been exchanged since: opening a pipe would wait for its writer.
     handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
-        _check(path, os.fstat(handle), most)
-        if not pointers:
+        status = os.fstat(handle)
+        _check(path, status, most)
+        if not pointers and status.st_size <= _MOST_POINTER_BYTES:
             _check_beginning(path, os.pread(handle, _MOST_POINTER_BYTES, 0))
         if (files := _READ.get()) is not None:
             files.append(path)

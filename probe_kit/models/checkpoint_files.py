@@ -7,7 +7,7 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
-from probe_kit._system.bounded_files import load_json, read_json_object
+from probe_kit._system.bounded_files import check_no_pointer, load_json, read_json_object
 from probe_kit._system.foreign_files import while_reading
 from probe_kit.errors import CheckpointError, UsageError
 
@@ -75,6 +75,7 @@ _AGAIN = "Take the files that the authors released, or save them again with tran
 _TOKENIZER_NAMES = (
     "tokenizer", "special_tokens_map", "added_tokens", "vocab", "merges", "spiece", "chat_template",
 )  # fmt: skip
+_TEXTS = (".jinja", ".txt")
 _PROCESSOR_NAMES = ("preprocessor_config", "processor_config", "video_preprocessor_config")
 
 
@@ -96,6 +97,9 @@ def while_reading_pretrained(folder: Path, loader: str) -> Iterator[None]:
         LfsPointerError: For a Git LFS pointer among them.
     """
     names, tokenizer = _files_of(loader), folder / "tokenizer.json"
+    for file in sorted(folder.glob("*")) if folder.is_dir() else ():
+        if file.suffix in _TEXTS and file.name.startswith(names):
+            check_no_pointer(file)  # any text is a template, or a list of words
     try:
         with while_reading(folder, advice=_AGAIN, names=names):
             yield

@@ -143,7 +143,9 @@ def test_names_that_decide_nothing_are_refused_with_the_way(
 
 def test_a_state_under_another_name_is_named_with_the_option(recording: Path) -> None:
     source = RecordingSource.open(LeRobotSource(str(recording)), False)
-    with pytest.raises(RecordingError, match=rf"'{JOINTS}' and 'state' have 8 numbers.*--feature {STATE}={JOINTS}"):
+    with pytest.raises(
+        RecordingError, match=rf"'{JOINTS}' and 'state' have 8 numbers.*--feature {STATE}={JOINTS}"
+    ):
         source.check_state_width("pi0", 8)
     with pytest.raises(RecordingError, match="a data set of this robot"):
         source.check_state_width("pi0", 9)
@@ -172,11 +174,12 @@ def test_a_map_of_something_else_is_refused(change: Callable[[dict[str, Any]], N
 
 @pytest.mark.parametrize(
     ("names", "shown"),
-    [([["x", "y"], ["z", "u", "v", "w", "t"]], "x, y, z, u, v, w, t"), (["a", "b"], "its 2 names do not fit: a, b")],
+    [
+        ([["x", "y"], ["z", "u", "v", "w", "t"]], "x, y, z, u, v, w, t"),
+        (["a", "b"], "its 2 names do not fit: a, b"),
+    ],
 )
-def test_names_of_a_data_set_are_shown_or_said(
-    names: object, shown: str, recording: Path, tmp_path: Path
-) -> None:
+def test_names_of_a_data_set_are_shown_or_said(names: object, shown: str, recording: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(recording, tmp_path / "rec")
     info = json.loads((folder / "meta" / "info.json").read_text(encoding="utf-8"))
     info["features"][ACTIONS]["names"] = names
