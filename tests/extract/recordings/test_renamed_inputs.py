@@ -1,4 +1,4 @@
-"""What a checkpoint's files and a data set say about names decides what is shown: the rename map, and `--feature`."""
+"""The names in a checkpoint's files and in a data set decide what is shown: the rename map, and `--feature`."""
 
 import json
 import shutil
@@ -23,7 +23,7 @@ JOINTS, ACTIONS = "observation.joints", "actions"
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two pictures in lerobot's names, one that openpi names, a state and actions in other names than lerobot's."""
+    """Pictures in names of lerobot and openpi, two states and actions in other names than lerobot's."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     folder = tmp_path_factory.mktemp("renamed") / "rec"
@@ -42,7 +42,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def fine_tune(folder: Path, cameras: tuple[str, ...], renames: object) -> Path:
-    """The embedded pi0 with these cameras and the step that `lerobot-train --rename_map` saves, written by lerobot."""
+    """The embedded pi0 with these cameras, and the step of `lerobot-train --rename_map` as lerobot saves it."""
     from lerobot.processor import DataProcessorPipeline
     from lerobot.processor.rename_processor import RenameObservationsProcessorStep
 
@@ -143,9 +143,8 @@ def test_names_that_decide_nothing_are_refused_with_the_way(
 
 def test_a_state_under_another_name_is_named_with_the_option(recording: Path) -> None:
     source = RecordingSource.open(LeRobotSource(str(recording)), False)
-    with pytest.raises(
-        RecordingError, match=rf"'{JOINTS}' and 'state' have 8 numbers.*--feature {STATE}={JOINTS}"
-    ):
+    message = rf"'{JOINTS}' and 'state' have 8 numbers.*--feature {STATE}={JOINTS}"
+    with pytest.raises(RecordingError, match=message):
         source.check_state_width("pi0", 8)
     with pytest.raises(RecordingError, match="a data set of this robot"):
         source.check_state_width("pi0", 9)
@@ -175,7 +174,7 @@ def test_a_map_of_something_else_is_refused(change: Callable[[dict[str, Any]], N
 @pytest.mark.parametrize(
     ("names", "shown"),
     [
-        ([["x", "y"], ["z", "u", "v", "w", "t"]], "x, y, z, u, v, w, t"),
+        ([["x", "y"], [*"zuvwt"]], "x, y, z, u, v, w, t"),
         (["a", "b"], "its 2 names do not fit: a, b"),
     ],
 )
