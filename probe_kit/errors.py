@@ -66,6 +66,15 @@ class NoTrajectoryError(UsageError):
     """The run keeps no trajectories, because it was made before they were stored."""
 
 
+# -- files of the user -------------------------------------------------------------------------------
+
+
+class LfsPointerError(ProbeKitError):
+    """A file is a Git LFS pointer, the few lines that stand for a file whose content was never fetched."""
+
+    exit_code = 3
+
+
 # -- suite and environment ---------------------------------------------------------------------------
 
 

@@ -1,4 +1,8 @@
-"""Reading of foreign files: regular files alone, bounded in bytes, depth and values; YAML, JSON and arrays."""
+"""Reading of foreign files: regular files alone, bounded in bytes, depth and values; YAML, JSON and arrays.
+
+A Git LFS pointer is refused wherever a file is opened: by `open_regular`, and by `check_no_pointer` before a
+library opens it by its name.
+"""
 
 import errno
 import gzip
@@ -9,13 +13,16 @@ import re
 import stat
 import zlib
 from codecs import BOM_UTF8
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from io import BufferedReader, BytesIO
 from pathlib import Path
 from tokenize import TokenError
 from typing import TYPE_CHECKING, Any, BinaryIO
 from zipfile import BadZipFile, ZipFile, ZipInfo
 
-from probe_kit.errors import ProbeKitError
+from probe_kit.errors import LfsPointerError, ProbeKitError
 
 if TYPE_CHECKING:
     from numpy.lib.npyio import NpzFile
@@ -39,13 +46,42 @@ def check_regular(path: Path, most: int = MOST_BYTES) -> None:
     _check(path, path.stat(), most)
 
 
-def open_regular(path: Path, most: int = MOST_BYTES) -> BufferedReader:
-    """Open a regular file of at most `most` bytes; for any other one raise OSError with `strerror` in words."""
+_READ: ContextVar[list[Path] | None] = ContextVar("read", default=None)
+
+
+@contextmanager
+def recorded_files() -> Iterator[list[Path]]:
+    """A context whose value gets every file that `open_regular` opens inside, in order."""
+    files: list[Path] = []
+    token = _READ.set(files)
+    try:
+        yield files
+    finally:
+        _READ.reset(token)
+
+
+def open_regular(path: Path, most: int = MOST_BYTES, pointers: bool = False) -> BufferedReader:
+    """Open a regular file of at most `most` bytes.
+
+    Args:
+        path: The file.
+        most: The largest size in bytes.
+        pointers: Whether a Git LFS pointer is opened as any other file, for its bytes.
+
+    Raises:
+        OSError: For any other file, with `strerror` in words.
+        LfsPointerError: For a Git LFS pointer.
+    """
     check_regular(path, most)
     # The file may have been exchanged since: opening a pipe would wait for its writer.
     handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
-        _check(path, os.fstat(handle), most)
+        status = os.fstat(handle)
+        _check(path, status, most)
+        if not pointers and status.st_size <= _MOST_POINTER_BYTES:
+            _check_beginning(path, os.pread(handle, _MOST_POINTER_BYTES, 0))
+        if (files := _READ.get()) is not None:
+            files.append(path)
         return os.fdopen(handle, "rb")
     except BaseException:
         os.close(handle)
@@ -64,6 +100,48 @@ def read_regular(path: Path, most: int = MOST_BYTES) -> bytes:
 def read_regular_text(path: Path, most: int = MOST_BYTES) -> str:
     """Return the text of a regular file in UTF-8. Raises OSError for another one, ValueError for other bytes."""
     return read_regular(path, most).decode("utf-8")
+
+
+# -- Git LFS --------------------------------------------------------------------------------------------------
+
+_POINTER = b"version https://git-lfs.github.com/spec/"
+_MOST_POINTER_BYTES = 1024
+"""The bytes that its specification allows a pointer."""
+_POINTED_SIZE = re.compile(rb"^size (\d{1,18})\r?$", re.MULTILINE)
+
+
+def is_pointer(path: Path) -> bool:
+    """Whether a file is a Git LFS pointer; not for one that is missing or cannot be read."""
+    try:
+        check_no_pointer(path)
+    except LfsPointerError:
+        return True
+    return False
+
+
+def check_no_pointer(path: Path) -> None:
+    """Raise LfsPointerError for a Git LFS pointer; what else is wrong with a file is said by what opens it."""
+    try:
+        if not path.is_file() or path.stat().st_size > _MOST_POINTER_BYTES:
+            return
+        with path.open("rb") as file:
+            beginning = file.read(_MOST_POINTER_BYTES)
+    except OSError:
+        return
+    _check_beginning(path, beginning)
+
+
+def _check_beginning(path: Path, beginning: bytes) -> None:
+    if not beginning.startswith(_POINTER):
+        return
+    size = _POINTED_SIZE.search(beginning)
+    stands = f" of {int(size[1]):,} bytes" if size else ""
+    clone = next((folder for folder in path.absolute().parents if (folder / ".git").exists()), None)
+    where = f"in {clone}" if clone else "in the clone that it was copied from, and copy it again"
+    raise LfsPointerError(
+        f"{path} is a Git LFS pointer, which stands for a file{stands} that was not fetched: expected the file "
+        f"itself. Run `git lfs pull` {where}"
+    )
 
 
 def _check(path: Path, status: os.stat_result, most: int) -> None:
@@ -246,11 +324,14 @@ def open_arrays(source: Path | BinaryIO | bytes) -> "NpzFile":
 
     Raises:
         ValueError: For a file whose arrays have more than `MOST_ARRAY_BYTES` once they are unpacked.
+        LfsPointerError: For a Git LFS pointer.
         Exception: One of `UNREADABLE` for a file that is no such file.
     """
     import numpy as np
 
     content: Any = BytesIO(source) if isinstance(source, bytes) else source
+    if isinstance(content, Path):
+        check_no_pointer(content)
     with ZipFile(content) as packed:
         size = sum(entry.file_size for entry in packed.infolist())
         if size > MOST_ARRAY_BYTES:

@@ -228,7 +228,7 @@ def load(
         task.check_loaded(settings, model)
     else:
         raise_together(task.early_checks(settings, source, fetch))
-    if check_cameras is not None and (early := source.shown_cameras(task.declared_cameras(settings))) is not None:
+    if check_cameras is not None and (early := source.shown_cameras(task.declared_inputs(settings))) is not None:
         check_cameras(early)
     if not fetch and (sizes := planned_sizes(settings, source.instructions)) is not None:
         settings = task.planned(settings, sizes)

@@ -308,7 +308,8 @@ def export(
 
 FAILED = 1
 _OFFERED = {
-    "checkpoint", "model_option", "episodes", "select", "camera", "rotate", "instruction", "accept_units",
+    "checkpoint", "model_option", "episodes", "select", "camera", "feature", "rotate", "instruction",
+    "accept_units",
 }  # fmt: skip
 dataset_app = typer.Typer(help="Inspect data sets of recordings.", no_args_is_help=True)
 

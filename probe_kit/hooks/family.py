@@ -31,7 +31,7 @@ from probe_kit.hooks.checkpoints.checkpoint import (
     without_revision,
 )
 from probe_kit.hooks.checkpoints.folders import check_files, checkpoint_folder, with_adapters_named
-from probe_kit.hooks.checkpoints.third_party import naming_checkpoint, while_loading
+from probe_kit.hooks.checkpoints.third_party import while_loading
 from probe_kit.hooks.contract.card import ModelCard, SourceWeights
 from probe_kit.hooks.contract.declared import (
     ALL_EDITS,
@@ -294,7 +294,7 @@ class Family:
         if self.declared and location is not None and not is_on_hub(location) and not Path(location).exists():
             checkpoint_folder(location)  # says that it is not there, or finds the user's home
         if location is not None and self.config_types and (fetch or not is_on_hub(location)):
-            with naming_checkpoint(self.name, location):
+            with while_loading(self.name, location):
                 weights = fetch and not random_weights
                 check_files(checkpoint_folder(location, self.files), self.config_types, weights, self.instead)
         return self._with_defaults(loader_options, location)
@@ -355,7 +355,7 @@ class Family:
         if (folder := configuration_folder(location)) is None:
             return None  # before the loader is imported, and torch with it
         load = self._imported(self.loader)
-        with naming_checkpoint(self.name, str(location)):
+        with while_loading(self.name, str(location)):
             values = self._with_defaults(loader_options, location)
             return outline_of(self.name, load, str(location), folder, dtype, values)
 
@@ -403,7 +403,7 @@ class Family:
         if self.words is None or (not fetch and location is not None and is_on_hub(location)):
             return
         check = self._imported(self.words)
-        with naming_checkpoint(self.name, str(location or "what it brings")):
+        with while_loading(self.name, str(location or "what it brings")):
             check(location, instructions, **loader_options)
 
     def whose_units(
@@ -424,7 +424,7 @@ class Family:
         if self.units is None or location is None or (not fetch and is_on_hub(location)):
             return ""
         describe_units = self._imported(self.units)
-        with naming_checkpoint(self.name, location):
+        with while_loading(self.name, location):
             return with_adapters_named(
                 str(describe_units(location, **self._with_defaults(loader_options, location)))
             )

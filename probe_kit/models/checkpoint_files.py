@@ -1,12 +1,14 @@
 """Small files of checkpoints: names of tensors, processors, statistics. Importing them loads no torch."""
 
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from probe_kit._system.bounded_files import read_json_object
+from probe_kit._system.bounded_files import check_no_pointer, read_json_object
+from probe_kit._system.foreign_files import while_reading
 from probe_kit.errors import CheckpointError, UsageError, WeightsError
 
 if TYPE_CHECKING:
@@ -190,6 +192,45 @@ def square_side(settings: PictureValues) -> int:
 # -- files that transformers reads ----------------------------------------------------------------------------
 
 _REMOTE_CODE = "trust_remote_code"
+_AGAIN = "Take the files that the authors released, or save them again with transformers"
+_TOKENIZER_NAMES = (
+    "tokenizer", "special_tokens_map", "added_tokens", "vocab", "merges", "spiece", "chat_template",
+)  # fmt: skip
+_TEXTS = (".jinja", ".txt")
+_PROCESSOR_NAMES = ("preprocessor_config", "processor_config", "video_preprocessor_config")
+
+
+def _files_of(loader: str) -> tuple[str, ...]:
+    """Return the beginnings of names of the files that a class of transformers reads, by the class's name."""
+    if "Config" in loader:
+        return ("config.json",)
+    pictures = _PROCESSOR_NAMES if "Processor" in loader else ()
+    words = () if "ImageProcessor" in loader or "VideoProcessor" in loader else _TOKENIZER_NAMES
+    return (*words, *pictures)
+
+
+@contextmanager
+def while_reading_pretrained(folder: Path, loader: str) -> Iterator[None]:
+    """Turn errors of a class of transformers, of this name, in the body into one that names the files it reads.
+
+    Raises:
+        CheckpointError: For files that it cannot read; of a damaged tokenizer.json with its own fault.
+        LfsPointerError: For a Git LFS pointer among them.
+    """
+    names, tokenizer = _files_of(loader), folder / "tokenizer.json"
+    for file in sorted(folder.glob("*")) if folder.is_dir() else ():
+        if file.suffix in _TEXTS and file.name.startswith(names):
+            check_no_pointer(file)  # any text is a template, or a list of words
+    try:
+        with while_reading(folder, advice=_AGAIN, names=names):
+            yield
+    except CheckpointError:
+        if "tokenizer" in names and tokenizer.is_file():
+            from tokenizers import Tokenizer
+
+            with while_reading(tokenizer, advice=_AGAIN):
+                Tokenizer.from_file(str(tokenizer))
+        raise
 
 
 def load_pretrained(loader: Any, source: Path | str, **options: Any) -> Any:
@@ -204,14 +245,14 @@ def load_pretrained(loader: Any, source: Path | str, **options: Any) -> Any:
         **options: Further keyword arguments of `from_pretrained`.
 
     Raises:
-        CheckpointError: If the object needs such code.
-        OSError: For missing files.
-        ValueError: For other files that transformers cannot read.
+        CheckpointError: If the object needs such code, or transformers cannot read its files.
+        LfsPointerError: For a Git LFS pointer among them.
     """
     try:
-        return loader.from_pretrained(str(source), trust_remote_code=False, **options)
-    except ValueError as error:
-        if _REMOTE_CODE not in str(error):
+        with while_reading_pretrained(Path(source), loader.__name__):
+            return loader.from_pretrained(str(source), trust_remote_code=False, **options)
+    except CheckpointError as error:
+        if not isinstance(error.__cause__, ValueError) or _REMOTE_CODE not in str(error.__cause__):
             raise
         raise CheckpointError(
             f"{source}: its configuration names Python code (auto_map) for {loader.__name__}, and probe_kit runs "

@@ -18,7 +18,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit._system.bounded_files import UNREADABLE, open_arrays, parse_json, read_json_object
+from probe_kit._system.bounded_files import UNREADABLE, check_no_pointer, open_arrays, parse_json, read_json_object
 from probe_kit._system.counting import counted
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.sites import Site, role_of_view
@@ -174,6 +174,7 @@ def _contents(path: Path) -> tuple[dict[str, NDArray[Any]], Mapping[str, Mapping
     """Return arrays by name, and the entry of each."""
     from safetensors import SafetensorError, safe_open
 
+    check_no_pointer(path)
     try:
         if path.suffix == ".npz":
             with open_arrays(path) as opened:

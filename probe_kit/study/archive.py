@@ -26,7 +26,7 @@ from zipfile import ZIP_DEFLATED, BadZipFile, ZipFile, ZipInfo
 
 from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, ValidationError
 
-from probe_kit._system.bounded_files import parse_json, read_regular
+from probe_kit._system.bounded_files import check_no_pointer, parse_json, read_regular
 from probe_kit._system.complaints import in_words
 from probe_kit._tables.content import Cell, Heading, Row
 from probe_kit._tables.table import Table
@@ -148,6 +148,7 @@ def open_archive(name: str | Path) -> Path | None:
 def _unpacked(file: Path) -> Path:
     folder = Path(tempfile.mkdtemp(prefix="probe-kit-pack-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    check_no_pointer(file)
     try:
         with ZipFile(file) as archive:
             _unpack(archive, file, folder)

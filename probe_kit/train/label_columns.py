@@ -19,7 +19,7 @@ from probe_kit._system.parquet_files import open_parquet, read_parquet
 from probe_kit._system.table_cells import Cell
 from probe_kit._system.text_tables import MOST_BYTES, cell_of, open_table
 from probe_kit._tables.label_table import LabelTable
-from probe_kit.errors import UsageError
+from probe_kit.errors import LfsPointerError, UsageError
 from probe_kit.train.choices import TASKS, Task
 
 if TYPE_CHECKING:
@@ -122,7 +122,7 @@ def _of_parquet(path: Path, requested: Sequence[str], names: Sequence[str]) -> L
             headings = file.schema_arrow.names
             position_of = _places(headings, requested, str(path))
             read = read_parquet(file, list(position_of))
-    except UsageError:
+    except (UsageError, LfsPointerError):
         raise
     except OSError as error:
         reason = str(error.strerror or error).rstrip(".")

@@ -236,7 +236,7 @@ def test_what_is_not_chosen_is_that_of_the_protocol_the_model_or_the_class() -> 
 def test_sources_share_the_options_that_mean_the_same() -> None:
     declared = [(one.parameter, one.option.metavar) for kind in SOURCES for one in options_of(kind)]
     shared = {name for name, _ in declared if [name for name, _ in declared].count(name) > 1}
-    assert shared == {"episodes", "no_pixels", "rotate"}
+    assert shared == {"episodes", "camera", "no_pixels", "rotate"}
     assert len(set(declared)) == len({name for name, _ in declared})
 
 

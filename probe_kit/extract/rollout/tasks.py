@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from probe_kit._system.bounded_files import parse_json, read_regular
 from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.extract.parts import SCRIPTED
 from probe_kit.extract.prompts import phrases
@@ -17,14 +16,12 @@ from probe_kit.extract.rollout.controllers import Controller, PolicyController, 
 from probe_kit.extract.settings import AskSettings, ExtractSettings, Settings
 from probe_kit.extract.sizes import PlannedSizes
 from probe_kit.extract.sources.source import Source
-from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE
 from probe_kit.hooks.checkpoints.third_party import with_origin
-from probe_kit.hooks.families.shared.kinds import STATE, cameras_of
 from probe_kit.runs.plan import Row
 
 if TYPE_CHECKING:
     from probe_kit.hooks import AnswerModel, Model, Policy
-    from probe_kit.hooks.contract.card import ModelCard
+    from probe_kit.hooks.contract.card import DeclaredInputs, ModelCard
     from probe_kit.hooks.family import Family
 
 
@@ -82,7 +79,7 @@ _CAPTURE_REFUSES = ("captured_calls", "execute", "rotation", "video")
 class _Task:
     """The steps of an extraction that depend on the task, with defaults for those that one task alone has.
 
-    In order: `check_meaningless` of settings, `declared_cameras` and `early_checks` of a family not yet loaded,
+    In order: `check_meaningless` of settings, `declared_inputs` and `early_checks` of a family not yet loaded,
     `planned` for settings that sizes decide, `check_loaded` of the loaded model, `view_of` the source as the model
     is shown it, and its `rows`. Every check raises UsageError.
 
@@ -96,7 +93,7 @@ class _Task:
 
     def check_loaded(self, *_: Any, **__: Any) -> None: ...
 
-    def declared_cameras(self, *_: Any, **__: Any) -> tuple[str, ...] | None: ...
+    def declared_inputs(self, *_: Any, **__: Any) -> "DeclaredInputs | None": ...
 
     def early_checks(self, *_: Any, **__: Any) -> list[Callable[[], object]]:
         return []
@@ -157,19 +154,19 @@ class Act(_Task):
 
         inputs = _declared_inputs(family, settings)
         checkpoint = model.checkpoint or model.family
-        return [check_instructions, *(() if inputs is None else source.early_checks(*inputs, checkpoint))]
+        return [check_instructions, *(() if inputs is None else source.early_checks(inputs, checkpoint))]
 
-    def declared_cameras(self, settings: ExtractSettings) -> tuple[str, ...] | None:
-        """Return the cameras of a checkpoint in lerobot's layout, else those of the model without its weights."""
+    def declared_inputs(self, settings: ExtractSettings) -> "DeclaredInputs | None":
+        """Return the inputs of a checkpoint in lerobot's layout, else those of the model without its weights."""
         from probe_kit.hooks.registry import get_family
 
         model, family = settings.model, get_family(settings.model.family)
         if family is None:
             return None
         if (inputs := _declared_inputs(family, settings)) is not None:
-            return inputs[0]
+            return inputs
         outline = family.outline(model.checkpoint, model.options, model.dtype)
-        return None if outline is None or outline.model is None else outline.model.card.cameras
+        return None if outline is None or outline.model is None else outline.model.card.inputs()
 
     def planned(self, settings: ExtractSettings, sizes: PlannedSizes) -> ExtractSettings:
         """Return the settings with the inferences of an episode counted."""
@@ -225,16 +222,11 @@ class Act(_Task):
         return settings, source, controller, calibration
 
 
-def _declared_inputs(family: "Family", settings: ExtractSettings) -> tuple[tuple[str, ...], int | None] | None:
-    """Return cameras and numbers of the state that a checkpoint in lerobot's layout declares; None without one."""
-    folder = family.folder_here(settings.model.checkpoint, settings.model.options)
-    try:
-        inputs = parse_json(read_regular(folder / CONFIG_FILE))["input_features"]
-        cameras = cameras_of(inputs)
-        state = int(inputs[STATE]["shape"][0]) if STATE in inputs else None
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, IndexError):
-        return None  # another layout; what it reads is known once it is loaded
-    return cameras, state
+def _declared_inputs(family: "Family", settings: ExtractSettings) -> "DeclaredInputs | None":
+    """Return the inputs that a checkpoint in lerobot's layout declares; None without one."""
+    from probe_kit.hooks.families.shared.lerobot.pipelines import declared_inputs
+
+    return declared_inputs(family.folder_here(settings.model.checkpoint, settings.model.options))
 
 
 def check_misfit(settings: ExtractSettings, reason: str | None, checkpoint: str) -> None:

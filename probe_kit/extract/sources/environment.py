@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field
 
 from probe_kit.extract.parts import read_options
-from probe_kit.extract.sources.recording import Episodes, Pixels, Rotations
+from probe_kit.extract.sources.recording import Cameras, Episodes, Pixels, Rotations
 from probe_kit.extract.sources.source import SourceSettings
 from probe_kit.hooks.contract.observation import Observation
 
@@ -66,6 +66,9 @@ class OwnEnvironment(Protocol):
         revision: A text that changes with whatever its numbers depend on, such as versions; part of a run's
             identity.
         action_names: The names of the numbers of an action, in the units of the checkpoint that plays it.
+
+    An environment may have `first_camera`, the name of its `Observation.image`. Cameras of the model are then
+    found by name, and the order of its pictures has no effect.
     """
 
     revision: str
@@ -104,9 +107,11 @@ class EnvSource(SourceSettings):
             or the name of an entry point of the group `probe_kit.environments`.
         options: Keyword arguments of the class.
         episodes: Indices among its episodes; None for all.
+        cameras: The environment's picture by camera of the model; `image` is that of `Observation.image` where the
+            environment does not name it. Empty for the names of the contract, or those of the checkpoint's files.
         max_steps: The number of actions after which an episode ends; None for the environment's own limit, or 200
             where it declares none.
-        rotations: The degrees by camera, counterclockwise; `*` names all cameras.
+        rotations: The degrees by camera of the model, counterclockwise; `*` names all cameras.
         accept_nondeterminism: Whether an environment is played in which one seed starts differently each time.
         pixels: Whether pictures at 32 × 32 are stored for controls.
         limit: The largest of the environment's own limits in actions, which is read when it is opened. None
@@ -130,6 +135,7 @@ class EnvSource(SourceSettings):
         default={}
     )
     episodes: Episodes = None
+    cameras: Cameras = ()
     max_steps: Annotated[
         Annotated[int, Field(ge=1, le=MOST_STEPS)] | None,
         typer.Option("--max-steps", help="Number of actions per episode."),

@@ -39,7 +39,7 @@ from probe_kit.extract.sources.environment import (
 )
 from probe_kit.extract.sources.environment_starts import compare_steps, start_digest
 from probe_kit.extract.sources.player import SIDE, Answer, Ending, InputsPlayer, Opens, frames_of_episode
-from probe_kit.extract.sources.recording import EVERY_CAMERA, degrees_of
+from probe_kit.extract.sources.recording import EVERY_CAMERA, Pairs, degrees_of
 from probe_kit.extract.sources.source import (
     FIRST_EPISODES,
     Played,
@@ -51,7 +51,9 @@ from probe_kit.extract.sources.source import (
 )
 from probe_kit.extract.sources.step_limits import checked_limit, declared_limit
 from probe_kit.hashing import derive_seed
+from probe_kit.hooks.contract.card import DeclaredInputs
 from probe_kit.hooks.contract.observation import Observation, checked_picture
+from probe_kit.hooks.families.shared.kinds import IMAGES, map_text, renamed_features
 from probe_kit.runs.input_content import EpisodeFrames, content_notes
 from probe_kit.runs.layout import AT_END, ENVIRONMENT, LIMIT, ONCE, START, TRUTHS
 from probe_kit.runs.plan import Row
@@ -138,7 +140,9 @@ def open_environment(source: EnvSource) -> OwnEnvironment:
     with naming_environment(source.environment, "its constructor", partial(_options_of, factory)):
         environment: OwnEnvironment = factory(**dict(source.options))
     check_members(environment, source.environment)
-    return RotatedEnvironment(environment, source.rotations) if source.rotations else environment
+    pictures = dict(source.cameras)
+    turns = [(pictures.get(camera, camera), degrees) for camera, degrees in source.rotations]
+    return RotatedEnvironment(environment, turns) if turns else environment
 
 
 def _options_of(factory: Callable[..., Any]) -> str:
@@ -156,7 +160,7 @@ class RotatedEnvironment:
 
     Args:
         environment: The environment, all of whose other parts stay as they are.
-        rotations: Pairs of a camera and degrees, counterclockwise. `*` is every camera, and a name that
+        rotations: Pairs of a picture's name and degrees, counterclockwise. `*` is every picture, and a name that
             `Observation.cameras` lacks the first picture.
     """
 
@@ -340,6 +344,101 @@ def fact_values(facts: Mapping[str, Any], names: Sequence[str], where: str) -> l
     return [float(facts[name]) for name in names]
 
 
+# -- pictures by camera ------------------------------------------------------------------------------------------
+
+
+def first_picture(environment: OwnEnvironment) -> str:
+    """Return the name of `Observation.image`: as the environment has it, else `image`."""
+    return str(getattr(environment, "first_camera", "image"))
+
+
+def mapped_pictures(
+    typed: Pairs, inputs: DeclaredInputs, pictures: Sequence[str], by_name: bool, where: str
+) -> Pairs:
+    """Return pairs of a camera of the model and a picture of the environment; none where the contract's are right.
+
+    Args:
+        typed: The pairs as the user mapped them; they count over all else.
+        inputs: The model's cameras, and names that its files rename.
+        pictures: The environment's pictures, that of `Observation.image` first.
+        by_name: Whether the first picture has a name too, so that all are looked up by name.
+        where: The environment, for messages.
+
+    Raises:
+        OwnEnvironmentError: For a camera or picture that does not exist, and for two pictures of one camera.
+    """
+    main, *further_cameras = inputs.cameras
+    both = f"the model has {', '.join(inputs.cameras)}; the environment shows {', '.join(pictures)}"
+    if typed:
+        pairs = {camera: name.removeprefix(IMAGES) for camera, name in typed}
+        if strange := [(camera, name) for camera, name in pairs.items() if name not in pictures]:
+            camera, name = strange[0]
+            raise OwnEnvironmentError(f"{where}: --camera {camera}={name}: there is no such picture ({both})")
+        if strange := [(camera, name) for camera, name in pairs.items() if camera not in inputs.cameras]:
+            camera, name = strange[0]
+            raise OwnEnvironmentError(f"{where}: --camera {camera}={name}: there is no such camera ({both})")
+    elif by_name:
+        pairs = _pairs_by_name(inputs, pictures, f"{where}: {{}} ({both})")
+        if main not in pairs:
+            return ()
+    else:
+        # By the contract its names are the model's: only one that the model lacks is looked up.
+        renamed = {name: inputs.renames.get(full_name(name), "").removeprefix(IMAGES) for name in pictures[1:]}
+        pairs = {renamed[name] or name: name for name in pictures[1:] if name not in further_cameras}
+        if not set(pairs) <= set(further_cameras) or not pairs:
+            return ()
+        pairs |= {main: pictures[0], **{name: name for name in pictures[1:] if name in further_cameras}}
+    if main not in pairs:
+        raise OwnEnvironmentError(
+            f"{where}: the model's first camera gets no picture ({both}). Map it, such as --camera "
+            f"{main}={pictures[0]}"
+        )
+    mapped = tuple((camera, pairs[camera]) for camera in inputs.cameras if camera in pairs)
+    by_contract = ((main, pictures[0]), *((name, name) for name in pictures[1:]))
+    return () if mapped == by_contract and not typed else mapped
+
+
+def _pairs_by_name(inputs: DeclaredInputs, pictures: Sequence[str], sentence: str) -> dict[str, str]:
+    """Return the picture of every camera that has one, as lerobot names them after the checkpoint's own map."""
+    names = {full_name(picture): picture for picture in pictures}
+    sources = renamed_features(names, inputs.renames)
+    by_camera = {camera: sources[full_name(camera)] for camera in inputs.cameras if full_name(camera) in sources}
+    if several := [camera for camera, features in by_camera.items() if len(features) > 1]:
+        camera = several[0]
+        problem = f"the checkpoint's rename map gives {' and '.join(by_camera[camera])} to the camera {camera}"
+        raise OwnEnvironmentError(f"{sentence.format(problem)}. Choose with --camera {camera}=PICTURE")
+    return {camera: names[features[0]] for camera, features in by_camera.items()}
+
+
+def full_name(picture: str) -> str:
+    """Return the name of the feature of a picture, as lerobot has it."""
+    return picture if picture.startswith("observation.") else f"{IMAGES}{picture}"
+
+
+def arranged(step: Step, pairs: Pairs, first: str, where: str) -> Step:
+    """Return a step whose pictures are those of the model's cameras; as it is where there are no pairs.
+
+    Args:
+        step: The step as the environment gave it.
+        pairs: A camera of the model and the name of its picture, the first camera in front.
+        first: The name of `Observation.image`.
+        where: The environment, for messages.
+
+    Raises:
+        OwnEnvironmentError: For a picture that the environment does not show.
+    """
+    if not pairs:
+        return step
+    observation = step.observation
+    pictures = {first: observation.image, **observation.cameras}
+    if missing := [name for _, name in pairs if name not in pictures]:
+        raise OwnEnvironmentError(f"{where} shows {', '.join(pictures)}, and no {missing[0]!r}. Correct --camera")
+    (_, main), *further_pairs = pairs
+    lens = observation.intrinsics if main == first else None
+    cameras = {camera: pictures[name] for camera, name in further_pairs}
+    return replace(step, observation=replace(observation, image=pictures[main], intrinsics=lens, cameras=cameras))
+
+
 CATEGORY = "all"
 """The category of every row: environments have no categories."""
 SUCCEEDED, FAILED, ENDED = "success", "failure", "ended"
@@ -367,6 +466,7 @@ class EnvironmentSource(Source[EnvSource]):
         chunk: The number of actions that the policy predicts at a time; 0 before.
         starts: The hashes of the first observations of the first episodes; empty before they were set up, and
             where they need not repeat.
+        renamed: The checkpoint's own map of names in words; empty before, or where it has none.
     """
 
     def __init__(
@@ -385,6 +485,7 @@ class EnvironmentSource(Source[EnvSource]):
             episode.max_steps is not None for _, episode in self.episodes
         )
         self._frames: list[EpisodeFrames] = []
+        self.renamed = ""
 
     @classmethod
     def open(cls, settings: EnvSource, selects_only: bool) -> Self:
@@ -504,12 +605,20 @@ class EnvironmentSource(Source[EnvSource]):
 
     def watched(self, cameras: Sequence[str]) -> Self:
         """Set up the first chosen episode; no action is executed, so that facts are those of `reset`."""
+        return self._begun(DeclaredInputs(tuple(cameras[:1])), False)
+
+    def _begun(self, inputs: DeclaredInputs, by_name: bool) -> Self:
+        typed = self.settings.cameras
         environment = open_environment(self.settings)
         try:
             first = started(environment, self.episodes[0][1], self.name)
+            first = self._mapped(environment, first, inputs, by_name)
         finally:
             environment.close()
-        self.seen, self.cameras = first.observation, [*cameras[:1], *first.observation.cameras]
+        if self.settings.rotations and self.settings.cameras != typed:
+            # Cameras of the model are rotated, and only now it is known which pictures they get.
+            return self._begun(inputs, by_name)
+        self.seen, self.cameras = first.observation, [*inputs.cameras[:1], *first.observation.cameras]
         self._frames = [frames_of_steps(self.episodes[0][1].id, [first])]
         self._note_facts(first)
         return self
@@ -518,6 +627,29 @@ class EnvironmentSource(Source[EnvSource]):
         """Return a sentence for every camera of one colour or under two names, in the first frames of episodes."""
         names = self.cameras or ["picture"]
         return tuple(content_notes(self._frames, names))
+
+    def _mapped(
+        self, environment: OwnEnvironment, step: Step, inputs: DeclaredInputs, by_name: bool = True
+    ) -> Step:
+        """Decide which picture a camera of the model gets, and return the step with its pictures so."""
+        pictures = [first_picture(environment), *step.observation.cameras]
+        by_name = by_name and hasattr(environment, "first_camera")
+        typed = self.settings.cameras
+        pairs = mapped_pictures(typed, inputs, pictures, by_name, self.name)
+        self.renamed = self._renamed(inputs, pictures)
+        self.settings = self.settings.changed(cameras=pairs)
+        return arranged(step, pairs, pictures[0], self.name)
+
+    def _renamed(self, inputs: DeclaredInputs, pictures: Sequence[str]) -> str:
+        """Return the checkpoint's own map in words, and where `--camera` contradicts it; empty without one."""
+        sources = renamed_features(map(full_name, pictures), inputs.renames)
+        unlike = [
+            f"{camera} is given {name}, and the map says {features[0].removeprefix(IMAGES)}"
+            for camera, name in self.settings.cameras
+            if (features := sources.get(full_name(camera), [])) and full_name(name) not in features
+        ]
+        options = f"; contradicted by --camera: {'; '.join(unlike)}" if unlike else ""
+        return map_text(inputs.renames) and f"{map_text(inputs.renames)}{options}"
 
     def check(self, policy: "Policy", accept_units: bool) -> "tuple[Self, Policy]":
         """Set up the first chosen episodes, let the policy predict once, and execute one action of the first.
@@ -541,6 +673,7 @@ class EnvironmentSource(Source[EnvSource]):
         environment, name = open_environment(self.settings), self.name
         try:
             first = started(environment, self.episodes[0][1], name)
+            first = self._mapped(environment, first, policy.card.inputs(policy.state_numbers))
             policy = self._with_cameras(policy, first.observation)
             self._check_state(policy, first.observation)
             chunk = self._predicted(policy, first.observation)
@@ -567,13 +700,13 @@ class EnvironmentSource(Source[EnvSource]):
         self.columns = tuple(sorted(step.facts))
         self.truths = [name for name in self.columns if isinstance(step.facts[name], bool | np.bool_)]
 
-    def shown_cameras(self, declared: Sequence[str] | None = None) -> tuple[str, ...] | None:
+    def shown_cameras(self, declared: "DeclaredInputs | None" = None) -> tuple[str, ...] | None:
         """Return the first camera, and those that the first observation names; None if they are unknown.
 
         The first episode is set up for this if no model was checked and `declared` has the cameras of one.
         """
         if not self.cameras and declared is not None:
-            self.watched(declared)
+            self._begun(declared, True)
         return tuple(self.cameras) or None
 
     def _with_cameras(self, policy: "Policy", observation: Observation) -> "Policy":
@@ -588,7 +721,7 @@ class EnvironmentSource(Source[EnvSource]):
         except ObservationError as error:
             raise OwnEnvironmentError(
                 f"{self.name}: {error}. `Observation.image` is the model's first camera; name the others in "
-                "`Observation.cameras` as the model does"
+                "`Observation.cameras` as the model does, or map them with --camera"
             ) from error
 
     def _check_state(self, policy: "Policy", observation: Observation) -> None:
@@ -646,7 +779,7 @@ class EnvironmentSource(Source[EnvSource]):
             "revision": self.revision,
             "max_steps": None if self._has_limits_of_episodes else settings.steps(),
             **({"rotations": [list(turn) for turn in settings.rotations]} if settings.rotations else {}),
-            "cameras": self.cameras,
+            "cameras": [list(pair) for pair in settings.cameras] or self.cameras,
             "inputs": shapes,
             "columns": list(self.columns),
             "names": {
@@ -683,18 +816,22 @@ class EnvironmentSource(Source[EnvSource]):
         }
         if self.seen is None:
             return described
-        turned = self.settings.rotations
-        cameras = [
-            f"{camera}, rotated by {degrees}°" if (degrees := degrees_of(turned, camera)) else camera
-            for camera in self.cameras
-        ]
+        pairs = self.settings.cameras
         return {
             "environment": terminal_safe(f"{self.name} ({self.revision})"),
-            "cameras": terminal_safe(", ".join(cameras)),
+            "cameras": terminal_safe(
+                "; ".join(f"{camera} from {name}{self._turned_by(camera)}" for camera, name in pairs)
+                or ", ".join(f"{camera}{self._turned_by(camera)}" for camera in self.cameras)
+            ),
+            **({"rename map": terminal_safe(self.renamed)} if self.renamed else {}),
             "actions": terminal_safe(", ".join(self.actions)),
             "facts": terminal_safe(", ".join(self.columns)) or "none",
             **{name: words for name, words in described.items() if name != "environment"},
         }
+
+    def _turned_by(self, camera: str) -> str:
+        degrees = degrees_of(self.settings.rotations, camera)
+        return f", rotated by {degrees}°" if degrees else ""
 
     def _limit_words(self, rows: Sequence[Row]) -> str:
         settings, most = self.settings, sorted({self.most_steps(row.content) for row in rows})
@@ -760,6 +897,7 @@ class EnvironmentPlayer(InputsPlayer):
                 "was prepared, in the process that plays it. Take all randomness from the episode's seed, or play "
                 "it with --accept-nondeterminism"
             )
+        step = self._arranged(step)
         self._first = _pictures(step)
         return self._see(step)
 
@@ -771,7 +909,7 @@ class EnvironmentPlayer(InputsPlayer):
             with naming_environment(name, "step()"):
                 answer = self._environment.step(action.copy())
             self._steps += 1
-            step = checked_step(answer, self.row.content, f"{name}, step() {self._steps}")
+            step = self._arranged(checked_step(answer, self.row.content, f"{name}, step() {self._steps}"))
             self._succeeded |= _succeeds(step)
             if step.done or self._steps >= most:
                 return self._end(step)
@@ -781,6 +919,9 @@ class EnvironmentPlayer(InputsPlayer):
         """Free the environment."""
         with naming_environment(self._settings.name, "close()"):
             self._environment.close()
+
+    def _arranged(self, step: Step) -> Step:
+        return arranged(step, self._settings.cameras, first_picture(self._environment), self._settings.name)
 
     def _see(self, step: Step) -> Observation:
         observation, most = step.observation, self._played.calls

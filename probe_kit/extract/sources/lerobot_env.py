@@ -134,6 +134,7 @@ class LeRobotEnvironment:
                 f"lerobot:{self._kind} shows {', '.join(sorted(features))}; expected pictures and {STATE}"
             )
         first, *other_cameras = pictures
+        self.first_camera = first.removeprefix(IMAGES)
         cameras = {name.removeprefix(IMAGES): pictures[name] for name in other_cameras}
         state = np.asarray(features[STATE][0], np.float32)
         return Observation(pictures[first], state, self._episode.instruction, None, cameras)

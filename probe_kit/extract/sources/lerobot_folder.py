@@ -31,6 +31,7 @@ from probe_kit.extract.sources.lerobot_meta import (
 from probe_kit.extract.sources.recorded_video import RecordedVideo, VideoError
 from probe_kit.extract.sources.recording import LeRobotSource, episodes_text
 from probe_kit.hooks.checkpoints.checkpoint import OFFLINE_WAY_OUT, hub_reason, unreachable, way_out
+from probe_kit.hooks.families.shared.feature_names import read_names
 from probe_kit.suite.pictures import decode_bytes
 
 MOST_FRAMES = 64
@@ -90,7 +91,7 @@ class LeRobotFolder(LeRobotMeta):
 
     def picture_shape(self, feature: str) -> tuple[int, int]:
         """Return height and width of a camera's pictures."""
-        shape, names = self.features[feature]["shape"], list(self.features[feature].get("names") or ())
+        shape, names = self.features[feature]["shape"], read_names(self.features[feature].get("names"))
         if names and names[0].startswith("channel"):
             return int(shape[1]), int(shape[2])
         return int(shape[0]), int(shape[1])
@@ -190,10 +191,12 @@ def open_lerobot(source: LeRobotSource) -> LeRobotFolder:
         MissingExtraError: Without the extra of recordings.
     """
     if source.is_local:
-        return LeRobotFolder.read(Path(source.folder).expanduser().resolve())
+        root = Path(source.folder).expanduser().resolve()
+        return LeRobotFolder.read(root).with_features(source.features)
     repo, _, revision = source.folder.partition("@")
     commit = resolved_commit(repo, revision)
-    return LeRobotFolder.read(_download(repo, commit, ["meta/*", "meta/**/*"]), repo, commit)
+    root = _download(repo, commit, ["meta/*", "meta/**/*"])
+    return LeRobotFolder.read(root, repo, commit).with_features(source.features)
 
 
 def resolved_commit(repo: str, revision: str) -> str:
@@ -351,6 +354,7 @@ class LeRobotFrames:
 
     def _read(self, path: Path, columns: Sequence[str], first: int, end: int) -> tuple[Any, int]:
         """Return row groups with rows `first` to `end`, or all if small, and the number of their first row."""
+        names, columns = columns, [self.folder.stored_names.get(name, name) for name in columns]
         with self.folder.opened.parquet(path) as parquet:
             if missing := [name for name in columns if name not in parquet.schema_arrow.names]:
                 raise RecordingError(
@@ -362,7 +366,8 @@ class LeRobotFrames:
             groups = np.flatnonzero((ends > first) & (ends - sizes < end))
             if _size_of(parquet.metadata, columns) <= MOST_AT_ONCE:
                 groups = np.flatnonzero(sizes)
-            return read_parquet(parquet, columns, groups.tolist()), int((ends - sizes)[groups[0]])
+            table = read_parquet(parquet, columns, groups.tolist()).select(columns)
+            return table.rename_columns(list(names)), int((ends - sizes)[groups[0]])
 
     def _scanned(self, path: Path) -> _DataFile:
         """Return a data file whose rows are those that meta says. Raises RecordingError for others."""

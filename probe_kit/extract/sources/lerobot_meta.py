@@ -4,7 +4,7 @@ import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from hashlib import blake2b, file_digest
 from itertools import pairwise
@@ -28,6 +28,7 @@ from probe_kit.extract.sources.lerobot_formats import (
     check_recorded,
     unfinished_files,
 )
+from probe_kit.hooks.families.shared.feature_names import names_misfit, names_of
 
 EXTRA = "datasets"
 IMAGE, VIDEO = "image", "video"
@@ -170,6 +171,7 @@ class LeRobotMeta:
         tasks: (number, text) of each line.
         repo: The name on the hub, None for a folder.
         revision: The commit on the hub, None for a folder.
+        stored_names: The names in the data set of features that are read under another one, by that one.
     """
 
     path: Path
@@ -179,6 +181,7 @@ class LeRobotMeta:
     episodes: tuple[EpisodeMeta, ...]
     repo: str | None = None
     revision: str | None = None
+    stored_names: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
     def read(cls, root: Path, repo: str | None = None, revision: str | None = None) -> Self:
@@ -214,11 +217,32 @@ class LeRobotMeta:
         """The frames per second."""
         return float(self.info["fps"])
 
-    @property
+    @cached_property
     def features(self) -> Mapping[str, Any]:
-        """The type, shape and names of numbers by feature."""
-        features: Mapping[str, Any] = self.info["features"]
-        return features
+        """The type, shape and names of numbers by feature, under the names by which they are read."""
+        stored: Mapping[str, Any] = self.info["features"]
+        if not self.stored_names:
+            return stored
+        unmapped = {name: feature for name, feature in stored.items() if name not in self.stored_names.values()}
+        return {**unmapped, **{name: stored[stored_name] for name, stored_name in self.stored_names.items()}}
+
+    def with_features(self, pairs: Iterable[tuple[str, str]]) -> Self:
+        """Return the same data set, some of whose features are read under another name: pairs of it and their own.
+
+        Raises:
+            RecordingError: For a feature that it lacks, or that is no list of numbers.
+        """
+        names = dict(pairs)
+        for name, stored in names.items():
+            feature = self.info["features"].get(stored)
+            if feature is None or feature["dtype"] not in NUMERIC:
+                has = "no such feature" if feature is None else f"it as {feature['dtype']}"
+                numeric = [other for other, entry in self.info["features"].items() if entry["dtype"] in NUMERIC]
+                raise RecordingError(
+                    f"--feature {name}={stored}: {self.name} has {has}; its features of numbers are "
+                    f"{', '.join(numeric) or 'none'}. Correct --feature"
+                )
+        return replace(self, stored_names=names) if names != self.stored_names else self
 
     @property
     def cameras(self) -> list[str]:
@@ -235,8 +259,13 @@ class LeRobotMeta:
 
     def feature_names(self, feature: str) -> tuple[str, ...] | None:
         """Return the names of the numbers of a feature; None where the data set names none, or not all."""
-        names = _flat_names(self.features[feature].get("names"))
-        return names if names is not None and (len(names),) == tuple(self.features[feature]["shape"]) else None
+        shape = tuple(self.features[feature]["shape"])
+        return names_of(self.features[feature].get("names"), shape[0]) if len(shape) == 1 else None
+
+    def names_misfit(self, feature: str) -> str:
+        """Return why the names of a feature's numbers are not used; empty where they are, or there are none."""
+        shape = tuple(self.features[feature]["shape"])
+        return names_misfit(self.features[feature].get("names"), shape[0]) if len(shape) == 1 else ""
 
     def task(self, number: int, episodes: Sequence[int] = ()) -> str:
         """Return the text of a task.
@@ -360,20 +389,6 @@ def _depth(feature: Mapping[str, Any]) -> bool:
     info, video = feature.get("info") or {}, feature.get("video_info") or {}
     flags = info.get("is_depth_map"), info.get("video.is_depth_map"), video.get("video.is_depth_map")
     return any(flags)
-
-
-def _flat_names(names: Any) -> tuple[str, ...] | None:
-    """Return names as a list, from {"motors": […]}, from groups of names, or from places by name."""
-    if isinstance(names, Mapping):
-        places = list(names.values())
-        if sorted(map(repr, places)) == sorted(map(repr, range(len(places)))):
-            return tuple(sorted(names, key=lambda name: names[name]))
-        if any(isinstance(part, str) or not isinstance(part, Sequence) for part in places):
-            return None
-        names = [name for part in places for name in part]
-    if isinstance(names, str) or not isinstance(names, Sequence):
-        return None
-    return tuple(map(str, names))
 
 
 def _read_info(root: Path, files: HashedFiles) -> Mapping[str, Any]:

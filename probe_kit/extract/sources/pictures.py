@@ -39,6 +39,7 @@ from probe_kit.suite.pictures import decode_bytes
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
+    from probe_kit.hooks.contract.card import DeclaredInputs
 
 PICTURE, INSTRUCTION, ID, GROUP = "picture", "instruction", "id", "group"
 """The columns of the table; the first two are required, and all others become labels."""
@@ -222,9 +223,9 @@ class PictureSource(Source[PictureFolder]):
         self.prediction = chunk.shape[0], chunk.shape[1]
         return self, policy
 
-    def shown_cameras(self, declared: Sequence[str] | None = None) -> tuple[str, ...]:
+    def shown_cameras(self, declared: "DeclaredInputs | None" = None) -> tuple[str, ...]:
         """Return the first camera: a row has one picture."""
-        return tuple(declared or (CAMERA,))[:1]
+        return (declared.cameras if declared else (CAMERA,))[:1]
 
     def watched(self, cameras: Sequence[str]) -> Self:
         """Show the pictures to the model's first camera."""

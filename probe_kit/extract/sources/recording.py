@@ -11,7 +11,7 @@ from pydantic import BeforeValidator, Field
 
 from probe_kit.errors import UsageError
 from probe_kit.extract.sources.source import REFUSED_WITHOUT_ACTING, SourceSettings
-from probe_kit.hooks.families.shared.kinds import IMAGES
+from probe_kit.hooks.families.shared.kinds import ACTION, IMAGES, STATE
 
 TURNS = (90, 180, 270)
 """The degrees by which pictures can be rotated, counterclockwise."""
@@ -109,6 +109,27 @@ def _pairs(option: str, example: str, value: Any) -> Any:
 EVERY_CAMERA = "*"
 """The camera of a rotation that names none: all of them."""
 
+Cameras = Annotated[
+    Pairs,
+    BeforeValidator(partial(_pairs, "--camera", f"base={IMAGES}top")),
+    _option(
+        "--camera",
+        metavar="CAMERA=FEATURE",
+        help="Which picture of the data set or environment a camera of the model gets; repeatable. Default: as "
+        "the checkpoint's files map them, else equal names.",
+    ),
+]
+
+
+def _features(value: Any) -> Any:
+    pairs = _pairs("--feature", f"{STATE}=state", value)
+    if strange := [name for name, _ in pairs if name not in (STATE, ACTION)]:
+        raise UsageError(
+            f"--feature {strange[0]}=…: expected {STATE} or {ACTION}, such as --feature {STATE}=state. Pictures "
+            "are mapped with --camera"
+        )
+    return pairs
+
 
 def _turns(value: Any) -> Any:
     turns = []
@@ -161,8 +182,9 @@ class LeRobotSource(SourceSettings):
         folder: The data set's folder, or USER/NAME@COMMIT of the hub.
         episodes: Indices of episodes; None for all.
         every: The step between shown frames: of each episode frame 0 and each so many frames on.
-        cameras: The feature of the data set by camera of the model; empty where both have one, or the names are
-            equal.
+        cameras: The feature of the data set by camera of the model; empty where both have one, where the names are
+            equal, or where the checkpoint's own files map them.
+        features: The feature of the data set by `observation.state` or `action`, where it has another name there.
         rotations: The degrees by camera of the model, counterclockwise; `*` names all cameras.
         instruction: The words that the model reads in place of the task of a frame; None for that task.
         pixels: Whether pictures at 32 × 32 are stored for controls.
@@ -196,13 +218,14 @@ class LeRobotSource(SourceSettings):
             help="Frames of an episode, such as every:5. Default: every:1.",
         ),
     ] = 1
-    cameras: Annotated[
+    cameras: Cameras = ()
+    features: Annotated[
         Pairs,
-        BeforeValidator(partial(_pairs, "--camera", f"base={IMAGES}top")),
+        BeforeValidator(_features),
         _option(
-            "--camera",
-            metavar="CAMERA=FEATURE",
-            help="Which picture of the data set a camera of the model gets; repeatable. Default: equal names.",
+            "--feature",
+            metavar="NAME=FEATURE",
+            help=f"Which feature of the data set is {STATE} or {ACTION}; repeatable. Default: equal names.",
         ),
     ] = ()
     rotations: Rotations = ()
@@ -226,10 +249,12 @@ class LeRobotSource(SourceSettings):
         super().__init__(**{"folder": folder, **choices})
 
     def model_post_init(self, _: Any) -> None:
-        """Raise UsageError for a camera or feature that is mapped twice."""
+        """Raise UsageError for a camera, a feature or a name that is mapped twice."""
         features: Iterable[tuple[str, list[str]]] = (
             ("camera", [name for name, _ in self.cameras]),
             ("feature", list(dict(self.cameras).values())),
+            ("name", [name for name, _ in self.features]),
+            ("feature", list(dict(self.features).values())),
         )
         for part, names in features:
             if twice := [name for name in names if names.count(name) > 1]:

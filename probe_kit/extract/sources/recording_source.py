@@ -5,6 +5,7 @@ from contextlib import suppress
 from functools import cached_property, partial
 from importlib.metadata import version
 from itertools import groupby
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -20,7 +21,7 @@ from probe_kit.extract.sources.lerobot_folder import (
     fetched,
     open_lerobot,
 )
-from probe_kit.extract.sources.lerobot_meta import IMAGE
+from probe_kit.extract.sources.lerobot_meta import IMAGE, KEYS, NUMERIC
 from probe_kit.extract.sources.player import SIDE, Answer, InputsPlayer, Opens, frames_of_episode
 from probe_kit.extract.sources.recording import EVERY_CAMERA, LeRobotSource, Pairs, degrees_of
 from probe_kit.extract.sources.source import (
@@ -34,8 +35,10 @@ from probe_kit.extract.sources.source import (
     unusual_shares,
 )
 from probe_kit.hashing import derive_seed
+from probe_kit.hooks.contract.card import DeclaredInputs
 from probe_kit.hooks.contract.observation import ARM_NUMBERS, Observation
-from probe_kit.hooks.families.shared.kinds import ACTION, IMAGES, STATE
+from probe_kit.hooks.families.shared.feature_names import read_names
+from probe_kit.hooks.families.shared.kinds import ACTION, IMAGES, STATE, map_text, renamed_features
 from probe_kit.runs.input_content import EpisodeFrames, content_notes
 from probe_kit.runs.layout import CAPTURE_ONLY, DATASET, OTHER_ACTIONS, RECORDED_EPISODES, TRUTHS
 from probe_kit.runs.plan import Row
@@ -64,6 +67,8 @@ class RecordingSource(Source[LeRobotSource]):
         unusual: (D,) share of the chosen frames whose number of the state is unusual; empty where the policy
             normalizes none.
         other_actions: The reason why recorded actions are not what the policy predicts; None if they are.
+        declared: The inputs that a checkpoint declares; None before it was looked at.
+        renamed: The checkpoint's own map of names in words, and what contradicts it; empty where it has none.
 
     Args:
         settings: The chosen episodes, frames and cameras.
@@ -85,6 +90,8 @@ class RecordingSource(Source[LeRobotSource]):
         self.prediction: tuple[int, int] = (0, 0)
         self.other_actions: str | None = None
         self.unusual: NDArray[np.float64] = np.zeros(0)
+        self.declared: DeclaredInputs | None = None
+        self.renamed = ""
 
     @classmethod
     def open(cls, settings: LeRobotSource, selects_only: bool) -> Self:
@@ -105,7 +112,7 @@ class RecordingSource(Source[LeRobotSource]):
 
     def watched(self, cameras: Sequence[str]) -> Self:
         """Map the model's first camera, and read all numbers of the chosen episodes."""
-        mapped = self.mapped(cameras[:1])
+        mapped = self.mapped(DeclaredInputs(tuple(cameras[:1])))
         fetched(mapped.folder, mapped.episodes, mapped.features)
         mapped.check_frames()
         return mapped
@@ -202,20 +209,22 @@ class RecordingSource(Source[LeRobotSource]):
 
     # -- a model -------------------------------------------------------------------------------------
 
-    def early_checks(
-        self, cameras: Sequence[str], state: int | None, checkpoint: str
-    ) -> list[Callable[[], object]]:
+    def early_checks(self, inputs: DeclaredInputs, checkpoint: str) -> list[Callable[[], object]]:
         """Return checks of the cameras and the width of the state."""
-        return [lambda: self.mapped(cameras), lambda: self.check_state_width(checkpoint, state)]
+        self.declared = inputs
+        return [
+            lambda: self.mapped(inputs),
+            lambda: self.with_renamed(inputs.renames).check_state_width(checkpoint, inputs.state),
+        ]
 
-    def shown_cameras(self, declared: Sequence[str] | None = None) -> tuple[str, ...] | None:
+    def shown_cameras(self, declared: DeclaredInputs | None = None) -> tuple[str, ...] | None:
         """Return the cameras to which a feature was mapped, or would be mapped."""
         pairs = self.settings.cameras if declared is None else self.mapped(declared).settings.cameras
         return tuple(camera for camera, _ in pairs) or None
 
-    def mapped(self, cameras: Sequence[str]) -> Self:
+    def mapped(self, inputs: DeclaredInputs) -> Self:
         """Return the same recordings with a feature for the model's cameras. Raises RecordingError without."""
-        pairs = mapped_cameras(self.settings.cameras, cameras, self.folder.cameras)
+        pairs = mapped_cameras(self.settings.cameras, inputs.cameras, self.folder.cameras, inputs.renames)
         names = [camera for camera, _ in pairs]
         rotations = self.settings.rotations
         if strange := [camera for camera, _ in rotations if camera not in (*names, EVERY_CAMERA)]:
@@ -223,7 +232,49 @@ class RecordingSource(Source[LeRobotSource]):
                 f"--rotate {strange[0]}=…: that camera gets no picture; those with one are {', '.join(names)}"
             )
         turns = {camera: turn for camera in names if (turn := degrees_of(rotations, camera))}
-        return type(self)(self.settings.changed(cameras=pairs, rotations=turns), self.folder, self.stretch)
+        renamed = self.with_renamed(inputs.renames)
+        settings = renamed.settings.changed(cameras=pairs, rotations=turns)
+        mapped = type(self)(settings, renamed.folder, self.stretch)
+        mapped.renamed = self._renamed(inputs)
+        return mapped
+
+    def with_renamed(self, renames: Mapping[str, str]) -> Self:
+        """Return the same recordings, whose state is the feature that a checkpoint's own map names.
+
+        A feature that the settings name counts over it.
+
+        Raises:
+            RecordingError: If the map gives the name of the state to several features, or takes it away.
+        """
+        features = self.folder.info["features"]
+        if not renames or STATE in dict(self.settings.features):
+            return self
+        sources = renamed_features(features, renames).get(STATE, [])
+        if len(sources) > 1 or (not sources and STATE in features):
+            several = f"{' and '.join(sources)} both become {STATE}" if sources else f"nothing becomes {STATE}"
+            raise RecordingError(
+                f"the checkpoint's rename map ({map_text(renames)}) does not say which feature of "
+                f"{self.folder.path.name} is the state: {several}. Give it with --feature {STATE}=FEATURE"
+            )
+        if not sources or sources == [STATE]:
+            return self
+        pairs = (*self.settings.features, (STATE, sources[0]))
+        return type(self)(self.settings.changed(features=pairs), self.folder.with_features(pairs), self.stretch)
+
+    def _renamed(self, inputs: DeclaredInputs) -> str:
+        """Return the checkpoint's own map in words, and where the settings contradict it; empty without one."""
+        renames, typed = inputs.renames, {f"{IMAGES}{camera}": name for camera, name in self.settings.cameras}
+        typed |= dict(self.settings.features)
+        by_name = renamed_features(self.folder.info["features"], renames)
+        unlike = [
+            f"{name.removeprefix(IMAGES)} is given {feature}, and the map says {' or '.join(by_name[name])}"
+            for name, feature in typed.items()
+            if renames and feature not in by_name.get(name, [feature])
+        ]
+        actions = [name for name, renamed in renames.items() if ACTION in (name, renamed)]
+        ignored = f"; not {actions[0]}: lerobot renames observations alone" if actions else ""
+        options = f"; contradicted by --camera or --feature: {'; '.join(unlike)}" if unlike else ""
+        return terminal_safe(f"{map_text(renames)}{ignored}{options}") if renames else ""
 
     def check_state_width(self, checkpoint: str, expected: int | None) -> None:
         """Raise RecordingError unless the recorded state has as many numbers as the model reads."""
@@ -231,10 +282,25 @@ class RecordingSource(Source[LeRobotSource]):
         if expected is None or width == expected:
             return
         described = "no " + STATE if width is None else f"{width} numbers as {STATE}"
-        raise RecordingError(
-            f"{self.folder.path.name} has {described}; {checkpoint} reads {expected}. Take the data set's own "
-            "checkpoint, or a data set of this robot"
+        similar = self._of_width(expected, STATE)
+        way_out = (
+            f"Its {' and '.join(map(repr, similar))} {'has' if len(similar) == 1 else 'have'} {expected} numbers: "
+            f"if that is the state, give --feature {STATE}={similar[0]}"
+            if similar
+            else "Take the data set's own checkpoint, or a data set of this robot"
         )
+        raise RecordingError(f"{self.folder.path.name} has {described}; {checkpoint} reads {expected}. {way_out}")
+
+    def _of_width(self, width: int, name: str) -> list[str]:
+        """Return features with so many numbers that may be the state, or the action, under another name."""
+        return [
+            feature
+            for feature, entry in self.folder.features.items()
+            if feature not in (*KEYS, STATE, ACTION)
+            and entry["dtype"] in NUMERIC
+            and tuple(entry["shape"]) == (width,)
+            and ("action" in feature.lower()) == (name == ACTION)
+        ]
 
     def check_frames(self) -> None:
         """Raise RecordingError for files, numbers or pictures of the chosen episodes that cannot be shown.
@@ -263,8 +329,9 @@ class RecordingSource(Source[LeRobotSource]):
             CheckpointError: For a checkpoint without statistics.
         """
         card = policy.card
-        raise_together(self.early_checks(card.cameras, policy.state_numbers, card.checkpoint))
-        fitted = self.mapped(card.cameras)
+        inputs = card.inputs(policy.state_numbers)
+        raise_together(self.early_checks(inputs, card.checkpoint))
+        fitted = self.mapped(inputs)
         fetched(fitted.folder, fitted.episodes, fitted.features)
         fitted.check_frames()
         try:
@@ -304,19 +371,24 @@ class RecordingSource(Source[LeRobotSource]):
     def _other_actions(self, policy: "Policy", predicted: int, actions: NDArray[np.float32] | None) -> str | None:
         """Return why the recorded actions are not what a policy predicts; None without a sign of that."""
         if actions is None:
-            return "the data set has no actions"
+            similar = self._of_width(predicted, ACTION)
+            how = f"; if {similar[0]!r} are the actions, give --feature {ACTION}={similar[0]}" if similar else ""
+            return f"the data set has no actions{how}"
         if actions.shape[1] != predicted:
             return f"the policy predicts {predicted} numbers, the data set has {actions.shape[1]}"
         if policy.predicts_relative:
             return "the policy predicts changes relative to the state (use_relative_actions)"
         if (reason := other_order(policy, self.folder.feature_names(ACTION) or ())) is not None:
             return reason
+        names, misfit = read_names(self.folder.features[ACTION].get("names")), self.folder.names_misfit(ACTION)
+        if policy.action_names is not None and misfit and (names is None or len(names) > 1):
+            return f"the checkpoint names its actions {', '.join(policy.action_names)}; of the data set, {misfit}"
         shares = policy.unusual_actions(actions).mean(axis=0)
         if not (shares > MOST_UNUSUAL).any():
             return None
-        names = self.folder.names(ACTION)
+        number_names = self.folder.names(ACTION)
         far = ", ".join(
-            f"{names[number]} {shares[number]:.0%}" for number in np.flatnonzero(shares > MOST_UNUSUAL)
+            f"{number_names[number]} {shares[number]:.0%}" for number in np.flatnonzero(shares > MOST_UNUSUAL)
         )
         return f"recorded actions lie outside the statistics of the checkpoint ({far}), so the units differ"
 
@@ -390,6 +462,7 @@ class RecordingSource(Source[LeRobotSource]):
             "fps": folder.fps,
             "frames": f"every:{settings.every}",
             "cameras": [[camera, feature, folder.encoding(feature)] for camera, feature in settings.cameras],
+            **({"features": [list(pair) for pair in settings.features]} if settings.features else {}),
             "rotations": [list(turn) for turn in settings.rotations],
             "instruction": settings.instruction,
             "inputs": dict(sorted(shapes.items())),
@@ -428,8 +501,9 @@ class RecordingSource(Source[LeRobotSource]):
 
     def describe(self, rows: Sequence[Row]) -> dict[str, str]:
         """Return data set, cameras and frames of a plan."""
-        settings, folder = self.settings, self.folder
-        turned = dict(settings.rotations)
+        planned = self.mapped(self.declared) if self.declared and not self.settings.cameras else self
+        settings, folder, turned = planned.settings, self.folder, dict(self.settings.rotations)
+        renamed = planned.renamed or (self._renamed(self.declared) if self.declared else "")
         cameras = [
             f"{camera} from {feature} ({folder.encoding(feature)})"
             + (f", rotated by {turned[camera]}°" if camera in turned else "")
@@ -443,8 +517,17 @@ class RecordingSource(Source[LeRobotSource]):
         return {
             "data set": f"{terminal_safe(where)}, {folder.fps:g} frames per second",
             "cameras": terminal_safe("; ".join(cameras)) or "mapped when the model is loaded",
+            **({"features": terminal_safe(_features_text(settings.features))} if settings.features else {}),
+            **({"rename map": renamed} if renamed else {}),
             "frames": f"{frames} of {len(episodes)} episodes (every:{settings.every}), in {len(rows)} rows",
+            **({"names not used": "; ".join(misfits)} if (misfits := self._name_misfits()) else {}),
         }
+
+    def _name_misfits(self) -> list[str]:
+        """Return why names of state or action are not used, by feature."""
+        folder = self.folder
+        features = (name for name in (STATE, ACTION) if name in folder.features)
+        return [terminal_safe(f"{name}: {misfit}") for name in features if (misfit := folder.names_misfit(name))]
 
     def facts(self) -> dict[str, str]:
         """Return format, episodes, frames, tasks and features of the data set, in words, for `dataset show`."""
@@ -476,6 +559,8 @@ class RecordingSource(Source[LeRobotSource]):
             "model": f"{policy.card.family}  weights {policy.card.weights_sha256[:12]}",
             "shown": "; ".join(f"{camera} from {feature}" for camera, feature in mapped.items())
             + (f"; without a picture: {', '.join(masked)}" if masked else ""),
+            **({"features": _features_text(self.settings.features)} if self.settings.features else {}),
+            **({"rename map": self.renamed} if self.renamed else {}),
             "predicts": f"{chunk} actions of {width} numbers; the data set has {recorded or 'no actions'}"
             + (f" of {recorded} numbers" if recorded and recorded != width else ""),
             "recorded actions": "not compared: " + self.other_actions
@@ -499,7 +584,11 @@ class RecordingSource(Source[LeRobotSource]):
 
     def _numbers(self, feature: str) -> str:
         width = self.folder.width(feature)
-        return "none" if width is None else f"{width} numbers: {', '.join(self.folder.names(feature)[:_LONGEST])}"
+        if width is None:
+            return "none"
+        misfit = self.folder.names_misfit(feature)
+        listed = ", ".join(self.folder.names(feature)[:_LONGEST])
+        return f"{width} numbers: {listed}" + (f" ({misfit})" if misfit else "")
 
 
 class RecordingPlayer(InputsPlayer):
@@ -565,22 +654,32 @@ class RecordingPlayer(InputsPlayer):
         return observation_of(pictures, state, self.row.instruction, recording.intrinsics)
 
 
-def mapped_cameras(typed: Pairs, model: Sequence[str], recorded: Sequence[str]) -> Pairs:
+def _features_text(features: Pairs) -> str:
+    return "; ".join(f"{name} from {feature}" for name, feature in features)
+
+
+def mapped_cameras(
+    typed: Pairs, model: Sequence[str], recorded: Sequence[str], renames: Mapping[str, str] = MappingProxyType({})
+) -> Pairs:
     """Return pairs of a camera of the model and a feature of the data set, in the model's order.
 
     Args:
-        typed: The pairs as the user mapped them; empty for equal names, or the only one of either.
+        typed: The pairs as the user mapped them; empty for those of the checkpoint's own map, equal names, or the
+            only one of either.
         model: The cameras of the model, the first one in front.
         recorded: The features of the data set that are pictures.
+        renames: The model's name of a feature by that of the data set, as the checkpoint's files say.
 
     Raises:
         RecordingError: For a camera or feature that does not exist. Also if the model's first camera gets no
-            picture.
+            picture, and if the checkpoint's map gives two pictures to one camera.
     """
     both = f"the model has {', '.join(model) or 'none'}; the data set has {', '.join(recorded) or 'none'}"
-    how = (
-        f"Map them, such as --camera {model[0] if model else 'base'}={recorded[0] if recorded else IMAGES + 'top'}"
-    )
+    by_name = renamed_features(recorded, renames)
+    if renames:
+        both += f"; the checkpoint's rename map says {map_text(renames)}"
+    example = by_name.get(f"{IMAGES}{model[0]}" if model else "", recorded) or [f"{IMAGES}top"]
+    how = f"Map them, such as --camera {model[0] if model else 'base'}={example[0]}"
     for camera, feature in typed:
         if camera not in model:
             raise RecordingError(f"--camera {camera}=…: the model has no such camera ({both}). {how}")
@@ -588,8 +687,13 @@ def mapped_cameras(typed: Pairs, model: Sequence[str], recorded: Sequence[str]) 
             raise RecordingError(f"--camera {camera}={feature}: the data set has no such picture ({both}). {how}")
     pairs = dict(typed)
     if not typed:
-        names = {feature.removeprefix(IMAGES): feature for feature in recorded}
-        pairs = {camera: names[camera] for camera in model if camera in names}
+        names = {name.removeprefix(IMAGES): features for name, features in by_name.items()}
+        if several := [camera for camera in model if len(names.get(camera, ())) > 1]:
+            raise RecordingError(
+                f"the checkpoint's rename map gives {' and '.join(names[several[0]])} to the camera {several[0]} "
+                f"({both}). {how}"
+            )
+        pairs = {camera: names[camera][0] for camera in model if camera in names}
         if not pairs and len(model) == len(recorded) == 1:
             pairs = {model[0]: recorded[0]}
     if not pairs or model[0] not in pairs:

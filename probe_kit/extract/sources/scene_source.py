@@ -30,6 +30,7 @@ from probe_kit.suite.sufficiency import Smallest
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
+    from probe_kit.hooks.contract.card import DeclaredInputs
 
 
 class ScenePlayer(Player):
@@ -321,9 +322,9 @@ class SceneSource(Source[SceneSettings]):
         blank, state = np.zeros((*scene.picture_shape, 3), np.uint8), np.zeros(8, np.float32)
         return Observation(blank, state, instruction, scene.intrinsics)
 
-    def shown_cameras(self, declared: Sequence[str] | None = None) -> tuple[str, ...]:
+    def shown_cameras(self, declared: "DeclaredInputs | None" = None) -> tuple[str, ...]:
         """Return the first camera: the scene has one."""
-        return tuple(declared or (CAMERA,))[:1]
+        return (declared.cameras if declared else (CAMERA,))[:1]
 
     def check(self, policy: "Policy", accept_units: bool) -> "tuple[Self, Policy]":
         """Raise UnitsError for a scene whose first states lie outside the statistics of a policy."""

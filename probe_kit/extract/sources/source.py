@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from probe_kit.env import SceneSpec
     from probe_kit.extract.sources.player import Opens
     from probe_kit.hooks import Policy
+    from probe_kit.hooks.contract.card import DeclaredInputs
     from probe_kit.runs.plan import Row
     from probe_kit.suite import Suite
 
@@ -235,17 +236,15 @@ class Source[Chosen: SourceSettings](ABC):
         """Return a sentence, without its stop, for all tasks that are one instruction, by spelling or by text."""
         return describe_spellings(self.instructions)
 
-    def early_checks(
-        self, cameras: Sequence[str], state: int | None, checkpoint: str
-    ) -> list[Callable[[], object]]:
-        """Return checks against the cameras and state width that a checkpoint declares, before it is loaded."""
-        del cameras, state, checkpoint
+    def early_checks(self, inputs: "DeclaredInputs", checkpoint: str) -> list[Callable[[], object]]:
+        """Return checks against the inputs that a checkpoint declares, before it is loaded."""
+        del inputs, checkpoint
         return []
 
-    def shown_cameras(self, declared: Sequence[str] | None = None) -> tuple[str, ...] | None:
+    def shown_cameras(self, declared: "DeclaredInputs | None" = None) -> tuple[str, ...] | None:
         """Return the model's cameras that get a picture, the first one in front; None if only a model can say.
 
-        They are those of the model once the source was checked against it. Before, `declared` has the cameras of a
+        They are those of the model once the source was checked against it. Before, `declared` has the inputs of a
         checkpoint that is not loaded yet, None where its files do not say.
         """
         del declared

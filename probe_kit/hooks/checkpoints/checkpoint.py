@@ -16,7 +16,7 @@ from probe_kit._system.bounded_files import (
     check_regular,
     load_json,
     load_yaml,
-    read_regular,
+    open_regular,
     read_regular_text,
 )
 from probe_kit.errors import CheckpointError, UsageError, WeightsError
@@ -467,7 +467,12 @@ def is_weights(path: Path) -> bool:
 
 def content_hashes(files: Mapping[str, Path]) -> dict[str, str]:
     """Return `file <name>` → sha256 of its bytes, for `ModelCard.settings`: a checkpoint's place has no effect."""
-    return {f"file {name}": hashlib.sha256(read_regular(path)).hexdigest() for name, path in files.items()}
+    return {f"file {name}": _content_hash(path) for name, path in files.items()}
+
+
+def _content_hash(path: Path) -> str:
+    with open_regular(path, pointers=True) as file:  # a loader may read none of a folder's files that are pointers
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def shard_name(name: object) -> str:

@@ -5,12 +5,14 @@ import json
 import shutil
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from probe_kit._system.bounded_files import read_json, read_json_object
-from probe_kit.errors import CheckpointError, WeightsError
+from probe_kit._system.bounded_files import load_json, read_json, read_json_object
+from probe_kit.errors import CheckpointError, ProbeKitError, WeightsError
 from probe_kit.hooks.checkpoints.checkpoint import (
     ADAPTER_FILE,
     CONFIG_FILE,
@@ -340,11 +342,14 @@ def check_files(
     file = folder / CONFIG_FILE
     adapter = adapter_in(folder) if weights else None
     if not file.is_file():
-        raise CheckpointError(f"{file} is missing; {folder} is not a checkpoint of {' or '.join(types)}")
+        way_out = _way_to_checkpoint(folder, types)
+        raise CheckpointError(f"{file} is missing; {folder} is not a checkpoint of {' or '.join(types)}{way_out}")
     config = read_json(file, CheckpointError, "Download the checkpoint again")
     model_type = _type_of(config)
     if not isinstance(model_type, str) or model_type not in types:
         way_out = dict(instead).get(str(model_type), "Pass the right --model")
+        if model_type is None and (elsewhere := _way_to_checkpoint(folder, types)):
+            raise CheckpointError(f"{file} names no type of model; expected {' or '.join(types)}{elsewhere}")
         raise CheckpointError(f"{file} holds a {model_type!r} model; expected {' or '.join(types)}. {way_out}")
     if not weights:
         return
@@ -352,6 +357,81 @@ def check_files(
     check_unambiguous(weights_folder)
     if lacking := missing_weights(weights_folder):
         raise WeightsError(f"no weights in {weights_folder}: {lacking}. {_way_to_weights(weights_folder)}")
+
+
+_DEEPEST = 4
+"""The folders between a training's output and the checkpoints in it, at most."""
+_MOST_FOLDERS = 2_000
+_OPENPI_STATISTICS = ("assets/norm_stats.json", "assets/*/norm_stats.json", "assets/*/*/norm_stats.json")
+_OPENPI_FIELDS = {"paligemma_variant", "action_expert_variant"}
+_NO_CONVERTER = (
+    "No release of openpi or lerobot converts it to lerobot's layout: take a checkpoint that lerobot-train saved, "
+    "or one of the hub in its layout"
+)
+
+
+def _way_to_checkpoint(folder: Path, types: Sequence[str]) -> str:
+    """Return where a checkpoint of these types lies near a folder, or whose layout it has; empty where unknown."""
+    if (below := _checkpoints_near(folder, types))[:1]:
+        more = f" (or {', '.join(map(str, below[1:3]))})" if len(below) > 1 else ""
+        return f". One lies in it: pass --checkpoint {below[0]}{more}"
+    statistics = [path for pattern in _OPENPI_STATISTICS for path in sorted(folder.glob(pattern))]
+    marks = [str(path.relative_to(folder)) for path in statistics]
+    if (folder / "params").is_dir() and (marks or (folder / "params" / "_METADATA").is_file()):
+        return (
+            f". This is openpi's JAX layout ({', '.join(['params', *marks])}). Its examples/"
+            f"convert_jax_model_to_pytorch.py writes openpi's PyTorch layout. {_NO_CONVERTER}"
+        )
+    if _fields_of(folder) & _OPENPI_FIELDS:
+        marks = ["config.json without a type", *marks]
+    return f". This is openpi's PyTorch layout ({', '.join(marks)}). {_NO_CONVERTER}" if marks else ""
+
+
+def _checkpoints_near(folder: Path, types: Sequence[str]) -> list[Path]:
+    """The folders of checkpoints of these types below one, or beside it as lerobot has them; the latest first."""
+    folders = [*_folders_below(folder), folder.absolute().parent / "pretrained_model"]
+    checkpoints = [path for path in folders if _has_type(path, types)]
+    distinct = {path.resolve(): path for path in sorted(checkpoints, key=_step)}
+    return list(distinct.values())[::-1]
+
+
+def _folders_below(folder: Path) -> list[Path]:
+    """The folders in one, up to `_DEEPEST` deep and `_MOST_FOLDERS` in all: it may be a home, or a whole disk."""
+    below, level = list[Path](), [folder]
+    for _ in range(_DEEPEST):
+        deeper: list[Path] = []
+        for path in level:
+            if len(below) + len(deeper) < _MOST_FOLDERS:
+                with suppress(OSError):
+                    deeper += [inner for inner in islice(path.iterdir(), _MOST_FOLDERS) if inner.is_dir()]
+        below, level = below + deeper, deeper
+    return below
+
+
+def _step(folder: Path) -> list[tuple[float, str]]:
+    """The key by which later checkpoints come last: a number at a name's end is a step; `last` is the latest."""
+    ends = [(part, part.rpartition("-")[2]) for part in folder.parts]
+    return [
+        (float("inf") if part == "last" else float(end) if end.isdecimal() else -1, part) for part, end in ends
+    ]
+
+
+def _has_type(folder: Path, types: Sequence[str]) -> bool:
+    """Whether a folder has the configuration of a model of these types, or is an adapter without any."""
+    try:
+        return _type_of(load_json(folder / CONFIG_FILE)) in types
+    except FileNotFoundError:
+        return (folder / ADAPTER_FILE).is_file()
+    except (OSError, ValueError, ProbeKitError):
+        return False
+
+
+def _fields_of(folder: Path) -> set[str]:
+    try:
+        config = load_json(folder / CONFIG_FILE)
+    except (OSError, ValueError):
+        return set()
+    return set(config) if isinstance(config, dict) else set()
 
 
 def _type_of(config: Any) -> Any:

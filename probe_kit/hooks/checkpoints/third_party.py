@@ -23,7 +23,9 @@ from typing import Any, TextIO
 import numpy as np
 from rich.file_proxy import FileProxy
 
+from probe_kit._system.bounded_files import recorded_files
 from probe_kit._system.escaping import terminal_safe
+from probe_kit._system.foreign_files import check_no_pointers, reason_of
 from probe_kit.errors import CheckpointError, InstructionError, PolicyFailedError, ProbeKitError, WeightsError
 from probe_kit.hooks.checkpoints.folders import with_adapters_named
 from probe_kit.hooks.contract.observation import Observation
@@ -188,8 +190,6 @@ def _noted_interruptions() -> Iterator[Interruptions]:
 
 # -- names of errors ------------------------------------------------------------------------------------------
 
-_LONGEST = 300
-
 
 @contextmanager
 def naming_checkpoint(model: str, location: str) -> Iterator[None]:
@@ -244,6 +244,10 @@ def while_acting(model: str, location: str, limit: float | None = None) -> Itera
             ) from error
 
 
+_MOST_FILES = 8
+"""The most files that an error of loading names: those that were read last, because one of them may be damaged."""
+
+
 @contextmanager
 def while_loading(model: str, location: str) -> Iterator[None]:
     """Turn errors of a loader's code in the body into errors of ours.
@@ -257,16 +261,23 @@ def while_loading(model: str, location: str) -> Iterator[None]:
         PolicyFailedError: For a loader that ends the process.
     """
     try:
-        with _said_when_asked_for("bitsandbytes"), naming_checkpoint(model, location):
+        with (
+            _said_when_asked_for("bitsandbytes"),
+            naming_checkpoint(model, location),
+            recorded_files() as files,
+        ):
             yield
     except ProbeKitError:
         raise
     except SystemExit as error:
         raise PolicyFailedError(f"{model} cannot be loaded: its code called sys.exit({error.code!r})") from error
     except Exception as error:
+        check_no_pointers(Path(location).expanduser())
+        latest = list(dict.fromkeys(path.name for path in reversed(files)))[:_MOST_FILES]
+        read = f" (it had read {', '.join(latest)})" if latest else ""
         raise CheckpointError(
-            f"{model} cannot be loaded from {location}: {in_words(error)}. A file of the checkpoint is damaged, "
-            "or was made for another version; download it again"
+            f"{model} cannot be loaded from {location}: {in_words(error)}. A file of the checkpoint is damaged"
+            f"{read}, or was made for another version; download it again"
         ) from error
 
 
@@ -286,8 +297,5 @@ def _said_when_asked_for(library: str) -> Iterator[None]:
 
 
 def in_words(error: BaseException) -> str:
-    """Return the class and the first line of an error."""
-    if isinstance(error, SystemExit):
-        return f"it called sys.exit({error.code!r})"
-    first = (str(error).strip().splitlines() or ["no message"])[0]
-    return f"{type(error).__name__}: {first[:_LONGEST]}"
+    """Return the class and the first line of an error, and of the error that it was raised from."""
+    return f"it called sys.exit({error.code!r})" if isinstance(error, SystemExit) else reason_of(error)

@@ -7,15 +7,15 @@ from copy import deepcopy
 from dataclasses import asdict, dataclass, replace
 from itertools import accumulate, takewhile
 from pathlib import Path
-from pickle import UnpicklingError
 from typing import Any, NamedTuple
 from zipfile import ZIP_STORED, BadZipFile, ZipFile
 
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import safe_open
 from torch import Tensor, nn
 
 from probe_kit._system.bounded_files import load_json
+from probe_kit._system.foreign_files import while_reading
 from probe_kit._system.imports import require
 from probe_kit.errors import WeightsError
 from probe_kit.hooks.checkpoints.checkpoint import INDEX_FILE, WEIGHTS_FILE, check_unambiguous, shard_name
@@ -398,12 +398,9 @@ def _shards(index: Path) -> dict[str, set[str] | None]:
 def _read_file(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     if not path.is_file():
         raise WeightsError(f"{path} is missing; download the checkpoint again")
-    try:
-        with safe_open(path, "pt") as file:
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-            metadata = file.metadata() or {}
-    except (SafetensorError, OSError, ValueError, AttributeError) as error:
-        raise WeightsError(f"{path} cannot be read ({error}); download the checkpoint again") from error
+    with while_reading(path, WeightsError, "Download the checkpoint again"), safe_open(path, "pt") as file:
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        metadata = file.metadata() or {}
     check_kinds(tensors, path)
     return tensors, metadata
 
@@ -431,12 +428,9 @@ def unpickled(path: Path) -> Any:
         WeightsError: For a file that cannot be read as plain tensors, or holds them compressed.
     """
     _check_not_compressed(path)
-    try:
+    advice = "Expected plain tensors: it may be damaged or unsafe"
+    with while_reading(path, WeightsError, advice):
         return torch.load(path, map_location="cpu", weights_only=True)
-    except (UnpicklingError, RuntimeError, EOFError, OSError, ValueError, KeyError, AttributeError) as error:
-        raise WeightsError(
-            f"{path} cannot be read as plain tensors ({error}); it may be damaged or unsafe"
-        ) from error
 
 
 def _check_not_compressed(path: Path) -> None:

@@ -73,6 +73,21 @@ class SourceWeights:
 
 
 @dataclass(frozen=True)
+class DeclaredInputs:
+    """The inputs that a checkpoint declares, by its files or as it is loaded.
+
+    Attributes:
+        cameras: The cameras that a picture can be given for, in order.
+        state: The count of numbers of the state; None where none is read, or no file says it.
+        renames: The model's name of a feature by the name that a data set has, as the checkpoint's files say.
+    """
+
+    cameras: tuple[str, ...]
+    state: int | None = None
+    renames: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class ModelCard:
     """The identity of a loaded model: weights, settings and shape.
 
@@ -96,6 +111,8 @@ class ModelCard:
             the family's own.
         repositories: Commits of further repositories of the hub that were read, by name: of the base of an
             adapter, a vision-language model or a tokenizer.
+        renames: The model's name of a feature by the name that a data set has, as the checkpoint's files rename
+            them; see `DeclaredInputs`.
     """
 
     family: str
@@ -120,11 +137,16 @@ class ModelCard:
     source: str | None = None
     source_weights: SourceWeights | None = None
     repositories: Mapping[str, str] = field(default_factory=dict)
+    renames: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def shown_cameras(self) -> tuple[str, ...]:
         """The cameras that get a picture; a model may have declared further ones, which stay empty."""
         return shown_cameras(self.cameras, self.needs)
+
+    def inputs(self, state: int | None = None) -> DeclaredInputs:
+        """Return cameras and renames beside the count of numbers of the state that the loaded model reads."""
+        return DeclaredInputs(self.cameras, state, self.renames)
 
     def to_json(self) -> dict[str, Any]:
         """Return plain values, as stored in a run's certificate."""
@@ -137,6 +159,7 @@ class ModelCard:
             "audit": dict(self.audit),
             "settings": dict(self.settings),
             "repositories": dict(self.repositories),
+            "renames": dict(self.renames),
             "needs": sorted(self.needs),
             "source_weights": None if self.source_weights is None else asdict(self.source_weights),
         }

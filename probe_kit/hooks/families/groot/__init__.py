@@ -35,6 +35,15 @@ FAMILIES = (
             "-M vlm=FOLDER. No remote code. One observation per call: its bridge reads padding"
         ),
         config_types=("groot", "Gr00tN1d7"),
+        instead=tuple(
+            (kind, f"It is a GR00T {version}, and only N1.7 is read here: take a fine-tune of N1.7")
+            for version, kinds in (
+                ("N1", ("gr00t_n1", "GR00T_N1")),
+                ("N1.5", ("gr00t_n1_5", "GR00T_N1_5", "gr00t_n1d5", "Gr00tN1d5")),
+                ("N1.6", ("gr00t_n1_6", "GR00T_N1_6", "gr00t_n1d6", "Gr00tN1d6")),
+            )
+            for kind in kinds
+        ),
         always_float32=True,
         parameters={"": 3_144_016_000},
         declared={

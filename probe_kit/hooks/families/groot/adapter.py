@@ -22,6 +22,7 @@ from probe_kit.hooks.families.groot.network import (
     GrootChoice,
     Places,
     build_groot,
+    check_version,
     flow_actions,
     is_nvidias,
     network_config,
@@ -29,8 +30,10 @@ from probe_kit.hooks.families.groot.network import (
 )
 from probe_kit.hooks.families.groot.packing import NvidiasPictures, Packing, Steps, lerobots_rule, read_steps
 from probe_kit.hooks.families.groot.units import action_units, state_units
+from probe_kit.hooks.families.shared.kinds import IMAGES
 from probe_kit.hooks.families.shared.lerobot.flow import PackedPolicy
 from probe_kit.hooks.families.shared.lerobot.normaliser import Normaliser
+from probe_kit.hooks.families.shared.lerobot.pipelines import PACKING_STEP, read_views, step_fields
 from probe_kit.hooks.families.shared.qwen import merger_norm
 from probe_kit.hooks.families.shared.taps import TOWER, Stack
 from probe_kit.hooks.outputs import Produce, RecordedRun, numpy_of
@@ -48,6 +51,15 @@ _DIFFUSERS = {"attention": "attn1", "heads": "attn1.to_out.0", "mlp": "ff"}
 def _lerobots_names(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Return tensors by lerobot's names, also of NVIDIA's files."""
     return renamed_tensors(tensors, lambda name: name if name.startswith(_MODEL) else f"{_MODEL}{name}")
+
+
+def _without_unread_views(config: Any, folder: Path) -> tuple[str, ...]:
+    """Take the pictures that lerobot's packing leaves out from the configuration, and return their names."""
+    views = step_fields(folder).get(PACKING_STEP, {}).get("video_modality_keys")
+    packed = read_views(list(config.image_features), views) if views else list(config.image_features)
+    unread = tuple(name for name in config.image_features if name not in packed)
+    config.input_features = {name: entry for name, entry in config.input_features.items() if name not in unread}
+    return tuple(name.removeprefix(IMAGES) for name in unread)
 
 
 class Groot(PackedPolicy):
@@ -103,9 +115,20 @@ class Groot(PackedPolicy):
             )
         else:
             config = super().parse_config(folder, evaluation)
+            config.unread_pictures = _without_unread_views(config, folder)
         config.resize, config.letterbox = evaluation.resize, evaluation.letterbox
         config.places = Places.of(folder, config.base_model_path, evaluation.vlm)
         return config
+
+    @classmethod
+    def current_values(cls, values: dict[str, Any], path: Path) -> dict[str, Any]:
+        """Return the fields as they are.
+
+        Raises:
+            CheckpointError: For a fine-tune of an older GR00T.
+        """
+        check_version(values, path)
+        return values
 
     @classmethod
     def build(cls, config: Any, folder: Path) -> Any:
@@ -162,7 +185,9 @@ class Groot(PackedPolicy):
         encode = self._steps.encode
         rule = encode.rule if isinstance(encode, NvidiasPictures) else lerobots_rule(encode)
         bars = "with black bars to a square first" if encode.letter_box_transform else "without letterbox"
-        return (*super()._notes(), *((video,) if frames > 1 else ()), f"pictures: {bars}, {rule}")
+        unread = getattr(self.config, "unread_pictures", ())
+        views = (f"lerobot leaves out {', '.join(unread)} (video_modality_keys)",) if unread else ()
+        return (*super()._notes(), *views, *((video,) if frames > 1 else ()), f"pictures: {bars}, {rule}")
 
     # -- acting ------------------------------------------------------------------------------------------
 
@@ -177,10 +202,6 @@ class Groot(PackedPolicy):
     @property
     def _head(self) -> Any:
         return self.network._groot_model.action_head
-
-    @property
-    def _action_numbers(self) -> int:
-        return int(self.config.output_features["action"].shape[0])
 
     def denoise(self, batch: Mapping[str, Tensor], noise: Tensor) -> Tensor:
         """Return the steps and numbers that this embodiment has."""

@@ -7,9 +7,11 @@ with noise that is given.
 Source: arXiv 2503.14734 and the released GR00T N1.7, through lerobot's `GrootPolicy`.
 """
 
+import re
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -18,6 +20,7 @@ import torch
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.policies.groot import groot_n1_7, modeling_groot
 from lerobot.policies.groot.configuration_groot import (
+    GROOT_N1_5_REMOVAL_GUIDANCE,
     GROOT_N1_7_BACKBONE_MODEL,
     GrootConfig,
     is_raw_groot_n1_7_checkpoint,
@@ -29,6 +32,7 @@ from torch import Tensor
 from transformers import BatchFeature
 
 from probe_kit._system.bounded_files import read_json_object
+from probe_kit._system.foreign_files import while_reading
 from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE
 from probe_kit.hooks.checkpoints.folders import inside_or_hub
@@ -183,6 +187,25 @@ class Places:
         return cls(content, base_folder, files, VLM if model_name.rstrip("/") == VLM else str(files))
 
 
+_OLDER = re.compile(r"gr00t[-_]?n1(?:[_.d]([0-6]))?(?![_.d]?\d)|^n?1[_.d]?([0-6])$", re.IGNORECASE)
+"""The name of a version before N1.7, as base models and `model_version` spell it."""
+
+
+def check_version(values: Mapping[str, Any], path: Path) -> None:
+    """Raise CheckpointError for the configuration of a fine-tune of an older GR00T, with lerobot's way out."""
+    if values.get("tokenizer_assets_repo") is not None:  # of N1.5 alone
+        minor: str | None = "5"
+    else:
+        texts = (values.get(name) for name in ("base_model_path", "model_version"))
+        older = next((match for text in texts if (match := _OLDER.search(str(text)))), None)
+        minor = None if older is None else older[1] or older[2] or ""
+    if minor is not None:
+        raise CheckpointError(
+            f"{path} describes a fine-tune of GR00T N1{minor and '.'}{minor}; lerobot {version('lerobot')} reads "
+            f"N1.7 alone. {GROOT_N1_5_REMOVAL_GUIDANCE if minor == '5' else 'Take a fine-tune of N1.7'}"
+        )
+
+
 def is_nvidias(folder: Path) -> bool:
     """Whether a folder has NVIDIA's layout."""
     return bool(is_raw_groot_n1_7_checkpoint(folder))
@@ -221,15 +244,16 @@ def nvidias_config(folder: Path, embodiment: str | None) -> GrootConfig:
     if not all(widths.values()):
         raise CheckpointError(f"{folder}: statistics.json has no numbers for state or action of {tag!r}. {_AGAIN}")
     cameras = modalities[tag].get("video", {}).get("modality_keys", [])
-    return GrootConfig(
-        device="cpu",
-        base_model_path=str(folder),
-        embodiment_tag=tag,
-        max_state_dim=network.get("max_state_dim", 132),
-        max_action_dim=network.get("max_action_dim", 132),
-        input_features={
-            **{f"{IMAGES}{camera}": PolicyFeature(FeatureType.VISUAL, (3, 256, 256)) for camera in cameras},
-            STATE: PolicyFeature(FeatureType.STATE, (widths["state"],)),
-        },
-        output_features={"action": PolicyFeature(FeatureType.ACTION, (widths["action"],))},
-    )
+    with while_reading(folder / CONFIG_FILE):
+        return GrootConfig(
+            device="cpu",
+            base_model_path=str(folder),
+            embodiment_tag=tag,
+            max_state_dim=network.get("max_state_dim", 132),
+            max_action_dim=network.get("max_action_dim", 132),
+            input_features={
+                **{f"{IMAGES}{camera}": PolicyFeature(FeatureType.VISUAL, (3, 256, 256)) for camera in cameras},
+                STATE: PolicyFeature(FeatureType.STATE, (widths["state"],)),
+            },
+            output_features={"action": PolicyFeature(FeatureType.ACTION, (widths["action"],))},
+        )

@@ -22,13 +22,13 @@ from lerobot.policies.groot.processor_groot import (
     make_groot_pre_post_processors,
 )
 from numpy.typing import NDArray
-from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor
 from torchvision.transforms.v2 import functional
 from transformers import AutoTokenizer, Qwen2VLImageProcessor, Qwen3VLProcessor, Qwen3VLVideoProcessor
 
 from probe_kit._system.bounded_files import read_json_object
+from probe_kit._system.foreign_files import while_reading
 from probe_kit.errors import CheckpointError, InstructionError
 from probe_kit.hooks.checkpoints.checkpoint import shard_name
 from probe_kit.hooks.families.shared.kinds import IMAGES, STATE
@@ -361,22 +361,23 @@ def read_steps(
 
 def _nvidias_steps(folder: Path, config: GrootConfig, settings: Mapping[str, Any]) -> Steps:
     fields = read_state_fields(folder, settings, str(config.embodiment_tag))
-    before, behind = make_groot_pre_post_processors(config)
+    with while_reading(folder / PROCESSOR_FILE):
+        before, behind = make_groot_pre_post_processors(config)
     read = _select_steps([*before.steps, *behind.steps], "processor_config.json and statistics.json")
     return replace(read, fields=fields)
 
 
 def _lerobots_steps(folder: Path, config: GrootConfig) -> Steps:
     check_pipelines(folder)
-    saved = [step for name in (PREPROCESSOR, POSTPROCESSOR) for step in saved_steps(folder, name)]
-    steps = [_built(folder, step) for step in saved if step.name not in _HARMLESS]
+    saved = [(name, step) for name in (PREPROCESSOR, POSTPROCESSOR) for step in saved_steps(folder, name)]
+    steps = [_built(folder, name, step) for name, step in saved if step.name not in _HARMLESS]
     # What the configuration says of the gripper counts, as in lerobot, not what the step was saved with.
     _apply_groot_action_decode_transform(SimpleNamespace(steps=steps), config.action_decode_transform)
     return _select_steps(steps, "policy_preprocessor.json and policy_postprocessor.json")
 
 
-def _built(folder: Path, saved: SavedStep) -> Any:
-    """Build lerobot's object of a saved step; never by the name of a class, which could be any.
+def _built(folder: Path, pipeline: str, saved: SavedStep) -> Any:
+    """Build lerobot's object of a saved step of a pipeline; never by the name of a class, which could be any.
 
     Raises:
         CheckpointError: For an unknown step, for one that cannot be built, and for statistics that are missing.
@@ -386,18 +387,14 @@ def _built(folder: Path, saved: SavedStep) -> Any:
             f"{folder} has the step {saved.name!r}, which changes numbers in a way probe_kit does not know. Known "
             f"are {', '.join((*_STEPS, *_HARMLESS))}"
         )
-    try:
+    with while_reading(folder / f"{pipeline}.json", advice="Save it with lerobot's own pipeline"):
         step = _STEPS[saved.name](**saved.config)
-    except TypeError as error:
-        raise CheckpointError(f"{folder}: the step {saved.name} cannot be built ({error})") from error
     if saved.state is not None:
         file = folder / shard_name(saved.state)
         if not file.is_file():
             raise CheckpointError(f"{file} is missing: it holds the statistics of {saved.name}")
-        try:
+        with while_reading(file, advice="Download the checkpoint again"):
             step.load_state_dict(load_file(file))
-        except (SafetensorError, OSError, RuntimeError) as error:
-            raise CheckpointError(f"{file} cannot be read ({error}); download the checkpoint again") from error
     return step
 
 
@@ -440,7 +437,7 @@ class Packing:
                 video_processor=load_pretrained(Qwen3VLVideoProcessor, folder),
                 chat_template=tokenizer.chat_template,
             )
-        except (OSError, ValueError) as error:
+        except (CheckpointError, OSError, ValueError) as error:
             raise CheckpointError(
                 f"{folder} lacks the tokenizer or processor of the vision-language model ({error}). Pass its "
                 "folder as -M vlm=FOLDER"

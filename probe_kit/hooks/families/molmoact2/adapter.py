@@ -360,10 +360,6 @@ class MolmoAct2(PackedPolicy):
         blocks = self.network._backbone().action_expert.blocks
         return recording_weights([block.cross_attn for block in blocks], note, _on_the_prompt)
 
-    @property
-    def _action_numbers(self) -> int:
-        return int(self.config.output_features["action"].shape[0])
-
     def _check_graphs(self) -> None:
         if uses_cuda_graphs(self.network):
             raise CaptureError(

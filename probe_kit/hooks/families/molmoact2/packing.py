@@ -18,6 +18,7 @@ from probe_kit.hooks.families.shared.kinds import STATE
 from probe_kit.hooks.families.shared.lerobot.flow import PackedRow, label_groups
 from probe_kit.hooks.families.shared.lerobot.normaliser import Normaliser
 from probe_kit.hooks.families.shared.lerobot.pipelines import MASKED, check_same, step_fields
+from probe_kit.models.checkpoint_files import while_reading_pretrained
 
 
 @dataclass(frozen=True)
@@ -176,21 +177,22 @@ class Packing:
 
     def __init__(self, config: Any, actions: int) -> None:
         """Make the packing step of lerobot from its configuration; `actions` counts the numbers of an action."""
-        self.step = MolmoAct2PackInputsProcessorStep(
-            checkpoint_path=config.checkpoint_path,
-            action_mode="continuous",
-            setup_type=config.setup_type,
-            control_mode=config.control_mode,
-            normalize_language=config.normalize_language,
-            add_setup_tokens=config.add_setup_tokens,
-            add_control_tokens=config.add_control_tokens,
-            num_state_tokens=config.num_state_tokens,
-            max_sequence_length=config.max_sequence_length,
-            chunk_size=config.chunk_size,
-            max_action_dim=config.expected_max_action_dim,
-            env_action_dim=actions,
-        )
-        self.tokenizer = self.step.processor.tokenizer
+        with while_reading_pretrained(Path(config.checkpoint_path), "AutoProcessor"):
+            self.step = MolmoAct2PackInputsProcessorStep(
+                checkpoint_path=config.checkpoint_path,
+                action_mode="continuous",
+                setup_type=config.setup_type,
+                control_mode=config.control_mode,
+                normalize_language=config.normalize_language,
+                add_setup_tokens=config.add_setup_tokens,
+                add_control_tokens=config.add_control_tokens,
+                num_state_tokens=config.num_state_tokens,
+                max_sequence_length=config.max_sequence_length,
+                chunk_size=config.chunk_size,
+                max_action_dim=config.expected_max_action_dim,
+                env_action_dim=actions,
+            )
+            self.tokenizer = self.step.processor.tokenizer
 
     def row(self, pictures: dict[str, NDArray[np.uint8]], task: str, state: NDArray[np.float32]) -> PackedRow:
         """Pack one row.

@@ -36,6 +36,7 @@ from tokenizers import Tokenizer
 from torch import Tensor, nn
 
 from probe_kit._system.bounded_files import load_json
+from probe_kit._system.foreign_files import while_reading
 from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.hooks.checkpoints.folders import inside_or_hub
 from probe_kit.hooks.contract.model import Unembedding
@@ -105,12 +106,12 @@ class FastTokenizer:
             raise CheckpointError(
                 f"{folder} is no FAST tokenizer: it has no {' and no '.join(lacking)}. Download it again"
             )
-        try:
+        again = "Download it again"
+        with while_reading(folder / FILES[1], advice=again):
             values = load_json(folder / FILES[1])
             scale, least = float(values["scale"]), int(values["min_token"])
+        with while_reading(folder / FILES[0], advice=again):
             pieces = Tokenizer.from_file(str(folder / FILES[0]))
-        except (KeyError, TypeError, ValueError, Exception) as error:  # tokenizers raises Exception itself
-            raise CheckpointError(f"the FAST tokenizer in {folder} cannot be read ({error!r})") from error
         if not scale > 0:
             raise CheckpointError(f"{folder / FILES[1]} has scale {scale}; expected a positive number")
         return cls(pieces, scale, least)

@@ -1,7 +1,8 @@
 """Declarations that all families of one kind share, for plans too. Imports no torch and no lerobot."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Any, Literal
 
 from probe_kit.hooks.contract.declared import Interventions, Option
@@ -95,10 +96,33 @@ _EMPTY_CAMERA = "empty_camera"
 """The beginning of the names that lerobot gives to cameras that never get a picture."""
 
 
-def cameras_of(features: Iterable[str]) -> tuple[str, ...]:
-    """Return the cameras among names of features that a picture can be given for, in their order."""
-    names = (name.removeprefix(IMAGES) for name in features if name.startswith(IMAGES))
-    return tuple(name for name in names if not name.startswith(_EMPTY_CAMERA))
+def cameras_of(features: Iterable[str], renames: Mapping[str, str] = MappingProxyType({})) -> tuple[str, ...]:
+    """Return the cameras among names of features that a picture can be given for, in their order.
+
+    An empty camera is one of them where `renames` gives its name to a picture of a data set, as lerobot then does.
+    """
+    pictures = (name for name in features if name.startswith(IMAGES))
+    names = ((name, name.removeprefix(IMAGES)) for name in pictures)
+    return tuple(
+        camera for name, camera in names if name in renames.values() or not camera.startswith(_EMPTY_CAMERA)
+    )
+
+
+def map_text(renames: Mapping[str, str]) -> str:
+    """Return a checkpoint's own map of names in words; empty for none."""
+    return ", ".join(f"{name} → {renamed}" for name, renamed in renames.items())
+
+
+def renamed_features(features: Iterable[str], renames: Mapping[str, str]) -> dict[str, list[str]]:
+    """Return the names that a data set has, in its order, by the name that a checkpoint gives each.
+
+    As in lerobot, all are renamed at once, so that two can exchange their names; several under one name are two
+    features for one input.
+    """
+    by_name: dict[str, list[str]] = {}
+    for feature in features:
+        by_name.setdefault(renames.get(feature, feature), []).append(feature)
+    return by_name
 
 
 Picture = Literal["padded", "padded-top-left", "squashed"]

@@ -1,17 +1,16 @@
 """Loading of a network: configuration, renamed weights, random weights, and the card."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
-from huggingface_hub.errors import StrictDataclassError
 from torch import Tensor, nn
 
 from probe_kit._system.bounded_files import load_json
-from probe_kit.errors import CheckpointError, UsageError, WeightsError
+from probe_kit._system.foreign_files import while_reading
+from probe_kit.errors import UsageError, WeightsError
 from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE, chosen_dtype, content_hashes, side_files
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.checkpoints.weights import Weights, WeightsAudit, doubles, load_weights, read_weights
@@ -227,9 +226,7 @@ def _stored_dtype(weights: Weights) -> str:
 # -- vision-language models -----------------------------------------------------------------------------------
 
 Build = Callable[[Any, torch.dtype, str], Any]
-# What Python, torch and transformers raise for numbers and names in a configuration that cannot be. Many kinds,
-# because nothing checks a configuration before its numbers reach the layers.
-_OF_VALUES = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RuntimeError, AssertionError)
+_OTHER_MODEL = "It describes no network of this family: download it again, or pass the right --model"
 
 
 @dataclass(frozen=True)
@@ -266,11 +263,11 @@ def load_vlm(
         raise UsageError("name a folder or hub id as --checkpoint")
     folder = checkpoint_folder(checkpoint)
     file = folder / CONFIG_FILE
-    with _describing(file):
+    with while_reading(file, advice=_OTHER_MODEL):
         config = recipe.config(without_precision(load_json(file)))
 
     def build(kind: torch.dtype, device: str) -> Any:
-        with _describing(file):
+        with while_reading(file, advice=_OTHER_MODEL):
             return recipe.build(config, kind, device)
 
     return load_network(
@@ -284,20 +281,3 @@ def load_vlm(
         weights_seed,
         name_in_module=lambda name: renamed(name, recipe.names),
     )
-
-
-@contextmanager
-def _describing(file: Path) -> Iterator[None]:
-    """Run the body, whose errors are because of what a configuration says.
-
-    Raises:
-        CheckpointError: For an error in the body; it names the file.
-    """
-    try:
-        yield
-    except (*_OF_VALUES, StrictDataclassError, OSError) as error:
-        reason = " ".join(str(error).split())[:300]
-        raise CheckpointError(
-            f"{file} describes no network of this family ({type(error).__name__}: {reason}); download it "
-            "again, or pass the right --model"
-        ) from error

@@ -14,6 +14,7 @@ from typing import Any
 from tokenizers import Tokenizer
 
 from probe_kit._system.bounded_files import load_json
+from probe_kit._system.foreign_files import while_reading
 from probe_kit.errors import CheckpointError, InstructionError, UsageError
 from probe_kit.hooks.checkpoints.checkpoint import GENERATION_FILE
 
@@ -59,7 +60,8 @@ class TokenizerFile:
     @cached_property
     def tokenizer(self) -> Any:
         """The library's tokenizer."""
-        return Tokenizer.from_file(str(self.file))
+        with while_reading(self.file, advice="Take the tokenizer that came with the checkpoint"):
+            return Tokenizer.from_file(str(self.file))
 
     @cached_property
     def settings(self) -> dict[str, Any]:

@@ -9,16 +9,18 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from safetensors import SafetensorError, safe_open
+from safetensors import safe_open
 from safetensors.numpy import load_file
 
 from probe_kit._system.bounded_files import parse_json, read_regular
+from probe_kit._system.foreign_files import while_reading
 from probe_kit.errors import CheckpointError
 from probe_kit.hooks.checkpoints.checkpoint import shard_name
 from probe_kit.hooks.families.shared.lerobot.pipelines import (
     MASKED,
     NORMALISERS,
     reads_state_as_it_is,
+    rename_map,
     saved_steps,
 )
 from probe_kit.models.bounds import check_bounds, check_deviations
@@ -164,7 +166,9 @@ def read_normaliser(folder: Path, pipeline: str, feature: str, kind: str) -> Nor
             if mode == "IDENTITY" or (kind == "STATE" and reads_state_as_it_is(step, feature)):
                 return Normaliser("IDENTITY", np.zeros(0, np.float32), np.zeros(0, np.float32), 0.0, path.name)
             low, high = _statistics(folder, step.state, feature, mode)
-            return Normaliser(mode, low, high, float(step.config.get("eps", _EPS)), str(step.state))
+            with while_reading(path):
+                eps = float(step.config.get("eps", _EPS))
+            return Normaliser(mode, low, high, eps, str(step.state))
     raise CheckpointError(f"{path} has no normaliser step: the units of {feature} are unknown")
 
 
@@ -173,14 +177,19 @@ def _statistics(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     if mode not in _NEEDED:
         raise CheckpointError(f"normalisation {mode!r} of {feature} is not one of {', '.join(_NEEDED)}, IDENTITY")
-    try:
+    with while_reading(folder / str(name), advice="Download it again"):
         path = folder / shard_name(name) if name else None
         arrays = load_file(path) if path is not None and path.is_file() else {}
-    except (SafetensorError, OSError, ValueError) as error:
-        raise CheckpointError(f"{folder / str(name)} cannot be read ({error}); download it again") from error
     keys = [f"{feature}.{statistic}" for statistic in _NEEDED[mode]]
     missing = [key for key in keys if key not in arrays]
     if missing:
+        sources = [name for name, renamed in rename_map(folder).items() if renamed == feature]
+        if stored := next((source for source in sources if f"{source}.{_NEEDED[mode][0]}" in arrays), None):
+            raise CheckpointError(
+                f"{path} has the statistics of {stored}, which the preprocessor's rename map calls {feature}: "
+                f"lerobot looks them up as {feature}, and so leaves that feature as it is. Fine-tune it on a data "
+                f"set whose feature is called {feature}"
+            )
         raise CheckpointError(
             f"{folder} has no statistics {', '.join(missing)} (looked in {name}): its {feature} has no physical "
             "unit. Take the statistics of the data set it was trained on"
@@ -196,12 +205,9 @@ def read_buffers(folder: Path) -> dict[str, NDArray[np.float32]]:
     """
     buffers: dict[str, NDArray[np.float32]] = {}
     for path in sorted(folder.glob("model*.safetensors")):
-        try:
-            with safe_open(path, "pt") as file:
-                names = [name for name in file.keys() if name.startswith(STATISTICS)]  # noqa: SIM118
-                buffers |= {name: file.get_tensor(name).float().numpy() for name in names}
-        except SafetensorError as error:
-            raise CheckpointError(f"{path} cannot be read ({error}); download the checkpoint again") from error
+        with while_reading(path, advice="Download the checkpoint again"), safe_open(path, "pt") as file:
+            names = [name for name in file.keys() if name.startswith(STATISTICS)]  # noqa: SIM118
+            buffers |= {name: file.get_tensor(name).float().numpy() for name in names}
     return buffers
 
 

@@ -6,11 +6,14 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from safetensors import SafetensorError, safe_open
+from safetensors import safe_open
 
-from probe_kit._system.bounded_files import read_json_object
+from probe_kit._system.bounded_files import load_json, read_json_object
+from probe_kit._system.foreign_files import while_reading
 from probe_kit.errors import CheckpointError
-from probe_kit.hooks.checkpoints.checkpoint import shard_name
+from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE, shard_name
+from probe_kit.hooks.contract.card import DeclaredInputs
+from probe_kit.hooks.families.shared.kinds import IMAGES, STATE, cameras_of
 
 Inert = Mapping[str, tuple[Any, ...] | None]
 """The fields of a newer lerobot by name, with the values under which inference is as without; None for any."""
@@ -87,8 +90,9 @@ def check_one_frame(config: Any, folder: Path) -> None:
 # -- pipelines ------------------------------------------------------------------------------------------------
 
 PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor", "policy_postprocessor"
+RENAMING = "rename_observations_processor"
 _HARMLESS = (
-    "rename_observations_processor", "to_batch_processor", "to_batch_processor_action",
+    RENAMING, "to_batch_processor", "to_batch_processor_action",
     "to_batch_processor_observation", "to_batch_processor_complementary_data", "device_processor",
 )  # fmt: skip
 """The steps that change no number: observations come here under the names of the policy."""
@@ -103,7 +107,7 @@ _FRAME = dict.fromkeys(("joint_signs", "joint_offsets"), _ANY)
 _TASK = ("task",)
 """The values of `task_key` that are honoured: lerobot puts the instruction there."""
 _FIELDS: Mapping[str, Mapping[str, tuple[Any, ...] | None]] = {
-    "rename_observations_processor": {"rename_map": _ANY},
+    RENAMING: {"rename_map": _ANY},
     "device_processor": {"device": _ANY, "float_dtype": (None, "float32")},
     **dict.fromkeys((*NORMALISERS, *MASKED), _NORMALISED),
     RELATIVE[0]: dict.fromkeys(("enabled", "exclude_joints", "action_names"), _ANY),
@@ -190,6 +194,62 @@ def step_fields(folder: Path) -> dict[str, Mapping[str, Any]]:
     """The fields of every saved step by its name, those before the policy first."""
     steps = (*saved_steps(folder, PREPROCESSOR), *saved_steps(folder, POSTPROCESSOR))
     return {step.name: step.config for step in steps}
+
+
+def rename_map(folder: Path) -> dict[str, str]:
+    """Return the policy's name of a feature by that of the data set, as the saved preprocessor renames them.
+
+    `lerobot-train --rename_map` saves it. lerobot renames what begins with `observation.`, and all at once.
+
+    Raises:
+        CheckpointError: For a map that does not map names to names.
+    """
+    renames: dict[str, str] = {}
+    for step in saved_steps(folder, PREPROCESSOR):
+        if step.name != RENAMING:
+            continue
+        saved = step.config.get("rename_map") or {}
+        if not isinstance(saved, dict) or not all(isinstance(name, str) for name in saved.values()):
+            raise CheckpointError(
+                f"{folder / PREPROCESSOR}.json has the rename_map {saved!r}; expected names of features by names. "
+                "Save it with lerobot's own pipeline"
+            )
+        later = {name: saved.get(renamed, renamed) for name, renamed in renames.items()}
+        renames = {**saved, **later}
+    return {name: renamed for name, renamed in renames.items() if name != renamed}
+
+
+def declared_inputs(folder: Path) -> DeclaredInputs | None:
+    """Return the inputs that a checkpoint in lerobot's layout declares; None for another layout.
+
+    Raises:
+        CheckpointError: For a preprocessor that cannot be read.
+        LfsPointerError: For a Git LFS pointer.
+    """
+    try:
+        config = load_json(folder / CONFIG_FILE)
+        features = config["input_features"]
+        state = int(features[STATE]["shape"][0]) if STATE in features else None
+        names, kind = list(features), str(config.get("type"))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, IndexError):
+        return None  # what it reads is known once it is loaded
+    renames, packs = rename_map(folder), step_fields(folder)
+    if kind == "molmoact2":  # the order of the step, else of the configuration
+        names = list(packs.get("molmoact2_pack_inputs", config).get("image_keys") or names)
+    if kind == "groot" and (views := packs.get(PACKING_STEP, {}).get("video_modality_keys")):
+        names = read_views(names, views)
+    return DeclaredInputs(cameras_of(names, renames), state, renames)
+
+
+PACKING_STEP = "groot_n1_7_pack_inputs_v1"
+_OTHER_NAMES = {"wrist_image": "image2"}
+"""The name that lerobot also accepts for a view of GR00T."""
+
+
+def read_views(features: Sequence[str], views: Sequence[str]) -> list[str]:
+    """Return the features that lerobot packs for GR00T, in their order: those that are a view, or else all."""
+    packed = {f"{IMAGES}{name}" for view in views for name in (view, _OTHER_NAMES.get(view, view))}
+    return [name for name in features if name in packed] or list(features)
 
 
 def check_pipelines(folder: Path) -> None:
@@ -289,11 +349,11 @@ def _normalised_pictures(folder: Path, step: SavedStep) -> list[str]:
     pictures = [
         name for name, feature in (step.config.get("features") or {}).items() if feature.get("type") == "VISUAL"
     ]
-    try:
-        with safe_open(folder / shard_name(step.state), "pt") as file:
-            stored = {name.rpartition(".")[0] for name in file.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError) as error:
-        raise CheckpointError(f"{folder / step.state} cannot be read ({error}); download it again") from error
+    with (
+        while_reading(folder / step.state, advice=_AGAIN),
+        safe_open(folder / shard_name(step.state), "pt") as file,
+    ):
+        stored = {name.rpartition(".")[0] for name in file.keys()}  # noqa: SIM118
     return [name for name in pictures if name in stored]
 
 

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from probe_kit._system.bounded_files import read_json_object
+from probe_kit._system.foreign_files import while_reading
 from probe_kit.errors import CheckpointError, InstructionError, ObservationError
 from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE, SMALL_FILES, side_files
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
@@ -29,6 +30,7 @@ from probe_kit.hooks.contract.model import Policy, Tap
 from probe_kit.hooks.contract.observation import ARM_NUMBERS, Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import PADDING, Site
+from probe_kit.hooks.families.shared.feature_names import names_misfit, names_of, read_names
 from probe_kit.hooks.families.shared.kinds import IMAGES, STATE, Evaluation, cameras_of
 from probe_kit.hooks.families.shared.lerobot.normaliser import (
     Normaliser,
@@ -48,6 +50,7 @@ from probe_kit.hooks.families.shared.lerobot.pipelines import (
     check_one_frame,
     check_steps,
     known_values,
+    rename_map,
     text_length,
 )
 from probe_kit.hooks.families.shared.lerobot.window import PictureWindow, read_window
@@ -62,6 +65,7 @@ MOST_TOKENS = 1 << 16
 TOKENS, MASK = "observation.language.tokens", "observation.language.attention_mask"
 UNCOMPARED = ("IDENTITY", "EXCLUDED")
 """The modes of units without statistics: the state is read as it is, or not at all."""
+_ACTION_NAMES = "action_feature_names"
 _DIMENSIONS = 7
 """The count of numbers of the arm's actions."""
 TEXT_FILES = (*SMALL_FILES, "policy_*.safetensors")
@@ -115,7 +119,8 @@ class LerobotPolicy(Policy):
         self.config, self.evaluation = network.config, network.config.evaluation
         self.stacks = self._stacks()
         self._read_streams()
-        self.cameras = cameras_of(self.config.image_features)
+        self.renames = rename_map(folder)
+        self.cameras = cameras_of(self.config.image_features, self.renames)
         self._show(self.cameras[:1])
 
     def with_cameras(self, cameras: Sequence[str]) -> Self:
@@ -230,7 +235,7 @@ class LerobotPolicy(Policy):
         config = cls._read_config(folder, evaluation)
         if dtype is not None:
             config.dtype = dtype
-        with WithoutFilling():
+        with WithoutFilling(), while_reading(folder / CONFIG_FILE):
             network = cls.build(config, folder)
         if random_weights:
             initialise(network, weights_seed)
@@ -250,6 +255,7 @@ class LerobotPolicy(Policy):
             notes=policy._notes(),
             embodiment=ARM,
             cameras=policy.cameras,
+            renames=policy.renames,
             chunk=config.chunk_size,
             execute=min(config.n_action_steps, config.chunk_size),
         )
@@ -308,7 +314,10 @@ class LerobotPolicy(Policy):
         if "rtc_config" in values:
             values["rtc_config"] = None  # real-time chunking mixes in actions of the chunk before
         # `from_pretrained` decodes in the same way, behind a command line with a help text for every field: 80 ms.
-        return draccus.decode(config_class, {name: value for name, value in values.items() if name != "type"})
+        if values.get(_ACTION_NAMES) is not None:  # draccus would make one text of a list in a list
+            values[_ACTION_NAMES] = list(read_names(values[_ACTION_NAMES]) or ())
+        with while_reading(path):
+            return draccus.decode(config_class, {name: value for name, value in values.items() if name != "type"})
 
     @classmethod
     def current_values(cls, values: dict[str, Any], path: Path) -> dict[str, Any]:
@@ -337,7 +346,9 @@ class LerobotPolicy(Policy):
     def _notes(self) -> tuple[str, ...]:
         masked = self.cameras[len(self.shown_cameras) :]
         cameras = (f"cameras without a picture: {', '.join(masked)}",) if masked else ()
-        return (*cameras, f"units: {self._units()}")
+        misfit = names_misfit(getattr(self.config, _ACTION_NAMES, None), self._action_numbers)
+        names = (f"names of actions ({_ACTION_NAMES}) are not used: {misfit}",) if misfit else ()
+        return (*cameras, *names, f"units: {self._units()}")
 
     def _units(self) -> str:
         """The source of the statistics that turn actions into metres, or the reason why there are none."""
@@ -402,9 +413,12 @@ class LerobotPolicy(Policy):
     @property
     def action_names(self) -> tuple[str, ...] | None:
         """The names in the configuration (`action_feature_names`), if there is one for each number."""
-        names = getattr(self.config, "action_feature_names", None)
-        count = self.config.output_features["action"].shape[0]
-        return tuple(map(str, names)) if names and len(names) == count else None
+        return names_of(getattr(self.config, _ACTION_NAMES, None), self._action_numbers)
+
+    @property
+    def _action_numbers(self) -> int:
+        """The count of numbers of an action in the checkpoint's configuration."""
+        return int(self.config.output_features["action"].shape[0])
 
     def unusual_states(self, states: NDArray[np.float32]) -> NDArray[np.bool_]:
         """Return (n, D): more than five deviations from the mean, or outside the bounds of the statistics."""
@@ -440,7 +454,7 @@ class LerobotPolicy(Policy):
 
     def configured_mismatch(self) -> str | None:
         """Return a reason for other actions than an end-effector delta."""
-        dimensions = self.config.output_features["action"].shape[0]
+        dimensions = self._action_numbers
         if dimensions != _DIMENSIONS:
             return f"{self.checkpoint} acts in {dimensions} dimensions; the arm needs a 7-DoF end-effector delta"
         if self.predicts_relative:
@@ -572,7 +586,7 @@ class LerobotPolicy(Policy):
         text = cls.__new__(cls)
         text.folder, text.evaluation = checkpoint_folder(checkpoint, TEXT_FILES), cls.choice(**options)
         text.config = cls._read_config(text.folder, text.evaluation)
-        text.cameras = text.shown_cameras = cameras_of(text.config.image_features)[:1]
+        text.cameras = text.shown_cameras = cameras_of(text.config.image_features, rename_map(text.folder))[:1]
         return text
 
     def window(self, camera: str) -> PictureWindow:
@@ -629,7 +643,7 @@ class LerobotPolicy(Policy):
             units: Normaliser | None = read_normaliser(self.folder, pipeline, feature, kind)
         else:
             units = from_buffers(self._buffers, self.config.normalization_mapping, feature, kind, self.checkpoint)
-        numbers = self.state_numbers if kind == "STATE" else int(self.config.output_features["action"].shape[0])
+        numbers = self.state_numbers if kind == "STATE" else self._action_numbers
         if units is not None and units.mode != "IDENTITY" and units.low.shape != (numbers,):
             raise CheckpointError(
                 f"{self.checkpoint} has statistics of shape {units.low.shape} for its {feature}, which has "
