@@ -79,7 +79,7 @@ _NAMING = ("processor_class", "image_processor_type", "feature_extractor_type", 
 
 
 class PictureValues(NamedTuple):
-    """What a checkpoint says about the preparation of pictures.
+    """The settings of a checkpoint for the preparation of pictures.
 
     Attributes:
         values: The settings by name.
@@ -172,8 +172,8 @@ def processor_settings(folder: Path, needed: Sequence[str], optional: Sequence[s
     values = stored.values
     if missing := [name for name in needed if values.get(name) is None]:
         raise CheckpointError(f"{stored.source} lacks {', '.join(missing)}. {_SAVE_AGAIN}")
-    named = {name: values[name] for name in (*needed, *optional) if values.get(name) is not None}
-    return PictureValues(named, stored.source)
+    settings = {name: values[name] for name in (*needed, *optional) if values.get(name) is not None}
+    return PictureValues(settings, stored.source)
 
 
 def square_side(settings: PictureValues) -> int:

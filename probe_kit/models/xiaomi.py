@@ -421,18 +421,18 @@ def _action_config(folder: Path) -> tuple[Mapping[str, Any], str]:
         CheckpointError: For files without any, or with different ones.
     """
     stored = {source: values.get("action_config") for source, values in processor_files(folder).items()}
-    places = [source for source, by_robot in stored.items() if by_robot]
-    if not places:
+    sources = [source for source, by_robot in stored.items() if by_robot]
+    if not sources:
         raise CheckpointError(
             f"{folder / STATISTICS_FILE} has no action_config: the actions have no physical unit and no length. "
             "Take the file that the checkpoint was released with"
         )
-    if different := [place for place in places[1:] if stored[place] != stored[places[0]]]:
+    if different := [source for source in sources[1:] if stored[source] != stored[sources[0]]]:
         raise CheckpointError(
-            f"{places[0]} and {different[0]} have different statistics in action_config. Remove the one that does "
-            "not belong to these weights"
+            f"{sources[0]} and {different[0]} have different statistics in action_config. Remove the one that "
+            "does not belong to these weights"
         )
-    return stored[places[0]] or {}, places[0]
+    return stored[sources[0]] or {}, sources[0]
 
 
 def _choose(robot: str | None, by_robot: Mapping[str, Any], source: str) -> str:

@@ -40,16 +40,16 @@ class TokenizerFile:
                 "of: copy it from that model's page, or name a folder that has it with -M tokenizer=DIR"
             )
 
-    def check_vocabulary(self, vocabulary: int, further: bool = False) -> None:
+    def check_vocabulary(self, vocabulary: int, allow_added: bool = False) -> None:
         """Raise CheckpointError for ids that a model with `vocabulary` of them does not have.
 
         Args:
             vocabulary: Number of ids that the model has.
-            further: Whether words that were added to the tokenizer may have higher ids, because they are refused
-                where a text has one. The processor of PaliGemma adds words that small models never learn.
+            allow_added: Whether words that were added to the tokenizer may have higher ids: they are refused where
+                a text has one. The processor of PaliGemma adds words that small models never learn.
         """
         added = self.tokenizer.get_added_tokens_decoder()
-        left_out = {token.content for token in added.values() if further and not token.special}
+        left_out = {token.content for token in added.values() if allow_added and not token.special}
         ids = self.tokenizer.get_vocab(with_added_tokens=True)
         if (highest := max(number for word, number in ids.items() if word not in left_out)) >= vocabulary:
             raise CheckpointError(
@@ -230,7 +230,7 @@ class FramedText(TokenizerFile):
         """
         TokenizerFile(folder).check_present()
         text = cls(folder, frame, int(config.vocab_size), _ends(generation, config))
-        text.check_vocabulary(text.vocabulary, further=True)
+        text.check_vocabulary(text.vocabulary, allow_added=True)
         return text
 
     def encoding(self, text: str, special: bool = False) -> Any:
