@@ -410,9 +410,9 @@ def _file_of(name: str, expected: str, files: Mapping[str, Path]) -> Path:
 def _content_sha256(name: str, path: Path) -> str:
     """Return the hash of a scene's file; of an arm's description also over the meshes that it names."""
     try:
-        (_, content), *named = files_of_description(path) if name == "arm_urdf" else [("", read_regular(path))]
+        (_, content), *meshes = files_of_description(path) if name == "arm_urdf" else [("", read_regular(path))]
         digest = hashlib.sha256(content)
-        for spelled, content in named:
+        for spelled, content in meshes:
             digest.update(f"{spelled}\0{len(content)}\0".encode("utf-8", "surrogateescape"))
             digest.update(content)
         return f"sha256:{digest.hexdigest()}"

@@ -48,8 +48,8 @@ def _named_files(path: Path, content: bytes, suffix: str) -> Iterator[tuple[str,
         return
     for match in _NAMED[suffix].finditer(content):
         name = match.group(1).decode("utf-8", "surrogateescape").strip()
-        if (named := _find(path.parent.resolve(), name)) is not None:
-            yield name, named
+        if (file := _find(path.parent.resolve(), name)) is not None:
+            yield name, file
 
 
 def _find(folder: Path, name: str) -> Path | None:

@@ -216,8 +216,8 @@ def _chunk_below(shape: tuple[int, ...], item: int, limit: int) -> tuple[int, ..
     """
     chunk = list(shape)
     for axis, length in enumerate(shape):
-        others = item * prod(chunk) // length
-        chunk[axis] = max(1, min(length, limit // others))
+        size_of_part = item * prod(chunk) // length
+        chunk[axis] = max(1, min(length, limit // size_of_part))
         if item * prod(chunk) <= limit:
             break
     return tuple(chunk)

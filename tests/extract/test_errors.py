@@ -86,7 +86,7 @@ def test_a_worker_process_hands_its_error_on(suite: Suite, tmp_path: Path) -> No
 def test_a_worker_on_a_cluster_answers_with_its_error_instead_of_dying(suite: Suite, tmp_path: Path) -> None:
     """Raised, it would come back as one of Ray's, or as that of a dead actor, and cost episodes."""
     extraction = spoiled_after_planning(suite, tmp_path)
-    actor = RayWorker((play_episodes, (extraction.settings, str(tmp_path / "run"))))
+    actor = RayWorker((play_episodes, (extraction.settings, str(tmp_path / "run"), None)))
     actor.work()
     answer = actor._reports.get()
     assert isinstance(answer, SuiteError)
@@ -264,7 +264,7 @@ def test_a_worker_holds_the_run_itself(settings: ExtractSettings, tmp_path: Path
         return left.pop(0) if left else None
 
     with pytest.raises(EOFError):
-        play_episodes((settings, address), take, lambda event: done.append(event.number))
+        play_episodes((settings, address, None), take, lambda event: done.append(event.number))
     assert done == EPISODES
     assert (tmp_path / "run" / "certificate.json").is_file()
     assert unheld == []

@@ -709,8 +709,8 @@ def observation_of(
 ) -> Observation:
     """Return the observation of pictures by camera, the first of which is the main one and has the intrinsics."""
     first, *other_cameras = pictures
-    others = {name: pictures[name] for name in other_cameras}
-    return Observation(pictures[first], state, instruction, intrinsics, others)
+    cameras = {name: pictures[name] for name in other_cameras}
+    return Observation(pictures[first], state, instruction, intrinsics, cameras)
 
 
 def _ahead(actions: NDArray[np.float64], frame: int, count: int) -> NDArray[np.float32]:

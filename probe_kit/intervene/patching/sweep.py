@@ -150,11 +150,11 @@ class Sweep:
         axes.set_yticks(range(len(roles)), roles)
         figure.colorbar(image, label=column, ticks=MaxNLocator(max(2, int(2 * height))))
         figure.draw_without_rendering()
-        below, beside = (
+        label_height, label_width = (
             max(getattr(name.get_window_extent(), side) for name in names) / figure.dpi
             for names, side in ((axes.get_xticklabels(), "height"), (axes.get_yticklabels(), "width"))
         )
-        figure.set_size_inches(width + beside + 1.4, height + below + 0.4)
+        figure.set_size_inches(width + label_width + 1.4, height + label_height + 0.4)
         return figure
 
 
