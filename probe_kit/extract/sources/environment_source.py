@@ -33,9 +33,9 @@ from probe_kit.extract.sources.source import (
     Played,
     Source,
     check_units,
+    compare_states,
     exchanged_names,
     predicted_once,
-    unusual_shares,
 )
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.observation import Observation, checked_picture
@@ -356,11 +356,12 @@ class EnvironmentSource(Source[EnvSource]):
             begins = [first, *(started(environment, episode, name) for episode in later)]
             for begin in begins:
                 self._check_state(policy, begin.observation)
-            unusual = unusual_shares(policy, np.stack([begin.observation.state for begin in begins]))
+            states = np.stack([begin.observation.state for begin in begins])
         finally:
             environment.close()
         self.seen, self.chunk = first.observation, len(chunk)
-        check_units(unusual, self._state_names, f"{name}, the state after reset()", policy, accept_units)
+        self.units = compare_states(policy, [states], self._state_names, begins=True)
+        check_units(self.units, f"{name}, the state after reset()", policy, accept_units)
         return self, policy
 
     def _note_facts(self, step: Step) -> None:

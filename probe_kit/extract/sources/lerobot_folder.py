@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._system.bounded_files import parse_json, read_regular
 from probe_kit._system.parquet_files import read_parquet
 from probe_kit.errors import RecordingError, UsageError
 from probe_kit.extract.sources.lerobot_meta import (
@@ -29,8 +30,10 @@ from probe_kit.extract.sources.lerobot_meta import (
 )
 from probe_kit.extract.sources.recording import LeRobotSource
 from probe_kit.hooks.checkpoints.checkpoint import OFFLINE_WAY_OUT, hub_reason, unreachable, way_out
+from probe_kit.hooks.contract.feature_statistics import FeatureStatistics
 from probe_kit.suite.pictures import LARGEST_PICTURE, decode_bytes
 
+STATISTICS = "meta/stats.json"
 MOST_FRAMES = 64
 """The most chosen frames that one row holds."""
 _COMMIT = re.compile(r"[0-9a-f]{40}")
@@ -63,6 +66,20 @@ class LeRobotFolder(LeRobotMeta):
     def names(self, feature: str) -> list[str]:
         """Return the names of the numbers of a feature; their positions where the data set names none."""
         return list(self.feature_names(feature) or map(str, range(self.width(feature) or 0)))
+
+    def statistics(self, feature: str) -> FeatureStatistics | None:
+        """Return the statistics of a feature that the data set stores of all its frames; None without any.
+
+        They are a summary that a later edit of the frames can leave behind: a file that cannot be read is none.
+        """
+        path, width = self.path / STATISTICS, self.width(feature)
+        if width is None or not path.is_file():
+            return None
+        try:
+            stored = parse_json(read_regular(path))
+            return FeatureStatistics.of(stored[feature], width)
+        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+            return None
 
     def picture_shape(self, feature: str) -> tuple[int, int]:
         """Return height and width of a camera's pictures."""
