@@ -30,6 +30,7 @@ from probe_kit.diagnose.results import (
 )
 from probe_kit.errors import CheckpointError, ObservationError, UnsupportedInterventionError, UsageError
 from probe_kit.extract.sources.inputs import STATE, with_input
+from probe_kit.extract.sources.source import STATE_UNITS
 from probe_kit.hooks.contract.card import EMBEDDED
 from probe_kit.hooks.contract.sites import KV_STREAM
 from probe_kit.hooks.family import SIZE
@@ -40,7 +41,7 @@ from probe_kit.intervene.patching.patch import Cell, patched
 from probe_kit.intervene.places import ALL, SiteGroup, resolve_sites
 from probe_kit.intervene.settings import has_sides, key_of
 from probe_kit.intervene.tokens import PairTokens, roles_of_tokens
-from probe_kit.runs.layout import DIAGNOSES
+from probe_kit.runs.layout import DIAGNOSES, UNITS
 from probe_kit.runs.reader import origin_of
 from probe_kit.runs.records import as_json
 from probe_kit.runs.results import is_complete, read_bundle, write_bundle
@@ -247,7 +248,7 @@ def diagnose_run(
         else:
             drawn, rows = frames_of(session, frames, paraphrases), []
         exchange = InputExchange(_inference(session), drawn, seed, rows, instructions)
-        diagnosed = _measure(session, exchange, inputs, inside, progress)
+        diagnosed = with_units(run, _measure(session, exchange, inputs, inside, progress))
         if base_policy is not None:
             progress("inputs of the base")
             diagnosed = exchange.against(_inference(session, base_policy), diagnosed)
@@ -301,6 +302,19 @@ def check_words(instructions: Sequence[str], of_frames: Iterable[str], tabled: b
     if tabled:
         raise UsageError("--instructions gives words of donors, and --pairs names donors; leave one of both out")
     check_further_instructions(instructions, of_frames)
+
+
+def with_units(run: "Run", inputs: Sequence[InputDiagnosis]) -> tuple[InputDiagnosis, ...]:
+    """Return the inputs; the state has the numbers that did not fit the checkpoint's statistics in the run."""
+    note = run.settings.get(UNITS, {}).get(STATE_UNITS)
+    if note is None:
+        return tuple(inputs)
+    return tuple(
+        replace(diagnosed, units=note["misfits"], units_are_other=note["are_other"])
+        if diagnosed.name == STATE
+        else diagnosed
+        for diagnosed in inputs
+    )
 
 
 def check_network(run: "Run") -> None:

@@ -117,6 +117,8 @@ class InputDiagnosis:
             changed.
         passage: The sites in the order of the network.
         note: Reason why there are no sites.
+        units: The numbers of a state that do not fit the statistics of the checkpoint, in words; empty for none.
+        units_are_other: Whether other units or another robot are certain.
         base: The same input in the base checkpoint; None without one.
         seed: The index of another seed; NaN where it was not measured.
     """
@@ -135,6 +137,8 @@ class InputDiagnosis:
     unchanged: int = 0
     passage: tuple[SitePassage, ...] = ()
     note: str = ""
+    units: str = ""
+    units_are_other: bool = False
     base: BaseComparison | None = None
     seed: Number = nan
 
@@ -150,8 +154,16 @@ class InputDiagnosis:
 
     @property
     def where(self) -> str:
-        """The place of the loss, or the sites that carry it; the note where nothing was measured inside."""
-        return describe_passage(self.passage, self.verdict) or self.note
+        """The place of the loss, or the sites that carry it; the note where nothing was measured inside.
+
+        Numbers in other units are lost in front of the network, wherever inside the difference ends.
+        """
+        inside = describe_passage(self.passage, self.verdict) or self.note
+        if not self.units:
+            return inside
+        lost = "the loss is" if self.units_are_other and self.verdict in IDLE else "a loss may be"
+        before = f"{lost} in front of the network: {self.units}"
+        return before if self.verdict in IDLE or not inside else f"{inside}; {before}"
 
 
 def describe_passage(passage: Sequence[SitePassage], verdict: Verdict) -> str:

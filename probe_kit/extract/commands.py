@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from probe_kit._system.counting import counted
+from probe_kit._system.escaping import terminal_safe
 from probe_kit._terminal import options as common
 from probe_kit._terminal.console import counter, err, marked, out, print_json, progress, say
 from probe_kit._terminal.field_options import command_with
@@ -160,6 +161,7 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
     from probe_kit.runs.writer import growth_words
 
     plan, identity, free = extraction.plan, extraction.identity(), location.free_bytes()
+    accepted = extraction.settings.machine.accept_units
     calibrated, measures = extraction.calibration, extraction.settings.machine.batch == "auto"
     needed = in_units(sum(space_needed(extraction.further_plan(location), extraction.settings).values()))
     weights = "not read" if extraction.declared else (identity["weights_sha256"] or "scripted")[:12]
@@ -170,6 +172,7 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
         "units": _units(extraction.settings),
         "protocol": _protocol(identity),
         **extraction.source.describe(plan.episodes),
+        **{name: terminal_safe(note.words) for name, note in extraction.source.unit_notes(accepted).items()},
         "grows": growth_words(location, plan),
         "streams": ("; ".join(_describe(s) for s in plan.streams) or "none") + source,
         "acts": _acts(identity, extraction.settings.source.subject),

@@ -4,7 +4,7 @@ import json
 import os
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -30,7 +30,7 @@ from probe_kit.extract.sources.source import Source, raise_together
 from probe_kit.hashing import canonical_json, sha256_json
 from probe_kit.hooks.registry import find_family, get_family
 from probe_kit.runs.commits import failure_key
-from probe_kit.runs.layout import GROUP_FILE, RUN_FILE, StoredStream
+from probe_kit.runs.layout import GROUP_FILE, RUN_FILE, UNITS, StoredStream
 from probe_kit.runs.plan import Plan, Row, further_rows
 from probe_kit.runs.provenance import provenance_here
 from probe_kit.runs.root import find_continuable, label_run
@@ -405,13 +405,15 @@ def _plan(
 ) -> Plan:
     """Return the plan of rows that store these streams, with `execute` actions per inference, 0 for none."""
     capture, streams = settings.capture, tuple(streams)
+    notes = source.unit_notes(settings.machine.accept_units)
+    units = {UNITS: {name: asdict(note) for name, note in notes.items()}} if notes else {}
     size = sum(stream.raw_bytes(capture.tokens == "all", capture.calls, capture.later_views) for stream in streams)
     return Plan(
         rows,
         streams,
         size * len(rows),
         source.identity(execute),
-        {**source.selection(rows), CONFIG: settings.stored_config()},
+        {**source.selection(rows), **units, CONFIG: settings.stored_config()},
         source.name_parts(),
         source.suite_parent,
         source.decoder,

@@ -348,7 +348,7 @@ def show_dataset(
             prepared = load(settings.changed(accept_units=True))  # units are checked behind the table
         recording = prepared.source  # type: ignore[assignment]
         policy: Policy = prepared.controller.model  # type: ignore[union-attr]  # scripts were refused
-        facts |= recording.facts_of(policy)
+        facts |= recording.facts_of(policy, settings.machine.accept_units)
     table = Table(show_header=False, box=None)
     table.add_column(style="dim", no_wrap=True)
     table.add_column(overflow="fold")

@@ -108,6 +108,8 @@ ENVIRONMENT = "environment"
 """The part of a run's settings that says in which environment of the user's own it was played."""
 RECORDED_EPISODES = "recorded_episodes"
 """The entry of `recording` in the settings with the number of episodes of the run's data set."""
+UNITS = "units"
+"""The entry of a selection that says which numbers do not fit the statistics of the checkpoint, by heading."""
 OTHER_ACTIONS = "other_actions"
 """The entry of a selection of recordings that says why predicted and recorded actions are not compared.
 

@@ -45,9 +45,9 @@ from probe_kit.extract.sources.source import (
     Played,
     Source,
     check_units,
+    compare_states,
     exchanged_names,
     predicted_once,
-    unusual_shares,
 )
 from probe_kit.extract.sources.step_limits import checked_limit, declared_limit
 from probe_kit.hashing import derive_seed
@@ -689,11 +689,12 @@ class EnvironmentSource(Source[EnvSource]):
             ids = [episode.id for _, episode in self.episodes]
             steps = [[first, second], *([begin] for begin in begins[1:])]
             self._frames = [frames_of_steps(*pair) for pair in zip(ids, steps, strict=False)]
-            unusual = unusual_shares(policy, np.stack([begin.observation.state for begin in begins]))
+            states = np.stack([begin.observation.state for begin in begins])
         finally:
             environment.close()
         self.seen, self.chunk = first.observation, len(chunk)
-        check_units(unusual, self._state_names, f"{name}, the state after reset()", policy, accept_units)
+        self.units = compare_states(policy, [states], self._state_names, begins=True)
+        check_units(self.units, f"{name}, the state after reset()", policy, accept_units)
         return self, policy
 
     def _note_facts(self, step: Step) -> None:

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._system.bounded_files import parse_json, read_regular
 from probe_kit._system.parquet_files import read_parquet
 from probe_kit.errors import RecordingError, UsageError
 from probe_kit.extract.sources.frame_times import BY_FAR, NONE, Drift, TickTimes, nearest_by_far
@@ -31,9 +32,11 @@ from probe_kit.extract.sources.lerobot_meta import (
 from probe_kit.extract.sources.recorded_video import RecordedVideo, VideoError
 from probe_kit.extract.sources.recording import LeRobotSource, episodes_text
 from probe_kit.hooks.checkpoints.checkpoint import OFFLINE_WAY_OUT, hub_reason, unreachable, way_out
+from probe_kit.hooks.contract.feature_statistics import FeatureStatistics
 from probe_kit.hooks.families.shared.feature_names import read_names
 from probe_kit.suite.pictures import decode_bytes
 
+STATISTICS = "meta/stats.json"
 MOST_FRAMES = 64
 """The most chosen frames that one row holds."""
 _COMMIT = re.compile(r"[0-9a-f]{40}")
@@ -88,6 +91,20 @@ class LeRobotFolder(LeRobotMeta):
                 "3 × 3 numbers"
             )
         return matrix
+
+    def statistics(self, feature: str) -> FeatureStatistics | None:
+        """Return the statistics of a feature that the data set stores of all its frames; None without any.
+
+        They are a summary that a later edit of the frames can leave behind: a file that cannot be read is none.
+        """
+        path, width = self.path / STATISTICS, self.width(feature)
+        if width is None or not path.is_file():
+            return None
+        try:
+            stored = parse_json(read_regular(path))
+            return FeatureStatistics.of(stored[feature], width)
+        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+            return None
 
     def picture_shape(self, feature: str) -> tuple[int, int]:
         """Return height and width of a camera's pictures."""

@@ -25,15 +25,16 @@ from probe_kit.extract.sources.lerobot_meta import IMAGE, KEYS, NUMERIC
 from probe_kit.extract.sources.player import SIDE, Answer, InputsPlayer, Opens, frames_of_episode
 from probe_kit.extract.sources.recording import EVERY_CAMERA, LeRobotSource, Pairs, degrees_of
 from probe_kit.extract.sources.source import (
-    MOST_UNUSUAL,
+    ACTION_UNITS,
     Played,
     Source,
     check_units,
+    compare_states,
     other_order,
     predicted_once,
     raise_together,
-    unusual_shares,
 )
+from probe_kit.extract.sources.units import Units, UnitsNote, compare_units
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.card import DeclaredInputs
 from probe_kit.hooks.contract.observation import ARM_NUMBERS, Observation
@@ -64,8 +65,7 @@ class RecordingSource(Source[LeRobotSource]):
 
     Attributes:
         prediction: The shape (chunk, D) of a prediction of the policy that was checked.
-        unusual: (D,) share of the chosen frames whose number of the state is unusual; empty where the policy
-            normalizes none.
+        action_units: The comparison of the recorded actions with the statistics of the policy that was checked.
         other_actions: The reason why recorded actions are not what the policy predicts; None if they are.
         declared: The inputs that a checkpoint declares; None before it was looked at.
         renamed: The checkpoint's own map of names in words, and what contradicts it; empty where it has none.
@@ -89,7 +89,7 @@ class RecordingSource(Source[LeRobotSource]):
         self.reader = LeRobotFrames(folder)
         self.prediction: tuple[int, int] = (0, 0)
         self.other_actions: str | None = None
-        self.unusual: NDArray[np.float64] = np.zeros(0)
+        self.action_units = Units()
         self.declared: DeclaredInputs | None = None
         self.renamed = ""
 
@@ -338,8 +338,9 @@ class RecordingSource(Source[LeRobotSource]):
             policy = policy.with_cameras([camera for camera, _ in fitted.settings.cameras])
         except ObservationError as error:
             raise RecordingError(f"{error}. Map the model's first cameras with --camera") from error
-        numbers = fitted._chosen_numbers()
-        fitted.unusual = fitted._unusual(policy, numbers.get(STATE))
+        numbers = fitted._recorded_numbers()
+        if STATE in numbers:
+            fitted.units = fitted._state_units(policy, numbers[STATE])
         chunk = predicted_once(policy, fitted.example(fitted.instructions[0]))
         fitted.prediction = chunk.shape[0], chunk.shape[1]
         fitted.other_actions = fitted._other_actions(policy, chunk.shape[1], numbers.get(ACTION))
@@ -347,35 +348,31 @@ class RecordingSource(Source[LeRobotSource]):
         return fitted, policy
 
     def check_recorded_units(self, policy: "Policy", accepted: bool) -> None:
-        """Raise UnitsError for recorded states outside the checkpoint's statistics, unless that is accepted."""
-        names = self.folder.names(STATE) if self.unusual.size else []
-        check_units(self.unusual, names, f"{self.folder.path.name}, {STATE}", policy, accepted)
+        """Raise UnitsError for recorded states in other units than the checkpoint's, unless that is accepted."""
+        check_units(self.units, f"{self.folder.path.name}, {STATE}", policy, accepted)
 
-    def _chosen_numbers(self) -> dict[str, NDArray[np.float32]]:
-        """Return state and action (n, D) of every chosen frame, as far as they are recorded."""
+    def _recorded_numbers(self) -> dict[str, list[NDArray[np.float32]]]:
+        """Return state and action (T, D) of every chosen episode, all its frames, as far as they are recorded."""
         names = [name for name in (STATE, ACTION) if self.folder.width(name) is not None]
-        episodes, every = [self.reader.numbers(episode, names) for episode in self.episodes], self.settings.every
-        return {
-            name: np.concatenate([numbers[name][::every] for numbers in episodes]).astype(np.float32)
-            for name in names
-        }
+        episodes = [self.reader.numbers(episode, names) for episode in self.episodes]
+        return {name: [numbers[name].astype(np.float32) for numbers in episodes] for name in names}
 
-    def _unusual(self, policy: "Policy", states: NDArray[np.float32] | None) -> NDArray[np.float64]:
-        if states is None:
-            return np.zeros(0)
-        if not np.isfinite(states).all():
+    def _state_units(self, policy: "Policy", episodes: list[NDArray[np.float32]]) -> Units:
+        if not all(np.isfinite(states[:: self.settings.every]).all() for states in episodes):
             name = self.folder.path.name
             raise RecordingError(f"{name}: {STATE} holds NaN or infinity; leave such episodes out")
-        return unusual_shares(policy, states)
+        return compare_states(policy, episodes, self.folder.names(STATE), self.folder.statistics(STATE))
 
-    def _other_actions(self, policy: "Policy", predicted: int, actions: NDArray[np.float32] | None) -> str | None:
+    def _other_actions(
+        self, policy: "Policy", predicted: int, actions: list[NDArray[np.float32]] | None
+    ) -> str | None:
         """Return why the recorded actions are not what a policy predicts; None without a sign of that."""
         if actions is None:
             similar = self._of_width(predicted, ACTION)
             how = f"; if {similar[0]!r} are the actions, give --feature {ACTION}={similar[0]}" if similar else ""
             return f"the data set has no actions{how}"
-        if actions.shape[1] != predicted:
-            return f"the policy predicts {predicted} numbers, the data set has {actions.shape[1]}"
+        if (width := actions[0].shape[1]) != predicted:
+            return f"the policy predicts {predicted} numbers, the data set has {width}"
         if policy.predicts_relative:
             return "the policy predicts changes relative to the state (use_relative_actions)"
         if (reason := other_order(policy, self.folder.feature_names(ACTION) or ())) is not None:
@@ -383,14 +380,12 @@ class RecordingSource(Source[LeRobotSource]):
         names, misfit = read_names(self.folder.features[ACTION].get("names")), self.folder.names_misfit(ACTION)
         if policy.action_names is not None and misfit and (names is None or len(names) > 1):
             return f"the checkpoint names its actions {', '.join(policy.action_names)}; of the data set, {misfit}"
-        shares = policy.unusual_actions(actions).mean(axis=0)
-        if not (shares > MOST_UNUSUAL).any():
+        if (expected := policy.action_statistics) is None:
             return None
-        number_names = self.folder.names(ACTION)
-        far = ", ".join(
-            f"{number_names[number]} {shares[number]:.0%}" for number in np.flatnonzero(shares > MOST_UNUSUAL)
-        )
-        return f"recorded actions lie outside the statistics of the checkpoint ({far}), so the units differ"
+        number_names, recorded = self.folder.names(ACTION), self.folder.statistics(ACTION)
+        self.action_units = compare_units(expected, actions, number_names, recorded)
+        refused = self.action_units.refused
+        return f"recorded actions do not fit the statistics of the checkpoint: {refused}" if refused else None
 
     def example(self, instruction: str) -> Observation:
         """Return blank pictures and a state of zeros."""
@@ -549,8 +544,18 @@ class RecordingSource(Source[LeRobotSource]):
             "data sha": f"meta {folder.meta_blake2b[:12]}",
         }
 
-    def facts_of(self, policy: "Policy") -> dict[str, str]:
-        """Describe how a policy that fits is shown the data set."""
+    def unit_notes(self, accepted: bool) -> dict[str, UnitsNote]:
+        """Return what does not fit of states, and of actions where they are compared nonetheless."""
+        note = None if self.action_units.are_other else self.action_units.note(accepted)
+        return super().unit_notes(accepted) | ({} if note is None else {ACTION_UNITS: note})
+
+    def facts_of(self, policy: "Policy", accepted: bool = False) -> dict[str, str]:
+        """Describe how a policy that fits is shown the data set.
+
+        Args:
+            policy: The policy that was checked.
+            accepted: Whether other units were accepted.
+        """
         mapped = dict(self.settings.cameras)
         masked = [camera for camera in policy.card.cameras if camera not in mapped]
         chunk, width = self.prediction
@@ -567,13 +572,16 @@ class RecordingSource(Source[LeRobotSource]):
             if self.other_actions
             else "compared with the recorded ones, see `probe-kit run show RUN --action-errors`",
             "state": self._shares(),
+            **{name: note.words for name, note in self.unit_notes(accepted).items()},
         }
 
     def _shares(self) -> str:
-        if not self.unusual.size:
+        if not self.units.shares.size:
             return "not compared: this model normalises no state"
         names = self.folder.names(STATE)
-        shares = [f"{names[number]} {share:.0%}" for number, share in enumerate(self.unusual) if share >= NAMED]
+        shares = [
+            f"{names[number]} {share:.0%}" for number, share in enumerate(self.units.shares) if share >= NAMED
+        ]
         return "outside the checkpoint's statistics: " + (
             ", ".join(shares[:_LONGEST]) or "less than 1 % of each number"
         )

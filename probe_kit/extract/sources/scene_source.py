@@ -16,7 +16,7 @@ from probe_kit.env.act2answer import Recorder
 from probe_kit.errors import SceneError, UsageError
 from probe_kit.extract.sources.player import Answer, Ending, Opens, Player
 from probe_kit.extract.sources.scene import SceneSettings
-from probe_kit.extract.sources.source import FIRST_EPISODES, Played, Source, check_units, unusual_shares
+from probe_kit.extract.sources.source import FIRST_EPISODES, Played, Source, check_units, compare_states
 from probe_kit.hashing import derive_seed, sha256_json
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.sites import CAMERA
@@ -327,13 +327,13 @@ class SceneSource(Source[SceneSettings]):
         return (declared.cameras if declared else (CAMERA,))[:1]
 
     def check(self, policy: "Policy", accept_units: bool) -> "tuple[Self, Policy]":
-        """Raise UnitsError for a scene whose first states lie outside the statistics of a policy."""
-        if accept_units or policy.state_numbers is None or "state" in policy.zero_filled_inputs():
+        """Raise UnitsError for a scene whose first states do not fit the statistics of a policy."""
+        if policy.state_numbers is None or "state" in policy.zero_filled_inputs():
             return self, policy
         states = policy.laid_out(self._first_states())
         names = [str(number) for number in range(states.shape[1])]
-        where = f"the scene {self.settings.scene.name}"
-        check_units(unusual_shares(policy, states), names, where, policy, accept_units)
+        self.units = compare_states(policy, [states], names, begins=True)
+        check_units(self.units, f"the scene {self.settings.scene.name}", policy, accept_units)
         return self, policy
 
     def _first_states(self) -> Any:

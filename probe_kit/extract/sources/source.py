@@ -18,7 +18,9 @@ from numpy.typing import NDArray
 from probe_kit._terminal.field_options import FieldOption, Part, options_of
 from probe_kit.errors import InstructionError, PolicyFailedError, RecordingError, UnitsError, UsageError
 from probe_kit.extract.sources.inputs import describe_spellings
+from probe_kit.extract.sources.units import Units, UnitsNote, compare_units
 from probe_kit.hooks.checkpoints.third_party import copied, while_acting
+from probe_kit.hooks.contract.feature_statistics import FeatureStatistics
 from probe_kit.hooks.contract.observation import Observation
 
 if TYPE_CHECKING:
@@ -30,6 +32,8 @@ if TYPE_CHECKING:
     from probe_kit.suite import Suite
 
 
+STATE_UNITS, ACTION_UNITS = "state units", "action units"
+"""The headings of what does not fit the statistics of a checkpoint."""
 REFUSED_WITHOUT_ACTING = (
     "protocol", "rotation", "video", "batch=auto", "execute", "later_views", "edits",
 )  # fmt: skip
@@ -157,6 +161,7 @@ class Source[Chosen: SourceSettings](ABC):
         columns: The names of numbers that become labels, such as facts.
         chunk: The number of actions that a policy predicts at a time; 0 where its card says it.
         suite: The suite of questions with two pictures; None for other sources.
+        units: The comparison of states with the statistics of the policy that was checked.
     """
 
     own_units: ClassVar[bool] = True
@@ -166,6 +171,7 @@ class Source[Chosen: SourceSettings](ABC):
     chunk: int = 0
     settings: Chosen
     suite: "Suite | None" = None
+    units: Units = Units()
 
     @classmethod
     @abstractmethod
@@ -288,6 +294,15 @@ class Source[Chosen: SourceSettings](ABC):
         """
         return ()
 
+    def unit_notes(self, accepted: bool) -> dict[str, UnitsNote]:
+        """Return what does not fit the statistics of the policy that was checked, by heading.
+
+        Args:
+            accepted: Whether other units were accepted.
+        """
+        note = self.units.note(accepted)
+        return {} if note is None else {STATE_UNITS: note}
+
     def targets(self) -> tuple[str, ...]:
         """Return the built-in targets of probes that the rows have, such as `side.correct` or `env.left`."""
         return ()
@@ -308,46 +323,40 @@ def raise_together(checks: Iterable[Callable[[], object]]) -> None:
         raise RecordingError(f"{len(errors)} things about the recordings do not fit the model:\n{listed}")
 
 
-MOST_UNUSUAL = 0.2
-"""The share of unusual values of one number of the state, above which a run is refused."""
 FIRST_EPISODES = 4
 """The episodes of a scene or environment whose first states are compared, before any is played."""
 
 
-def unusual_shares(policy: "Policy", states: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Return by number (D,) the share of states (n, D) in which it lies far outside the checkpoint's statistics.
+def compare_states(
+    policy: "Policy",
+    episodes: Sequence[NDArray[np.float32]],
+    names: Sequence[str],
+    recorded: FeatureStatistics | None = None,
+    begins: bool = False,
+) -> Units:
+    """Compare states (T, D) of every episode with the checkpoint's statistics; see `compare_units`.
 
-    It is empty for a policy that normalizes no state.
+    Nothing is compared for a policy that reads or normalizes no state.
     """
-    if policy.state_numbers is None:
-        return np.zeros(0)
-    shares: NDArray[np.float64] = policy.unusual_states(states).mean(axis=0)
-    return shares
+    expected = None if policy.state_numbers is None else policy.state_statistics
+    return Units() if expected is None else compare_units(expected, episodes, names, recorded, begins)
 
 
-def check_units(
-    shares: NDArray[np.float64], names: Sequence[str], where: str, policy: "Policy", accepted: bool
-) -> None:
-    """Raise UnitsError for states far outside the checkpoint's statistics, unless that is accepted.
+def check_units(units: Units, where: str, policy: "Policy", accepted: bool) -> None:
+    """Raise UnitsError for states in other units than the checkpoint's statistics, unless that is accepted.
 
     Args:
-        shares: (D,) of `unusual_shares`.
-        names: The names of the numbers of the state.
+        units: The comparison of the states.
         where: The source, for the message.
         policy: The policy whose checkpoint the message names.
         accepted: Whether such states are accepted.
     """
-    if accepted or not (shares > MOST_UNUSUAL).any():
-        return
-    worst = ", ".join(
-        f"{'number ' * names[at].isdecimal()}{names[at]} in {shares[at]:.0%}"
-        for at in np.flatnonzero(shares > MOST_UNUSUAL)
-    )
-    raise UnitsError(
-        f"{where}: many states lie outside the statistics of {policy.card.checkpoint} ({worst}); "
-        f"expected at most {MOST_UNUSUAL:.0%} of each number. The units or the robot differ: take a checkpoint "
-        "that was trained on such states, or accept it with --accept-units"
-    )
+    if units.are_other and not accepted:
+        raise UnitsError(
+            f"{where}: states do not fit the statistics of {policy.card.checkpoint}: {units.refused}. These are "
+            "other units or another robot. Give the states as in training, take a checkpoint that was trained on "
+            "such states, or accept it with --accept-units"
+        )
 
 
 def other_order(policy: "Policy", names: Sequence[str]) -> str | None:

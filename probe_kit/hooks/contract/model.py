@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from probe_kit.errors import CaptureError, ObservationError, UnknownSiteError, UsageError
 from probe_kit.hooks.contract.card import ModelCard, model_html, model_text
 from probe_kit.hooks.contract.declared import ALL_EDITS, Interventions
+from probe_kit.hooks.contract.feature_statistics import FeatureStatistics
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import Site, Stream, first_of
@@ -396,29 +397,31 @@ class Policy(Model):
         """The names of the numbers that `predict` gives, in order; None where the checkpoint has none."""
         return None
 
-    def unusual_states(self, states: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """Return (n, D) which numbers of recorded states (n, D) lie far outside the checkpoint's own statistics.
+    @property
+    def state_statistics(self) -> FeatureStatistics | None:
+        """The statistics of states that the checkpoint was trained on; None where nothing is compared.
 
         Raises:
-            CheckpointError: For a checkpoint without statistics.
+            CheckpointError: For a checkpoint that lacks statistics.
         """
-        return np.zeros(states.shape, bool)
+        return None
 
     @property
     def unguarded_state(self) -> str | None:
         """The reason why the states of a source are compared with no statistics; None where they are compared.
 
-        `unusual_states` compares them. A family that reads a state has statistics of it, or says here why not; the
+        `state_statistics` has them. A family that reads a state has statistics of it, or says here why not; the
         card's notes repeat it.
         """
         if self.state_numbers is None:
             return "no state is read"
-        compares = type(self).unusual_states is not Policy.unusual_states
+        compares = type(self).state_statistics is not Policy.state_statistics
         return None if compares else "the family has no statistics of states"
 
-    def unusual_actions(self, actions: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """Return (n, D) which numbers of recorded actions (n, D) lie far outside the checkpoint's statistics."""
-        return np.zeros(actions.shape, bool)
+    @property
+    def action_statistics(self) -> FeatureStatistics | None:
+        """The statistics of actions that the checkpoint was trained on; None where nothing is compared."""
+        return None
 
     @property
     def predicts_relative(self) -> bool:

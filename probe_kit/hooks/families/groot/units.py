@@ -1,7 +1,7 @@
 """Physical units of GR00T, as the processors of lerobot and of NVIDIA map them to the network's numbers."""
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,10 +14,9 @@ from lerobot.policies.groot.utils import config_value
 from numpy.typing import NDArray
 
 from probe_kit.errors import CheckpointError
+from probe_kit.hooks.contract.feature_statistics import LEVELS, FeatureStatistics
 from probe_kit.hooks.families.groot.packing import StateFields
 from probe_kit.hooks.families.shared.lerobot.normaliser import Normaliser
-
-_TURN = 2 * np.pi
 
 
 @dataclass(frozen=True)
@@ -50,15 +49,19 @@ class StateUnits(Normaliser):
             position = end
         return np.asarray(np.concatenate([*parts, mapped[..., position:]], -1), np.float32)
 
-    def unusual(self, values: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """Return (..., D): outside the bounds, or far from the mean; never of what is not read.
+    @property
+    def statistics(self) -> FeatureStatistics | None:
+        """The statistics with which states are compared; None where the state is not read.
 
         An angle in radians comes back after a turn; one in degrees lies outside the bounds and beyond a turn.
         """
-        beyond = super().unusual(values)
+        statistics = super().statistics
+        if statistics is None or self.excluded:
+            return None
+        periodic = np.zeros(statistics.width, bool)
         for begin, end in self.angles:
-            beyond[..., begin:end] &= np.abs(values[..., begin:end]) > _TURN
-        return np.zeros_like(beyond) if self.excluded else beyond
+            periodic[begin:end] = True
+        return replace(statistics, periodic=periodic)
 
 
 def state_units(
@@ -79,8 +82,9 @@ def state_units(
         return _nvidias_state(step, numbers, source, fields)
     if not step.normalize_min_max:
         raise CheckpointError(f"{source} does not normalise the state: its units are unknown")
-    low, high = _bounds((step.stats or {}).get("observation.state", {}), numbers, "observation.state", source)
-    return Normaliser("MIN_MAX", low, high, 0.0, source, clamped=step.clip_outliers)
+    stored = (step.stats or {}).get("observation.state", {})
+    low, high = _bounds(stored, numbers, "observation.state", source)
+    return Normaliser("MIN_MAX", low, high, 0.0, source, clamped=step.clip_outliers, stored=stored)
 
 
 def action_units(
@@ -105,12 +109,14 @@ def action_units(
         return _grouped(step, numbers, source, () if fields is None else fields.action_deviations)
     if not step.normalize_min_max:
         raise CheckpointError(f"{source} does not normalise actions: their units are unknown")
-    low, high = _bounds((step.stats or {}).get("action", {}), numbers, "action", source)
+    stored = (step.stats or {}).get("action", {})
+    low, high = _bounds(stored, numbers, "action", source)
     jumps = step.libero_gripper_action and numbers >= 7
     if jumps and not step.libero_gripper_binarize:
         raise CheckpointError(f"{source} asks for a gripper between −1 and 1 that lerobot does not write itself")
     sign = numbers - 1 if jumps else None
-    return Normaliser("MIN_MAX", low, high, 0.0, source, clamped=step.clip_normalized_action, sign=sign)
+    clamped = step.clip_normalized_action
+    return Normaliser("MIN_MAX", low, high, 0.0, source, clamped=clamped, sign=sign, stored=stored)
 
 
 def _nvidias_state(step: GrootN17PackInputsStep, numbers: int, source: str, fields: StateFields) -> StateUnits:
@@ -126,8 +132,9 @@ def _nvidias_state(step: GrootN17PackInputsStep, numbers: int, source: str, fiel
     mode = "EXCLUDED (zeros)" if fields.excluded else mode
     clamped = ~scored & step.clip_outliers
     units = StateUnits(
-        mode, low, high, 0.0, source, scored=scored, clamped=clamped, angles=angles, excluded=fields.excluded
-    )
+        mode, low, high, 0.0, source, scored=scored, clamped=clamped, angles=angles, excluded=fields.excluded,
+        stored=_all_side_by_side(keys, statistics, numbers),
+    )  # fmt: skip
     if units.numbers > step.max_state_dim:
         raise CheckpointError(
             f"{source}: the state with its sines and cosines has {units.numbers} numbers; the network reads "
@@ -172,6 +179,18 @@ def _side_by_side(
     return below, above, np.array(flags, bool), ends
 
 
+def _all_side_by_side(
+    keys: Sequence[str], statistics: Mapping[str, Any], numbers: int
+) -> dict[str, NDArray[np.float64]]:
+    """Return every statistic (numbers,) that all groups have, the groups side by side."""
+    entries = [statistics.get(key, {}) for key in keys]
+    return {
+        name: np.concatenate([np.atleast_1d(np.asarray(entry[name], np.float64)) for entry in entries])[:numbers]
+        for name in (*LEVELS, "std")
+        if entries and all(name in entry for entry in entries)
+    }
+
+
 def _mode(names: tuple[str, str], scored: NDArray[np.bool_]) -> str:
     bounds_mode = "QUANTILES" if names[0] == "q01" else "MIN_MAX"
     return bounds_mode if not scored.any() else "MEAN_STD" if scored.all() else f"{bounds_mode} and MEAN_STD"
@@ -210,7 +229,10 @@ def _grouped(
         raise CheckpointError(f"{source} has no action 'gripper', which LIBERO's convention is about")
     sign = begin if step.action_decode_transform is not None else None
     low, high, flags = low[:numbers], high[:numbers], flags[:numbers]
-    return Normaliser(_mode(names, flags), low, high, 0.0, source, scored=flags, clamped=~flags, sign=sign)
+    stored = _all_side_by_side(keys, statistics, numbers)
+    return Normaliser(
+        _mode(names, flags), low, high, 0.0, source, scored=flags, clamped=~flags, sign=sign, stored=stored
+    )
 
 
 def _bounds(

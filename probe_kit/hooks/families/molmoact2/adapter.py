@@ -333,7 +333,7 @@ class MolmoAct2(PackedPolicy):
             clamped &= ~(plain if config.unclamped is None else _of_width(config.unclamped, numbers))
         frame = config.state_frame if is_state else config.action_frame
         statistics = (units.mode, units.low, units.high, units.eps, units.source)
-        return FramedUnits(*statistics, plain=plain, clamped=clamped, frame=frame)
+        return FramedUnits(*statistics, plain=plain, clamped=clamped, frame=frame, stored=units.stored)
 
     # -- acting ------------------------------------------------------------------------------------------
 

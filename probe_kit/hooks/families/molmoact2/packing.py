@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from probe_kit.errors import CheckpointError, InstructionError, ObservationError
+from probe_kit.hooks.contract.feature_statistics import FeatureStatistics
 from probe_kit.hooks.families.shared.kinds import STATE
 from probe_kit.hooks.families.shared.lerobot.flow import PackedRow, label_groups
 from probe_kit.hooks.families.shared.lerobot.normaliser import Normaliser
@@ -82,9 +83,15 @@ class FramedUnits(Normaliser):
         slopes[..., : len(self.frame.signs)] *= self.frame.signs
         return slopes
 
-    def unusual(self, values: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """Return (..., D) which values are unusual, in the frame of the statistics."""
-        return super().unusual(self.frame.entered(values))
+    @property
+    def statistics(self) -> FeatureStatistics | None:
+        """The statistics in the frame of the robot, whose values are compared."""
+        statistics, joints = super().statistics, len(self.frame.signs)
+        if statistics is None:
+            return None
+        slopes, offsets = np.ones(statistics.width), np.zeros(statistics.width)
+        slopes[:joints], offsets[:joints] = self.frame.signs, -self.frame.signs * self.frame.offsets
+        return statistics.mapped(slopes, offsets)
 
 
 # -- settings of processor steps ------------------------------------------------------------------------------

@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal
@@ -16,6 +16,7 @@ from probe_kit._system.bounded_files import parse_json, read_regular
 from probe_kit._system.foreign_files import while_reading
 from probe_kit.errors import CheckpointError
 from probe_kit.hooks.checkpoints.checkpoint import shard_name
+from probe_kit.hooks.contract.feature_statistics import LEVELS, FeatureStatistics
 from probe_kit.hooks.families.shared.lerobot.pipelines import (
     MASKED,
     NORMALISERS,
@@ -28,10 +29,6 @@ from probe_kit.models.pi0 import STATISTICS
 
 _EPS = 1e-8
 """The number in denominators, where the checkpoint says no other: LeRobot's default."""
-USUAL_DEVIATIONS = 5.0
-"""The number of deviations from the mean; values further away are unusual."""
-_ROUNDING = 1e-3
-"""The share of the range by which a value may lie outside of its bounds."""
 _STEPS = (*NORMALISERS, *MASKED)
 # The two statistics each mode needs, as (offset-like, scale-like).
 _NEEDED = {
@@ -40,7 +37,7 @@ _NEEDED = {
     "QUANTILES": ("q01", "q99"),
     "QUANTILE10": ("q10", "q90"),
 }
-
+_NAMED = {**_NEEDED, "BOUNDS": ("q01", "q99")}
 
 Mask = NDArray[np.bool_] | bool
 
@@ -59,6 +56,7 @@ class Normaliser:
         plain: Mask of the numbers that stay as they are.
         clamped: Mask of the network's numbers that are moved to -1 to 1.
         sign: Index of the action that becomes −1 or 1, as LIBERO's gripper; None where there is none.
+        stored: (D,) every statistic of the feature that the file holds, by lerobot's name.
 
     Raises:
         CheckpointError: For statistics that are not finite, or whose scale is not positive.
@@ -73,6 +71,7 @@ class Normaliser:
     plain: Mask = False
     clamped: Mask = False
     sign: int | None = None
+    stored: Mapping[str, NDArray[Any]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         scored = self._scored
@@ -132,17 +131,23 @@ class Normaliser:
             slopes[..., self.sign] = 0
         return slopes
 
-    def unusual(self, values: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """Return (..., D) which physical values are over five deviations from the mean, or outside the bounds.
+    @property
+    def statistics(self) -> FeatureStatistics | None:
+        """The statistics with which physical values are compared; None where none normalise them.
 
-        They include values that `normalise` clamps, and never numbers without statistics.
+        Numbers that stay as they are have statistics too, and are not compared.
         """
         if self.mode == "IDENTITY":
-            return np.zeros(values.shape, bool)
-        far = np.abs(values - self.low) > USUAL_DEVIATIONS * (self.high + self.eps)
-        slack = _ROUNDING * (self.high - self.low) + _EPS
-        beyond = (values < self.low - slack) | (values > self.high + slack)
-        return np.asarray(np.where(self._scored, far, beyond) & ~np.asarray(self.plain))
+            return None
+        low, high = next((pair for mode, pair in _NAMED.items() if self.mode.startswith(mode)), ("", ""))
+        stored = FeatureStatistics.of(self.stored, len(self.low))
+        values = {} if stored is None else dict(stored.values)
+        for names, mask in (((low, high), ~self._scored), (("mean", "std"), self._scored)):
+            for name, numbers in zip(names, (self.low, self.high), strict=True):
+                if name and mask.any():
+                    other = values.get(name, np.full(len(mask), np.nan))
+                    values[name] = np.where(mask, numbers.astype(np.float64), other)
+        return FeatureStatistics(values, np.broadcast_to(~np.asarray(self.plain), self.low.shape))
 
 
 def read_normaliser(folder: Path, pipeline: str, feature: str, kind: str) -> Normaliser:
@@ -165,16 +170,17 @@ def read_normaliser(folder: Path, pipeline: str, feature: str, kind: str) -> Nor
             mode = (step.config.get("norm_map") or {}).get(kind, "IDENTITY")
             if mode == "IDENTITY" or (kind == "STATE" and reads_state_as_it_is(step, feature)):
                 return Normaliser("IDENTITY", np.zeros(0, np.float32), np.zeros(0, np.float32), 0.0, path.name)
-            low, high = _statistics(folder, step.state, feature, mode)
+            low, high, stored = _statistics(folder, step.state, feature, mode)
             with while_reading(path):
                 eps = float(step.config.get("eps", _EPS))
-            return Normaliser(mode, low, high, eps, str(step.state))
+            return Normaliser(mode, low, high, eps, str(step.state), stored=stored)
     raise CheckpointError(f"{path} has no normaliser step: the units of {feature} are unknown")
 
 
 def _statistics(
     folder: Path, name: str | None, feature: str, mode: str
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+) -> tuple[NDArray[np.float32], NDArray[np.float32], dict[str, NDArray[Any]]]:
+    """Return the two statistics of a mode, and all of the feature by their names."""
     if mode not in _NEEDED:
         raise CheckpointError(f"normalisation {mode!r} of {feature} is not one of {', '.join(_NEEDED)}, IDENTITY")
     with while_reading(folder / str(name), advice="Download it again"):
@@ -184,9 +190,9 @@ def _statistics(
     missing = [key for key in keys if key not in arrays]
     if missing:
         sources = [name for name, renamed in rename_map(folder).items() if renamed == feature]
-        if stored := next((source for source in sources if f"{source}.{_NEEDED[mode][0]}" in arrays), None):
+        if source_name := next((source for source in sources if f"{source}.{_NEEDED[mode][0]}" in arrays), None):
             raise CheckpointError(
-                f"{path} has the statistics of {stored}, which the preprocessor's rename map calls {feature}: "
+                f"{path} has the statistics of {source_name}, which the preprocessor's rename map calls {feature}: "
                 f"lerobot looks them up as {feature}, and so leaves that feature as it is. Fine-tune it on a data "
                 f"set whose feature is called {feature}"
             )
@@ -194,7 +200,8 @@ def _statistics(
             f"{folder} has no statistics {', '.join(missing)} (looked in {name}): its {feature} has no physical "
             "unit. Take the statistics of the data set it was trained on"
         )
-    return arrays[keys[0]], arrays[keys[1]]
+    stored = {name: arrays[f"{feature}.{name}"] for name in (*LEVELS, "std") if f"{feature}.{name}" in arrays}
+    return arrays[keys[0]], arrays[keys[1]], stored
 
 
 def read_buffers(folder: Path) -> dict[str, NDArray[np.float32]]:

@@ -26,6 +26,7 @@ from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE, SMALL_FILES, sid
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.checkpoints.weights import Weights, load_weights, read_weights
 from probe_kit.hooks.contract.card import ARM
+from probe_kit.hooks.contract.feature_statistics import FeatureStatistics
 from probe_kit.hooks.contract.model import Policy, Tap
 from probe_kit.hooks.contract.observation import ARM_NUMBERS, Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles
@@ -420,9 +421,10 @@ class LerobotPolicy(Policy):
         """The count of numbers of an action in the checkpoint's configuration."""
         return int(self.config.output_features["action"].shape[0])
 
-    def unusual_states(self, states: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """Return (n, D): more than five deviations from the mean, or outside the bounds of the statistics."""
-        return self.state_units.unusual(states)
+    @property
+    def state_statistics(self) -> FeatureStatistics | None:
+        """All statistics of states that stand beside those that normalise."""
+        return self.state_units.statistics
 
     @property
     def unguarded_state(self) -> str | None:
@@ -435,9 +437,10 @@ class LerobotPolicy(Policy):
             return f"the state is {units.mode} by {units.source}"
         return None
 
-    def unusual_actions(self, actions: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """Return (n, D): more than five deviations from the mean, or outside the bounds of the statistics."""
-        return self.action_units.unusual(actions)
+    @property
+    def action_statistics(self) -> FeatureStatistics | None:
+        """All statistics of actions that stand beside those that normalise."""
+        return self.action_units.statistics
 
     @cached_property
     def predicts_relative(self) -> bool:
