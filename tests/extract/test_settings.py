@@ -432,8 +432,15 @@ def test_lost_or_changed_provenance_is_found(suite: Suite, tmp_path: Path) -> No
     assert "was changed" in verify_run(run.path).problems[0]
     record.unlink()
     assert "is missing" in verify_run(run.path).problems[0]
-    with pytest.raises(RunDamagedError, match="provenance"):
+    assert Run(locate(run.path)).provenances == run.provenances, "the certificate says the same"
+    assert extract_run(expert(suite), run.path).stamp == run.stamp
+    assert verify_run(run.path).ok
+    (run.path / "certificate.json").unlink()
+    record.unlink()
+    with pytest.raises(RunDamagedError, match=r"provenance/.* is missing.*run the same `probe-kit extract` again"):
         _ = Run(locate(run.path)).mixed
+    assert extract_run(expert(suite), run.path).stamp == run.stamp
+    assert verify_run(run.path).ok
 
 
 def test_the_versions_of_the_machine_are_those_of_the_packages() -> None:
