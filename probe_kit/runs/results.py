@@ -203,12 +203,12 @@ def is_complete(location: Location, home: str, key: str) -> bool:
     """Whether the bundle `key` is stored with all its files. One that lost a file is made again, not refused.
 
     Raises:
-        RunDamagedError: If its head was changed.
+        RunDamagedError: If its head was changed, or names a file elsewhere.
     """
     folder = f"{home}/{key}"
     if not location.exists(f"{folder}/{HEAD}"):
         return False
-    head = Head.read(location, f"{folder}/{HEAD}", advice_for(folder))
+    head = _read_head(location, folder)
     names = {actual: name for name, (actual, _) in head.files.items()}
     missing = {TIMES, *names} - {*location.sizes(folder, (TIMES, *names))}
     if not missing:
@@ -235,8 +235,14 @@ def read_bundle(location: Location, home: str, key: str) -> Bundle:
 
 def _read_bundle(location: Location, home: str, key: str, run: str | None) -> Bundle:
     folder, expected = f"{home}/{key}", {"key": key, "run": run}
-    head = Head.read(location, f"{folder}/{HEAD}", advice_for(folder), **expected)
+    head = _read_head(location, folder, **expected)
     times = Times.read(location, f"{folder}/{TIMES}", advice_for(folder), **expected)
+    parts = {part: value for part, value in head.content.items() if part not in ("key", "run", "files")}
+    return Bundle(location, home, key, parts, times.model_extra or {}, head.files)
+
+
+def _read_head(location: Location, folder: str, **expected: str | None) -> Head:
+    head = Head.read(location, f"{folder}/{HEAD}", advice_for(folder), **expected)
     if strange := sorted(
         actual for actual, _ in head.files.values() if "/" in actual or actual in ("", ".", "..")
     ):
@@ -244,8 +250,7 @@ def _read_bundle(location: Location, home: str, key: str, run: str | None) -> Bu
             f"{location}/{folder}/{HEAD} names {strange[0]!r}, which is not a file in the same folder. "
             f"{advice_for(folder)}"
         )
-    parts = {part: value for part, value in head.content.items() if part not in ("key", "run", "files")}
-    return Bundle(location, home, key, parts, times.model_extra or {}, head.files)
+    return head
 
 
 def bundle_keys(location: Location, home: str) -> list[str]:

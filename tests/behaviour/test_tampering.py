@@ -366,8 +366,9 @@ def test_a_pipe_or_a_device_in_the_place_of_a_file_is_not_waited_for(run: Path, 
     os.mkfifo(run / key)
     found = verify_run(run, deep=True)
     assert not found.ok or found.committed < found.planned
-    with pytest.raises((RunDamagedError, RunIncompleteError)):
-        readings(run)
+    if key != "certificate.json":  # which other records repeat
+        with pytest.raises((RunDamagedError, RunIncompleteError)):
+            readings(run)
 
 
 # -- nothing -----------------------------------------------------------------------------------------------

@@ -17,7 +17,7 @@ from probe_kit._terminal.field_options import command_with, options_of
 from probe_kit.cli import app
 from probe_kit.env import SceneSpec
 from probe_kit.env.spec import PRESETS
-from probe_kit.errors import SettingsMismatchError, UsageError
+from probe_kit.errors import RunDamagedError, SettingsMismatchError, UsageError
 from probe_kit.extract import AskSettings, EnvSource, ExtractSettings, LeRobotSource, extract_run, prepare
 from probe_kit.extract.config_files import read_config
 from probe_kit.extract.extraction import open_checked
@@ -432,10 +432,15 @@ def test_lost_or_changed_provenance_is_found(suite: Suite, tmp_path: Path) -> No
     assert "was changed" in verify_run(run.path).problems[0]
     record.unlink()
     assert "is missing" in verify_run(run.path).problems[0]
-    assert not Run(locate(run.path)).mixed, "the certificate says what the record said"
-    extract_run(expert(suite), tmp_path / "run")
-    assert record.is_file(), "what follows from the rest of a run is made again"
-    assert verify_run(run.path).problems == ()
+    assert Run(locate(run.path)).provenances == run.provenances, "the certificate says the same"
+    assert extract_run(expert(suite), run.path).stamp == run.stamp
+    assert verify_run(run.path).ok
+    (run.path / "certificate.json").unlink()
+    record.unlink()
+    with pytest.raises(RunDamagedError, match=r"provenance/.* is missing.*run the same `probe-kit extract` again"):
+        _ = Run(locate(run.path)).mixed
+    assert extract_run(expert(suite), run.path).stamp == run.stamp
+    assert verify_run(run.path).ok
 
 
 def test_the_versions_of_the_machine_are_those_of_the_packages() -> None:

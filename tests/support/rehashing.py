@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from probe_kit.hashing import sha256_json
+from probe_kit.runs.array_lengths import without_length
 from probe_kit.runs.arrays import inner_chunks
 from probe_kit.runs.records import BLOCK_BYTES, HASH, Checksum, as_record, block_digest
 
@@ -19,7 +20,9 @@ def rehash(run: Path) -> None:
     shutil.rmtree(run / "sealed", ignore_errors=True)
     root = _content(run / "run.json")
     metadata = sorted((run / "data.zarr").rglob("zarr.json"))
-    root["objects"] = {path.relative_to(run).as_posix(): _sum(path).to_json() for path in metadata}
+    # As the run began: the length that other tools see is no part of its identity.
+    begun = {path.relative_to(run).as_posix(): without_length(path.read_bytes()) for path in metadata}
+    root["objects"] = {key: Checksum.of(content).to_json() for key, content in begun.items()}
     identity = _write(run / "run.json", root)
     plans: dict[int, str] = {}
     for path in sorted((run / "plan").glob("*.json")):
