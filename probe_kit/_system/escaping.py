@@ -3,6 +3,7 @@
 import csv
 import io
 import re
+import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,11 @@ if TYPE_CHECKING:
 _BIDI = "\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069"
 UNSAFE = re.compile(f"[\x00-\x08\x0b-\x1f\x7f-\x9f{_BIDI}\u2028\u2029\ufeff\ud800-\udfff]")
 """Control characters but tab and newline, bidirectional marks, foreign line ends, halves of surrogate pairs."""
+
+
+def as_argument(place: object) -> str:
+    """Return a path or an address as it is typed behind a command: in quotes where a shell would split it."""
+    return shlex.quote(str(place))
 
 
 def terminal_safe(text: str) -> str:

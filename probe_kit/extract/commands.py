@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from probe_kit._system.counting import counted
-from probe_kit._system.escaping import terminal_safe
+from probe_kit._system.escaping import as_argument, terminal_safe
 from probe_kit._terminal import options as common
 from probe_kit._terminal.console import counter, err, marked, out, print_json, progress, say
 from probe_kit._terminal.field_options import command_with
@@ -280,9 +280,10 @@ def _next_command(run: "Run") -> str:
     from probe_kit.suite.sufficiency import probe_command
 
     if run.streams and run.inputs is not None:
-        return f"probe-kit targets {run.location}"
+        return f"probe-kit targets {as_argument(run.location)}"
     groups = run.episodes.groupby("category")["group_id"].nunique().to_dict() if run.streams else {}
-    return probe_command(run.location, groups) or f"probe-kit retention {run.location}"
+    place = as_argument(run.location)
+    return probe_command(place, groups) or f"probe-kit retention {place}"
 
 
 def print_input_notes(run: "Run") -> None:
@@ -293,7 +294,13 @@ def print_input_notes(run: "Run") -> None:
     for note in notes_of_content(run):
         say(content_warning(note))
     for note in input_notes(run.certificate):
-        say(marked("[yellow]{}; [bold]probe-kit diagnose {}[/] says where it is lost[/]", note, run.location))
+        say(
+            marked(
+                "[yellow]{}; [bold]probe-kit diagnose {}[/] says where it is lost[/]",
+                note,
+                as_argument(run.location),
+            )
+        )
 
 
 def _print_outcomes(run: "Run") -> None:
@@ -380,7 +387,7 @@ def _print_answers(runs: "Sequence[Run]") -> None:
         out.print(str(run.location), soft_wrap=True)
     if SIDE not in runs[0].episodes:
         step = "targets {}" if runs[0].streams else "labels {}"
-        say(marked(f"next: [bold]probe-kit {step}[/]", runs[0].location))
+        say(marked(f"next: [bold]probe-kit {step}[/]", as_argument(runs[0].location)))
         return
     places = " ".join(str(run.location) for run in runs)
     say(marked("next: [bold]probe-kit retention {}[/]  add policy runs of the suite", places))

@@ -13,6 +13,7 @@ import typer
 from pydantic import create_model
 
 from probe_kit._system.bounded_files import read_json_object
+from probe_kit._system.escaping import as_argument
 from probe_kit._terminal.field_options import FieldOption, Part
 from probe_kit.errors import UsageError
 from probe_kit.extract.parts import is_here
@@ -79,7 +80,7 @@ def _of_run(folder: Path, typed: Mapping[str, Any], asks: bool) -> Mapping[str, 
         raise UsageError(f"{folder} does not say with which settings it was requested; type the options again")
     if asks != ("prompt" in config["task"]):
         words, command = ("was not asked", "extract") if asks else ("was asked", "ask")
-        raise UsageError(f"{folder} {words}; repeat it with `probe-kit {command} --config {folder}`")
+        raise UsageError(f"{folder} {words}; repeat it with `probe-kit {command} --config {as_argument(folder)}`")
     if any(edit.get("vector") for edit in config["task"].get("edits", ())):
         raise UsageError(
             f"{folder} was edited by vectors, which no run stores; repeat it in Python with `vectors`"

@@ -15,6 +15,7 @@ from rich.panel import Panel
 from rich.text import Text
 
 from probe_kit._system.counting import counted
+from probe_kit._system.escaping import as_argument
 from probe_kit._tables.numbers import whole_percent
 from probe_kit._tables.printing import Format, print_table
 from probe_kit._tables.table import Table
@@ -245,7 +246,8 @@ def intervene(
     print_result(result, style, details)
     if style == "table":
         has_sides = result.outcomes.has_sides
-        following = f"retention {run}" if has_sides else f"run show {run}"
+        place = as_argument(run)
+        following = f"retention {place}" if has_sides else f"run show {place}"
         what = "use beside probes and success" if has_sides else "what the run stores"
         say(marked("next: [bold]probe-kit {}[/]  {}", following, what))
     say(marked("stored as {}", result.key))

@@ -21,6 +21,7 @@ from typing import Any, Self
 import numpy as np
 
 from probe_kit._system.bounded_files import parse_json
+from probe_kit._system.escaping import as_argument
 from probe_kit.errors import NoInterventionsError, RunDamagedError
 from probe_kit.intervene.outcomes import (
     BY_CONDITION,
@@ -212,7 +213,7 @@ def find_stored(run: RunReader, key: str | None = None, kind: str | None = None)
         if not candidates:
             raise NoInterventionsError(
                 f"{run.location} has no stored intervention{'' if kind is None else f' of kind {kind}'} on its "
-                f"episodes. Run `probe-kit intervene {run.location}`"
+                f"episodes. Run `probe-kit intervene {as_argument(run.location)}`"
             )
         return candidates[-1]
     by_key = {intervention.key: intervention for intervention in candidates}

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal, Self, get_args
 
 from probe_kit._system.counting import counted
-from probe_kit._system.escaping import csv_of_frame, without_folders
+from probe_kit._system.escaping import as_argument, csv_of_frame, without_folders
 from probe_kit._tables.formats import render
 from probe_kit._tables.table import Table
 from probe_kit.env.scoring import DEFAULT_RULE, SENSITIVITY_RADII, check_rule
@@ -552,7 +552,7 @@ def _read_sides(runs: Sequence[TableRun], keys: Sequence[str | None]) -> tuple[P
             notes.append(
                 f"The probes {probes.key} of {run.location} are of other episodes than the run has now: "
                 "accuracies and success rates do not belong together. "
-                f"`probe-kit train {run.location}` fits new ones."
+                f"`probe-kit train {as_argument(run.location)}` fits new ones."
             )
         probes_of_rows.append((table_run, probes))
     return probes_of_rows, notes

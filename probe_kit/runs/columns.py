@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from zarr.errors import ChunkNotFoundError
 
+from probe_kit._system.escaping import as_argument
 from probe_kit.errors import RunDamagedError
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.runs.array_store import ArrayStore
@@ -96,7 +97,7 @@ class Columns:
 
 
 def _sealing(location: Location) -> str:
-    return f"`probe-kit run verify {location} --seal` builds the columns again"
+    return f"`probe-kit run verify {as_argument(location)} --seal` builds the columns again"
 
 
 def find_columns(root: Root, commits: Mapping[int, Commit], skip_damaged: bool = False) -> Columns | None:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit._system.counting import counted
+from probe_kit._system.escaping import as_argument
 from probe_kit.errors import UsageError
 from probe_kit.runs.run_source import Origin
 
@@ -40,10 +41,11 @@ def origin_of(run: RunReader) -> Origin:
 def check_sides(run: RunReader, purpose: str) -> None:
     """Raise UsageError for a run without sides; the message says that `purpose` is not possible without them."""
     if SIDE not in run.episodes:
+        place = as_argument(run.location)
         raise UsageError(
             f"{run.location} has no column {SIDE}: {run.source.words}. There are no sides, so {purpose} is not "
-            f"possible. `probe-kit targets {run.location}` lists what can be decoded, `probe-kit labels "
-            f"{run.location}` writes a table for labels of your own"
+            f"possible. `probe-kit targets {place}` lists what can be decoded, `probe-kit labels {place}` "
+            "writes a table for labels of your own"
         )
 
 

@@ -16,6 +16,7 @@ from typing import Any, ClassVar, NoReturn, NotRequired, TypedDict, cast
 
 from pydantic import ConfigDict, field_serializer, field_validator
 
+from probe_kit._system.escaping import as_argument
 from probe_kit.errors import ActivationsLeftOutError, RunDamagedError, RunNotFoundError, UsageError
 from probe_kit.hashing import sha256_json
 from probe_kit.runs.array_lengths import with_length, without_length
@@ -380,5 +381,5 @@ def check_label(label: str) -> None:
 
 def read_label(root: Root) -> str:
     """Return a run's label. Raises RunDamagedError if its record is missing, changed, or of another run."""
-    advice = f"Write it anew: `probe-kit run show {root.location} --label LABEL`"
+    advice = f"Write it anew: `probe-kit run show {as_argument(root.location)} --label LABEL`"
     return Label.read(root.location, LABEL_FILE, advice, run=root.identity).label

@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from probe_kit._system.escaping import as_argument
 from probe_kit._terminal.notebook import facts_html
 from probe_kit.env.scoring import DEFAULT_RULE, check_rule
 from probe_kit.errors import (
@@ -696,7 +697,7 @@ class Run:
         if self.columns is None:
             warnings.warn(
                 f"{self.location} is not sealed; columns are put together from rows, which is slow but gives the "
-                f"same numbers. `probe-kit run verify {self.location} --seal` makes it fast",
+                f"same numbers. `probe-kit run verify {as_argument(self.location)} --seal` makes it fast",
                 NotSealedWarning,
                 stacklevel=2,
             )

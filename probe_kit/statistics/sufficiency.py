@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from probe_kit._system.counting import counted
+from probe_kit._system.escaping import as_argument
 from probe_kit.errors import TooFewGroupsError
 from probe_kit.statistics.bootstrap import GAINS, group_bootstrap
 from probe_kit.statistics.crossfit import CHANCE, FEWEST_GROUPS, GroupSums, Matrix
@@ -124,7 +125,7 @@ def probe_command(run: object, groups: Mapping[Any, int]) -> str:
     enough = [name for name, count in groups.items() if count >= GROUPS_FOR_PROBES]
     if not enough:
         return ""
-    option = "" if len(enough) == len(groups) else f" --categories {','.join(enough)}"
+    option = "" if len(enough) == len(groups) else f" --categories {as_argument(','.join(enough))}"
     return f"probe-kit train {run}{option}"
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from probe_kit._system.counting import counted
+from probe_kit._system.escaping import as_argument
 from probe_kit._tables.printing import Format, print_table
 from probe_kit._terminal.console import counter, err, marked, out, print_json, print_text, progress, say
 from probe_kit._terminal.options import (
@@ -133,7 +134,7 @@ def run(
     if failed or plan.totals()["missing"]:
         raise typer.Exit(UNFINISHED)
     if study.study.tables:
-        say(marked("next: [bold]probe-kit study table {}[/]", file))
+        say(marked("next: [bold]probe-kit study table {}[/]", as_argument(file)))
 
 
 def _print(plan: "StudyPlan", as_json: bool) -> None:

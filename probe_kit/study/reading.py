@@ -13,6 +13,7 @@ from pydantic import BaseModel, ValidationError
 
 from probe_kit._system.bounded_files import read_regular
 from probe_kit._system.complaints import MISSING, UNKNOWN, complaints_of, joined
+from probe_kit._system.escaping import as_argument
 from probe_kit.errors import UsageError
 from probe_kit.study import schema
 from probe_kit.study.archive import RUNS, STUDY_FILE, Pack, open_archive
@@ -53,7 +54,7 @@ class LoadedStudy:
     @property
     def typed(self) -> str:
         """The argument of `probe-kit study` for this study: the name of a shipped one, else the file."""
-        return self.file.stem if self.file in shipped_studies().values() else str(self.file)
+        return self.file.stem if self.file in shipped_studies().values() else as_argument(self.file)
 
 
 def find_study(name: str) -> Path:

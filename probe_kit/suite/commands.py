@@ -7,6 +7,7 @@ import typer
 
 from probe_kit._system.bounded_files import load_json, parse_json
 from probe_kit._system.counting import counted
+from probe_kit._system.escaping import as_argument
 from probe_kit._terminal.console import counter, err, marked, out, print_json, progress
 from probe_kit._terminal.options import AsJson, Categories, Seed, choices, one_of
 from probe_kit.errors import UsageError
@@ -88,9 +89,10 @@ def from_csv(
     out.print(
         f"{suite.identity}: {counted(count, 'item')} in {counted(groups, 'group')} in {out_folder}", soft_wrap=True
     )
-    err.print(f"next: probe-kit suite validate {out_folder} --baselines", soft_wrap=True)
+    err.print(f"next: probe-kit suite validate {as_argument(out_folder)} --baselines", soft_wrap=True)
     err.print(
-        f"then: probe-kit extract --model pi0-tiny --suite {out_folder} --out runs/{out_folder.name}-questions",
+        f"then: probe-kit extract --model pi0-tiny --suite {as_argument(out_folder)} "
+        f"--out {as_argument(f'runs/{out_folder.name}-questions')}",
         soft_wrap=True,
     )
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 from rich.text import Text
 
 from probe_kit._system.counting import counted
+from probe_kit._system.escaping import as_argument
 from probe_kit._terminal import options as common
 from probe_kit._terminal.console import counter, marked, out, progress, say, split
 from probe_kit.errors import TooFewGroupsError, UnbalancedEpisodesError, UsageError
@@ -113,7 +114,7 @@ def train(
         count = write_direction_file(fitted[0].directions, directions, opened.weights_sha256)
         say(marked("{} directions: {}", count, directions))
     of_target = "" if target_options.is_side else f" --target {shlex.quote(target)}"
-    say(marked("next: [bold]probe-kit retention {}{}[/]", run, of_target))
+    say(marked("next: [bold]probe-kit retention {}{}[/]", as_argument(run), of_target))
 
 
 def _train(

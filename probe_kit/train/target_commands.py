@@ -10,6 +10,7 @@ from warnings import catch_warnings, simplefilter
 import typer
 
 from probe_kit._system.counting import counted
+from probe_kit._system.escaping import as_argument
 from probe_kit._tables.numbers import NONE
 from probe_kit._tables.printing import Format, print_table
 from probe_kit._tables.table import Table
@@ -56,7 +57,12 @@ def targets(
         (row.options for row in listed if row.options is not None), key=lambda options: "--task" in options
     )
     if not possible:
-        say(marked("next: [bold]probe-kit labels {}[/]  writes a table to which you add labels of your own", run))
+        say(
+            marked(
+                "next: [bold]probe-kit labels {}[/]  writes a table to which you add labels of your own",
+                as_argument(run),
+            )
+        )
         return
     say(marked("next: [bold]{}[/]", _command(str(run), possible[0])))
 
@@ -213,7 +219,13 @@ def labels(
     )
     if opened.inputs is None and (reason := why_no_sim(opened)):
         say(marked("[yellow]no sim.* columns:[/] {}", reason))
-    say(marked("next: add a column, then [bold]probe-kit train {} --labels {} --target COLUMN[/]", run, out_file))
+    say(
+        marked(
+            "next: add a column, then [bold]probe-kit train {} --labels {} --target COLUMN[/]",
+            as_argument(run),
+            as_argument(out_file),
+        )
+    )
 
 
 def _open(run: str, partial: bool, wording: str | None) -> "Run":

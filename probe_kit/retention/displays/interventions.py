@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._system.escaping import as_argument
 from probe_kit.errors import NoInterventionsError
 from probe_kit.hooks.contract.sites import KV_STREAM
 from probe_kit.intervene.kinds.attention import (
@@ -113,7 +114,7 @@ class SiteEffectDisplay(Display):
         if not rows:
             raise NoInterventionsError(
                 f"{run.location} has no stored interchange of {category!r} in a layer of the backbone or of the "
-                f"keys and values. Run `probe-kit intervene {run.location} --kind interchange`"
+                f"keys and values. Run `probe-kit intervene {as_argument(run.location)} --kind interchange`"
             )
         probed_curve(results, view, category)  # raises where there is none; `scores_of` would be empty
         scores = scores_of(results, category, view, BACKBONE).sort_values("layer")
@@ -262,8 +263,8 @@ class AttentionDisplay(Display):
         recorded = (stored_attention(run) if stored is None else stored).get(category)
         if recorded is None:
             raise NoInterventionsError(
-                f"{run.location} has no stored attention of {category!r}. Run `probe-kit intervene {run.location} "
-                "--kind attention`"
+                f"{run.location} has no stored attention of {category!r}. Run "
+                f"`probe-kit intervene {as_argument(run.location)} --kind attention`"
             )
         left_out = {ALL, "special", *TILE_ROLES}
         by_block = recorded.frame(("block",))
@@ -339,8 +340,8 @@ def attention_on_picture(run: RunReader, category: str | None = None) -> "Figure
     if pictured is None:
         raise NoInterventionsError(
             f"{run.location} has no attention on patches{f' of {category!r}' if category else ''}, or no picture "
-            f"to draw it on. Run `probe-kit intervene {run.location} --kind attention` on a run that stores "
-            "pictures, with a family that says which token sees which pixels"
+            f"to draw it on. Run `probe-kit intervene {as_argument(run.location)} --kind attention` on a run that "
+            "stores pictures, with a family that says which token sees which pixels"
         )
     return _draw_on_picture(pictured, ProvenanceLine.of_run(run))
 
@@ -470,7 +471,8 @@ class DoseResponseDisplay(Display):
             raise NoInterventionsError(
                 f"{run.location} has no stored steering of {category!r}"
                 f"{f' at {position}' if position else ''}{alternatives}. "
-                f"Run `probe-kit intervene {run.location} --kind steer --sites backbone.NN --roles image`"
+                f"Run `probe-kit intervene {as_argument(run.location)} --kind steer --sites backbone.NN "
+                "--roles image`"
             )
         position = position or next(iter(by_position))
         rows = by_position[position]

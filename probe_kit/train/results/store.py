@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from probe_kit._system.bounded_files import UNREADABLE, open_arrays
-from probe_kit._system.escaping import csv_of_frame
+from probe_kit._system.escaping import as_argument, csv_of_frame
 from probe_kit.errors import NoProbesError, RunDamagedError, UsageError
 from probe_kit.hashing import sha256_json
 from probe_kit.hooks.contract.sites import Site
@@ -185,7 +185,11 @@ def load_results(run: RunReader, key: str | None = None, target: str | None = No
         if not run.streams:
             raise NoProbesError(f"{location} has no activations to probe: of {run.model!r} no stream was stored.")
         hint = f" (of {len(stored)} stored, none: other episodes or another target)" if stored else ""
-        advice = how_to_probe(run) if target in SIDES else f"Run `probe-kit train {location} --target {target}`."
+        advice = (
+            how_to_probe(run)
+            if target in SIDES
+            else f"Run `probe-kit train {as_argument(location)} --target {as_argument(target)}`."
+        )
         raise NoProbesError(f"{location} has no probes for target {target!r} on its episodes{hint}. {advice}")
     return _read(run, newest)
 
@@ -253,9 +257,9 @@ def is_current(settings: ProbeSettings, run: RunReader) -> bool:
 def how_to_probe(run: RunReader) -> str:
     """Return a sentence that says how a run gets probes: the command, or that it has too few groups of items."""
     if run.recorded or run.in_own_environment:
-        return f"`probe-kit targets {run.location}` lists what can be probed."
+        return f"`probe-kit targets {as_argument(run.location)}` lists what can be probed."
     if not {"category", "group_id"} <= set(run.episodes):
-        return f"Run `probe-kit train {run.location}`."
+        return f"Run `probe-kit train {as_argument(run.location)}`."
     counts = run.episodes.groupby("category", sort=False)["group_id"].nunique().to_dict()
     command = probe_command(run.location, counts)
     few = [f"{name} has {count}" for name, count in counts.items() if count < GROUPS_FOR_PROBES]

@@ -192,9 +192,9 @@ def _statistics(
         sources = [name for name, renamed in rename_map(folder).items() if renamed == feature]
         if source_name := next((source for source in sources if f"{source}.{_NEEDED[mode][0]}" in arrays), None):
             raise CheckpointError(
-                f"{path} has the statistics of {source_name}, which the preprocessor's rename map calls {feature}: "
-                f"lerobot looks them up as {feature}, and so leaves that feature as it is. Fine-tune it on a data "
-                f"set whose feature is called {feature}"
+                f"{path} has the statistics of {source_name}, which the preprocessor's rename map calls "
+                f"{feature}: lerobot looks them up as {feature}, and so leaves that feature as it is. Fine-tune "
+                f"it on a data set whose feature is called {feature}"
             )
         raise CheckpointError(
             f"{folder} has no statistics {', '.join(missing)} (looked in {name}): its {feature} has no physical "
