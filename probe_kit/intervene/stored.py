@@ -20,7 +20,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from probe_kit._system.bounded_files import parse_json
+from probe_kit._system.bounded_files import UNREADABLE, parse_json
 from probe_kit.errors import NoInterventionsError, RunDamagedError
 from probe_kit.intervene.outcomes import (
     BY_CONDITION,
@@ -34,7 +34,15 @@ from probe_kit.intervene.outcomes import (
 from probe_kit.intervene.settings import FIRST_CHUNK, FORMAT, PER_STEP, key_of
 from probe_kit.runs.layout import INTERVENTIONS
 from probe_kit.runs.reader import RunReader, full_name
-from probe_kit.runs.results import Bundle, advice_for, complete_key, fields_problem, is_complete, read_bundles
+from probe_kit.runs.results import (
+    Bundle,
+    advice_for,
+    axes_problem,
+    complete_key,
+    fields_problem,
+    is_complete,
+    read_bundles,
+)
 from probe_kit.runs.store import Location
 
 EPISODES, EFFECTS, CERTIFICATE = "episodes.npz", "effects.csv", "certificate.json"
@@ -90,14 +98,38 @@ class Measurement:
         Raises:
             RunDamagedError: If they were changed, or have the names of another version of probe_kit.
         """
-        stored = arrays_from_bytes(self.read(EPISODES))
-        if problem := fields_problem(ConditionOutcomes, stored):
+        stored = self.arrays(EPISODES, ConditionOutcomes, ConditionOutcomes.AXES)
+        if (first := str(stored["conditions"][:1])) != f"[{CLEAN!r}]":
             folder = f"{INTERVENTIONS}/{self.key}"
             raise RunDamagedError(
-                f"{self.run.location}/{folder}/{EPISODES} {problem}: another version of probe_kit made it. "
+                f"{self.run.location}/{folder}/{EPISODES} has {first} as its first condition; expected {CLEAN!r}. "
                 f"{advice_for(folder)}"
             )
         return ConditionOutcomes(**stored, seed_text=self.run.seed_text)
+
+    def arrays(self, name: str, record: type, axes: Mapping[str, str]) -> dict[str, Any]:
+        """Return the arrays of a stored file, which are fields of a dataclass.
+
+        Args:
+            name: The file.
+            record: The dataclass.
+            axes: The types and axes of the arrays, see `axes_problem`.
+
+        Raises:
+            RunDamagedError: For a file that is none of arrays, and for other names, types or shapes.
+        """
+        folder = f"{INTERVENTIONS}/{self.key}"
+        where = f"{self.run.location}/{folder}/{name}"
+        content = self.read(name)
+        try:
+            stored = arrays_from_bytes(content)
+        except UNREADABLE as error:
+            raise RunDamagedError(f"{where} cannot be read: {error}. {advice_for(folder)}") from error
+        if problem := fields_problem(record, stored):
+            raise RunDamagedError(f"{where} {problem}: another version of probe_kit made it. {advice_for(folder)}")
+        if problem := axes_problem(axes, stored):
+            raise RunDamagedError(f"{where} {problem}. {advice_for(folder)}")
+        return stored
 
     @cached_property
     def certificate(self) -> dict[str, Any]:

@@ -164,6 +164,8 @@ class PictureSource(Source[PictureFolder]):
         if not {PICTURE, INSTRUCTION} <= set(read.names):
             columns = ", ".join(read.names) or "no line"
             raise UsageError(f"--table {table} has {columns}; expected the columns {PICTURE} and {INSTRUCTION}")
+        if hostile := [name for name in read.names if UNSAFE.search(name)]:
+            raise RecordingError(f"{read.where(read.line)} has the heading {hostile[0]!r}; expected plain text")
         names = [name for name in read.names if name and name not in (PICTURE, INSTRUCTION, ID, GROUP)]
         texts = _with_groups(read, list(read.rows()))
         values, coded_names = _coded(read, texts, names)
@@ -367,9 +369,17 @@ def _line(text: Cells, folder: Path, where: str, numbers: tuple[float, ...]) -> 
     for name in (PICTURE, INSTRUCTION):
         if not text[name] or UNSAFE.search(text[name] or ""):
             raise RecordingError(f"{where} has the {name} {text[name] or ''!r}; expected plain text")
+    # Rows and labels are stored, and shown by tools that make nothing safe.
+    if hostile := [name for name, cell in text.items() if cell and UNSAFE.search(cell)]:
+        raise RecordingError(f"{where} has the {hostile[0]} {text[hostile[0]]!r}; expected plain text")
     path = Path(text[PICTURE] or "")
     if path.is_absolute() or ".." in path.parts:
         raise RecordingError(f"{where} names {path}; expected a file in the folder of --pictures")
+    if not (folder / path).resolve().is_relative_to(folder.resolve()):
+        raise RecordingError(
+            f"{where} names {path}, a link to a file outside the folder of --pictures; expected a file in it. "
+            "Copy the picture into the folder (cp -L)"
+        )
     return Line(folder / path, _digest(_read(folder / path)), numbers)
 
 
