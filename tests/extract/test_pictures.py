@@ -128,7 +128,7 @@ def test_another_picture_is_another_row(folder: Path, tmp_path: Path) -> None:
         ("picture,instruction\ntable.csv,go\n", "table.csv"),
         ("picture,instruction,id\n0.png,go,\x1b[31mred\n", "the id .*expected plain text"),
         ("picture,instruction,group\n0.png,go,\u202ered\n", "the group .*expected plain text"),
-        ("picture,instruction,side\n0.png,go,\x9b2J\n", "the side .*expected plain text"),
+        ("picture,instruction,side\n0.png,go,\x9b2J\n", "column 'side' holds the control .*expected plain text"),
         ("picture,instruction,\x1b[2J\n0.png,go,left\n", "the heading .*expected plain text"),
     ],
 )

@@ -336,7 +336,7 @@ class LeRobotMeta:
         total = self.info.get("total_episodes", len(numbers))
         if type(total) is not int:
             raise RecordingError(
-                f"{self.name}: {INFO} has total_episodes {repr(total)[:80]}; expected a number. {_AGAIN}"
+                f"{self.name}: {INFO} has total_episodes {_shown(total)}; expected a number. {_AGAIN}"
             )
         # Counted, not listed: a number of a few digits can name more episodes than memory holds.
         lacking = next(number for number in count() if number not in known)
@@ -361,8 +361,8 @@ class LeRobotMeta:
         ):
             if self.info.get(total_name, found) != found:
                 raise RecordingError(
-                    f"{self.name}: {INFO} has {total_name} {repr(self.info[total_name])[:80]}; its tables have {found}. "
-                    f"{_AGAIN}"
+                    f"{self.name}: {INFO} has {total_name} {_shown(self.info[total_name])}; its tables have "
+                    f"{found}. {_AGAIN}"
                 )
 
     def _check_names(self) -> None:
@@ -381,8 +381,8 @@ class LeRobotMeta:
             rate = (self.features[camera].get("info") or {}).get("video.fps")
             if rate is not None and not _equal_rates(rate, self.fps):
                 raise RecordingError(
-                    f"{self.name}: {INFO} says that {camera} has {repr(rate)[:80]} frames per second, and the data set "
-                    f"{self.fps:g}; expected the same. {_AGAIN}"
+                    f"{self.name}: {INFO} says that {camera} has {_shown(rate)} frames per second, and the data "
+                    f"set {self.fps:g}; expected the same. {_AGAIN}"
                 )
             slack = HALF / self.fps
             by_file: dict[Path, list[tuple[VideoRange, int]]] = {}
@@ -411,6 +411,11 @@ def _equal_rates(rate: Any, other: float) -> bool:
     return isinstance(rate, int | float) and rate <= _MOST_FPS and abs(rate - other) <= RATE_ROUNDING * other
 
 
+def _shown(value: Any) -> str:
+    """Return a foreign value for a message."""
+    return repr(value)[:80]
+
+
 def _depth(feature: Mapping[str, Any]) -> bool:
     info, video = feature.get("info") or {}, feature.get("video_info") or {}
     flags = info.get("is_depth_map"), info.get("video.is_depth_map"), video.get("video.is_depth_map")
@@ -427,10 +432,10 @@ def _check_info(root: Path, info: Mapping[str, Any]) -> None:
     """Raise RecordingError unless rate and features are such that frames can be read."""
     fps = info.get("fps")
     if isinstance(fps, bool) or not isinstance(fps, int | float) or not 0 < fps < float("inf"):
-        raise RecordingError(f"{root.name}: {INFO} has fps {repr(fps)[:80]}; expected a number above 0. {_AGAIN}")
+        raise RecordingError(f"{root.name}: {INFO} has fps {_shown(fps)}; expected a number above 0. {_AGAIN}")
     if not _LEAST_FPS <= fps <= _MOST_FPS:
         raise RecordingError(
-            f"{root.name}: {INFO} has fps {repr(fps)[:80]}; expected {_LEAST_FPS:g} to {_MOST_FPS:g}. {_AGAIN}"
+            f"{root.name}: {INFO} has fps {_shown(fps)}; expected {_LEAST_FPS:g} to {_MOST_FPS:g}. {_AGAIN}"
         )
     features = info.get("features")
     if not isinstance(features, Mapping) or not all(map(_is_feature, features.values())):
