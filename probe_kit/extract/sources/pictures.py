@@ -366,12 +366,10 @@ def _with_groups(table: TextTable, lines: list[tuple[int, Cells]]) -> list[tuple
 
 def _line(text: Cells, folder: Path, where: str, numbers: tuple[float, ...]) -> Line:
     """Return a line of the table. Raises RecordingError naming what is wrong with it."""
-    for name in (PICTURE, INSTRUCTION):
-        if not text[name] or UNSAFE.search(text[name] or ""):
-            raise RecordingError(f"{where} has the {name} {text[name] or ''!r}; expected plain text")
-    # Rows and labels are stored, and shown by tools that make nothing safe.
-    if hostile := [name for name, cell in text.items() if cell and UNSAFE.search(cell)]:
-        raise RecordingError(f"{where} has the {hostile[0]} {text[hostile[0]]!r}; expected plain text")
+    for name in (PICTURE, INSTRUCTION, ID, GROUP):  # labels are checked by `LabelTable`
+        cell = text.get(name) or ""
+        if UNSAFE.search(cell) or (not cell and name in (PICTURE, INSTRUCTION)):
+            raise RecordingError(f"{where} has the {name} {cell!r}; expected plain text")
     path = Path(text[PICTURE] or "")
     if path.is_absolute() or ".." in path.parts:
         raise RecordingError(f"{where} names {path}; expected a file in the folder of --pictures")
