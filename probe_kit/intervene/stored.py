@@ -100,11 +100,7 @@ class Measurement:
         """
         stored = self.arrays(EPISODES, ConditionOutcomes, ConditionOutcomes.AXES)
         if (first := str(stored["conditions"][:1])) != f"[{CLEAN!r}]":
-            folder = f"{INTERVENTIONS}/{self.key}"
-            raise RunDamagedError(
-                f"{self.run.location}/{folder}/{EPISODES} has {first} as its first condition; expected {CLEAN!r}. "
-                f"{advice_for(folder)}"
-            )
+            raise self._damaged(EPISODES, f"has {first} as its first condition; expected {CLEAN!r}")
         return ConditionOutcomes(**stored, seed_text=self.run.seed_text)
 
     def arrays(self, name: str, record: type, axes: Mapping[str, str]) -> dict[str, Any]:
@@ -118,18 +114,21 @@ class Measurement:
         Raises:
             RunDamagedError: For a file that is none of arrays, and for other names, types or shapes.
         """
-        folder = f"{INTERVENTIONS}/{self.key}"
-        where = f"{self.run.location}/{folder}/{name}"
         content = self.read(name)
         try:
             stored = arrays_from_bytes(content)
         except UNREADABLE as error:
-            raise RunDamagedError(f"{where} cannot be read: {error}. {advice_for(folder)}") from error
+            raise self._damaged(name, f"cannot be read: {error}") from error
         if problem := fields_problem(record, stored):
-            raise RunDamagedError(f"{where} {problem}: another version of probe_kit made it. {advice_for(folder)}")
+            raise self._damaged(name, f"{problem}: another version of probe_kit made it")
         if problem := axes_problem(axes, stored):
-            raise RunDamagedError(f"{where} {problem}. {advice_for(folder)}")
+            raise self._damaged(name, problem)
         return stored
+
+    def _damaged(self, name: str, problem: str) -> RunDamagedError:
+        """Return the error about one file."""
+        folder = f"{INTERVENTIONS}/{self.key}"
+        return RunDamagedError(f"{self.run.location}/{folder}/{name} {problem}. {advice_for(folder)}")
 
     @cached_property
     def certificate(self) -> dict[str, Any]:

@@ -354,15 +354,15 @@ class LeRobotMeta:
                     f"expected {expected}, where the one before it ends. {_AGAIN}"
                 )
             expected += episode.length
-        for total_name, found in (
+        for total_name, total in (
             ("total_episodes", len(numbers)),
             ("total_frames", expected),
             ("total_tasks", len(self.tasks)),
         ):
-            if self.info.get(total_name, found) != found:
+            if self.info.get(total_name, total) != total:
                 raise RecordingError(
                     f"{self.name}: {INFO} has {total_name} {_shown(self.info[total_name])}; its tables have "
-                    f"{found}. {_AGAIN}"
+                    f"{total}. {_AGAIN}"
                 )
 
     def _check_names(self) -> None:
