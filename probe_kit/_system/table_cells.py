@@ -26,6 +26,9 @@ FALSE = frozenset({"no", "n", "false", "f", "0", "0.0"})
 MOST_DIGITS = 400
 """The digits of an integer that are read: with so many it is refused; Python converts no more than 4,300."""
 
+MOST_COUNT_DIGITS = 18
+"""The digits of a number that counts or numbers things; so many fit into 64 bits."""
+
 _INTEGER = re.compile(r"[+-]?[0-9]+")
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 _PLAIN = re.compile(r"[+-]?(0|[1-9][0-9]*)(\.[0-9]*)?")
@@ -38,6 +41,14 @@ _MARK = re.compile(r"^'(?=[+-]?[.,]?[0-9])")
 """The mark by which spreadsheets keep a number as text."""
 _EDGES = "\u200b\u2060\ufeff"
 """Signs of no width, which Python does not count as white space."""
+
+
+def is_count(text: str) -> bool:
+    """Whether a text is a whole number from 0 on in digits alone, of at most `MOST_COUNT_DIGITS`.
+
+    Python converts no more than 4,300 digits, and arrays hold no more than 64 bits.
+    """
+    return text.isdecimal() and len(text) <= MOST_COUNT_DIGITS
 
 
 def plain_cell(text: str) -> str:

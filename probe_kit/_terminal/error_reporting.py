@@ -26,9 +26,9 @@ _LONGEST = 300
 def report_error(error: BaseException) -> int:
     """Print on stderr why a command ended, and return its exit code.
 
-    The code is 1 if the result is not as requested, or if an internal error occurred. The traceback of the latter
-    is in the file that is named. It is 2 if an argument or a path that was given cannot be used. It is 3 if the
-    command refused, or if the disk is full or read-only.
+    The code is 1 if the result is not as requested, if memory ended, or if an internal error occurred. The
+    traceback of the last is in the file that is named. It is 2 if an argument or a path that was given cannot be
+    used. It is 3 if the command refused, or if the disk is full or read-only.
     """
     if isinstance(error, KeyboardInterrupt):
         say(marked("[yellow]interrupted[/]. Completed work is saved; run the same command to resume."))
@@ -53,7 +53,37 @@ def report_error(error: BaseException) -> int:
                 "must raise an error instead. Completed work is saved"
             )
         )
+    if _is_out_of_memory(error):
+        complain(
+            "MemoryError",
+            f"memory ended in {_frame(error)}: {_first_line(error)}. Use fewer --batch, --workers or --items, a "
+            "smaller input, or a machine with more memory. Completed work is saved; run the same command to "
+            "resume",
+        )
+        return UNFORESEEN
     return report_unexpected(error)
+
+
+def _is_out_of_memory(error: BaseException) -> bool:
+    """Whether memory ended: torch raises classes of its own, and plain RuntimeError on a CPU."""
+    return (
+        isinstance(error, MemoryError)
+        or type(error).__name__ == "OutOfMemoryError"
+        or (isinstance(error, RuntimeError) and "can't allocate memory" in str(error))
+    )
+
+
+def _frame(error: BaseException) -> str:
+    """Return the last function of probe_kit that an error passed, with its module; `a library` without any."""
+    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
+    modules = [(str(frame.f_globals.get("__name__")), frame.f_code.co_name) for frame in frames]
+    ours = [f"{name} of {module}" for module, name in modules if module.partition(".")[0] == "probe_kit"]
+    return ours[-1] if ours else "a library"
+
+
+def _first_line(error: BaseException) -> str:
+    lines = str(error).strip().splitlines() or ["what it makes is larger than the memory that is left"]
+    return lines[0][:_LONGEST].rstrip(".")
 
 
 def _complain(error: ProbeKitError) -> int:
@@ -68,10 +98,9 @@ def _path(name: str | bytes | int) -> str:
 def report_unexpected(error: BaseException) -> int:
     """Report an internal error in one line, with the file of its traceback, and return the exit code."""
     first = (str(error).strip().splitlines() or ["no message"])[0][:_LONGEST]
-    hint = "Use fewer --batch, --workers or --items. " if isinstance(error, MemoryError) else ""
     complain(
         "InternalError",
-        f"{type(error).__name__}: {first}. {hint}This is a bug in probe_kit or in a library it calls. "
+        f"{type(error).__name__}: {first}. This is a bug in probe_kit or in a library it calls. "
         f"Completed work is saved. The traceback is in {_written(error)}; please report it",
     )
     return UNFORESEEN

@@ -12,6 +12,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._system.table_cells import is_count
 from probe_kit.errors import NoDirectionError, UsageError
 
 Array = NDArray[np.float64]
@@ -58,7 +59,7 @@ class Method:
             if rank:
                 raise UsageError("leace takes one direction per token, and no number; leave it out")
             return cls()
-        if rank and not (rank.isdecimal() and int(rank) > 0):
+        if rank and not (is_count(rank) and int(rank) > 0):
             raise UsageError(f"{text!r}: expected a number of directions behind the colon, such as {way}:{RANK}")
         return cls(way, int(rank or RANK))
 

@@ -1,9 +1,9 @@
 """The outcomes of an intervention's conditions: per episode where the action goes, and how far it changed."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from io import BytesIO
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -132,6 +132,15 @@ class ConditionOutcomes:
         inferences: (N, 2) rows of these inferences in the run's episodes, and their calls; None likewise.
         patches: (N, B, P) attention on single patches; None where it is not known.
     """
+
+    AXES: ClassVar[Mapping[str, str]] = {
+        **dict.fromkeys(("episodes", "items", "groups", "categories", "sides"), "U E"),
+        **dict.fromkeys(("displacement", "max_action_change", "toward", "size"), "f KE"),
+        "conditions": "U K",
+        "edit_log": "f KEL",
+        "replay_error": "f E",
+        "episode_outcomes": "U KE",
+    }
 
     conditions: tuple[str, ...]
     episodes: NDArray[np.str_]

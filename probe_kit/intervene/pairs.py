@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Union
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._system.table_cells import is_count
 from probe_kit._system.text_tables import open_table
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.observation import Observation
@@ -94,7 +95,7 @@ def read_pairs(path: Path) -> tuple[PairRow, ...]:
     rows = []
     for line, cells in table.rows(PAIR_COLUMNS):
         for column in PAIR_COLUMNS[1::2]:
-            if not ((text := cells[column] or "").isascii() and text.isdecimal()):
+            if not ((text := cells[column] or "").isascii() and is_count(text)):
                 raise UsageError(
                     f"{table.where(line, column)} is {text!r}; expected the number of a frame, from 0"
                 )

@@ -25,10 +25,10 @@ SEPARATOR = "|"
 """Separator between the parts of a condition's name, such as `backbone.02|image`."""
 SHORTEST_RANGE = 3
 """Number of consecutive layers from which on they are named by their first and last."""
-_POSITIONS = re.compile(r"(?P<first>\d+)(-(?P<last>\d+))?")
+_POSITIONS = re.compile(r"(?P<first>\d{1,18})(-(?P<last>\d{1,18}))?")
 _PATTERN = re.compile(
-    r"(?P<stream>[a-z][a-z_0-9]*)\.(?P<layer>\*|\d+)(\.(?P<quantity>[a-z_]+)(\.(?P<head>\*|\d+))?)?"
-    r"(@(?P<first>\d+)(-(?P<last>\d+))?)?"
+    r"(?P<stream>[a-z][a-z_0-9]*)\.(?P<layer>\*|\d{1,18})(\.(?P<quantity>[a-z_]+)(\.(?P<head>\*|\d{1,18}))?)?"
+    r"(@(?P<first>\d{1,18})(-(?P<last>\d{1,18}))?)?"
 )
 
 

@@ -20,7 +20,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from probe_kit._system.bounded_files import parse_json
+from probe_kit._system.bounded_files import UNREADABLE, parse_json
 from probe_kit._system.escaping import as_argument
 from probe_kit.errors import NoInterventionsError, RunDamagedError
 from probe_kit.intervene.outcomes import (
@@ -35,7 +35,15 @@ from probe_kit.intervene.outcomes import (
 from probe_kit.intervene.settings import FIRST_CHUNK, FORMAT, PER_STEP, key_of
 from probe_kit.runs.layout import INTERVENTIONS
 from probe_kit.runs.reader import RunReader, full_name
-from probe_kit.runs.results import Bundle, advice_for, complete_key, fields_problem, is_complete, read_bundles
+from probe_kit.runs.results import (
+    Bundle,
+    advice_for,
+    axes_problem,
+    complete_key,
+    fields_problem,
+    is_complete,
+    read_bundles,
+)
 from probe_kit.runs.store import Location
 
 EPISODES, EFFECTS, CERTIFICATE = "episodes.npz", "effects.csv", "certificate.json"
@@ -91,14 +99,37 @@ class Measurement:
         Raises:
             RunDamagedError: If they were changed, or have the names of another version of probe_kit.
         """
-        stored = arrays_from_bytes(self.read(EPISODES))
-        if problem := fields_problem(ConditionOutcomes, stored):
-            folder = f"{INTERVENTIONS}/{self.key}"
-            raise RunDamagedError(
-                f"{self.run.location}/{folder}/{EPISODES} {problem}: another version of probe_kit made it. "
-                f"{advice_for(folder)}"
-            )
+        stored = self.arrays(EPISODES, ConditionOutcomes, ConditionOutcomes.AXES)
+        if (first := str(stored["conditions"][:1])) != f"[{CLEAN!r}]":
+            raise self._damaged(EPISODES, f"has {first} as its first condition; expected {CLEAN!r}")
         return ConditionOutcomes(**stored, seed_text=self.run.seed_text)
+
+    def arrays(self, name: str, record: type, axes: Mapping[str, str]) -> dict[str, Any]:
+        """Return the arrays of a stored file, which are fields of a dataclass.
+
+        Args:
+            name: The file.
+            record: The dataclass.
+            axes: The types and axes of the arrays, see `axes_problem`.
+
+        Raises:
+            RunDamagedError: For a file that is none of arrays, and for other names, types or shapes.
+        """
+        content = self.read(name)
+        try:
+            stored = arrays_from_bytes(content)
+        except UNREADABLE as error:
+            raise self._damaged(name, f"cannot be read: {error}") from error
+        if problem := fields_problem(record, stored):
+            raise self._damaged(name, f"{problem}: another version of probe_kit made it")
+        if problem := axes_problem(axes, stored):
+            raise self._damaged(name, problem)
+        return stored
+
+    def _damaged(self, name: str, problem: str) -> RunDamagedError:
+        """Return the error about one file."""
+        folder = f"{INTERVENTIONS}/{self.key}"
+        return RunDamagedError(f"{self.run.location}/{folder}/{name} {problem}. {advice_for(folder)}")
 
     @cached_property
     def certificate(self) -> dict[str, Any]:

@@ -6,6 +6,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from probe_kit._system.counting import counted
+from probe_kit._system.table_cells import is_count
 from probe_kit._tables.numbers import number, percent, points, with_limits
 from probe_kit._tables.table import Table
 from probe_kit.errors import UsageError
@@ -72,7 +73,7 @@ def read_steps(text: str | None, runs: Sequence[RunReader]) -> dict[str, int]:
         steps = [training_step(run) for run in runs]
     else:
         parts = [part.strip() for part in text.split(",")]
-        if not all(part.isdecimal() for part in parts):
+        if not all(map(is_count, parts)):
             raise UsageError(f"--compare steps={text}; expected a training step per run, such as steps=1000,2000")
         steps = [int(part) for part in parts]
     if len(steps) != len(runs):

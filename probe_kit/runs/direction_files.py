@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from probe_kit._system.bounded_files import UNREADABLE, check_no_pointer, open_arrays, parse_json, read_json_object
 from probe_kit._system.counting import counted
+from probe_kit._system.table_cells import is_count
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.sites import Site, role_of_view
 
@@ -213,7 +214,7 @@ def _rounding(values: NDArray[Any]) -> float:
 def _of_autoencoder(folder: Path, name: str) -> FileDirection:
     """Return one feature of a sparse autoencoder that SAELens wrote."""
     arrays, _ = _contents(folder / SAE_WEIGHTS)
-    if DECODER not in arrays or not name.isdecimal() or int(name) >= len(arrays[DECODER]):
+    if DECODER not in arrays or not is_count(name) or int(name) >= len(arrays[DECODER]):
         count = len(arrays.get(DECODER, ()))
         raise UsageError(f"{folder} has {count} features; expected {folder.name}#NUMBER, counted from 0")
     settings = folder / SAE_SETTINGS

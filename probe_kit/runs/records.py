@@ -5,14 +5,17 @@
                       └── stamp ── columns, probes
 
 The hash is that of the canonical JSON of the parsed content: another spelling of the same values is the same
-record. Any other value, a key that is named twice, and a part that the model does not know are damage. A record
-names the run it belongs to by the hash of `run.json`, so none counts in another run. Hashes detect accidents. They
-are no protection against an attacker who recomputes them: see `docs/storage.md`.
+record to every reader; `run verify --deep` compares the bytes too. Any other value, a key that is named twice, and
+a part that the model does not know are damage. A record names the run it belongs to by the hash of `run.json`, so
+none counts in another run. Hashes detect accidents. They are no protection against an attacker who recomputes
+them: see `docs/storage.md`.
 """
 
 import json
 import re
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from hashlib import blake2b
 from typing import Annotated, Any, ClassVar, NamedTuple, Self
 
@@ -198,6 +201,19 @@ def as_record(content: Mapping[str, Any]) -> bytes:
     return as_json({**content, HASH: digest(canonical(content))})
 
 
+_EXACT: ContextVar[bool] = ContextVar("exact", default=False)
+
+
+@contextmanager
+def exact_records(exact: bool = True) -> Iterator[None]:
+    """A context in which `read_record` takes a record only in the bytes that probe_kit writes."""
+    token = _EXACT.set(exact)
+    try:
+        yield
+    finally:
+        _EXACT.reset(token)
+
+
 def read_record(raw: bytes, name: str, advice: str) -> dict[str, Any]:
     """Return the content of a record, with its hash.
 
@@ -207,7 +223,7 @@ def read_record(raw: bytes, name: str, advice: str) -> dict[str, Any]:
         advice: The remedy, for the message.
 
     Raises:
-        RunDamagedError: Unless the hash is that of the values.
+        RunDamagedError: Unless the hash is that of the values, and within `exact_records` the bytes are ours.
     """
     content = read_plain(raw, name, advice)
     carried = content.pop(HASH, None)
@@ -217,6 +233,11 @@ def read_record(raw: bytes, name: str, advice: str) -> dict[str, Any]:
         raise RunDamagedError(f"{name} was changed after it was written: it nests too deeply. {advice}") from None
     if carried != computed:
         raise RunDamagedError(f"{name} was changed after it was written: its hash is another one. {advice}")
+    if _EXACT.get() and raw != as_json({**content, HASH: computed}):
+        raise RunDamagedError(
+            f"{name} was changed after it was written: it holds the same values in other bytes (white space, "
+            f"order or escapes). {advice}"
+        )
     return {HASH: computed, **content}
 
 

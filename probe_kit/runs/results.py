@@ -319,6 +319,30 @@ def fields_problem(record: type, names: Collection[str]) -> str:
     return " and ".join(parts)
 
 
+def axes_problem(axes: Mapping[str, str], arrays: Mapping[str, NDArray[Any]]) -> str:
+    """Return how stored arrays contradict their types or each other's lengths; empty if they do not.
+
+    Args:
+        axes: By array the kinds of its type, as numpy names them, a space, and a letter per axis. A letter stands
+            for one length in all arrays, a digit for itself. An array without an entry has any axes.
+        arrays: The arrays by name.
+    """
+    lengths: dict[str, tuple[int, str]] = {}
+    for name, array in arrays.items():
+        if name not in axes:
+            continue
+        kinds, _, letters = axes[name].partition(" ")
+        if array.dtype.kind not in kinds or array.ndim != len(letters):
+            return f"has {name} as {array.dtype} of shape {array.shape}; expected {len(letters)} axes of {kinds!r}"
+        for letter, length in zip(letters, array.shape, strict=True):
+            due, other = (int(letter), "") if letter.isdigit() else lengths.setdefault(letter, (length, name))
+            if length != due:
+                return f"has {name} of shape {array.shape}; expected {due} in place of {length}" + (
+                    f", as in {other}" if other else ""
+                )
+    return ""
+
+
 # -- pieces of unfinished results --------------------------------------------------------------------------------
 
 

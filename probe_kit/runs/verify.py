@@ -28,7 +28,7 @@ from probe_kit.runs.contents import StoredObject, sizes_of, stored_objects, stra
 from probe_kit.runs.layout import COLUMNS, COMMITS, DATA, SEALED, StoredStream, VectorKind
 from probe_kit.runs.plan import count_plans
 from probe_kit.runs.provenance import read_processes
-from probe_kit.runs.records import RESTORE, digest_of, is_hash_name
+from probe_kit.runs.records import RESTORE, digest_of, exact_records, is_hash_name
 from probe_kit.runs.results import BUNDLES, bundle_keys, read_bundle
 from probe_kit.runs.root import Root, read_label, read_root
 from probe_kit.runs.run import Run, read_run
@@ -220,8 +220,9 @@ class Audit:
 def verify_run(path: Path | str | Location, deep: bool = False) -> Audit:
     """Compare a run with its records. Problems are collected, not raised.
 
-    Compares records, the sizes of all objects, and their owners. With `deep` it also compares every byte, columns
-    against rows, and every reader of the run and of its stored results.
+    Compares records by their values, the sizes of all objects, and their owners. With `deep` it also compares
+    every byte, those of records among them, columns against rows, and every reader of the run and of its stored
+    results.
 
     Raises:
         RunNotFoundError: If there is no run at `path`.
@@ -229,7 +230,8 @@ def verify_run(path: Path | str | Location, deep: bool = False) -> Audit:
     location = locate(path)
     while True:
         before = count_plans(location)
-        audit = _audit(location, deep)
+        with exact_records(deep):
+            audit = _audit(location, deep)
         if audit.ok or count_plans(location) == before:  # else it grew while it was compared
             return audit
 

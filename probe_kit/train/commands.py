@@ -8,6 +8,7 @@ from rich.text import Text
 
 from probe_kit._system.counting import counted
 from probe_kit._system.escaping import as_argument
+from probe_kit._system.table_cells import is_count
 from probe_kit._terminal import options as common
 from probe_kit._terminal.console import counter, marked, out, progress, say, split
 from probe_kit.errors import TooFewGroupsError, UnbalancedEpisodesError, UsageError
@@ -260,7 +261,7 @@ def _calls(text: str, run: "RunReader") -> list[int]:
     if text == "all":
         return list(range(run.captured_calls))
     parts = split(text) or ()
-    if not parts or not all(part.isdecimal() for part in parts):
+    if not parts or not all(map(is_count, parts)):
         raise UsageError(f"--call {text!r}; expected numbers from 0, comma-separated, or all")
     return list(dict.fromkeys(map(int, parts)))
 

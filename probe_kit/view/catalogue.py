@@ -5,6 +5,7 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
+from probe_kit._system.table_cells import is_count
 from probe_kit.hashing import sha256_json
 from probe_kit.retention.columns.text import VIEWER_WORDS
 from probe_kit.runs import Run
@@ -144,7 +145,7 @@ class Catalogue:
                 return episodes_payload(self.runs[key])
             case [key, "results"]:
                 return results_payload(self.runs[key])
-            case [key, "target", number] if number.isdecimal():
+            case [key, "target", number] if is_count(number):
                 return target_map_payload(self.runs[key], int(number))
             case [key, "map", category]:
                 return site_map_payload(self.runs[key], category)

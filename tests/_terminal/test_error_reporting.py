@@ -60,7 +60,7 @@ def test_what_can_be_foreseen_has_its_message_and_code(error: BaseException, cod
 
 @pytest.mark.parametrize(
     "error",
-    [KeyError("x"), ValueError("one\ntwo"), MemoryError(), RecursionError("deep"), OSError(5, "I/O error")],
+    [KeyError("x"), ValueError("one\ntwo"), RecursionError("deep"), OSError(5, "I/O error")],
 )
 def test_what_nobody_foresaw_is_one_line_and_a_file(error: Exception, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
@@ -71,6 +71,24 @@ def test_what_nobody_foresaw_is_one_line_and_a_file(error: Exception, tmp_path: 
     (file,) = tmp_path.iterdir()
     assert str(file) in said.replace(" ", "") or file.name in said.replace(" ", "")
     assert re.search(r"Traceback.*in fail", file.read_text(encoding="utf-8"), re.DOTALL)
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError(),
+        MemoryError("Unable to allocate 7.28 TiB for an array with shape (1000000000000,)"),
+        RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 8 bytes"),
+    ],
+)
+def test_memory_that_ended_is_no_bug_and_says_what_to_do(error: Exception, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    code, said = ended(error)
+    assert code == 1
+    assert (str(error) or "larger than the memory") in " ".join(said.split())
+    assert "fewer --batch" in said
+    assert "bug" not in said
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_traceback_that_cannot_be_written_is_said_to_be_lost(tmp_path: Path, monkeypatch, capsys) -> None:

@@ -26,9 +26,18 @@ from safetensors.torch import save_file
 from probe_kit._system import bounded_files
 from probe_kit._system.bounded_files import load_gzipped_json, open_arrays, parse_json
 from probe_kit.errors import RunDamagedError, SuiteError, UsageError, WeightsError
+from probe_kit.extract import LeRobotSource
+from probe_kit.extract.sources.recording import read_episodes
 from probe_kit.hooks.checkpoints.weights import read_pickle, read_weights
+from probe_kit.hooks.contract.sites import Site
+from probe_kit.hooks.families.shared.feature_names import names_of
+from probe_kit.hooks.families.shared.token_decoder import top_of
+from probe_kit.intervene.erasers import Method
+from probe_kit.intervene.pairs import read_pairs
+from probe_kit.intervene.places import PlaceName
 from probe_kit.runs import Run, open_run, verify_run
 from probe_kit.runs.arrays import open_array
+from probe_kit.runs.direction_files import read_direction
 from probe_kit.runs.store import locate
 from probe_kit.study import load_study
 from probe_kit.suite import Suite, rules
@@ -370,3 +379,49 @@ def test_the_same_run_unchanged_is_read(run: Path) -> None:
     rehash(run)
     assert np.isfinite(np.asarray(column(run))).all()
     assert replace(open_run(run).streams["backbone"]).name == "backbone"
+
+
+# -- numbers -------------------------------------------------------------------------------------------------
+
+MANY = "1" * 5000
+"""More digits than Python converts."""
+
+
+def pairs_of(folder: Path, *cells: str) -> object:
+    (folder / "pairs.csv").write_text(f"episode,frame,donor_episode,donor_frame\n{','.join(cells)}\n")
+    return read_pairs(folder / "pairs.csv")
+
+
+def feature_of(folder: Path, number: str) -> object:
+    save_file({"W_dec": torch.eye(3)}, folder / "sae_weights.safetensors")
+    return read_direction(f"{folder}#{number}")
+
+
+NUMBERS: dict[str, Callable[[Path, str], object]] = {
+    "a frame": lambda folder, number: pairs_of(folder, "a", number, "b", "0"),
+    "a donor's frame": lambda folder, number: pairs_of(folder, "a", "0", "b", number),
+    "a feature": feature_of,
+    "a layer": lambda _, number: Site.parse(f"backbone.{number}.residual"),
+    "an iteration": lambda _, number: Site.parse(f"backbone.01.residual@{number}"),
+    "a place": lambda _, number: PlaceName.parse(f"backbone.{number}"),
+    "a head": lambda _, number: PlaceName.parse(f"backbone.01.heads.{number}"),
+    "iterations": lambda _, number: PlaceName.parse(f"backbone.01@0-{number}"),
+    "every so many": lambda _, number: LeRobotSource("x", every=f"every:{number}"),
+    "degrees": lambda _, number: LeRobotSource("x", rotations=(number.replace("2", "180", 1),)),
+    "tokens": lambda _, number: top_of(number, ()),
+    "episodes": lambda _, number: read_episodes(f"0:{number}"),
+    "one episode": lambda _, number: read_episodes(number),
+    "erased directions": lambda _, number: Method.of(f"inlp:{number}"),
+}
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+def test_a_number_of_more_digits_than_python_converts_is_refused_by_name(name: str, tmp_path: Path) -> None:
+    NUMBERS[name](tmp_path, "2" if name != "a layer" else "02")
+    with pytest.raises(UsageError):
+        NUMBERS[name](tmp_path, MANY)
+
+
+def test_names_of_numbers_at_places_of_many_digits_are_no_names() -> None:
+    assert names_of({"0": "x", "1": "y"}, 2) == ("x", "y")
+    assert names_of({"0": "x", MANY: "y"}, 2) != ("x", "y")

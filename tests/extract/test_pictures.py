@@ -126,6 +126,10 @@ def test_another_picture_is_another_row(folder: Path, tmp_path: Path) -> None:
         ),
         ("picture,instruction,id\n0.png,go,a\n0.png,go,a\n", "the id 'a' twice"),
         ("picture,instruction\ntable.csv,go\n", "table.csv"),
+        ("picture,instruction,id\n0.png,go,\x1b[31mred\n", "the id .*expected plain text"),
+        ("picture,instruction,group\n0.png,go,\u202ered\n", "the group .*expected plain text"),
+        ("picture,instruction,side\n0.png,go,\x9b2J\n", "column 'side' holds the control .*expected plain text"),
+        ("picture,instruction,\x1b[2J\n0.png,go,left\n", "the heading .*expected plain text"),
     ],
 )
 def test_a_line_that_cannot_be_shown_is_named(folder: Path, tmp_path: Path, table: str, message: str) -> None:
@@ -134,6 +138,23 @@ def test_a_line_that_cannot_be_shown_is_named(folder: Path, tmp_path: Path, tabl
     with pytest.raises(ProbeKitError, match=message) as refused:
         source(tmp_path).open()
     assert isinstance(refused.value, RecordingError | UsageError)
+
+
+def test_a_link_in_the_folder_is_followed_within_it_alone(folder: Path, tmp_path: Path) -> None:
+    home, beside = tmp_path / "home", tmp_path / "home-beside"
+    shutil.copytree(folder, home)
+    shutil.copytree(folder, beside)
+    (home / "inside.png").symlink_to("0.png")
+    (home / "outside.png").symlink_to(beside / "0.png")
+    (home / "elsewhere").symlink_to(beside)
+    (tmp_path / "another").symlink_to(home)
+    for name in ("inside.png", "outside.png", "elsewhere/0.png"):
+        (home / "table.csv").write_text(f"picture,instruction\n{name},go\n", encoding="utf-8")
+        if name == "inside.png":
+            assert len(source(tmp_path / "another").open().rows(0)) == 1
+            continue
+        with pytest.raises(RecordingError, match=f"line 2 names {name}, a link to a file outside"):
+            source(home).open()
 
 
 def test_a_table_of_a_spreadsheet_is_read_by_the_rules_of_all_tables(folder: Path, tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ from probe_kit.hooks.contract.sites import Site
 from probe_kit.runs import Run, open_run, root, seal, verify_run
 from probe_kit.runs.array_lengths import without_length
 from probe_kit.runs.layout import INTERVENTIONS
-from probe_kit.runs.records import HASH, Checksum, Record, Sums, as_record, read_record
+from probe_kit.runs.records import HASH, Checksum, Record, Sums, as_record, exact_records, read_record
 from probe_kit.runs.results import PARTIAL, bundle_keys, read_bundles, write_bundle
 from probe_kit.runs.root import read_root
 from probe_kit.runs.run import NotSealedWarning
@@ -58,6 +58,16 @@ def test_a_record_is_plain_json_with_the_hash_of_its_canonical_json() -> None:
 @pytest.mark.parametrize("spell", SPELLINGS.values(), ids=SPELLINGS)
 def test_another_spelling_of_the_same_values_is_the_same_record(spell) -> None:
     content = json.loads(as_record(CONTENT))
+    assert read_record(spell(content), "it", "do") == content
+
+
+@pytest.mark.parametrize("spell", SPELLINGS.values(), ids=SPELLINGS)
+def test_a_deep_verification_takes_a_record_in_no_other_bytes(spell) -> None:
+    content = json.loads(as_record(CONTENT))
+    with exact_records():
+        assert read_record(as_record(CONTENT), "it", "do") == content
+        with pytest.raises(RunDamagedError, match=r"it was changed .* same values in other bytes .* do"):
+            read_record(spell(content), "it", "do")
     assert read_record(spell(content), "it", "do") == content
 
 

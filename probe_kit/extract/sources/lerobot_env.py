@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit._system.imports import require
+from probe_kit._system.table_cells import is_count
 from probe_kit.errors import MissingExtraError, OwnEnvironmentError, ProbeKitError, UsageError
 from probe_kit.extract.sources.environment import SUCCESS, EnvEpisode, Step
 from probe_kit.extract.sources.step_limits import limit_of
@@ -221,7 +222,7 @@ def _count_initial_states(environment: Any) -> int | None:
 
 def _count(per_task: int | str) -> int:
     """Return the number of episodes of a task. Raises UsageError for what is none."""
-    if not str(per_task).isdecimal() or int(per_task) < 1:
+    if not is_count(str(per_task)) or int(per_task) < 1:
         raise UsageError(f"--env-option per_task={per_task}; expected a number of episodes from 1 on")
     return int(per_task)
 

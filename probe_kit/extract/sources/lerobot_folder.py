@@ -39,6 +39,8 @@ from probe_kit.suite.pictures import decode_bytes
 STATISTICS = "meta/stats.json"
 MOST_FRAMES = 64
 """The most chosen frames that one row holds."""
+_MOST_WIDTH = 1 << 16
+"""The most numbers of a state or an action."""
 _COMMIT = re.compile(r"[0-9a-f]{40}")
 
 
@@ -64,6 +66,11 @@ class LeRobotFolder(LeRobotMeta):
                 f"{self.path.name}: {feature} is {self.features[feature]['dtype']} of shape {shape}; expected a "
                 "list of numbers"
             )
+        if shape[0] > _MOST_WIDTH:
+            raise RecordingError(
+                f"{self.path.name}: meta/info.json gives {feature} {shape[0]:,} numbers; expected at most "
+                f"{_MOST_WIDTH:,}. Copy the data set again, or repair its meta"
+            )
         return int(shape[0])
 
     def names(self, feature: str) -> list[str]:
@@ -83,7 +90,7 @@ class LeRobotFolder(LeRobotMeta):
             return None
         try:
             matrix = np.asarray(stored, np.float32)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             matrix = np.empty(0, np.float32)
         if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
             raise RecordingError(

@@ -20,7 +20,7 @@ _CONVERTER = "-m lerobot.scripts.convert_dataset_v21_to_v30"
 _OLD_INFO = "meta_data/info.json"
 """The file of formats 1.x."""
 _MAGIC = b"PAR1"
-_VERSION = re.compile(r"v?(\d+)\.(\d+)")
+_VERSION = re.compile(r"v?(\d{1,9})\.(\d{1,9})")
 _LONGEST = 3
 
 
@@ -49,9 +49,11 @@ def check_format(root: Path, info: Mapping[str, Any], repo: str | None, revision
     major, minor = map(int, numbers.groups()) if numbers else (0, 0)
     name = root.name if repo is None else repo
     if numbers is None:
-        raise RecordingError(f"{name}: {INFO} has the codebase_version {version}; {READ}. Copy the data set again")
+        raise RecordingError(
+            f"{name}: {INFO} has the codebase_version {version[:80]}; {READ}. Copy the data set again"
+        )
     if major > 3:
-        raise RecordingError(f"{name} has format {version}, of a later lerobot; {READ}. Update probe_kit")
+        raise RecordingError(f"{name} has format {version[:80]}, of a later lerobot; {READ}. Update probe_kit")
     if (major, minor) == (2, 1):
         raise RecordingError(f"{name} has format {version}; {READ}. {_conversion(root, info, repo, revision)}")
     if major < 3:

@@ -1,19 +1,23 @@
 """The `meta` of a LeRobotDataset of format 3.0, its contradictions, and files read as hashed."""
 
 import os
+import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from hashlib import blake2b, file_digest
-from itertools import pairwise
-from math import isfinite
+from itertools import count, pairwise
+from math import isfinite, prod
 from pathlib import Path
+from string import Formatter
 from typing import Any, BinaryIO, Self
 
 from probe_kit._system.bounded_files import open_regular, read_json_object
 from probe_kit._system.counting import ranges_of
+from probe_kit._system.escaping import UNSAFE
+from probe_kit._system.foreign_files import while_reading
 from probe_kit._system.imports import require
 from probe_kit._system.parquet_files import open_parquet, read_parquet
 from probe_kit.errors import RecordingError
@@ -46,6 +50,15 @@ _AGAIN = "Copy the data set again, or repair its meta"
 _DIGITS = 16
 _MOST_BYTES = 1 << 40
 """The most bytes of a file, videos included: no bound but that of a disk."""
+_MOST_AXES, _MOST_NUMBERS = 5, 1 << 26
+"""The axes and the numbers of a feature in a frame; lerobot writes five axes at most."""
+_LARGEST_PICTURE = 8192
+_LEAST_FPS, _MOST_FPS = 1e-6, 1e6
+_MOST_FRAMES = 1 << 31
+"""The most frames of an episode: two years at 30 frames per second."""
+_MOST_TEMPLATE = 1000
+_WIDE = re.compile(r"\d{3}|[{}]")
+"""A width of a format beyond 99, or one that a number of the table decides."""
 _Stamp = tuple[int, ...]
 
 
@@ -188,11 +201,17 @@ class LeRobotMeta:
         """Return the meta of the data set in `root`.
 
         Raises:
-            RecordingError: For another format, a missing file, and where two parts contradict each other.
+            RecordingError: For another format, a missing file, a value beyond all bounds, and where two parts
+                contradict each other.
             MissingExtraError: Without the libraries that read it.
         """
-        files = HashedFiles(root)
         check_is_data_set(root)
+        with while_reading(root, RecordingError, _AGAIN, ("meta",)):
+            return cls._read(root, repo, revision)
+
+    @classmethod
+    def _read(cls, root: Path, repo: str | None, revision: str | None) -> Self:
+        files = HashedFiles(root)
         info = _read_info(root, files)
         check_recorded(root, info)
         check_format(root, info, repo, revision)
@@ -313,11 +332,18 @@ class LeRobotMeta:
         if numbers == list(range(len(numbers))):
             data = [self.path / episode.file for episode in self.episodes]
             check_continued(self.path, self.info, [episode.length for episode in self.episodes], data)
+        known = set(numbers)
         total = self.info.get("total_episodes", len(numbers))
-        if lacking := sorted(set(range(max((total, *numbers)) if numbers else total)) - set(numbers)):
+        if type(total) is not int:
+            raise RecordingError(
+                f"{self.name}: {INFO} has total_episodes {_shown(total)}; expected a number. {_AGAIN}"
+            )
+        # Counted, not listed: a number of a few digits can name more episodes than memory holds.
+        lacking = next(number for number in count() if number not in known)
+        if lacking < max((total, *numbers)):
             raise RecordingError(
                 f"{self.name}: {EPISODES} has {len(numbers)} episodes, up to number {max(numbers, default=0)}, "
-                f"and not episode {lacking[0]}; expected all from 0 on. Give the episodes new numbers, or take "
+                f"and not episode {lacking}; expected all from 0 on. Give the episodes new numbers, or take "
                 "the data set as it was before an episode was removed"
             )
         expected = 0
@@ -328,15 +354,15 @@ class LeRobotMeta:
                     f"expected {expected}, where the one before it ends. {_AGAIN}"
                 )
             expected += episode.length
-        for total_name, count in (
+        for total_name, total in (
             ("total_episodes", len(numbers)),
             ("total_frames", expected),
             ("total_tasks", len(self.tasks)),
         ):
-            if self.info.get(total_name, count) != count:
+            if self.info.get(total_name, total) != total:
                 raise RecordingError(
-                    f"{self.name}: {INFO} has {total_name} {self.info[total_name]!r}; its tables have {count}. "
-                    f"{_AGAIN}"
+                    f"{self.name}: {INFO} has {total_name} {_shown(self.info[total_name])}; its tables have "
+                    f"{total}. {_AGAIN}"
                 )
 
     def _check_names(self) -> None:
@@ -355,8 +381,8 @@ class LeRobotMeta:
             rate = (self.features[camera].get("info") or {}).get("video.fps")
             if rate is not None and not _equal_rates(rate, self.fps):
                 raise RecordingError(
-                    f"{self.name}: {INFO} says that {camera} has {rate!r} frames per second, and the data set "
-                    f"{self.fps:g}; expected the same. {_AGAIN}"
+                    f"{self.name}: {INFO} says that {camera} has {_shown(rate)} frames per second, and the data "
+                    f"set {self.fps:g}; expected the same. {_AGAIN}"
                 )
             slack = HALF / self.fps
             by_file: dict[Path, list[tuple[VideoRange, int]]] = {}
@@ -382,7 +408,12 @@ class LeRobotMeta:
 
 def _equal_rates(rate: Any, other: float) -> bool:
     """Whether two rates are equal up to the rounding of one such as 30000 / 1001."""
-    return isinstance(rate, int | float) and abs(rate - other) <= RATE_ROUNDING * other
+    return isinstance(rate, int | float) and rate <= _MOST_FPS and abs(rate - other) <= RATE_ROUNDING * other
+
+
+def _shown(value: Any) -> str:
+    """Return a foreign value for a message."""
+    return repr(value)[:80]
 
 
 def _depth(feature: Mapping[str, Any]) -> bool:
@@ -400,11 +431,18 @@ def _read_info(root: Path, files: HashedFiles) -> Mapping[str, Any]:
 def _check_info(root: Path, info: Mapping[str, Any]) -> None:
     """Raise RecordingError unless rate and features are such that frames can be read."""
     fps = info.get("fps")
-    if isinstance(fps, bool) or not isinstance(fps, int | float) or not (isfinite(fps) and fps > 0):
-        raise RecordingError(f"{root.name}: {INFO} has fps {fps!r}; expected a number above 0. {_AGAIN}")
+    if isinstance(fps, bool) or not isinstance(fps, int | float) or not 0 < fps < float("inf"):
+        raise RecordingError(f"{root.name}: {INFO} has fps {_shown(fps)}; expected a number above 0. {_AGAIN}")
+    if not _LEAST_FPS <= fps <= _MOST_FPS:
+        raise RecordingError(
+            f"{root.name}: {INFO} has fps {_shown(fps)}; expected {_LEAST_FPS:g} to {_MOST_FPS:g}. {_AGAIN}"
+        )
     features = info.get("features")
     if not isinstance(features, Mapping) or not all(map(_is_feature, features.values())):
         raise RecordingError(f"{root.name}: {INFO} has no features with dtype and shape each. {_AGAIN}")
+    for name, feature in features.items():
+        if problem := _feature_problem(feature):
+            raise RecordingError(f"{root.name}: {INFO} gives {str(name)[:80]} {problem}. {_AGAIN}")
 
 
 def _is_feature(feature: Any) -> bool:
@@ -414,6 +452,22 @@ def _is_feature(feature: Any) -> bool:
         and isinstance(feature.get("shape"), Sequence)
         and all(type(size) is int for size in feature["shape"])
     )
+
+
+def _feature_problem(feature: Mapping[str, Any]) -> str:
+    """Return why no frame can have such a feature, before room for one is made; empty where it can."""
+    shape, is_picture = feature["shape"], feature["dtype"] in (IMAGE, VIDEO)
+    axes = (2, 3) if is_picture else range(1, _MOST_AXES + 1)
+    least, most = (1, _LARGEST_PICTURE) if is_picture else (0, _MOST_NUMBERS)
+    written = str(shape[:_MOST_AXES])[:80]
+    if len(shape) not in axes:
+        return f"a shape of {len(shape)} axes, {written}; expected {min(axes)} to {max(axes)}"
+    if not all(least <= size <= most for size in shape) or prod(shape) > _MOST_NUMBERS:
+        return f"the shape {written}; expected {least} to {most:,} per axis, {_MOST_NUMBERS:,} numbers in all"
+    for part in ("info", "video_info"):
+        if not isinstance(feature.get(part) or {}, Mapping):
+            return f"{part} as a {type(feature[part]).__name__}; expected an object"
+    return ""
 
 
 def _read_table(root: Path, files: HashedFiles, path: Path, columns: Sequence[str] | None = None) -> Any:
@@ -489,6 +543,11 @@ def _check_line(line: Mapping[str, Any], where: str) -> None:
                 f"{where} has {name} {cell!r} for episode {line[_NUMBER]!r}; expected "
                 f"{'seconds' if is_time else 'a whole number from 0 on'}. {_AGAIN}"
             )
+    if line[_LENGTH] > _MOST_FRAMES:
+        raise RecordingError(
+            f"{where} says that episode {line[_NUMBER]} has {line[_LENGTH]} frames; expected at most "
+            f"{_MOST_FRAMES:,}. {_AGAIN}"
+        )
     if line[_LENGTH] < 1 or line[_TO] - line[_FROM] != line[_LENGTH]:
         raise RecordingError(
             f"{where} says that episode {line[_NUMBER]} has {line[_LENGTH]} frames, and the indices "
@@ -499,15 +558,33 @@ def _check_line(line: Mapping[str, Any], where: str) -> None:
 def _path_of(root: Path, info: Mapping[str, Any], template: str, episode: int, **parts: Any) -> Path:
     """Return a file that `info` names, in the data set's folder. Raises RecordingError for one outside it."""
     try:
-        path = Path(str(info[template]).format(**parts))
+        path = Path(_filled(info[template], parts))
     except (KeyError, IndexError, ValueError, AttributeError) as error:
         raise RecordingError(
-            f"{root.name}: {INFO} has {template} {info.get(template)!r}, which names no file of chunk_index and "
-            f"file_index ({error}). {_AGAIN}"
+            f"{root.name}: {INFO} has {template} {str(info.get(template))[:200]!r}, which names no file of "
+            f"chunk_index and file_index ({error}). {_AGAIN}"
         ) from error
     if path.is_absolute() or ".." in path.parts:
         raise RecordingError(
             f"{root.name}: {INFO} names {path} for episode {episode}; expected a file in the data set's folder. "
             "Correct data_path and video_path"
         )
+    return path
+
+
+def _filled(template: Any, parts: Mapping[str, Any]) -> str:
+    """Return a path with its fields filled in. Raises ValueError or KeyError for one that names no file.
+
+    A format can ask for any width: the fields are those of `parts` alone, and their widths have two digits.
+    """
+    if not isinstance(template, str) or len(template) > _MOST_TEMPLATE:
+        raise ValueError(f"expected a text of at most {_MOST_TEMPLATE:,} characters")
+    for _, name, width, _ in Formatter().parse(template):
+        if name is not None and name not in parts:
+            raise KeyError(name)
+        if width and _WIDE.search(width):
+            raise ValueError(f"expected a format of at most 99 characters, not {width[:20]!r}")
+    path = template.format(**parts)
+    if UNSAFE.search(path):
+        raise ValueError("expected no control characters")
     return path

@@ -164,6 +164,8 @@ class PictureSource(Source[PictureFolder]):
         if not {PICTURE, INSTRUCTION} <= set(read.names):
             columns = ", ".join(read.names) or "no line"
             raise UsageError(f"--table {table} has {columns}; expected the columns {PICTURE} and {INSTRUCTION}")
+        if hostile := [name for name in read.names if UNSAFE.search(name)]:
+            raise RecordingError(f"{read.where(read.line)} has the heading {hostile[0]!r}; expected plain text")
         names = [name for name in read.names if name and name not in (PICTURE, INSTRUCTION, ID, GROUP)]
         texts = _with_groups(read, list(read.rows()))
         values, coded_names = _coded(read, texts, names)
@@ -364,12 +366,18 @@ def _with_groups(table: TextTable, lines: list[tuple[int, Cells]]) -> list[tuple
 
 def _line(text: Cells, folder: Path, where: str, numbers: tuple[float, ...]) -> Line:
     """Return a line of the table. Raises RecordingError naming what is wrong with it."""
-    for name in (PICTURE, INSTRUCTION):
-        if not text[name] or UNSAFE.search(text[name] or ""):
-            raise RecordingError(f"{where} has the {name} {text[name] or ''!r}; expected plain text")
+    for name in (PICTURE, INSTRUCTION, ID, GROUP):  # labels are checked by `LabelTable`
+        cell = text.get(name) or ""
+        if UNSAFE.search(cell) or (not cell and name in (PICTURE, INSTRUCTION)):
+            raise RecordingError(f"{where} has the {name} {cell!r}; expected plain text")
     path = Path(text[PICTURE] or "")
     if path.is_absolute() or ".." in path.parts:
         raise RecordingError(f"{where} names {path}; expected a file in the folder of --pictures")
+    if not (folder / path).resolve().is_relative_to(folder.resolve()):
+        raise RecordingError(
+            f"{where} names {path}, a link to a file outside the folder of --pictures; expected a file in it. "
+            "Copy the picture into the folder (cp -L)"
+        )
     return Line(folder / path, _digest(_read(folder / path)), numbers)
 
 

@@ -9,6 +9,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import typer
 from pydantic import BeforeValidator, Field
 
+from probe_kit._system.table_cells import is_count
 from probe_kit.errors import UsageError
 from probe_kit.extract.sources.source import REFUSED_WITHOUT_ACTING, SourceSettings
 from probe_kit.hooks.families.shared.kinds import ACTION, IMAGES, STATE
@@ -16,8 +17,8 @@ from probe_kit.hooks.families.shared.kinds import ACTION, IMAGES, STATE
 TURNS = (90, 180, 270)
 """The degrees by which pictures can be rotated, counterclockwise."""
 MOST_EPISODES = 1_000_000
-_RANGE = re.compile(r"(\d+)(?::(\d+))?")
-_EVERY = re.compile(r"every:([1-9]\d*)")
+_RANGE = re.compile(r"(\d{1,18})(?::(\d{1,18}))?")
+_EVERY = re.compile(r"every:([1-9]\d{0,17})")
 _HUB = re.compile(r"[\w.-]+/[\w.-]+(@[\w./-]+)?")
 _option = partial(typer.Option, rich_help_panel="Recordings")
 
@@ -142,7 +143,7 @@ def _turns(value: Any) -> Any:
             for text in several
         ]
     for camera, degrees in _pairs("--rotate", "base=180", several):
-        if not str(degrees).isdecimal():
+        if not is_count(str(degrees)):
             which = "" if camera == EVERY_CAMERA else f"{camera}="
             raise UsageError(f"--rotate {which}{degrees}; expected degrees, such as {which}180")
         turns.append((camera, int(degrees)))

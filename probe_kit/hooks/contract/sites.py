@@ -24,7 +24,7 @@ HEADS = "heads"
 """
 
 _PATTERN = re.compile(
-    r"(?P<stream>[a-z][a-z_0-9]*)\.(?P<layer>\d{2,})\.(?P<quantity>[a-z_]+)(@(?P<iteration>\d+))?"
+    r"(?P<stream>[a-z][a-z_0-9]*)\.(?P<layer>\d{2,18})\.(?P<quantity>[a-z_]+)(@(?P<iteration>\d{1,18}))?"
 )
 # Streams whose name says their part, so that an adapter need not.
 _KNOWN_PARTS: dict[str, Part] = {

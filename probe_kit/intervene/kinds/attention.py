@@ -133,13 +133,13 @@ class AttentionReadout(Intervention):
         Raises:
             RunDamagedError: If a stored file was changed.
         """
-        return AttentionShares.from_bytes(measurement.read(ATTENTION_FILE)).rows()
+        return AttentionShares.stored(measurement).rows()
 
     @staticmethod
     def table(rows: "Sequence[AttentionRow]", context: Measurement) -> "Table":
         """Return one line per category and block of the backbone that is read."""
         del rows
-        attention = AttentionShares.from_bytes(context.read(ATTENTION_FILE))
+        attention = AttentionShares.stored(context)
         means = attention.rows(("block",))
         roles = [role for role in dict.fromkeys(row.role for row in means) if role not in (CORRECT, OTHER)]
         lines: list[tuple[tuple[str, ...], tuple[dict[str, float], str]]] = []
@@ -236,6 +236,14 @@ class PatchAttention:
         boxes: (P, 4) places of the patches, see `token_boxes`.
     """
 
+    AXES: ClassVar[Mapping[str, str]] = {
+        "episodes": "U N",
+        "calls": "iu N",
+        "weights": "f NBP",
+        "cameras": "U P",
+        "boxes": "f P4",
+    }
+
     episodes: NDArray[np.str_]
     calls: NDArray[np.int64]
     weights: NDArray[np.float16]
@@ -270,7 +278,7 @@ def stored_patch_attention(run: RunReader) -> dict[str, PatchAttention]:
     """
     stored = {category: result.stored for category, (result, _) in preferred_attention(run).items()}
     read = {
-        measured.key: PatchAttention(**arrays_from_bytes(measured.read(PATCHES_FILE)))
+        measured.key: PatchAttention(**measured.arrays(PATCHES_FILE, PatchAttention, PatchAttention.AXES))
         for measured in stored.values()
         if PATCHES_FILE in measured.files
     }
@@ -331,6 +339,13 @@ class AttentionShares:
             without a token, such as a tile behind the arm.
     """
 
+    AXES: ClassVar[Mapping[str, str]] = {
+        **dict.fromkeys(("episodes", "groups", "categories", "sides"), "U N"),
+        "roles": "U R",
+        "calls": "iu N",
+        "mass": "f NBIHR",
+    }
+
     roles: tuple[str, ...]
     episodes: NDArray[np.str_]
     groups: NDArray[np.str_]
@@ -342,6 +357,11 @@ class AttentionShares:
     def __post_init__(self) -> None:
         # Stored names are an array.
         object.__setattr__(self, "roles", tuple(map(str, self.roles)))
+
+    @classmethod
+    def stored(cls, measured: Measurement) -> Self:
+        """Return those of a stored intervention. Raises RunDamagedError for a file that was changed."""
+        return cls(**measured.arrays(ATTENTION_FILE, cls, cls.AXES))
 
     @classmethod
     def from_bytes(cls, content: bytes) -> Self:
@@ -483,7 +503,7 @@ def preferred_attention(run: RunReader) -> dict[str, tuple[StoredResult, Attenti
     for result in stored_results(run, ATTENTION):
         key, before = result.stored.key, preferred.get(result.category)
         if key not in read:
-            read[key] = AttentionShares.from_bytes(result.stored.read(ATTENTION_FILE))
+            read[key] = AttentionShares.stored(result.stored)
         category_shares = read[key].only(read[key].categories == result.category)
         if before is None or (before[0].rank, len(before[1].roles)) <= (result.rank, len(category_shares.roles)):
             preferred[result.category] = result, category_shares

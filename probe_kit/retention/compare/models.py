@@ -17,7 +17,7 @@ from probe_kit.statistics.retention import Scores, retention
 
 # -- what a network grew from --------------------------------------------------------------------------------
 
-_STEP = re.compile(r"(?:^|.*(?:step|checkpoint|ckpt|iter|iteration)s?[-_=]?)0*(\d+)$", re.IGNORECASE)
+_STEP = re.compile(r"(?:^|.*(?:step|checkpoint|ckpt|iter|iteration)s?[-_=]?)0*(\d{1,18})$", re.IGNORECASE)
 """The name of a folder of a training: `020000`, `checkpoint-500`, `step_20000`, `ckpt-3`."""
 _INNER = ("pretrained_model", "model", "params", "weights")
 """Folders that trainers put below that of a step. Others are not skipped: a folder above may be a date."""

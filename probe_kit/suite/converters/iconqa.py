@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from probe_kit._system.table_cells import is_count
 from probe_kit.errors import SuiteError
 from probe_kit.hashing import derive_seed
 from probe_kit.suite.converters.candidates import (
@@ -213,7 +214,7 @@ def _count_of(problem: Any, where: str) -> int | None:
     text = str(answer).strip().lower()
     if text in _NUMBERS:
         return _NUMBERS.index(text) + 1
-    return int(text) if text.isdigit() and 1 <= int(text) <= 9 else None
+    return int(text) if is_count(text) and 1 <= int(text) <= 9 else None
 
 
 def _singular(noun: str) -> str:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from probe_kit._system.table_cells import number_of
+from probe_kit._system.table_cells import is_count, number_of
 from probe_kit._system.text_tables import open_table
 from probe_kit.errors import SuiteError, UsageError
 from probe_kit.suite.converters.candidates import Candidate, MmbenchOptions, Reading, SourcePicture
@@ -152,7 +152,7 @@ def _picture_cell(index: int, rows: Mapping[int, Row], where: str) -> tuple[int,
     while len(rows[holder]["image"].strip()) <= _LONGEST_REFERENCE:
         visited.add(holder)
         reference = rows[holder]["image"].strip()
-        if not reference.isdigit() or int(reference) not in rows or int(reference) in visited:
+        if not is_count(reference) or int(reference) not in rows or int(reference) in visited:
             raise SuiteError(
                 f"{SOURCE}: {where}: its picture is in row {reference!r}, which holds none. Use the whole file."
             )

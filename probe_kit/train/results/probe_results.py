@@ -1,6 +1,7 @@
 """Probe results: settings, directions, the table of scores with its best sites, and the decisions behind it."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from functools import cached_property
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit._system.bounded_files import open_arrays
+from probe_kit._system.bounded_files import UNREADABLE, open_arrays
 from probe_kit._tables.numbers import p_text
 from probe_kit._tables.table import Table
 from probe_kit.errors import UnknownSiteError
@@ -30,6 +31,7 @@ from probe_kit.train.samples import is_token_view
 
 if TYPE_CHECKING:
     import pandas as pd
+    from numpy.lib.npyio import NpzFile
 
 
 FORMAT = 8  # raise when settings have other fields or would give other numbers
@@ -157,6 +159,18 @@ class StoredDirections(Mapping[Place, Direction]):
             self._checked = True
         return self._bundle.open(self._name)
 
+    @contextmanager
+    def _arrays(self) -> Iterator["NpzFile"]:
+        """Open the file. A file, or an array in it, that cannot be read raises RunDamagedError."""
+        with self._open() as file:
+            try:
+                with open_arrays(file) as arrays:
+                    yield arrays
+            except KeyError:  # a place that was not probed
+                raise
+            except UNREADABLE as error:
+                raise self._bundle.damaged(self._name, f"cannot be read: {error}") from error
+
     def __getitem__(self, key: Place) -> Direction:
         return self.read([key])[key]
 
@@ -167,7 +181,7 @@ class StoredDirections(Mapping[Place, Direction]):
             KeyError: For a place that was not probed.
         """
         directions = {}
-        with self._open() as file, open_arrays(file) as arrays:
+        with self._arrays() as arrays:
             for key in places:
                 name = "/".join(map(str, key))
                 if f"{name}/weights" not in arrays:
@@ -178,7 +192,7 @@ class StoredDirections(Mapping[Place, Direction]):
         return directions
 
     def __iter__(self) -> Iterator[Place]:
-        with self._open() as file, open_arrays(file) as arrays:
+        with self._arrays() as arrays:
             for name in dict.fromkeys(member.rpartition("/")[0] for member in arrays):
                 category, view, site = name.rsplit("/", 2)
                 yield category, view, Site.parse(site)

@@ -3,6 +3,8 @@
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from probe_kit._system.table_cells import is_count
+
 _Names = tuple[str, ...]
 
 
@@ -60,7 +62,7 @@ def _places(spelling: Any, group: _Names = ()) -> Iterator[_Leaf]:
         for name, part in spelling.items():
             if type(part) is int:
                 yield str(name), part, group
-            elif isinstance(part, str) and str(name).isdecimal():
+            elif isinstance(part, str) and is_count(str(name)):
                 yield part, int(name), group
             else:
                 yield from _places(part, (*group, str(name)))

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from probe_kit._system.bounded_files import read_json_object
+from probe_kit._system.table_cells import is_count
 from probe_kit.errors import CheckpointError, InstructionError, UsageError
 from probe_kit.hooks.checkpoints.checkpoint import GENERATION_FILE
 from probe_kit.hooks.contract.model import Model, Tap, Unembedding
@@ -93,7 +94,7 @@ def top_of(top_k: str, folders: Sequence[Path]) -> int | None:
     if top_k == CHECKPOINT:
         file = next((folder / GENERATION_FILE for folder in folders if (folder / GENERATION_FILE).is_file()), None)
         return TOP if file is None else _stored_top(file)
-    if not top_k.isdecimal() or int(top_k) < 1:
+    if not is_count(top_k) or int(top_k) < 1:
         raise UsageError(f"top_k is {top_k!r}; expected a number from 1 on, {ALL} or {CHECKPOINT}")
     return int(top_k)
 
