@@ -1,7 +1,7 @@
 """The folder of a study: which run in it is that of a cell, and what its model was when it was played.
 
 A run's folder is named by settings and by the content of the checkpoint. Each run of a network leaves a record
-`OUT/_checkpoints/<run>.json`: the path and content of its files, and the weights that it was played with. So a
+`OUT/_checkpoints/<run>+<paths>.json`: path and content of its files, and the weights that it was played with. So a
 study can be read without the files, and a run in the folder of another one is noticed wherever files lie.
 
 Studies of earlier versions have no records, and their folders are named by name, size and time of files. They are
@@ -10,7 +10,7 @@ looked up by that name, or, without the files, by the settings and the path of t
 
 import json
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
@@ -18,7 +18,7 @@ from typing import Any, ClassVar
 
 from probe_kit.errors import ProbeKitError, SettingsMismatchError
 from probe_kit.extract.parts import is_here
-from probe_kit.hashing import canonical_json
+from probe_kit.hashing import canonical_json, sha256_json
 from probe_kit.hooks.checkpoints.checkpoint import is_on_hub
 from probe_kit.runs import open_run
 from probe_kit.runs.layout import RUN_FILE
@@ -81,11 +81,14 @@ class StudyFolder:
 
     @cached_property
     def _models(self) -> dict[str, PlayedModel]:
-        """The records by the folder of their run."""
+        """The records by the names of their files."""
         stored = self._location.read_all(RECORDS, ".json")
         name = f"{self._out}/{RECORDS}"
-        models = [PlayedModel.parse(raw, f"{name}/{key}", _ADVICE) for key, raw in stored.items()]
-        return {model.run: model for model in models}
+        return {key: PlayedModel.parse(raw, f"{name}/{key}", _ADVICE) for key, raw in stored.items()}
+
+    def _newest(self, is_meant: Callable[[PlayedModel], bool]) -> PlayedModel | None:
+        models = filter(is_meant, self._models.values())
+        return max(models, key=lambda model: model.when, default=None)
 
     # -- content -------------------------------------------------------------------------------------------------
 
@@ -96,13 +99,17 @@ class StudyFolder:
         """
         contents = self._contents_here(cell)
         for name, text in cell.paths.items():
-            if name in contents:
-                continue
-            noted = [model for model in self._models.values() if model.model == cell.model]
-            noted = [model for model in noted if name in model.contents and model.paths.get(name) == text]
-            if noted:
-                contents[name] = max(noted, key=lambda model: model.when).contents[name]
+            if (
+                name not in contents
+                and (model := self._newest(self._with_path(cell.model, name, text))) is not None
+            ):
+                contents[name] = model.contents[name]
         return contents
+
+    @staticmethod
+    def _with_path(model_name: str, name: str, text: str) -> Callable[[PlayedModel], bool]:
+        """Return whether a model was loaded from the file of this text."""
+        return lambda model: model.model == model_name and model.paths.get(name) == text and name in model.contents
 
     def _contents_here(self, cell: Cell, again: bool = False) -> dict[str, str]:
         options = {f"option {name}" for name in cell.settings.model.files()}
@@ -110,9 +117,10 @@ class StudyFolder:
         for name, text in cell.paths.items():
             if name not in {CHECKPOINT, *options} or not is_here(text):
                 continue
-            if again or text not in self._contents:
+            if text not in self._contents:
                 self._contents[text] = content_of(text)
-            if (content := self._contents[text]) is not None:
+            content = content_of(text) if again else self._contents[text]
+            if content is not None:
                 contents[name] = content
         return contents
 
@@ -122,8 +130,9 @@ class StudyFolder:
         """Return the key of the stored run of a cell, or that of a new run."""
         contents = self.contents(cell)
         key = cell.key_with(contents)
-        if not contents and cell.settings.model.checkpoint is None:
-            return key  # of embedded or random weights, which the settings name
+        checkpoint = cell.settings.model.checkpoint
+        if not contents and (checkpoint is None or ("://" in self._out and is_on_hub(checkpoint))):
+            return key  # which is that of every version; and a bucket is listed object by object
         if not self._has_run(cell, key):
             return self._former_key(cell, contents) or key
         return key
@@ -137,17 +146,12 @@ class StudyFolder:
         stamp = former_stamp(checkpoint) if checkpoint is not None and is_here(checkpoint) else None
         if contents and self._has_run(cell, key := cell.key_with({} if stamp is None else {CHECKPOINT: stamp})):
             return key
-        if not contents and "://" in self._out and is_on_hub(str(checkpoint)):
-            return None  # runs of a hub id never had another name, and a bucket is listed object by object
         keys = self._keys_of_content(cell, contents) if contents else self.keys_of_name(cell)
         runs = defaultdict[str, list[tuple[int, str]]](list)
         for key in keys:
             location = locate(f"{self._out}/{cell.folder_of(key)}")
             try:
-                if any(
-                    stored != expected
-                    for _, stored, expected in changed_settings(read_root(location).own_settings, cell)
-                ):
+                if any(changed_settings(read_root(location).own_settings, cell)):
                     continue
                 run = open_run(location, allow_partial=True)
                 card = run.certificate.get("policy") or {} if run.commits() else {}
@@ -169,8 +173,8 @@ class StudyFolder:
     def _keys_of_content(self, cell: Cell, contents: Mapping[str, str]) -> list[str]:
         """Return the keys of the cell's name under which runs of these files are recorded."""
         prefix = cell.folder_of("")
-        names = [name for name, model in self._models.items() if self._is_of(model, cell, contents)]
-        return [name.removeprefix(prefix) for name in names if name.startswith(prefix)]
+        runs = {model.run for model in self._models.values() if self._is_of(model, cell, contents)}
+        return sorted(run.removeprefix(prefix) for run in runs if run.startswith(prefix))
 
     @staticmethod
     def _is_of(model: PlayedModel, cell: Cell, contents: Mapping[str, str]) -> bool:
@@ -203,11 +207,9 @@ class StudyFolder:
 
     def played_model(self, cell: Cell) -> PlayedModel | None:
         """Return the model as the run of a cell, or another run of the same files, was played; None if unknown."""
-        model = self._models.get(cell.folder)
         contents = self.contents(cell)
-        if model is not None or not contents:
-            return model
-        return next((other for other in self._models.values() if self._is_of(other, cell, contents)), None)
+        model = self._newest(lambda model: model.run == cell.folder)
+        return model or (self._newest(lambda model: self._is_of(model, cell, contents)) if contents else None)
 
     def note_played(self, cell: Cell) -> None:
         """Write the record of a run that this process, or a worker of it, has just played.
@@ -234,7 +236,7 @@ class StudyFolder:
         contents = self._contents_here(cell)
         if not contents:
             return
-        if (model := self._models.get(cell.folder)) is not None:
+        if (model := self._newest(lambda model: model.run == cell.folder)) is not None:
             self._note(cell, model.weights_sha256, model.policy)
             return
         run = open_run(locate(cell.location(self._out)), allow_partial=True)
@@ -249,18 +251,13 @@ class StudyFolder:
             run=cell.folder, model=cell.model, asks=cell.asks, paths=cell.paths, contents=contents,
             weights_sha256=weights_sha256, policy=dict(policy), when=when,
         )  # fmt: skip
-        former = self._models.get(cell.folder)
-        of_path = [
-            other
-            for other in self._models.values()
-            if other.model == cell.model and other.paths == cell.paths and other.contents
-        ]
-        newest = max(of_path, key=lambda other: other.when, default=None)
-        if model.same(former) and (newest is None or newest.contents == contents):
+        name = f"{cell.folder.replace('/', '+')}+{sha256_json(cell.paths)[:KEY_DIGITS]}.json"
+        newest = self._newest(lambda other: (other.model, other.paths) == (cell.model, cell.paths))
+        if model.same(self._models.get(name)) and (newest is None or newest.contents == contents):
             return
-        with self._location.explained_errors():
-            self._location.write(f"{RECORDS}/{cell.folder.replace('/', '+')}.json", model.to_bytes())
-        self._models[cell.folder] = model
+        with self._location.explained_errors(), self._location.tended(RECORDS):
+            self._location.write(f"{RECORDS}/{name}", model.to_bytes())
+        self._models[name] = model
 
 
 # -- settings ----------------------------------------------------------------------------------------------------
