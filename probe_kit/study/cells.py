@@ -7,7 +7,7 @@ study need no lock between them.
 """
 
 import json
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cached_property
@@ -94,6 +94,7 @@ def slugs(names: Sequence[str]) -> tuple[str, ...]:
 
 KEY_DIGITS = 8
 """Digits of a key in a folder's name; `stored` detects two settings that share them."""
+CHECKPOINT = "checkpoint"
 
 
 @dataclass(frozen=True)
@@ -133,6 +134,7 @@ class Cell:
         suite: The suite of all cells.
         unavailable: Reason why it is not played, empty if it is.
         packed_key: In an archive, the key of the run that was packed.
+        find_key: Finds the key of the stored run, see `StudyFolder.key`; None names files by their paths.
     """
 
     model: str
@@ -143,6 +145,7 @@ class Cell:
     suite: PlannedSuite
     unavailable: str = ""
     packed_key: str = ""
+    find_key: "Callable[[Cell], str] | None" = field(default=None, compare=False, repr=False)
 
     @property
     def name(self) -> str:
@@ -200,14 +203,29 @@ class Cell:
 
     @cached_property
     def key(self) -> str:
-        """The hash of everything that the settings decide except the selection; it names the run's folder."""
+        """The key in the name of the run's folder."""
         if self.packed_key:
             return self.packed_key
-        settings = self.settings
+        return self.key_with({}) if self.find_key is None else self.find_key(self)
+
+    @property
+    def paths(self) -> dict[str, str]:
+        """The texts that may name files of this machine: the checkpoint, and options by `option NAME`."""
+        model = self.settings.model
+        checkpoint = {} if model.checkpoint is None else {CHECKPOINT: model.checkpoint}
+        return checkpoint | {f"option {name}": str(value) for name, value in model.options.items()}
+
+    def key_with(self, contents: Mapping[str, Any]) -> str:
+        """Return the hash of everything that the settings decide except the selection.
+
+        Args:
+            contents: What stands for the files that `paths` names; the others are named by their texts.
+        """
+        settings, files = self.settings, {**self.paths, **contents}
         decided = {
             **settings.identity(),
-            "checkpoint": checkpoint_stamp(settings.model.checkpoint),
-            "options": {name: str(value) for name, value in settings.model.options.items()},  # some are paths
+            "checkpoint": files.get(CHECKPOINT),
+            "options": {name: files[f"option {name}"] for name in settings.model.options},
             "weights_seed": settings.model.weights_seed,
             "protocol": settings.task.protocol,
             "wordings": settings.wordings,
@@ -219,7 +237,11 @@ class Cell:
     @property
     def folder(self) -> str:
         """The run's folder below `out`, such as `base/plain-seed1-0123abcd`."""
-        return f"{self.name.replace('/seed ', '-seed')}-{self.key}"
+        return self.folder_of(self.key)
+
+    def folder_of(self, key: str) -> str:
+        """Return the folder below `out` of a run of this key."""
+        return f"{self.name.replace('/seed ', '-seed')}-{key}"
 
     def location(self, out: str) -> str:
         """Return the location of the run below `out`."""
@@ -232,18 +254,6 @@ class Cell:
         return self.settings.changed(
             suite=folder, categories=self.selection.categories, items=self.selection.items
         )
-
-
-def checkpoint_stamp(checkpoint: str | None) -> Any:
-    """Return a stamp that distinguishes checkpoints without reading gigabytes for every plan.
-
-    Of a folder or file, it is name, size and time of every file; else the hub id.
-    """
-    if checkpoint is None or not (folder := Path(checkpoint).expanduser()).exists():
-        return checkpoint
-    files = sorted(folder.rglob("*")) if folder.is_dir() else [folder]
-    stats = [(file, file.stat()) for file in files if file.is_file()]
-    return [[file.relative_to(folder).as_posix(), stat.st_size, stat.st_mtime_ns] for file, stat in stats]
 
 
 # -- failures ----------------------------------------------------------------------------------------------------

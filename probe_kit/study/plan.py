@@ -20,11 +20,12 @@ from probe_kit.runs.layout import RUN_FILE, StoredStream
 from probe_kit.runs.root import read_root
 from probe_kit.runs.run_folders import in_units
 from probe_kit.runs.store import locate
-from probe_kit.study.cells import KEY_DIGITS, NOT_TRIED_AGAIN, Cell, Failure, Failures, Selection
+from probe_kit.study.cells import NOT_TRIED_AGAIN, Cell, Failure, Failures, Selection
 from probe_kit.study.expansion import control_of
 from probe_kit.study.reading import LoadedStudy
 from probe_kit.study.schema import ProbesTable, unknown
-from probe_kit.study.stored import changed_settings, open_matching, part_of, probe_key_of
+from probe_kit.study.stored import open_matching, part_of, probe_key_of
+from probe_kit.study.study_folder import changed_settings
 from probe_kit.train.results.control_scores import Controls, UntrainedScore
 from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.store import load_results, read_controls, read_probes, settings_of
@@ -366,10 +367,9 @@ def _planned(study: LoadedStudy, cell: Cell) -> PlannedCell:
 def _why_new(study: LoadedStudy, cell: Cell) -> str:
     """Return the changes since the newest run of the same model, condition and seed on this machine, if any."""
     out = study.study.folder
-    digits = "[0-9a-f]" * KEY_DIGITS
-    files = () if "://" in out else Path(out).glob(f"{cell.folder[:-KEY_DIGITS]}{digits}/{RUN_FILE}")
-    former_files = (file for file in files if file.parent != Path(cell.location(out)))
-    former = max(former_files, key=lambda file: file.stat().st_mtime_ns, default=None)
+    keys = () if study.folder is None or "://" in out else study.folder.keys_of_name(cell)
+    files = (Path(out) / cell.folder_of(key) / RUN_FILE for key in keys if key != cell.key)
+    former = max(files, key=lambda file: file.stat().st_mtime_ns, default=None)
     if former is None:
         return "new"
     try:

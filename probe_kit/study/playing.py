@@ -21,6 +21,7 @@ from probe_kit.errors import (
     ProbeKitError,
     RunIncompleteError,
     RunNotFoundError,
+    SettingsMismatchError,
     StoreError,
     WorkerDiedError,
 )
@@ -144,8 +145,15 @@ def conduct_study(
         failures += [failure for failure in before if failure and failure.stage in NOT_TRIED_AGAIN]
         missing = [planned for planned in missing if not planned.given_up]
     stored.check_place()  # a place that cannot be written is no model's failure
+    folder, recorded = plan.study.folder, set[str]()
 
     def note(event: Event) -> None:
+        if folder is not None and not isinstance(event, Failure) and event.run not in recorded:
+            recorded.add(event.run)  # with the first episode: a killed run resumes with the same model
+            try:
+                folder.note_played(cells[event.run])
+            except SettingsMismatchError as error:
+                note(Failure.of("checking", event.model, event.run, error))
         if isinstance(event, RunFinished):
             stored.clear(cells[event.run])
         elif isinstance(event, Failure):
@@ -160,6 +168,8 @@ def conduct_study(
     for planned in plan.played:
         if not planned.sealed:  # its process was killed after the last episode
             seal(locate(planned.location))
+        if folder is not None and planned.state == "whole":
+            folder.note_stored(planned.cell)
     return failures
 
 

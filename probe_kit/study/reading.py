@@ -21,6 +21,7 @@ from probe_kit.study.cells import Cell, PlannedSuite, planned_suite
 from probe_kit.study.checks import misfits, unknown_names
 from probe_kit.study.expansion import expand
 from probe_kit.study.schema import Mistake, Place, StudyFileError, part_in_file
+from probe_kit.study.study_folder import StudyFolder
 
 _MOST_BYTES = 1 << 20
 """Largest number of bytes of a study file, which may come with an archive of anyone."""
@@ -38,6 +39,7 @@ class LoadedStudy:
         file: Path of the file.
         cells: The runs that it needs.
         pack: The record of the archive that it was read from, whose runs hold no activations; else None.
+        folder: The folder of its runs; None for an archive, whose record names its runs.
     """
 
     file: Path
@@ -45,6 +47,7 @@ class LoadedStudy:
     suite: PlannedSuite
     cells: tuple[Cell, ...]
     pack: Pack | None = None
+    folder: StudyFolder | None = None
 
     @property
     def archive(self) -> Path | None:
@@ -114,7 +117,9 @@ def load_study(name: str | Path) -> LoadedStudy:
     if mistakes:
         raise StudyFileError(str(file), content, mistakes)
     if pack is None:
-        return LoadedStudy(file, study, suite, tuple(cells))
+        folder = StudyFolder(study.folder)
+        named = tuple(replace(cell, find_key=folder.key) for cell in cells)
+        return LoadedStudy(file, study, suite, named, folder=folder)
     keys, runs = {name: run.key for name, run in pack.runs.items()}, str(file.parent / RUNS)
     packed = tuple(replace(cell, packed_key=keys.get(cell.name, "")) for cell in cells)
     return LoadedStudy(file, study.model_copy(update={"out": runs}), suite, packed, pack)

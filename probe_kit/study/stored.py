@@ -4,7 +4,6 @@ A folder's name says which run should lie in it. No number is taken before the c
 weights, wordings and suite.
 """
 
-import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain, combinations
@@ -13,14 +12,15 @@ from typing import TYPE_CHECKING, Any
 
 from probe_kit._terminal.console import say
 from probe_kit.errors import ProbeKitError, RunIncompleteError, RunNotFoundError, SettingsMismatchError, UsageError
-from probe_kit.hashing import canonical_json
+from probe_kit.extract.parts import is_here
 from probe_kit.hooks.checkpoints.checkpoint import COMMIT_DIGITS, is_on_hub, without_revision
 from probe_kit.runs import open_run
 from probe_kit.runs.store import locate
-from probe_kit.runs.writer import flat_settings
-from probe_kit.study.cells import Cell, Failures, Selection, checkpoint_stamp
+from probe_kit.study.cells import Cell, Failures, Selection
+from probe_kit.study.file_contents import content_of
 from probe_kit.study.reading import LoadedStudy, load_study, shipped_studies
 from probe_kit.study.schema import ProbesTable
+from probe_kit.study.study_folder import Change, PlayedModel, changed_settings
 from probe_kit.train.probe_sweep import probe_settings
 from probe_kit.train.results.probe_results import ProbeResults
 from probe_kit.train.results.store import is_stored, load_results, read_probes, settings_of
@@ -29,19 +29,21 @@ if TYPE_CHECKING:
     from probe_kit.runs import Run
 
 
-_OF_LOADED_MODEL = {"dtype", "weights_sha256", "execute", "captured_calls", "policy", "begun", "zeros_for"}
-"""Settings of a run that the loaded model decides where the file leaves them open."""
 _MOST_PRINTED = 3
-Change = tuple[str, Any, Any]
-"""Path of a setting, its stored value, and the value that the cell has."""
 
 
-def differences(run: "Run", cell: Cell) -> Iterator[str]:
-    """Yield the settings in which a run is not one of `cell`, in words, stored value first."""
+def differences(run: "Run", cell: Cell, played: PlayedModel | None = None) -> Iterator[str]:
+    """Yield the settings in which a run is not one of `cell`, in words, stored value first.
+
+    Args:
+        run: The stored run.
+        cell: The cell that it may belong to.
+        played: The cell's model as it was played; None if that is not known.
+    """
     changes = chain(
         changed_settings(run.root.own_settings, cell),
         [("wordings", list(run.wordings), list(cell.settings.wordings or ()))],
-        _weights(run, cell),
+        _weights(run, cell, played),
     )
     for name, stored, expected in changes:
         if stored != expected:
@@ -55,38 +57,12 @@ def differences(run: "Run", cell: Cell) -> Iterator[str]:
         yield f"item {changed[0]!r} {state} since it was played ({len(changed)} of {len(hashes)} items)"
 
 
-def changed_settings(own_settings: Mapping[str, Any], cell: Cell) -> Iterator[Change]:
-    """Yield the settings of a stored run that differ from those of `cell`."""
-    stored, expected = flat_settings(own_settings), flat_settings(_expected(cell))
-    for name in sorted(stored | expected):
-        is_open = name.partition(".")[0] in _OF_LOADED_MODEL
-        if (name in expected or not is_open) and stored.get(name) != expected.get(name):
-            yield name, stored.get(name), expected.get(name)
+def _weights(run: "Run", cell: Cell, played: PlayedModel | None) -> Iterator[Change]:
+    """Yield what the process that loaded the model recorded of it, and what the cell's model is.
 
-
-def _expected(cell: Cell) -> dict[str, Any]:
-    """Return the settings that a run of the cell has whatever model is loaded, as plain values.
-
-    Settings that the file leaves to the model are absent.
-    """
-    settings = cell.settings
-    decided = {
-        name: value
-        for name, value in settings.identity().items()
-        if name != "dtype" and not (name in _OF_LOADED_MODEL and value in (None, "all"))
-    }
-    name, _, version = cell.suite.identity.rpartition("@")
-    expected = {**decided, "scene": settings.scene.to_json(), "suite": {"name": name, "version": version}}
-    plain: dict[str, Any] = json.loads(canonical_json(expected))
-    return plain
-
-
-def _weights(run: "Run", cell: Cell) -> Iterator[Change]:
-    """Yield the seed of random weights, or the checkpoint, as the process that loaded them recorded it.
-
-    A card has the commit of a hub id. A file may name a branch or nothing: then repository and folder count. The
-    folder of a local checkpoint may have been moved since. If it is still at its old path, and is another one than
-    the file's by name, size and time of its files, the run is another checkpoint's.
+    A card has the commit of a hub id. A file may name a branch or nothing: then repository and folder count. Of a
+    local checkpoint the content counts, wherever its files lie: by the weights that were loaded from it. A run of
+    an earlier version left no record of them: it is compared if the files still lie where it had loaded them.
     """
     if not run.commits():
         return
@@ -98,8 +74,13 @@ def _weights(run: "Run", cell: Cell) -> Iterator[Change]:
         has_commit = len(expected.partition("@")[2]) == COMMIT_DIGITS
         names = [name if has_commit else without_revision(name) for name in (stored, expected)]
         yield "checkpoint", names[0], names[1]
-    stamps = [checkpoint_stamp(stored), checkpoint_stamp(expected)]
-    if all(isinstance(stamp, list) for stamp in stamps) and stamps[0] != stamps[1]:
+    if played is not None:
+        policy: Mapping[str, Any] = run.root.own_settings.get("policy") or {}
+        yield "weights_sha256", run.weights_sha256, played.weights_sha256
+        # Another version may name more of what a model reads.
+        common = sorted(policy.keys() & played.policy.keys())
+        yield from ((f"policy.{name}", policy[name], played.policy[name]) for name in common)
+    elif is_here(stored) and is_here(expected) and content_of(stored) != content_of(expected):
         yield "checkpoint", stored, expected
 
 
@@ -250,8 +231,14 @@ def open_matching(study: LoadedStudy, cell: Cell, partial: bool) -> "Run":
     Raises:
         SettingsMismatchError: For the run of another cell, which it names.
     """
+
+    def played(any_cell: Cell) -> PlayedModel | None:
+        return None if study.folder is None else study.folder.played_model(any_cell)
+
+    if study.folder is not None:
+        study.folder.check_unambiguous(cell)
     run = open_run(locate(cell.location(study.study.folder)), allow_partial=partial)
-    problems = list(differences(run, cell))
+    problems = list(differences(run, cell, played(cell)))
     packed = None if study.pack is None else study.pack.runs.get(cell.name)
     if not problems and packed is not None and packed.settings_sha256 != run.settings_sha256:
         hashes = f"{run.settings_sha256[:12]}, noted {packed.settings_sha256[:12]}"
@@ -259,7 +246,8 @@ def open_matching(study: LoadedStudy, cell: Cell, partial: bool) -> "Run":
     if not problems:
         return run
     cells = (other for other in study.cells if other.name != cell.name)
-    owner = next((f" It is a run of {other.name}." for other in cells if not any(differences(run, other))), "")
+    owners = (other.name for other in cells if not any(differences(run, other, played(other))))
+    owner = next((f" It is a run of {name}." for name in owners), "")
     more = f" and {len(problems) - _MOST_PRINTED} more" if len(problems) > _MOST_PRINTED else ""
     raise SettingsMismatchError(
         f"{run.location} should hold the run of {cell.name}, and holds another one: "

@@ -5,13 +5,13 @@ never be mixed with, or called, the paper's numbers. Each couple of tiles gives 
 same places, each the target once. Neither the pictures alone nor the text alone can give the answer away.
 """
 
-import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
+from probe_kit._system.user_cache import user_cache
 from probe_kit.errors import UsageError
 from probe_kit.hashing import sha256_json, sha256_text
 from probe_kit.suite.categories import CATEGORIES, check_categories
@@ -172,8 +172,7 @@ def default_folder(
 ) -> Path:
     """Return the folder in which `default_suite` keeps the suite of these arguments, built or not."""
     key = _cache_key(_options(categories, items_per_category, seed))
-    cache = os.environ.get("PROBE_KIT_CACHE") or Path.home() / ".cache" / "probe_kit"
-    return Path(cache) / "suites" / f"{default_identity().replace('@', '-')}-{key}"
+    return user_cache() / "suites" / f"{default_identity().replace('@', '-')}-{key}"
 
 
 def default_identity() -> str:
