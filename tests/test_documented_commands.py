@@ -53,6 +53,7 @@ OTHER_PROGRAMS = {
 
 OF_OTHERS = {
     "--help": "every program's",
+    "--rename": "lerobot's --rename_map",
     "--help-all": "every command's",
     "--extra": "uv's",
     "--gpus": "docker's",

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from probe_kit._system.bounded_files import parse_json, read_regular
 from probe_kit._system.imports import require
 from probe_kit._system.machine import same_scheduling
 from probe_kit.env import SceneSpec
@@ -141,7 +142,7 @@ def _features(shape: tuple[int, ...]) -> dict[str, Any]:
 
 def _write_lens(file: Path, scene: SceneSpec) -> None:
     """Add the camera's matrix in pixels of the picture to the description of its feature."""
-    info = json.loads(file.read_text(encoding="utf-8"))
+    info = parse_json(read_regular(file))
     info["features"][CAMERA]["info"] = {
         **(info["features"][CAMERA].get("info") or {}),
         "intrinsics": scene.intrinsics.tolist(),

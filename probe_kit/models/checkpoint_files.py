@@ -249,7 +249,7 @@ def load_pretrained(loader: Any, source: Path | str, **options: Any) -> Any:
         LfsPointerError: For a Git LFS pointer among them.
     """
     try:
-        with while_reading_pretrained(Path(source), loader.__name__):
+        with while_reading_pretrained(Path(source), getattr(loader, "__name__", "its loader")):
             return loader.from_pretrained(str(source), trust_remote_code=False, **options)
     except CheckpointError as error:
         if not isinstance(error.__cause__, ValueError) or _REMOTE_CODE not in str(error.__cause__):

@@ -57,7 +57,7 @@ def _without_unread_views(config: Any, folder: Path) -> tuple[str, ...]:
     """Take the pictures that lerobot's packing leaves out from the configuration, and return their names."""
     views = step_fields(folder).get(PACKING_STEP, {}).get("video_modality_keys")
     packed = read_views(list(config.image_features), views) if views else list(config.image_features)
-    unread = tuple(name for name in config.image_features if name not in packed)
+    unread = tuple(name for name in config.image_features if name not in packed and name.startswith(IMAGES))
     config.input_features = {name: entry for name, entry in config.input_features.items() if name not in unread}
     return tuple(name.removeprefix(IMAGES) for name in unread)
 
