@@ -153,7 +153,7 @@ LOOKED_FOR = {
     "view": "Make one with",
     "labels": "Make one with",
     "targets": "Make one with",
-    "diagnose": "accepted so far|Make one with|kitchen is no LeRobotDataset|holds no|Not a model",
+    "diagnose": "accepted so far|Make one with|kitchen is no LeRobotDataset|holds no|Not a model|words.txt",
     "train": "Make one with|AWS_ACCESS_KEY_ID",
     "intervene": "Make one with",
     "retention": "Make one with",

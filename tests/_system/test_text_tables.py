@@ -264,7 +264,15 @@ def test_groups_are_texts_as_they_are_written(cells: list[object], names: list[s
 
 @pytest.mark.parametrize(
     "cells",
-    [["7", "007"], ["7", "7.0"], ["7.0", "07"], ["Kitchen", "kitchen"], ["Straße", "STRASSE"], ["a", "-"], ["a", "none"]],
+    [
+        ["7", "007"],
+        ["7", "7.0"],
+        ["7.0", "07"],
+        ["Kitchen", "kitchen"],
+        ["Straße", "STRASSE"],
+        ["a", "-"],
+        ["a", "none"],
+    ],
 )
 def test_two_spellings_of_one_group_are_refused(cells: list[str]) -> None:
     with pytest.raises(UsageError, match="row 1"):

@@ -388,7 +388,9 @@ MANY = "1" * 5000
 
 
 def pairs_of(folder: Path, *cells: str) -> object:
-    (folder / "pairs.csv").write_text(f"episode,frame,donor_episode,donor_frame\n{','.join(cells)}\n")
+    (folder / "pairs.csv").write_text(
+        f"episode,frame,donor_episode,donor_frame\n{','.join(cells)}\n", encoding="utf-8"
+    )
     return read_pairs(folder / "pairs.csv")
 
 

@@ -261,15 +261,15 @@ def copied_arm(tmp_path: Path) -> Path:
     """The description of a copy of the Panda whose meshes a test may change."""
     folder = shutil.copytree(Path(pybullet_data.getDataPath()) / "franka_panda", tmp_path / "arm")
     urdf = folder / "panda.urdf"
-    urdf.write_text(urdf.read_text().replace("package://", f"{folder}/"))
+    urdf.write_text(urdf.read_text(encoding="utf-8").replace("package://", f"{folder}/"), encoding="utf-8")
     return urdf
 
 
 def enlarge_hand(urdf: Path) -> None:
     for mesh in (urdf.parent / "meshes").rglob("hand.obj"):
         grown = re.sub(r"^v (\S+) (\S+) (\S+)", lambda v: "v " + " ".join(str(2 * float(x)) for x in v.groups()),
-                       mesh.read_text(), flags=re.MULTILINE)  # fmt: skip
-        mesh.write_text(grown)
+                       mesh.read_text(encoding="utf-8"), flags=re.MULTILINE)  # fmt: skip
+        mesh.write_text(grown, encoding="utf-8")
 
 
 @pytest.mark.parametrize("change", ["mesh", "material", "texture"])
@@ -280,7 +280,7 @@ def test_a_scene_is_another_once_a_file_of_its_arm_changed(copied_arm: Path, cha
         enlarge_hand(copied_arm)
     else:
         material = next((copied_arm.parent / "meshes" / "visual").glob("hand.mtl"))
-        material.write_text(f"{material.read_text()}\nmap_Kd colour.png\n")
+        material.write_text(f"{material.read_text(encoding='utf-8')}\nmap_Kd colour.png\n", encoding="utf-8")
         picture = material.with_name("colour.png")
         picture.write_bytes(b"one")
         if change == "texture":
@@ -305,7 +305,9 @@ def test_an_edited_mesh_is_drawn_in_the_same_process(copied_arm: Path) -> None:
     after = picture()
     assert (before != after).any()
     fresh = shutil.copytree(copied_arm.parent, copied_arm.parent.with_name("fresh")) / "panda.urdf"
-    fresh.write_text(fresh.read_text().replace(f"{copied_arm.parent}/", f"{fresh.parent}/"))
+    fresh.write_text(
+        fresh.read_text(encoding="utf-8").replace(f"{copied_arm.parent}/", f"{fresh.parent}/"), encoding="utf-8"
+    )
     copied_arm = fresh  # a name that PyBullet never read in this process
     np.testing.assert_array_equal(picture(), after)
 
