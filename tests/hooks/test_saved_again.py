@@ -361,7 +361,11 @@ def newest(tmp_path_factory: pytest.TempPathFactory) -> Path:
     uv = shutil.which("uv") or next(map(str, Path(__file__).parents[2].glob(".uv/bin/uv")), None)
     pip = [uv, "pip", "install", "--python", sys.executable] if uv else [sys.executable, "-m", "pip", "install"]
     done = subprocess.run(
-        [*pip, "--no-deps", "--target", str(folder), *NEWEST], capture_output=True, text=True, check=False
+        [*pip, "--no-deps", "--target", str(folder), *NEWEST],
+        capture_output=True,
+        text=True,
+        check=False,
+        encoding="utf-8",
     )
     if done.returncode:
         reason = (done.stderr.strip().splitlines() or ["no message"])[-1]
@@ -402,6 +406,7 @@ def _run(jobs: list[tuple[str, ...]], transformers: Path | None, root: Path) -> 
         capture_output=True,
         text=True,
         check=False,
+        encoding="utf-8",
     )
     assert done.returncode == 0, done.stderr[-3000:]
 

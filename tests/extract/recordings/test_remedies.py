@@ -227,7 +227,9 @@ def typed(command: str, folder: Path, **environment: str) -> None:
     """Run a command as typed in a shell, whose working folder is another one."""
     variables = {**os.environ, **OFFLINE, **environment}
     shell = ["bash", "-c", command]
-    done = subprocess.run(shell, cwd=folder, env=variables, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        shell, cwd=folder, env=variables, capture_output=True, text=True, check=False, encoding="utf-8"
+    )
     assert done.returncode == 0, done.stderr[-2000:]
 
 
@@ -294,8 +296,7 @@ def test_the_printed_line_downloads_and_converts_a_data_set_of_the_hub(tmp_path:
         shown = [str(Path(sys.executable).with_name("probe-kit")), "dataset", "show"]
         refused = subprocess.run(
             [*shown, f"lab/kitchen@{commit}"], cwd=work, env={**os.environ, **environment}, capture_output=True,
-            text=True, check=False,
-        )  # fmt: skip
+            text=True, check=False, encoding="utf-8")  # fmt: skip
         text = " ".join(refused.stderr.split())
         assert f"Then give {work / 'kitchen'} in place of lab/kitchen" in text
         typed(line(text), work, **environment)
@@ -309,7 +310,7 @@ def test_the_episodes_that_a_refusal_names_are_read_as_typed(copy: Path) -> None
     table.loc[table["episode_index"] == 1, "timestamp"] = 0.0
     pd.DataFrame(table).to_parquet(copy / DATA)
     shown = [str(Path(sys.executable).with_name("probe-kit")), "dataset", "show", str(copy)]
-    refused = subprocess.run(shown, capture_output=True, text=True, check=False)
+    refused = subprocess.run(shown, capture_output=True, text=True, check=False, encoding="utf-8")
     option = re.search(r"--episodes \S+", refused.stderr)
     assert option is not None, refused.stderr
     subprocess.run([*shown, *option[0].split()], capture_output=True, check=True)
