@@ -2,7 +2,9 @@
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from hashlib import sha256
+from math import nan
 from statistics import NormalDist
 from typing import Any
 
@@ -368,3 +370,18 @@ def test_what_the_seed_decides_is_said(every: float, told: bool) -> None:
     )
     lines = sentences(Diagnosis("key", "policy", 24, 12, inputs))
     assert ("the seed decides it" in lines[-1]) is told
+
+
+@pytest.mark.parametrize("verdict", ["no effect", "does not arrive"])
+def test_a_state_in_other_units_is_lost_in_front_of_the_network_wherever_its_difference_ends(
+    verdict: Verdict,
+) -> None:
+    passage = (SitePassage("backbone.00", 0.5, nan), SitePassage("expert.00", 0.2, nan))
+    state = InputDiagnosis("state", verdict, "", passage=passage)
+    assert "in front of" not in sentence(state)
+    units = "j0 about 57.3 times smaller than in training, as radians for degrees"
+    certain = replace(state, units=units, units_are_other=True)
+    assert certain.where == f"the loss is in front of the network: {units}"
+    assert "behind" not in sentence(certain)
+    assert replace(state, units=units).where == f"a loss may be in front of the network: {units}"
+    assert replace(state, verdict="moves", units=units, units_are_other=True).where.endswith(units)

@@ -6,6 +6,6 @@ from typing import Any
 import pytest
 
 
-def slow_but(default: Collection[str], names: Iterable[str]) -> list[Any]:
+def slow_but(default: Collection[Any], names: Iterable[Any]) -> list[Any]:
     """Return every name as a parameter of a test; all but the default ones are slow."""
     return [pytest.param(name, marks=[pytest.mark.slow] * (name not in default)) for name in names]

@@ -1,7 +1,7 @@
 """Other units or another robot? The numbers of a source are compared with the statistics of a checkpoint.
 
-A number is compared by all statistics that both sides have, see `FeatureStatistics.distance`. Where it does not fit,
-the explanations of this file are tried: the one that makes it fit is reported. `docs/own-data.md` states the rule.
+A number is compared by all statistics that both sides have, see `FeatureStatistics.distance`. Where it does not
+fit, explanations are tried: the one that makes it fit is reported. `docs/own-data.md` states the rule.
 """
 
 from collections import Counter
@@ -18,19 +18,29 @@ from probe_kit.hooks.contract.feature_statistics import FeatureStatistics, Numbe
 MOST_OUTSIDE = 0.2
 """The share of values of a number beyond the checkpoint's support, above which states are refused."""
 DEGREES = 180 / np.pi
-FACTORS = {DEGREES: ("degrees", "radians"), 100.0: ("centimetres or percent", "metres or shares"),
+PERCENT = 100.0
+CLEARLY = 1.7
+"""The part by which percent has to fit better than degrees, whose factors are close to each other."""
+FACTORS = {DEGREES: ("degrees", "radians"), PERCENT: ("centimetres or percent", "metres or shares"),
            1000.0: ("millimetres", "metres")}  # fmt: skip
 """The factors between units that people mix up, with the names of the smaller and of the larger unit."""
 FAR = 4.0
 """The distance from which a factor is looked for; a factor of 57 at the same place makes it 6 or more."""
 UNLIKE = 0.8
-"""The distance from which another explanation than a factor is looked for."""
+"""The distance from which another explanation than a factor is looked for; less where the others are closer."""
+TWIN = 0.05
+"""The median distance of all numbers, once explained, up to which a data set is the training data, changed."""
+LEAST_UNLIKE = 0.15
+CLEAR = 0.25
+"""The distance from which a number of such a twin is certain to be changed."""
 LIKE = 0.3
 """The distance up to which a number fits under an explanation that is not a factor."""
 BETTER = 4.0
 """An explanation divides the distance by this at least."""
 ALIKE = 0.5
 """The median distance of all numbers, once explained, up to which a data set is like the training data."""
+COMPARABLE = 2.0
+"""The median distance of all numbers, once explained, up to which one or two of them are suspicious."""
 MOST_NUMBERS = 0.8
 """With so many of its numbers under one factor, a data set is in other units whatever its distance is."""
 LEAST_NUMBERS = 3
@@ -70,7 +80,7 @@ class Units:
 
     Attributes:
         misfits: The numbers that do not fit, by reason; the certain ones first.
-        shares: (D,) the share of the values beyond the support of the statistics; empty where nothing was compared.
+        shares: (D,) the share of the values beyond the support of the statistics; empty where none was compared.
     """
 
     misfits: tuple[Misfit, ...] = ()
@@ -146,7 +156,7 @@ def compare_units(
 
 
 def _describes(recorded: FeatureStatistics, seen: FeatureStatistics) -> bool:
-    """Whether stored statistics can be those of a data set with these values: they contain them, and their mean."""
+    """Whether stored statistics can be those of a data set with these values: they contain all, and their mean."""
     low, high = recorded.level("min"), recorded.level("max")
     slack = 1e-3 * (high - low) + 1e-5 * np.maximum(np.abs(low), np.abs(high)) + 1e-6
     levels = [seen.level("min"), seen.level("max"), recorded.level("mean")]
@@ -188,7 +198,7 @@ class _Comparison:
     def beyond_extremes(self) -> Numbers:
         """The share (D,) of values beyond the stored extremes, 0 where there are none."""
         low, high = self.expected.level("min"), self.expected.level("max")
-        slack = 1e-5 * np.maximum(np.abs(low), np.abs(high)) + 1e-6
+        slack = 1e-2 * (high - low) + 1e-5 * np.maximum(np.abs(low), np.abs(high)) + 1e-6
         beyond = (self.frames < low - slack) | (self.frames > high + slack)
         return np.asarray((beyond & self.expected.compared).mean(axis=0))
 
@@ -210,6 +220,12 @@ class _Comparison:
     def before(self) -> Numbers:
         """The distance (D,) of every number as it is."""
         return self.expected.distance(self.recorded)
+
+    @cached_property
+    def unlike(self) -> float:
+        """The distance from which a number differs from its training more than the others do."""
+        typical = float(np.median(self.before[self.moves])) if self.moves.any() else UNLIKE
+        return min(UNLIKE, max(LEAST_UNLIKE, BETTER * typical))
 
     def misfits(self) -> Iterator[Misfit]:
         """Yield the numbers that do not fit, each under one explanation."""
@@ -251,7 +267,7 @@ class _Comparison:
             note(misfit, distances)
         for kind, slope, offset in self._mirrors():
             distances = self.expected.distance(self.recorded.mapped(slope, offset))
-            fits = free & (self.before >= UNLIKE) & (distances <= np.minimum(LIKE, self.before / BETTER))
+            fits = free & (self.before >= self.unlike) & (distances <= np.minimum(LIKE, self.before / BETTER))
             for number in np.flatnonzero(fits).tolist():
                 words = self._mirror_words(kind, number, offset)
                 note(Misfit(kind, (number,), False, words), distances)
@@ -259,18 +275,22 @@ class _Comparison:
             note(Misfit("factor", numbers, False, self._factor_words(factor, numbers), factor), distances)
         offsets = np.nan_to_num(self.expected.center - self.recorded.center)
         distances = self.expected.distance(self.recorded.mapped(1.0, offsets))
-        fits = free & (self.before >= UNLIKE) & (distances <= np.minimum(LIKE, self.before / BETTER))
+        fits = free & (self.before >= self.unlike) & (distances <= np.minimum(LIKE, self.before / BETTER))
         for number in np.flatnonzero(fits).tolist():
             note(Misfit("offset", (number,), False, self._offset_words(number, -offsets[number])), distances)
-        alike = self.moves.any() and np.median(after[self.moves]) <= ALIKE
+        typical = float(np.median(after[self.moves])) if self.moves.any() else np.inf
         for misfit in groups:
-            yield replace(misfit, is_sure=self._is_sure(misfit, after, bool(alike)))
+            is_sure = self._is_sure(misfit, after, typical)
+            # Where most numbers are unlike the training, one or two that hardly move show no factor.
+            if is_sure or typical <= COMPARABLE or len(misfit.numbers) >= LEAST_NUMBERS:
+                yield replace(misfit, is_sure=is_sure)
 
-    def _is_sure(self, misfit: Misfit, after: Numbers, alike: bool) -> bool:
-        """Whether an explanation is certain: values lie outside, or all other numbers are those of the training."""
+    def _is_sure(self, misfit: Misfit, after: Numbers, typical: float) -> bool:
+        """Whether an explanation is certain: values lie outside, or the other numbers are as in training."""
         numbers = list(misfit.numbers)
-        if self.is_outside[numbers].any():
+        if self.is_outside[numbers].any() or (typical <= TWIN and (self.before[numbers] >= CLEAR).all()):
             return True
+        alike = typical <= ALIKE
         match misfit.kind:
             case "factor":
                 many = len(numbers) >= max(LEAST_NUMBERS, MOST_NUMBERS * self.moves.sum())
@@ -285,7 +305,7 @@ class _Comparison:
         """Yield cycles of numbers that fit in each other's place."""
         from scipy.optimize import linear_sum_assignment  # type: ignore[import-untyped]
 
-        unlike = np.flatnonzero(free & (self.before >= UNLIKE))
+        unlike = np.flatnonzero(free & (self.before >= self.unlike))
         if len(unlike) < 2:
             return
         costs = np.stack([self._of_partner(unlike, partner) for partner in unlike], axis=1)
@@ -327,16 +347,34 @@ class _Comparison:
         factors = [value for factor in FACTORS for value in (factor, 1 / factor)]
         distances = np.stack([self.expected.distance(self.recorded.mapped(1 / factor)) for factor in factors])
         fits = free & (self.before >= FAR) & (distances <= self.before / BETTER)
+        # Degrees are the more frequent cause: percent has to fit clearly better.
+        percent = [max(factor, 1 / factor) == PERCENT for factor in factors]
+        distances = np.where(np.array(percent)[:, None], CLEARLY, 1) * distances
         best = [int(np.nanargmin(np.where(fits[:, n], distances[:, n], np.inf))) if fits[:, n].any() else -1
                 for n in range(self.expected.width)]  # fmt: skip
         counts = Counter(index for index in best if index >= 0)
-        # Degrees and percent are less than twice apart: numbers of one cause get the factor of most of them.
+        low, high = self.expected.support
+        least, most = self.recorded.bounds
+        inside = np.stack([(least / factor >= low) & (most / factor <= high) for factor in factors])
+        # Numbers of one cause get the factor of most of them, where that is as plausible: degrees and percent are
+        # less than twice apart, and a number that moves less than in training fits several factors.
         for number, index in enumerate(best):
-            near = [other for other in counts if fits[other, number] and 0.5 < factors[other] / factors[index] < 2]
-            if index >= 0 and near:
+            near = [
+                other
+                for other in counts
+                if index >= 0
+                and fits[other, number]
+                and (factors[other] > 1) == (factors[index] > 1)
+                and (inside[other, number] or 0.5 < factors[other] / factors[index] < 2)
+            ]
+            if near:
                 best[number] = max(near, key=lambda other: (counts[other], -distances[other, number]))
         groups = {index: tuple(n for n, other in enumerate(best) if other == index) for index in counts}
-        return [(factors[index], numbers, distances[index]) for index, numbers in groups.items() if numbers]
+        return [
+            (factors[index], numbers, distances[index] / (CLEARLY if percent[index] else 1))
+            for index, numbers in groups.items()
+            if numbers
+        ]
 
     # -- explanations by the place alone -----------------------------------------------------------------
 
@@ -356,13 +394,14 @@ class _Comparison:
         after = np.stack([off(self.seen.center / factor) for factor in factors])
         low, high = self.expected.bounds
         inside = np.stack([
-            ((self.frames / factor >= low - (high - low) / 2) & (self.frames / factor <= high + (high - low) / 2)).all(0)
+            (np.abs(self.frames / factor - (low + high) / 2) <= high - low).all(axis=0)
             for factor in factors
         ])  # fmt: skip
         # A number that is zero in every unit, or zero in training, shows no factor.
         informative = (np.abs(center) > scale / 2) & self.begins
-        free = ~np.isin(np.arange(self.expected.width), list(taken))
-        fits = free & inside & (after <= np.minimum(2, before / 2)) & (informative | self.is_outside)
+        # The spread of what moves was compared already, and no factor explained it.
+        free = ~np.isin(np.arange(self.expected.width), list(taken)) & (self.begins | ~self.moves)
+        fits = free & inside & (after <= before / 2) & (informative | self.is_outside)
         counts = fits.sum(axis=1)
         totals = np.where(fits, np.log1p(before) - np.log1p(after), 0).sum(axis=1)
         if not counts.any():
@@ -419,7 +458,7 @@ class _Comparison:
         small, large = next(units for value, units in FACTORS.items() if np.isclose(value, times))
         size, had, due = ("larger", small, large) if factor > 1 else ("smaller", large, small)
         return (
-            f"{self._listed(numbers)} about {times:.3g} times {size} than in training, as {had} for {due} "
+            f"{self._listed(numbers)} about {_rounded(times)} times {size} than in training, as {had} for {due} "
             f"({self._ranges(numbers[0])})"
         )
 
@@ -441,3 +480,8 @@ class _Comparison:
             f"{self._name(number)} lies outside the statistics in {self.shares[number]:.0%} of the frames "
             f"({self._ranges(number)})"
         )
+
+
+def _rounded(times: float) -> str:
+    """Return a factor in figures, such as 57.3 and 1,000."""
+    return f"{times:,.1f}".removesuffix(".0")

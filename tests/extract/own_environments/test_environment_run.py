@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -346,7 +347,8 @@ def test_states_in_other_units_are_refused_of_an_environment_unless_accepted(
 
     monkeypatch.setattr(reach_env, "Degrees", type("Degrees", (reach_env.ReachEnv,), {"_as_step": turned}), False)
     with pytest.raises(
-        UnitsError, match=r"reach_env:Degrees, the state after reset\(\): .*outside the statistics"
+        UnitsError,
+        match=r"reach_env:Degrees, the state after reset\(\): .*57.3 times larger .*degrees for radians",
     ):
         prepare(settings_of("Degrees"), model=pi0_tiny)
     one, two = (
@@ -364,11 +366,12 @@ def test_a_scene_whose_states_lie_outside_the_statistics_is_refused_unless_accep
     chosen = ExtractSettings("pi0-tiny", categories=("color",), items=2, env_workers=0)
     assert prepare(chosen, model=pi0_tiny).plan.episodes
 
-    def still(states: np.ndarray) -> np.ndarray:
-        return np.arange(states.shape[1]) * np.ones_like(states) == 3
-
-    monkeypatch.setattr(pi0_tiny, "unusual_states", still)
-    with pytest.raises(UnitsError, match=r"the scene .*outside the statistics .* \(number 3 in 100%\); .*-units"):
+    moved = pi0_tiny.state_statistics
+    assert moved is not None
+    deviations = np.where(np.arange(moved.width) == 3, 0, moved.level("std"))
+    still = replace(moved, values={**moved.values, "std": deviations})
+    monkeypatch.setattr(Pi0, "state_statistics", still)
+    with pytest.raises(UnitsError, match=r"the scene .*: number 3 lies outside the statistics in 100%.*-units"):
         prepare(chosen, model=pi0_tiny)
     accepted = ExtractSettings("pi0-tiny", categories=("color",), items=2, env_workers=0, accept_units=True)
     assert prepare(accepted, model=pi0_tiny).plan.episodes

@@ -15,6 +15,8 @@ import pandas as pd
 import pytest
 from PIL import Image
 
+from probe_kit.diagnose.diagnosis import with_units
+from probe_kit.diagnose.results import InputDiagnosis
 from probe_kit.env import SceneSpec
 from probe_kit.errors import RecordingError, SettingsMismatchError, UnitsError, UsageError
 from probe_kit.extract import ExtractSettings, LeRobotSource, extract_run, prepare
@@ -127,8 +129,8 @@ def test_predictions_are_what_the_policy_acts_in_a_scene(run: Run, pi0_tiny: Pi0
 
 def test_predicted_actions_are_compared_with_recorded_ones_in_their_units(run: Run) -> None:
     """Recorded actions are 10 × episode + frame, far outside what the policy was trained on."""
-    assert run.settings["recording"]["other_actions"].startswith("recorded actions lie outside the statistics")
-    with pytest.raises(UsageError, match="not compared: recorded actions lie outside"):
+    assert run.settings["recording"]["other_actions"].startswith("recorded actions do not fit the statistics")
+    with pytest.raises(UsageError, match="not compared: recorded actions do not fit"):
         compare_actions(run)
 
 
@@ -355,9 +357,14 @@ def test_states_far_outside_the_checkpoints_statistics_are_refused_unless_accept
     scale = np.array([1000, 1000, 1000, 1, 1, 1, 1, 1], np.float32)
     other = [[replace(one, state=one.state * scale) for one in episode] for episode in observations(1)]
     folder = write_recording(tmp_path / "rec", other)
-    with pytest.raises(UnitsError, match=r"outside the statistics of embedded \(s0 in 100%.*--accept-units"):
+    with pytest.raises(UnitsError, match=r"statistics of embedded: s0 \(number 0\).* as millimetres .*--accept-"):
         prepare(settings(folder), model=pi0_tiny)
-    assert prepare(settings(folder, accept_units=True), model=pi0_tiny).plan.episodes
+    accepted = prepare(settings(folder, accept_units=True), model=pi0_tiny).run(tmp_path / "run")
+    stored = accepted.settings["units"]["state units"]
+    assert (stored["are_other"], stored["are_accepted"]) == (True, True)
+    assert "1,000 times larger" in stored["misfits"]
+    (state,) = with_units(accepted, [InputDiagnosis("state", "no effect", "")])
+    assert state.where.startswith("the loss is in front of the network: s0")
 
 
 def test_statistics_of_the_data_set_change_nothing(

@@ -89,8 +89,9 @@ def test_angles_are_read_as_sines_then_cosines_in_the_place_of_their_group(chang
     own = expected(_MINMAX[:3], np.sin(angles), np.cos(angles), _MINMAX[6:])
     np.testing.assert_allclose(state_read(policy), own, atol=1e-6)
     assert any("SIN_COS" in note for note in policy.card.notes)
-    assert not policy.state_units.unusual(np.full((1, 8), -6, np.float32))[0, 3:6].any()  # less than a turn
-    assert policy.state_units.unusual(np.full((1, 8), 99, np.float32))[0, 3:6].all()  # degrees
+    assert policy.state_statistics is not None
+    assert not policy.state_statistics.outside(np.full((1, 8), -6, np.float32))[0, 3:6].any()  # less than a turn
+    assert policy.state_statistics.outside(np.full((1, 8), 99, np.float32))[0, 3:6].all()  # degrees
     assert policy.act(seen_by(policy), [0]).shape[-1] == 7
 
 

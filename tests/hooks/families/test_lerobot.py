@@ -446,44 +446,54 @@ def test_the_tokenizer_that_a_newer_lerobot_saved_into_the_checkpoint_is_read(
 
 
 STATE_LOW, STATE_HIGH = np.array([-1.0, 0.0], np.float32), np.array([1.0, 0.5], np.float32)
-INSIDE, BELOW, ABOVE = (
-    np.array([row], np.float32) for row in ((0.9, 0.5), (-1.1, 0.2), (0.0, 0.6))
-)  # fmt: skip
-BOUNDED: dict[str, Normaliser] = {
-    "MIN_MAX": Normaliser("MIN_MAX", STATE_LOW, STATE_HIGH, 1e-8, "file"),
-    "QUANTILES": Normaliser("QUANTILES", STATE_LOW, STATE_HIGH, 1e-8, "file"),
-    "clipped": Bounds("BOUNDS", STATE_LOW, STATE_HIGH, 0.0, "file"),
-    "clamped": Normaliser("QUANTILES", STATE_LOW, STATE_HIGH, 1e-8, "file", clamped=True),
+MAPS: dict[str, tuple[Normaliser, list[float], list[float]]] = {
+    "MIN_MAX": (Normaliser("MIN_MAX", STATE_LOW, STATE_HIGH, 1e-8, "file"), [-2, -0.25], [2, 0.75]),
+    "QUANTILES": (Normaliser("QUANTILES", STATE_LOW, STATE_HIGH, 1e-8, "file"), [-3, -0.5], [3, 1]),
+    "QUANTILE10": (Normaliser("QUANTILE10", STATE_LOW, STATE_HIGH, 1e-8, "file"), [-5, -1], [5, 1.5]),
+    "MEAN_STD": (Normaliser("MEAN_STD", STATE_LOW, STATE_HIGH, 1e-8, "file"), [-6, -2.5], [4, 2.5]),
+    "clipped": (Bounds("BOUNDS", STATE_LOW, STATE_HIGH, 0.0, "file"), [-3, -0.5], [3, 1]),
+    "clamped": (Normaliser("MIN_MAX", STATE_LOW, STATE_HIGH, 1e-8, "file", clamped=True), [-2, -0.25], [2, 0.75]),
 }
 
 
-@pytest.mark.parametrize("name", BOUNDED)
-def test_values_outside_the_bounds_are_unusual_also_where_the_network_reads_them_clipped(name: str) -> None:
-    units = BOUNDED[name]
-    assert units.unusual(INSIDE).tolist() == [[False, False]]
-    assert units.unusual(BELOW).tolist() == [[True, False]]
-    assert units.unusual(ABOVE).tolist() == [[False, True]]
+@pytest.mark.parametrize("name", MAPS)
+def test_values_beyond_the_support_of_the_statistics_are_outside_also_where_they_are_clipped(name: str) -> None:
+    """Half a range beyond the extremes, further beyond quantiles, five deviations from the mean."""
+    units, lowest, highest = MAPS[name]
+    statistics = units.statistics
+    assert statistics is not None
+    np.testing.assert_allclose(statistics.support, (lowest, highest), atol=1e-2)
+    for ends, direction in ((lowest, -1), (highest, 1)):
+        inside, outside = (np.array(ends) - direction * by for by in (0.01, -0.01))
+        assert not statistics.outside(inside).any()
+        assert statistics.outside(outside).all()
 
 
-def test_more_than_five_deviations_from_the_mean_are_unusual() -> None:
-    units = Normaliser("MEAN_STD", STATE_LOW, STATE_HIGH, 1e-8, "file")
-    values = np.array([[3.9, 2.4], [4.1, -2.6]], np.float32)
-    assert units.unusual(values).tolist() == [[False, False], [True, True]]
+def test_a_number_that_never_moved_has_its_own_value_whose_rounding_is_no_other_unit() -> None:
+    """lerobot stores a mean that is a float32 step off beside a deviation of exactly 0."""
+    value = np.float32(-1.5708)
+    mean, deviation = np.array([value + np.float32(2e-7), 1], np.float32), np.array([0, 1], np.float32)
+    statistics = Normaliser("MEAN_STD", mean, deviation, 1e-8, "file").statistics
+    assert statistics is not None
+    assert statistics.outside(np.array([[value, 0], [-1.6, 0]])).tolist() == [[False, False], [True, False]]
 
 
-def test_numbers_without_statistics_are_never_unusual() -> None:
+def test_numbers_without_statistics_are_never_outside() -> None:
     nothing = np.zeros(0, np.float32)
-    assert not Normaliser("IDENTITY", nothing, nothing, 0.0, "file").unusual(1e9 * BELOW).any()
+    assert Normaliser("IDENTITY", nothing, nothing, 0.0, "file").statistics is None
     plain = np.array([True, False])
-    masked = Normaliser("MIN_MAX", STATE_LOW, STATE_HIGH, 1e-8, "file", plain=plain, clamped=True)
-    assert masked.unusual(BELOW).tolist() == [[False, False]]
+    masked = Normaliser("MIN_MAX", STATE_LOW, STATE_HIGH, 1e-8, "file", plain=plain, clamped=True).statistics
+    assert masked is not None
+    assert masked.outside(np.array([[-9.0, 9.0]])).tolist() == [[False, True]]
 
 
-def test_recorded_joints_are_compared_in_the_frame_of_the_statistics() -> None:
+def test_recorded_joints_are_compared_in_the_frame_of_the_robot() -> None:
     frame = JointFrame(np.array([-1], np.float32), np.array([2], np.float32))
     units = FramedUnits("MIN_MAX", STATE_LOW, STATE_HIGH, 1e-8, "file", clamped=True, frame=frame)
-    values = np.array([[2.0, 0.2], [0.0, 0.2]], np.float32)
-    assert units.unusual(values).tolist() == [[False, False], [True, False]]
+    values = np.array([[2.0, 0.2], [-0.5, 0.2]], np.float32)
+    assert units.statistics is not None
+    np.testing.assert_allclose(units.statistics.bounds, ([1, 0], [3, 0.5]))
+    assert units.statistics.outside(values).tolist() == [[False, False], [True, False]]
     np.testing.assert_allclose(units.restore(units.normalise(values[:1])), values[:1])
 
 

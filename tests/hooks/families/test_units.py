@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from probe_kit.cli import app
 from probe_kit.errors import UnitsError, UsageError
-from probe_kit.extract.sources.source import check_units, unusual_shares
+from probe_kit.extract.sources.source import check_units, compare_states
 from probe_kit.hooks import load_policy
 from probe_kit.hooks.registry import find_family, own_families
 from tests.support.every_checkpoint import WRITERS
@@ -153,11 +153,13 @@ def test_a_state_in_other_units_is_refused_or_the_family_says_why_it_is_not_comp
     assert notes == []
     assert policy.state_numbers is not None
     far = np.full((4, policy.state_numbers), 1e4, np.float32)
-    shares = unusual_shares(policy, far)
-    assert shares.tolist() == [1.0] * policy.state_numbers
     names = [str(number) for number in range(policy.state_numbers)]
-    with pytest.raises(UnitsError, match=r"the source: .*outside the statistics of .*--accept-units"):
-        check_units(shares, names, "the source", policy, False)
+    for begins in (True, False):
+        units = compare_states(policy, [far], names, begins=begins)
+        assert units.shares.tolist() == [1.0] * policy.state_numbers
+        with pytest.raises(UnitsError, match=r"the source: .*do not fit the statistics of .*--accept-units"):
+            check_units(units, "the source", policy, False)
+        check_units(units, "the source", policy, True)
 
 
 def test_a_state_that_a_checkpoint_reads_as_it_is_is_named(tmp_path: Path) -> None:
