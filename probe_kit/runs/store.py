@@ -32,6 +32,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Literal
 
 from probe_kit._system.imports import require
 from probe_kit.errors import SettingsMismatchError, StoreError, UsageError
+from probe_kit.runs.array_lengths import without_length
 from probe_kit.runs.folder import DRAFT, Folder, check_inside, check_size, is_inside
 
 if TYPE_CHECKING:
@@ -436,7 +437,8 @@ def begin(location: Location, objects: Mapping[str, bytes], last: str) -> None:
         raise SettingsMismatchError(f"{location} holds {strange[0]} and is not a run; choose another --out")
     for key, content in objects.items():
         try:
-            same = key == last or location.create(key, content) or location.read(key) == content
+            # A process that began at the same time, and was quicker, may have said how long the arrays are.
+            same = key == last or location.create(key, content) or without_length(location.read(key)) == content
         except NotADirectoryError as error:
             raise SettingsMismatchError(f"{location} is a file, not a folder; choose another --out") from error
         if not same:

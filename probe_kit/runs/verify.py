@@ -73,12 +73,12 @@ def _seal(run: Run, deep: bool = False) -> bool:
     run.location.remove(SEALED)  # nothing counts that is not whole
     folder = columns_folder(run.stamp)
     store = ArrayStore(run.location, folder, {})  # what a killed process left there does not exist for it
-    group = zarr.open_group(store, mode="w", zarr_format=3)
+    # With its attributes at once: of processes that seal a bucket together, each finds the bytes that it wrote.
+    group = zarr.open_group(store, mode="w", zarr_format=3, attributes={"stamp": run.stamp})
     for name in run.streams:
         for kind in run.root.vector_kinds:
             _write_vectors(run, name, kind, group)
         _write_roles(run, name, group)
-    group.attrs["stamp"] = run.stamp
     run.location.flush(f"{folder}/{key}" for key in store.written)
     write_seal(run.root, commits, store.written)  # what makes them count, so last
     _remove_former(run)

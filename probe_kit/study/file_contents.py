@@ -104,7 +104,7 @@ def _cached(file: Path) -> str | None:
 
 
 def _read_hash(file: Path) -> str:
-    """Return the sha256 of a file, and keep it once the file is old enough to be told from a later state."""
+    """Return the sha256 of a file, and keep it if the file's times distinguish it from later states."""
     before, begun = _identity(file), time.time_ns()
     with file.open("rb") as stream:
         digest = hashlib.file_digest(stream, "sha256").hexdigest()

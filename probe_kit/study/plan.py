@@ -367,7 +367,9 @@ def _planned(study: LoadedStudy, cell: Cell) -> PlannedCell:
 def _why_new(study: LoadedStudy, cell: Cell) -> str:
     """Return the changes since the newest run of the same model, condition and seed on this machine, if any."""
     out = study.study.folder
-    keys = () if study.folder is None or "://" in out else study.folder.keys_of_name(cell)
+    if study.home is not None and (hint := study.home.hint(cell)):
+        return f"new: {hint}"
+    keys = () if study.home is None or "://" in out else study.home.keys_of_name(cell)
     files = (Path(out) / cell.folder_of(key) / RUN_FILE for key in keys if key != cell.key)
     former = max(files, key=lambda file: file.stat().st_mtime_ns, default=None)
     if former is None:

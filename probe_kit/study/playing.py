@@ -145,13 +145,13 @@ def conduct_study(
         failures += [failure for failure in before if failure and failure.stage in NOT_TRIED_AGAIN]
         missing = [planned for planned in missing if not planned.given_up]
     stored.check_place()  # a place that cannot be written is no model's failure
-    folder, recorded = plan.study.folder, set[str]()
+    home, recorded = plan.study.home, set[str]()
 
     def note(event: Event) -> None:
-        if folder is not None and not isinstance(event, Failure) and event.run not in recorded:
+        if home is not None and not isinstance(event, Failure) and event.run not in recorded:
             recorded.add(event.run)  # with the first episode: a killed run resumes with the same model
             try:
-                folder.note_played(cells[event.run])
+                home.note_played(cells[event.run])
             except SettingsMismatchError as error:
                 note(Failure.of("checking", event.model, event.run, error))
         if isinstance(event, RunFinished):
@@ -168,8 +168,8 @@ def conduct_study(
     for planned in plan.played:
         if not planned.sealed:  # its process was killed after the last episode
             seal(locate(planned.location))
-        if folder is not None and planned.state == "whole":
-            folder.note_stored(planned.cell)
+        if home is not None and planned.state == "whole":
+            home.note_stored(planned.cell)
     return failures
 
 

@@ -39,7 +39,7 @@ class LoadedStudy:
         file: Path of the file.
         cells: The runs that it needs.
         pack: The record of the archive that it was read from, whose runs hold no activations; else None.
-        folder: The folder of its runs; None for an archive, whose record names its runs.
+        home: The folder of its runs; None for an archive, whose record names its runs.
     """
 
     file: Path
@@ -47,7 +47,7 @@ class LoadedStudy:
     suite: PlannedSuite
     cells: tuple[Cell, ...]
     pack: Pack | None = None
-    folder: StudyFolder | None = None
+    home: StudyFolder | None = None
 
     @property
     def archive(self) -> Path | None:
@@ -117,9 +117,9 @@ def load_study(name: str | Path) -> LoadedStudy:
     if mistakes:
         raise StudyFileError(str(file), content, mistakes)
     if pack is None:
-        folder = StudyFolder(study.folder)
-        named = tuple(replace(cell, find_key=folder.key) for cell in cells)
-        return LoadedStudy(file, study, suite, named, folder=folder)
+        home = StudyFolder(study.folder)
+        cells = [replace(cell, find_key=home.key) for cell in cells]
+        return LoadedStudy(file, study, suite, tuple(cells), home=home)
     keys, runs = {name: run.key for name, run in pack.runs.items()}, str(file.parent / RUNS)
     packed = tuple(replace(cell, packed_key=keys.get(cell.name, "")) for cell in cells)
     return LoadedStudy(file, study.model_copy(update={"out": runs}), suite, packed, pack)

@@ -233,11 +233,18 @@ def open_matching(study: LoadedStudy, cell: Cell, partial: bool) -> "Run":
     """
 
     def played(any_cell: Cell) -> PlayedModel | None:
-        return None if study.folder is None else study.folder.played_model(any_cell)
+        return None if study.home is None else study.home.played_model(any_cell)
 
-    if study.folder is not None:
-        study.folder.check_unambiguous(cell)
-    run = open_run(locate(cell.location(study.study.folder)), allow_partial=partial)
+    if study.home is not None:
+        study.home.check_unambiguous(cell)
+    try:
+        run = open_run(locate(cell.location(study.study.folder)), allow_partial=partial)
+    except RunNotFoundError as error:
+        if study.home is not None and (hint := study.home.hint(cell)):
+            raise RunNotFoundError(
+                f"{hint}. Give the file a path that is here, or that of a stored run"
+            ) from error
+        raise
     problems = list(differences(run, cell, played(cell)))
     packed = None if study.pack is None else study.pack.runs.get(cell.name)
     if not problems and packed is not None and packed.settings_sha256 != run.settings_sha256:

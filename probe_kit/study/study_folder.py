@@ -9,8 +9,9 @@ looked up by that name, or, without the files, by the settings and the path of t
 """
 
 import json
+import re
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
@@ -172,9 +173,7 @@ class StudyFolder:
 
     def _keys_of_content(self, cell: Cell, contents: Mapping[str, str]) -> list[str]:
         """Return the keys of the cell's name under which runs of these files are recorded."""
-        prefix = cell.folder_of("")
-        runs = {model.run for model in self._models.values() if self._is_of(model, cell, contents)}
-        return sorted(run.removeprefix(prefix) for run in runs if run.startswith(prefix))
+        return _keys_in((model.run for model in self._models.values() if self._is_of(model, cell, contents)), cell)
 
     @staticmethod
     def _is_of(model: PlayedModel, cell: Cell, contents: Mapping[str, str]) -> bool:
@@ -188,20 +187,28 @@ class StudyFolder:
 
     def keys_of_name(self, cell: Cell) -> list[str]:
         """Return the keys of all stored runs of the cell's name, whatever they hold."""
-        prefix = cell.folder_of("")
         if "://" in self._out:
-            names = [key.removesuffix(f"/{RUN_FILE}") for key in self._location.keys(cell.model)]
+            runs = [key.removesuffix(f"/{RUN_FILE}") for key in self._location.keys(cell.model)]
         else:
-            files = Path(self._out).glob(f"{prefix}{'[0-9a-f]' * KEY_DIGITS}/{RUN_FILE}")
-            names = [file.parent.relative_to(self._out).as_posix() for file in files]
-        keys = [name.removeprefix(prefix) for name in names if name.startswith(prefix)]
-        return sorted(key for key in keys if len(key) == KEY_DIGITS and set(key) <= set("0123456789abcdef"))
+            files = Path(self._out).glob(f"{cell.folder_of('')}*/{RUN_FILE}")
+            runs = [file.parent.relative_to(self._out).as_posix() for file in files]
+        return _keys_in(runs, cell)
 
     def check_unambiguous(self, cell: Cell) -> None:
         """Raise SettingsMismatchError if several stored runs may be that of a cell."""
         _ = cell.key
         if problem := self._problems.get(cell.name):
             raise SettingsMismatchError(problem)
+
+    def hint(self, cell: Cell) -> str:
+        """Return why no run is known to be that of a cell whose checkpoint is not here; empty if it is here."""
+        checkpoint = cell.settings.model.checkpoint
+        if checkpoint is None or is_on_hub(checkpoint) or CHECKPOINT in self.contents(cell):
+            return ""
+        models = [model for model in self._models.values() if model.model == cell.model]
+        paths = sorted({model.paths[CHECKPOINT] for model in models if CHECKPOINT in model.contents})
+        played = f"; runs of {cell.model} were played from {', '.join(paths)}" if paths else ""
+        return f"the checkpoint {checkpoint} is not here, and no run is known to be played from it{played}"
 
     # -- records -------------------------------------------------------------------------------------------------
 
@@ -258,6 +265,12 @@ class StudyFolder:
         with self._location.explained_errors(), self._location.tended(RECORDS):
             self._location.write(f"{RECORDS}/{name}", model.to_bytes())
         self._models[name] = model
+
+
+def _keys_in(runs: Iterable[str], cell: Cell) -> list[str]:
+    """Return the keys in the names of folders that are named as those of the cell, each once."""
+    pattern = re.compile(rf"{re.escape(cell.folder_of(''))}([0-9a-f]{{{KEY_DIGITS}}})")
+    return sorted({match[1] for run in runs if (match := pattern.fullmatch(run))})
 
 
 # -- settings ----------------------------------------------------------------------------------------------------

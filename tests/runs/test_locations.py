@@ -1,6 +1,7 @@
 """Folders and buckets: one contract, runs in a bucket, and servers that are slow, fail or forget."""
 
 import itertools
+import json
 import re
 import resource
 import subprocess
@@ -35,6 +36,7 @@ from probe_kit.extract import ExtractSettings, extract_run
 from probe_kit.hooks import Site
 from probe_kit.runs import Run, open_run, seal, verify_run
 from probe_kit.runs import store as buckets
+from probe_kit.runs.array_lengths import with_length
 from probe_kit.runs.array_store import ArrayStore
 from probe_kit.runs.folder import Folder
 from probe_kit.runs.layout import COLUMNS
@@ -126,6 +128,16 @@ class LocationContract:
         begin(location, BEGINNING, "run.json")
         begin(location, {**BEGINNING, "run.json": b"of another process, which was second"}, "run.json")
         assert {key: location.read(key) for key in location.keys("")} == BEGINNING
+
+    def test_a_run_begins_though_another_process_has_set_the_length_of_its_arrays(
+        self, location: Location
+    ) -> None:
+        array = {"shape": [1_000_000, 2], "attributes": {}, "node_type": "array"}
+        begun = {"data.zarr/x/zarr.json": json.dumps(array, indent=2).encode(), "run.json": b"run"}
+        longer = with_length(begun["data.zarr/x/zarr.json"], 12)
+        location.write("data.zarr/x/zarr.json", longer)
+        begin(location, begun, "run.json")
+        assert {key: location.read(key) for key in location.keys("")} == {**begun, "data.zarr/x/zarr.json": longer}
 
     def test_a_location_that_holds_something_else_is_left_alone(self, location: Location) -> None:
         location.write("thesis.txt", b"do not touch")

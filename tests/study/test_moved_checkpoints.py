@@ -1,6 +1,7 @@
 """Runs of local checkpoints belong to models by content, wherever its files lie, and without them."""
 
 import os
+import re
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -9,11 +10,15 @@ import pytest
 
 import probe_kit.models.checkpoints
 from probe_kit.errors import RunDamagedError, RunIncompleteError, SettingsMismatchError
+from probe_kit.extract import ExtractSettings
 from probe_kit.runs import Run
 from probe_kit.runs.layout import RUN_FILE
+from probe_kit.runs.store import locate
 from probe_kit.study import conduct_study, file_contents, load_study, make_table, pack_study, plan_study
+from probe_kit.study.cells import Cell, planned_suite
 from probe_kit.study.file_contents import content_of, former_stamp
-from probe_kit.study.study_folder import RECORDS, PlayedModel
+from probe_kit.study.schema import SuiteTable
+from probe_kit.study.study_folder import RECORDS, PlayedModel, StudyFolder
 from probe_kit.suite import Suite
 from tests.study.small_study import HEAD
 
@@ -156,14 +161,14 @@ def keys(file: Path) -> dict[str, str]:
 
 
 def note(file: Path, when: str) -> None:
-    """Write the records of a study as if it had been played; a run is told by its `run.json`."""
+    """Write the records of a study as if it had been played; a run is there if it has a `run.json`."""
     study = load_study(file)
     out = Path(study.study.folder)
     (out / RECORDS).mkdir(parents=True, exist_ok=True)
     for cell in study.cells:
-        assert study.folder is not None
+        assert study.home is not None
         model = PlayedModel(
-            run=cell.folder, model=cell.model, asks=False, paths=cell.paths, contents=study.folder.contents(cell),
+            run=cell.folder, model=cell.model, asks=False, paths=cell.paths, contents=study.home.contents(cell),
             weights_sha256="0" * 64, policy={}, when=when,
         )  # fmt: skip
         (out / RECORDS / f"{cell.folder.replace('/', '+')}.json").write_bytes(model.to_bytes())
@@ -187,6 +192,9 @@ def test_a_run_has_one_name_with_and_without_the_files_of_its_checkpoint(
     assert keys(file) == before
     assert keys(write_file(tmp_path, small_suite, tmp_path / "away")) == before
     unknown = keys(write_file(tmp_path, small_suite, tmp_path / "elsewhere"))
+    state = {planned.cell.name: planned.why for planned in plan_study(load_study(file)).cells}["late/dark"]
+    paths = f"{tmp_path / 'elsewhere' / 'late'} is not here, .*; runs of late were played from {tmp_path / 'late'}"
+    assert re.match(f"new: the checkpoint {paths}$", state)
     assert {name for name in before if unknown[name] == before[name]} == {
         "random/plain",
         "random/plain/seed 1",
@@ -212,6 +220,22 @@ def test_of_two_contents_of_one_path_the_last_one_counts_without_the_files(
     record.write_bytes(record.read_bytes().replace(b"2026-01-0", b"2025-01-0"))
     with pytest.raises(RunDamagedError, match=r"was changed after it was written: .*or delete it"):
         keys(file)
+
+
+def test_a_file_that_an_option_names_counts_by_content_too(small_suite: Suite, tmp_path: Path) -> None:
+    suite = planned_suite(SuiteTable(path=str(small_suite.folder)))[0]
+
+    def key(checkpoint: str, tokenizer: str) -> str:
+        settings = ExtractSettings("magma", checkpoint, options={"tokenizer": tokenizer})
+        return Cell("m", "plain", 0, settings, {}, suite, find_key=StudyFolder(str(tmp_path / "out")).key).key
+
+    first, other = files_in(tmp_path / "first"), files_in(tmp_path / "other")
+    weights = files_in(tmp_path / "weights")
+    assert key(str(weights), str(first)) == key(str(weights), str(other)) == key(str(first), str(weights))
+    assert key("lab/weights", str(first)) == key("lab/weights", str(other)) != key("lab/others", str(first))
+    overwrite(other / "config.json", b"[]")
+    of_names = {key(*names) for names in (("lab/weights", str(first)), ("lab/weights", str(other)))}
+    assert len(of_names | {key(str(weights), str(other)), key(str(other), str(weights))}) == 4
 
 
 # -- played runs -------------------------------------------------------------------------------------------------
@@ -343,3 +367,40 @@ def test_runs_of_an_earlier_version_are_those_that_were_loaded_from_the_same_pat
         monkeypatch.setattr(Run, "weights_sha256", property(lambda run: run.location.name))
         with pytest.raises(SettingsMismatchError, match=r"2 different weights, all loaded from .*late, which"):
             rows(file)
+
+
+@pytest.mark.slow
+def test_a_study_in_a_bucket_is_read_without_checkpoints_and_notices_exchanged_runs(
+    file: Path, away: Path, bucket: str
+) -> None:
+    before, out, text = rows(file), file.parent / "out", file.read_text(encoding="utf-8")
+    assert away.is_dir()
+    late, early = (next((out / name).glob("plain-????????")).relative_to(out).as_posix() for name in CHECKPOINTS)
+    for url, names in ((f"{bucket}/right", {}), (f"{bucket}/wrong", {late: early, early: late})):
+        for path in filter(Path.is_file, out.rglob("*")):
+            key = path.relative_to(out).as_posix()
+            run = "/".join(key.split("/")[:2])
+            locate(url).write(f"{names.get(run, run)}{key.removeprefix(run)}", path.read_bytes())
+    file.write_text(text.replace(str(out), f"{bucket}/right"), encoding="utf-8")
+    assert rows(file) == before
+    file.write_text(text.replace(str(out), f"{bucket}/wrong"), encoding="utf-8")
+    with pytest.raises(
+        SettingsMismatchError, match=r"should hold the run of late/plain.* It is a run of early/plain"
+    ):
+        rows(file)
+
+
+@pytest.mark.slow
+def test_a_checkpoint_that_changes_while_it_is_played_is_said(small_suite: Suite, tmp_path: Path) -> None:
+    copy_embedded(tmp_path)
+    file = write_file(tmp_path, small_suite, tmp_path)
+
+    def train_on(event: object) -> None:
+        readme = tmp_path / "early" / "trained.md"
+        if not readme.exists() and getattr(event, "run", "") == "late/plain":
+            readme.write_text("one step more", encoding="utf-8")
+
+    failures = conduct_study(plan_study(load_study(file), only="main"), train_on, env_workers=0)
+    assert [failure.run for failure in failures] == ["early/plain", "early/plain/seed 1"]
+    assert "early was changed while early/plain was played" in failures[0].reason
+    assert {planned.state for planned in plan_study(load_study(file), only="early").cells} == {"new"}
