@@ -120,7 +120,7 @@ def test_one_small_region_of_the_workspace_is_said_and_not_refused() -> None:
 
 
 def test_statistics_of_a_data_set_that_do_not_describe_its_frames_decide_nothing() -> None:
-    """Someone converted the frames and left `meta/stats.json` as it was."""
+    """The frames were converted, and `meta/stats.json` stayed as it was."""
     episodes = played(0, 12, 40, 1)
     units = compare_units(checkpoint(episodes), multiplied(episodes, 1000, slice(0, 3)), NAMES, recorded(episodes))
     assert units.are_other

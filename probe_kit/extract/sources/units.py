@@ -143,23 +143,23 @@ def compare_units(
     """
     frames = np.concatenate([np.asarray(episode, np.float64) for episode in episodes])
     episodes = [episode[np.isfinite(episode).all(axis=1)] for episode in episodes]
-    seen = FeatureStatistics.of_episodes(
+    observed = FeatureStatistics.of_episodes(
         [episode for episode in episodes if len(episode)] or [np.zeros_like(frames)]
     )
-    if recorded is not None and not _describes(recorded, seen):
+    if recorded is not None and not _describes(recorded, observed):
         recorded = None
     if recorded is not None and _same(recorded, expected):
         return Units(shares=np.zeros(len(names)))
-    comparison = _Comparison(expected, frames, seen, recorded or seen, names, begins)
+    comparison = _Comparison(expected, frames, observed, recorded or observed, names, begins)
     misfits = sorted(comparison.misfits(), key=lambda misfit: not misfit.is_sure)
     return Units(tuple(misfits), comparison.shares)
 
 
-def _describes(recorded: FeatureStatistics, seen: FeatureStatistics) -> bool:
+def _describes(recorded: FeatureStatistics, observed: FeatureStatistics) -> bool:
     """Whether stored statistics can be those of a data set with these values: they contain all, and their mean."""
     low, high = recorded.level("min"), recorded.level("max")
     slack = 1e-3 * (high - low) + 1e-5 * np.maximum(np.abs(low), np.abs(high)) + 1e-6
-    levels = [seen.level("min"), seen.level("max"), recorded.level("mean")]
+    levels = [observed.level("min"), observed.level("max"), recorded.level("mean")]
     return all(((level >= low - slack) & (level <= high + slack)).all() for level in levels)
 
 
@@ -179,7 +179,7 @@ class _Comparison:
 
     expected: FeatureStatistics
     frames: Numbers
-    seen: FeatureStatistics
+    observed: FeatureStatistics
     recorded: FeatureStatistics
     names: Sequence[str]
     begins: bool
@@ -230,18 +230,18 @@ class _Comparison:
     def misfits(self) -> Iterator[Misfit]:
         """Yield the numbers that do not fit, each under one explanation."""
         explained = [] if self.begins else list(self._matched())
-        taken = {number for misfit in explained for number in misfit.numbers}
-        explained += self._located(taken)
-        taken |= {number for misfit in explained for number in misfit.numbers}
+        explained_numbers = {number for misfit in explained for number in misfit.numbers}
+        explained += self._located(explained_numbers)
+        explained_numbers |= {number for misfit in explained for number in misfit.numbers}
         yield from explained
         for number in np.flatnonzero(self.is_outside).tolist():
-            if number not in taken:
+            if number not in explained_numbers:
                 yield Misfit("outside", (number,), True, self._outside_words(number))
-                taken.add(number)
+                explained_numbers.add(number)
         far = [
             number
             for number in np.flatnonzero(self.beyond_extremes > MOST_OUTSIDE).tolist()
-            if number not in taken
+            if number not in explained_numbers
         ]
         if far:
             worst = f"{self._listed(far)} beyond the least and largest value of training in up to "
@@ -249,7 +249,7 @@ class _Comparison:
                 "outside", tuple(far), False, f"{worst}{self.beyond_extremes[far].max():.0%} of the frames"
             )
         if not self.begins:
-            yield from self._narrow(taken)
+            yield from self._narrow(explained_numbers)
 
     # -- explanations by all statistics ------------------------------------------------------------------
 
@@ -334,7 +334,7 @@ class _Comparison:
     def _of_partner(self, numbers: NDArray[np.intp], partner: int) -> Numbers:
         """Return the distance of every one of some numbers, if the partner's values stood in its place."""
         order = np.full(len(numbers), partner)
-        return self.expected.taken(numbers).distance(self.recorded.taken(order))
+        return self.expected.reordered(numbers).distance(self.recorded.reordered(order))
 
     def _mirrors(self) -> list[tuple[Kind, float, Numbers]]:
         """Return the sign, and the gripper turned round: x becomes least plus largest value minus x."""
@@ -378,7 +378,7 @@ class _Comparison:
 
     # -- explanations by the place alone -----------------------------------------------------------------
 
-    def _located(self, taken: set[int]) -> list[Misfit]:
+    def _located(self, explained_numbers: set[int]) -> list[Misfit]:
         """Return the factor that explains the place of numbers whose spread shows nothing.
 
         These are the beginnings of episodes, and numbers that never move and lie outside.
@@ -390,8 +390,8 @@ class _Comparison:
         def off(values: Numbers) -> Numbers:
             return np.asarray(np.abs(values - center) / scale)
 
-        before = off(self.seen.center)
-        after = np.stack([off(self.seen.center / factor) for factor in factors])
+        before = off(self.observed.center)
+        after = np.stack([off(self.observed.center / factor) for factor in factors])
         low, high = self.expected.bounds
         inside = np.stack([
             (np.abs(self.frames / factor - (low + high) / 2) <= high - low).all(axis=0)
@@ -400,7 +400,7 @@ class _Comparison:
         # A number that is zero in every unit, or zero in training, shows no factor.
         informative = (np.abs(center) > scale / 2) & self.begins
         # The spread of what moves was compared already, and no factor explained it.
-        free = ~np.isin(np.arange(self.expected.width), list(taken)) & (self.begins | ~self.moves)
+        free = ~np.isin(np.arange(self.expected.width), list(explained_numbers)) & (self.begins | ~self.moves)
         fits = free & inside & (after <= before / 2) & (informative | self.is_outside)
         counts = fits.sum(axis=1)
         totals = np.where(fits, np.log1p(before) - np.log1p(after), 0).sum(axis=1)
@@ -420,11 +420,11 @@ class _Comparison:
 
     # -- what is only suspicious -------------------------------------------------------------------------
 
-    def _narrow(self, taken: set[int]) -> Iterator[Misfit]:
+    def _narrow(self, explained_numbers: set[int]) -> Iterator[Misfit]:
         """Yield the numbers that hardly move, where these are half of those that moved in training or more."""
         expected, recorded = self.expected.scales(self.recorded)
         ratio = np.where(self.moves, recorded / np.where(expected > 0, expected, 1), np.nan)
-        numbers = [n for n in np.flatnonzero(ratio < NARROW).tolist() if n not in taken]
+        numbers = [n for n in np.flatnonzero(ratio < NARROW).tolist() if n not in explained_numbers]
         if numbers and 2 * len(numbers) >= self.moves.sum():
             times = float(1 / np.nanmedian(ratio[numbers]))
             words = (

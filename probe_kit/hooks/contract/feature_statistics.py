@@ -147,12 +147,12 @@ class FeatureStatistics:
             values[name] = slopes * mirrored + offset
         return FeatureStatistics(values, self.compared, self.periodic)
 
-    def taken(self, order: Sequence[int] | NDArray[np.intp]) -> "FeatureStatistics":
+    def reordered(self, order: Sequence[int] | NDArray[np.intp]) -> "FeatureStatistics":
         """Return the statistics of the numbers in another order."""
-        chosen = np.asarray(order)
-        values = {name: numbers[chosen] for name, numbers in self.values.items()}
+        indices = np.asarray(order)
+        values = {name: numbers[indices] for name, numbers in self.values.items()}
         return FeatureStatistics(
-            values, self.compared[chosen], self.periodic[chosen] if self.periodic.size else self.periodic
+            values, self.compared[indices], self.periodic[indices] if self.periodic.size else self.periodic
         )
 
     def scales(self, other: "FeatureStatistics") -> tuple[Numbers, Numbers]:

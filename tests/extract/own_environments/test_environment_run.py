@@ -334,23 +334,34 @@ def test_small_frames_are_the_first_and_the_last_picture(name: str) -> None:
 # -- units and names ---------------------------------------------------------------------------------------
 
 
-def turned(self: ReachEnv, *of: Any) -> Any:
-    found = ReachEnv._as_step(self, *of)
-    own = found.observation
-    return Step(Observation(own.image, own.state * np.float32(57.3), own.instruction), found.done, found.facts)
+def multiplied(factor: float) -> type[ReachEnv]:
+    """The environment whose states are all multiplied."""
+
+    def as_step(self: ReachEnv, *of: Any) -> Step:
+        step = ReachEnv._as_step(self, *of)
+        seen = step.observation
+        return replace(step, observation=replace(seen, state=seen.state * np.float32(factor)))
+
+    return type("Degrees", (ReachEnv,), {"_as_step": as_step})
 
 
+@pytest.mark.parametrize(
+    ("factor", "words"),
+    [
+        (57.3, "57.3 times larger than in training, as degrees for radians"),
+        pytest.param(1 / 57.3, "times smaller than in training", marks=pytest.mark.slow),
+    ],
+)
 def test_states_in_other_units_are_refused_of_an_environment_unless_accepted(
-    pi0_tiny: Pi0, monkeypatch: pytest.MonkeyPatch
+    pi0_tiny: Pi0, monkeypatch: pytest.MonkeyPatch, factor: float, words: str
 ) -> None:
     import reach_env
 
-    monkeypatch.setattr(reach_env, "Degrees", type("Degrees", (reach_env.ReachEnv,), {"_as_step": turned}), False)
-    with pytest.raises(
-        UnitsError,
-        match=r"reach_env:Degrees, the state after reset\(\): .*57.3 times larger .*degrees for radians",
-    ):
+    monkeypatch.setattr(reach_env, "Degrees", multiplied(factor), False)
+    with pytest.raises(UnitsError, match=rf"reach_env:Degrees, the state after reset\(\): .*{words}"):
         prepare(settings_of("Degrees"), model=pi0_tiny)
+    accepted = prepare(settings_of("Degrees", accept_units=True), model=pi0_tiny)
+    assert words in accepted.plan.selection["units"]["state units"]["misfits"]
     one, two = (
         prepare(settings_of(name, accept_units=name == "Degrees"), model=pi0_tiny)
         for name in ("Degrees", "ReachEnv")

@@ -423,7 +423,7 @@ class LerobotPolicy(Policy):
 
     @property
     def state_statistics(self) -> FeatureStatistics | None:
-        """All statistics of states that stand beside those that normalise."""
+        """The statistics of states in the file that normalises them, also those that the mode does not need."""
         return self.state_units.statistics
 
     @property
@@ -439,7 +439,7 @@ class LerobotPolicy(Policy):
 
     @property
     def action_statistics(self) -> FeatureStatistics | None:
-        """All statistics of actions that stand beside those that normalise."""
+        """The statistics of actions in the file that normalises them, also those that the mode does not need."""
         return self.action_units.statistics
 
     @cached_property
