@@ -36,6 +36,7 @@ SMALLEST: dict[str, list[str]] = {
     "score_coverage": ["--draws", "2"],
     "suite_random_features": ["--items", "12", "--width", "8", "--categories", "color"],
     "throughput": ["--subjects", "tiny", "--batches", "1,2", "--repeats", "1"],
+    "units": ["--worlds", "1"],
     "verdict_coverage": ["--draws", "4", "--only", "absent"],
     "waiting": ["--subjects", "tiny", "--items", "2"],
 }

@@ -16,9 +16,9 @@ UNSAFE = re.compile(f"[\x00-\x08\x0b-\x1f\x7f-\x9f{_BIDI}\u2028\u2029\ufeff\ud80
 """Control characters but tab and newline, bidirectional marks, foreign line ends, halves of surrogate pairs."""
 
 
-def as_argument(place: object) -> str:
+def as_argument(path: object) -> str:
     """Return a path or an address as it is typed behind a command: in quotes where a shell would split it."""
-    return shlex.quote(str(place))
+    return shlex.quote(str(path))
 
 
 def terminal_safe(text: str) -> str:

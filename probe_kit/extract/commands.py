@@ -282,8 +282,8 @@ def _next_command(run: "Run") -> str:
     if run.streams and run.inputs is not None:
         return f"probe-kit targets {as_argument(run.location)}"
     groups = run.episodes.groupby("category")["group_id"].nunique().to_dict() if run.streams else {}
-    place = as_argument(run.location)
-    return probe_command(place, groups) or f"probe-kit retention {place}"
+    location = as_argument(run.location)
+    return probe_command(location, groups) or f"probe-kit retention {location}"
 
 
 def print_input_notes(run: "Run") -> None:

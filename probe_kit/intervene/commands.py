@@ -246,8 +246,8 @@ def intervene(
     print_result(result, style, details)
     if style == "table":
         has_sides = result.outcomes.has_sides
-        place = as_argument(run)
-        following = f"retention {place}" if has_sides else f"run show {place}"
+        location = as_argument(run)
+        following = f"retention {location}" if has_sides else f"run show {location}"
         what = "use beside probes and success" if has_sides else "what the run stores"
         say(marked("next: [bold]probe-kit {}[/]  {}", following, what))
     say(marked("stored as {}", result.key))

@@ -41,10 +41,10 @@ def origin_of(run: RunReader) -> Origin:
 def check_sides(run: RunReader, purpose: str) -> None:
     """Raise UsageError for a run without sides; the message says that `purpose` is not possible without them."""
     if SIDE not in run.episodes:
-        place = as_argument(run.location)
+        location = as_argument(run.location)
         raise UsageError(
             f"{run.location} has no column {SIDE}: {run.source.words}. There are no sides, so {purpose} is not "
-            f"possible. `probe-kit targets {place}` lists what can be decoded, `probe-kit labels {place}` "
+            f"possible. `probe-kit targets {location}` lists what can be decoded, `probe-kit labels {location}` "
             "writes a table for labels of your own"
         )
 

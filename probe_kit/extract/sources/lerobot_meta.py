@@ -332,14 +332,14 @@ class LeRobotMeta:
         if numbers == list(range(len(numbers))):
             data = [self.path / episode.file for episode in self.episodes]
             check_continued(self.path, self.info, [episode.length for episode in self.episodes], data)
-        known = set(numbers)
+        present = set(numbers)
         total = self.info.get("total_episodes", len(numbers))
         if type(total) is not int:
             raise RecordingError(
-                f"{self.name}: {INFO} has total_episodes {_shown(total)}; expected a number. {_AGAIN}"
+                f"{self.name}: {INFO} has total_episodes {_as_text(total)}; expected a number. {_AGAIN}"
             )
         # Counted, not listed: a number of a few digits can name more episodes than memory holds.
-        lacking = next(number for number in count() if number not in known)
+        lacking = next(number for number in count() if number not in present)
         if lacking < max((total, *numbers)):
             raise RecordingError(
                 f"{self.name}: {EPISODES} has {len(numbers)} episodes, up to number {max(numbers, default=0)}, "
@@ -361,7 +361,7 @@ class LeRobotMeta:
         ):
             if self.info.get(total_name, total) != total:
                 raise RecordingError(
-                    f"{self.name}: {INFO} has {total_name} {_shown(self.info[total_name])}; its tables have "
+                    f"{self.name}: {INFO} has {total_name} {_as_text(self.info[total_name])}; its tables have "
                     f"{total}. {_AGAIN}"
                 )
 
@@ -381,7 +381,7 @@ class LeRobotMeta:
             rate = (self.features[camera].get("info") or {}).get("video.fps")
             if rate is not None and not _equal_rates(rate, self.fps):
                 raise RecordingError(
-                    f"{self.name}: {INFO} says that {camera} has {_shown(rate)} frames per second, and the data "
+                    f"{self.name}: {INFO} says that {camera} has {_as_text(rate)} frames per second, and the data "
                     f"set {self.fps:g}; expected the same. {_AGAIN}"
                 )
             slack = HALF / self.fps
@@ -411,7 +411,7 @@ def _equal_rates(rate: Any, other: float) -> bool:
     return isinstance(rate, int | float) and rate <= _MOST_FPS and abs(rate - other) <= RATE_ROUNDING * other
 
 
-def _shown(value: Any) -> str:
+def _as_text(value: Any) -> str:
     """Return a foreign value for a message."""
     return repr(value)[:80]
 
@@ -432,10 +432,10 @@ def _check_info(root: Path, info: Mapping[str, Any]) -> None:
     """Raise RecordingError unless rate and features are such that frames can be read."""
     fps = info.get("fps")
     if isinstance(fps, bool) or not isinstance(fps, int | float) or not 0 < fps < float("inf"):
-        raise RecordingError(f"{root.name}: {INFO} has fps {_shown(fps)}; expected a number above 0. {_AGAIN}")
+        raise RecordingError(f"{root.name}: {INFO} has fps {_as_text(fps)}; expected a number above 0. {_AGAIN}")
     if not _LEAST_FPS <= fps <= _MOST_FPS:
         raise RecordingError(
-            f"{root.name}: {INFO} has fps {_shown(fps)}; expected {_LEAST_FPS:g} to {_MOST_FPS:g}. {_AGAIN}"
+            f"{root.name}: {INFO} has fps {_as_text(fps)}; expected {_LEAST_FPS:g} to {_MOST_FPS:g}. {_AGAIN}"
         )
     features = info.get("features")
     if not isinstance(features, Mapping) or not all(map(_is_feature, features.values())):
