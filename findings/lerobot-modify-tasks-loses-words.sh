@@ -13,7 +13,13 @@
 # Prints what it saw; exits 0 if it is still so, 1 if it changed.
 set -u
 work=$(mktemp -d); trap 'rm -rf "$work"' EXIT; cd "$work"
-python3.12 -m venv venv >/dev/null && ./venv/bin/pip install -q "lerobot[dataset]==0.6.1" || exit 2
+if command -v uv >/dev/null; then
+    uv venv --quiet --python 3.12 venv
+    uv pip install --quiet --python venv/bin/python "lerobot[dataset]==0.6.1"
+else
+    python3.12 -m venv venv
+    venv/bin/python -m pip install --quiet "lerobot[dataset]==0.6.1"
+fi
 export HF_HUB_OFFLINE=1 HF_HOME=$work/hf HF_LEROBOT_HOME=$work/lerobot OMP_NUM_THREADS=1
 cat > record.py <<'P'
 import sys

@@ -11,8 +11,13 @@
 # Exit 0: still so. Exit 1: changed.
 set -e
 W=$(mktemp -d); trap 'rm -rf "$W"' EXIT; cd "$W"
-python3 -m venv env
-env/bin/pip -q install "lerobot==0.6.1"
+if command -v uv >/dev/null; then
+    uv venv --quiet --python 3.12 env
+    uv pip install --quiet --python env/bin/python "lerobot[dataset]==0.6.1"
+else
+    python3.12 -m venv env
+    env/bin/python -m pip install --quiet "lerobot[dataset]==0.6.1"
+fi
 cat > show.py <<'P'
 import dataclasses
 import tempfile

@@ -18,8 +18,13 @@ set -e
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 cd "$folder"
-python3 -m venv env
-env/bin/python -m pip install --quiet obstore==0.12.1
+if command -v uv >/dev/null; then
+    uv venv --quiet --python 3.12 env
+    uv pip install --quiet --python env/bin/python obstore==0.12.1
+else
+    python3.12 -m venv env
+    env/bin/python -m pip install --quiet obstore==0.12.1
+fi
 cat > look.py <<'P'
 import socket
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
