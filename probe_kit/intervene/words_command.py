@@ -98,7 +98,7 @@ def words(
     else:
         out.print(_table(value, match, rows))
     if out_file is not None and len(rows):
-        say(marked("wrote {} to {}. Steer along one: --kind steer --sites backbone.{} --direction {}",
+        say(marked("wrote {} to {}. Steer along one: --kind steer --sites backbone.{} --roles all --direction {}",
                    counted(len(rows), "direction"), out_file, f"{value.blocks[rows[0]] + 1:02d}",
                    f"{out_file}#{value.direction_name(rows[0])}"))  # fmt: skip
 
