@@ -26,6 +26,7 @@ from probe_kit.extract.commands import ask, extract
 from probe_kit.extract.inspect_commands import check_environment, dataset_app, models, run_app
 from probe_kit.hooks.commands import new_adapter, verify
 from probe_kit.intervene.commands import KindHelp, intervene, list_runs, show
+from probe_kit.intervene.words_command import words
 from probe_kit.retention.commands import retention
 from probe_kit.study.commands import app as study_app
 from probe_kit.suite.commands import app as suite_app
@@ -41,7 +42,7 @@ PANELS = {
     "Start": ("demo", "doctor", "models"),
     "Make runs": ("suite", "extract", "ask", "dataset", "run"),
     "Probe": ("power", "targets", "train", "labels"),
-    "Is it used?": ("diagnose", "intervene"),
+    "Is it used?": ("diagnose", "intervene", "words"),
     "Read results": ("retention", "view"),
     "A whole study from one file": ("study",),
     "Your own model or environment": ("new-adapter", "check-adapter", "check-environment", "verify"),
@@ -166,7 +167,7 @@ for name, commands in (("suite", suite_app), ("run", run_app), ("study", study_a
 run_app.command()(show)
 run_app.command("list")(list_runs)
 for command in (
-    *(demo, doctor, models, extract, ask, power, targets, train, labels, diagnose, retention, view),
+    *(demo, doctor, models, extract, ask, power, targets, train, labels, diagnose, words, retention, view),
     *(new_adapter, check_adapter, check_environment, verify),
 ):
     app.command(rich_help_panel=_PANEL_OF[command.__name__.replace("_", "-")])(command)

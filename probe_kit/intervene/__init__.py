@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from probe_kit.intervene.sessions import ReplaySession, ReplaySource
     from probe_kit.intervene.stored import stored_interventions
     from probe_kit.intervene.verdict import Behaviour, Places, UseVerdict, classify_all, classify_use
+    from probe_kit.intervene.vocabulary import ValueWords, WordMatch, value_words
     from probe_kit.runs.direction_files import write_directions
 
 __all__ = [
@@ -63,6 +64,8 @@ __all__ = [
     "ReplaySource",
     "Steering",
     "UseVerdict",
+    "ValueWords",
+    "WordMatch",
     "best_patch_targets",
     "classify_all",
     "classify_use",
@@ -73,6 +76,7 @@ __all__ = [
     "stored_interventions",
     "stored_joint_places",
     "stored_site_effects",
+    "value_words",
     "write_directions",
 ]
 
@@ -116,6 +120,9 @@ __getattr__, __dir__ = lazy_names(
         "load_effects": "results",
         "stored_image_swaps": "kinds.image_swap",
         "stored_interventions": "stored",
+        "value_words": "vocabulary",
+        "ValueWords": "vocabulary",
+        "WordMatch": "vocabulary",
         "write_directions": "probe_kit.runs.direction_files",
     },
 )

@@ -197,6 +197,19 @@ class Model(ABC):
         """The modules that turn last residuals into tokens, for a logit lens; None for a model without tokens."""
         return None
 
+    @property
+    def word_head(self) -> Unembedding | None:
+        """The modules that read a vector of a stream in the words of the vocabulary; None where there are none.
+
+        By default those of the logit lens. A model that puts out no tokens has them where its prompt's decoder
+        shares the embedding with its head, as PaliGemma does.
+        """
+        return self.unembedding
+
+    def token_texts(self) -> tuple[str, ...] | None:
+        """Return the text of every token by its id, alone; None if the model cannot say."""
+        return None
+
     def token_ids(self, instructions: Sequence[str]) -> list[tuple[int, ...]] | None:
         """Return per instruction the ids that reach the network as its prompt; None if the model cannot say."""
         del instructions

@@ -151,6 +151,10 @@ class Magma(TokenDecoder, Policy, SpeakingModel):
         """The settings of cutting pictures into crops."""
         return PictureSettings.of(self.config.vision, self.loaded.folder)
 
+    def token_texts(self) -> tuple[str, ...]:
+        """Return the text of every token by its id."""
+        return self.text.texts
+
     @cached_property
     def text(self) -> ChatText:
         """The chat text.

@@ -25,9 +25,17 @@ from probe_kit._system.bounded_files import load_json
 from probe_kit.errors import CheckpointError
 from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE, without_revision
 from probe_kit.hooks.contract.card import EMBEDDED
+from probe_kit.hooks.contract.model import Unembedding
 from probe_kit.hooks.contract.observation import ARM_NUMBERS, laid_out
 from probe_kit.hooks.families.shared.kinds import STATE, Picture
-from probe_kit.hooks.families.shared.lerobot.flow import LerobotFlow, PaliGemmaPolicy, StatePrompt, sizes_file
+from probe_kit.hooks.families.shared.lerobot.flow import (
+    GatelessNorm,
+    LerobotFlow,
+    PaliGemmaPolicy,
+    StatePrompt,
+    TiedHead,
+    sizes_file,
+)
 from probe_kit.hooks.families.shared.lerobot.normaliser import (
     FILES,
     NO_STATISTICS,
@@ -207,6 +215,12 @@ class Pi0(PaliGemmaPolicy, LerobotFlow):
         backbone, expert = joint.paligemma.model.language_model, joint.gemma_expert.model
         vision = joint.paligemma.model.vision_tower.vision_model
         return flow_stacks(backbone, expert, vision, self.iterations)
+
+    @property
+    def word_head(self) -> Unembedding:
+        """PaliGemma's final norm, and its embedding, which its head shares; pi0 itself puts out no words."""
+        decoder = self._joint.paligemma.model.language_model
+        return Unembedding(("backbone",), GatelessNorm(decoder.norm), TiedHead(decoder.embed_tokens))
 
     @property
     def _joint(self) -> Any:

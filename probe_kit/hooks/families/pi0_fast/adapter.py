@@ -43,7 +43,7 @@ from probe_kit.hooks.contract.model import Unembedding
 from probe_kit.hooks.contract.sites import Stream
 from probe_kit.hooks.families.pi0_fast import CAPTURED, FAST
 from probe_kit.hooks.families.shared.kinds import Evaluation
-from probe_kit.hooks.families.shared.lerobot.flow import PaliGemmaPolicy, StatePrompt, sizes_file
+from probe_kit.hooks.families.shared.lerobot.flow import GatelessNorm, PaliGemmaPolicy, StatePrompt, sizes_file
 from probe_kit.hooks.families.shared.lerobot.pipelines import CROP
 from probe_kit.hooks.families.shared.lerobot.policy import MASK, TOKENS
 from probe_kit.hooks.families.shared.taps import (
@@ -452,7 +452,7 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
     def unembedding(self) -> Unembedding:
         """The final norm and head of PaliGemma."""
         head = self.network.model.paligemma_with_expert.paligemma.lm_head
-        return Unembedding(("backbone", "action"), _FinalNorm(self._decoder.norm), head)
+        return Unembedding(("backbone", "action"), GatelessNorm(self._decoder.norm), head)
 
     # -- verification ------------------------------------------------------------------------------------
 
@@ -474,19 +474,6 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
             "prefix_pad": lambda: self.recorded_padding(run.recorded),
             "logits": lambda: numpy_of(torch.stack([step[:, -1] for step in run.calls["logits"]])),
         }
-
-
-class _FinalNorm(nn.Module):
-    """The norm of lerobot without the gate that it returns beside what is normed."""
-
-    def __init__(self, norm: nn.Module) -> None:
-        super().__init__()
-        self.norm = norm
-
-    def forward(self, residual: Tensor) -> Tensor:
-        """Return the normed residual (…, D)."""
-        normed: Tensor = self.norm(residual)[0]
-        return normed
 
 
 def _warn_of_problems() -> None:

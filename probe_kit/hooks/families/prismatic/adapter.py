@@ -219,6 +219,10 @@ class PrismaticModel(TokenDecoder):
         rows = [prepare_picture(checked_picture(image), self.pictures) for image in images]
         return torch.from_numpy(np.stack(rows)).to(self.loaded.device)
 
+    def token_texts(self) -> tuple[str, ...]:
+        """Return the text of every token by its id."""
+        return self.tokenizer.texts
+
     @cached_property
     def tokenizer(self) -> FileTokenizer:
         """The tokenizer of the checkpoint, or the chosen one.

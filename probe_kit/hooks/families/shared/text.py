@@ -107,10 +107,22 @@ class TokenizerFile:
                     "write it without"
                 )
 
+    @cached_property
+    def texts(self) -> tuple[str, ...]:
+        """The text of every token by its id, alone; empty for ids that the tokenizer leaves out."""
+        return token_texts(self.tokenizer)
+
     def words(self, ids: Sequence[int], ends: Collection[int] = ()) -> str:
         """The text of ids up to one of `ends`, without special tokens."""
         answer = list(takewhile(lambda number: number not in ends, ids))
         return str(self.tokenizer.decode(answer, skip_special_tokens=True)).strip()
+
+
+def token_texts(tokenizer: Any) -> tuple[str, ...]:
+    """Return the text of every token of a tokenizer of `tokenizers` by its id, alone; special ones by name."""
+    ids = tokenizer.get_vocab(with_added_tokens=True).values()
+    texts = tokenizer.decode_batch([[number] for number in range(max(ids) + 1)], skip_special_tokens=False)
+    return tuple(text if tokenizer.id_to_token(number) is not None else "" for number, text in enumerate(texts))
 
 
 def positions_of(encoding: Any, start: int, stop: int) -> tuple[bool, ...]:

@@ -283,6 +283,10 @@ class VisionLanguageModel(SpeakingModel):
         """The decoder's final norm and head."""
         return Unembedding.of_decoder(("backbone", ANSWER), self.causal, self.language.norm)
 
+    def token_texts(self) -> tuple[str, ...]:
+        """Return the text of every token by its id."""
+        return self.text.texts
+
     # -- inputs ------------------------------------------------------------------------------------------
 
     @cached_property

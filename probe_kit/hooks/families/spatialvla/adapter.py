@@ -334,6 +334,10 @@ class SpatialVLA(TokenDecoder, Policy):
         """Return the ids of a whole prompt, places for the picture first; see `Speech.prompt`."""
         return self.speech.prompt(instruction)
 
+    def token_texts(self) -> tuple[str, ...]:
+        """Return the text of every token by its id."""
+        return self.speech.tokenizer.texts
+
     def token_ids(self, instructions: Sequence[str]) -> list[tuple[int, ...]]:
         """The ids of each whole prompt behind the picture."""
         return [tuple(self.prompt(instruction)[self.config.patches :]) for instruction in instructions]

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.nn import functional
 from transformers import AutoTokenizer
 
 from probe_kit.errors import CheckpointError
@@ -24,6 +25,7 @@ from probe_kit.hooks.families.shared.kinds import FLOW, IMAGES
 from probe_kit.hooks.families.shared.lerobot.pipelines import tokenizer_folder, tokenizer_name
 from probe_kit.hooks.families.shared.lerobot.policy import LerobotPolicy, checked_steps
 from probe_kit.hooks.families.shared.taps import attach_prompt_kv
+from probe_kit.hooks.families.shared.text import token_texts
 from probe_kit.hooks.families.shared.token_decoder import seeded_noise
 from probe_kit.hooks.outputs import Arrays, Produce, RecordedRun, euler_path, numpy_of
 from probe_kit.models.checkpoint_files import load_pretrained
@@ -334,6 +336,31 @@ def sizes_file(folder: Path) -> Path | None:
     return sizes[0] if sizes else None
 
 
+class GatelessNorm(nn.Module):
+    """The norm of lerobot without the gate that it returns beside what is normed."""
+
+    def __init__(self, norm: nn.Module) -> None:
+        super().__init__()
+        self.norm = norm
+
+    def forward(self, residual: Tensor) -> Tensor:
+        """Return the normed residual (…, D)."""
+        normed: Tensor = self.norm(residual)[0]
+        return normed
+
+
+class TiedHead(nn.Module):
+    """The head of a language model whose weights are those of its embedding."""
+
+    def __init__(self, embedding: nn.Embedding) -> None:
+        super().__init__()
+        self.embedding = embedding
+
+    def forward(self, normed: Tensor) -> Tensor:
+        """Return logits (…, V) of normed residuals (…, D)."""
+        return functional.linear(normed, self.embedding.weight)
+
+
 class PaliGemmaPolicy(LerobotPolicy):
     """A lerobot policy whose prompt is read by PaliGemma."""
 
@@ -354,6 +381,10 @@ class PaliGemmaPolicy(LerobotPolicy):
                 f"{self.folder} has no tokenizer.json and the {gated}{repository} cannot be fetched. Run "
                 "`hf auth login`, or put its tokenizer.json and tokenizer_config.json into the checkpoint folder"
             ) from error
+
+    def token_texts(self) -> tuple[str, ...]:
+        """Return the text of every token by its id."""
+        return token_texts(self.tokenizer.backend_tokenizer)
 
     def _tokenizer_folder(self) -> Path | None:
         if (saved := tokenizer_folder(self.folder)) is not None:
