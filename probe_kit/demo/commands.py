@@ -19,13 +19,16 @@ def demo(
         bool,
         typer.Option(
             "--compare",
-            help="Validate the pipeline instead: run policies with known ground truth, print expected and "
-            "measured verdicts. Exits with 1 if a verdict is wrong; undecided ones are counted apart.",
+            help="Check probe-kit itself: play policies whose true verdict is known, and print "
+            "expected and measured "
+            "verdicts. The exit code is 1 if a verdict is wrong; undecided verdicts are counted separately.",
         ),
     ] = False,
     full: Annotated[
         bool,
-        typer.Option("--full", help="Ask 24 items of 4 categories, and permute 200 times, as --compare does."),
+        typer.Option(
+            "--full", help="Use 24 items of 4 categories and 200 permutations, as --compare does. Takes longer."
+        ),
     ] = False,
 ) -> None:
     """Run the whole pipeline on the embedded models: answers, episodes, activations, probes, retention.

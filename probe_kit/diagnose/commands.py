@@ -51,13 +51,14 @@ Require = Annotated[
         "--require",
         parser=common.Names.parse,
         metavar="A,B,…",
-        help="Inputs that must matter. Default: all that vary.",
+        help="Inputs that must change the action. Default: all inputs that vary in the data.",
     ),
 ]
 Paraphrases = Annotated[
     Path | None,
     further_option(
-        "--paraphrases", help="CSV file with columns instruction, other: the same meaning in other words."
+        "--paraphrases",
+        help="CSV file with the columns instruction and other: the same instruction in other words.",
     ),
 ]
 Target = Annotated[
@@ -65,16 +66,21 @@ Target = Annotated[
     typer.Option(
         "--target",
         metavar="COLUMN",
-        help="Probe a side or a column, built in or of --labels.",
+        help="What the probes decode: a side, a built-in column, or a column of --labels.",
     ),
 ]
-Labels = Annotated[Path | None, further_option("--labels", help="Table with the column of --target.")]
+Labels = Annotated[
+    Path | None, further_option("--labels", help="Table (CSV or Parquet) with the column that --target names.")
+]
 Base = Annotated[
     str | None,
-    typer.Option("--base", metavar="CHECKPOINT", help="Compare with the checkpoint that this one was tuned from."),
+    typer.Option(
+        "--base", metavar="CHECKPOINT", help="Also compare with the checkpoint that this one was fine-tuned from."
+    ),
 ]
 Inside = Annotated[
-    bool, further_option("--inside/--no-inside", help="Patch every site, to find where an input is lost.")
+    bool,
+    further_option("--inside/--no-inside", help="Patch every site, to find the layer at which an input is lost."),
 ]
 Html = Annotated[Path | None, typer.Option("--html", help="Also write a page with a figure.")]
 

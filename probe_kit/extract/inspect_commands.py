@@ -256,34 +256,40 @@ def export(
     ],
     out_file: Annotated[
         Path | None,
-        typer.Option("--out", metavar="FILE", help="What to write. Default: <run>.<format> beside the run."),
+        typer.Option(
+            "--out", metavar="FILE", help="File or folder to write. Default: <run>.<format> beside the run."
+        ),
     ] = None,
     sites: Annotated[
         Names | None,
         typer.Option(
             "--sites",
             **LISTED,
-            help="Of parquet, sae and directions: sites, such as backbone.07, expert or expert.*@9. Default: all.",
+            help="For parquet, sae and directions: sites, such as backbone.07, expert or expert.*@9. "
+            "Default: all.",
         ),
     ] = None,
     view: Annotated[
         str | None,
         typer.Option(
             "--view",
-            help="Of parquet, sae and directions: a pooled view, tokens or tokens:ROLE. Default: all pooled "
-            "views, or mean in sae.",
+            help="For parquet, sae and directions: a pooled view, tokens or tokens:ROLE. Default: all "
+            "pooled views, "
+            "or mean in sae.",
         ),
     ] = None,
-    dtype: Annotated[SaeDtype, typer.Option("--dtype", help="Of sae: type of the memory maps.")] = "bfloat16",
-    seed: Annotated[int, typer.Option("--seed", help="Of sae: seed of the order of rows.")] = 0,
+    dtype: Annotated[
+        SaeDtype, typer.Option("--dtype", help="For sae: data type of the memory maps.")
+    ] = "bfloat16",
+    seed: Annotated[int, typer.Option("--seed", help="For sae: seed of the order of rows.")] = 0,
     suite: Annotated[
-        Path | None, typer.Option("--suite", help="Of lerobot: folder of the run's suite, if it was moved.")
+        Path | None, typer.Option("--suite", help="For lerobot: folder of the run's suite, if it was moved.")
     ] = None,
     arm_urdf: Annotated[
-        Path | None, typer.Option("--arm-urdf", help="Of lerobot: URDF file of the run's arm, if it was moved.")
+        Path | None, typer.Option("--arm-urdf", help="For lerobot: URDF file of the run's arm, if it was moved.")
     ] = None,
     background: Annotated[
-        Path | None, typer.Option("--background", help="Of lerobot: photo of the run's table, if it was moved.")
+        Path | None, typer.Option("--background", help="For lerobot: photo of the run's table, if it was moved.")
     ] = None,
     partial: Partial = False,
 ) -> None:
@@ -370,12 +376,16 @@ def check_environment(
     rotate: Annotated[
         list[str] | None,
         typer.Option(
-            "--rotate", metavar="[CAMERA=]DEGREES", help="Rotate pictures, as extract does with the same option."
+            "--rotate", metavar="[CAMERA=]DEGREES", help="Rotate pictures as `extract --rotate` does, such as 180."
         ),
     ] = None,
     picture: Annotated[
         Path | None,
-        typer.Option("--picture", metavar="FILE", help="Write the first picture of every camera, side by side."),
+        typer.Option(
+            "--picture",
+            metavar="FILE",
+            help="Image file to write: the first picture of every camera, side by side.",
+        ),
     ] = None,
     as_json: common.AsJson = False,
 ) -> None:

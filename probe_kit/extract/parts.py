@@ -126,7 +126,12 @@ class Capture(Part):
     """
 
     tokens: Annotated[
-        Tokens, stored_option("--tokens", help="pooled: store pooled views. all: also store every token (large).")
+        Tokens,
+        stored_option(
+            "--tokens",
+            help="pooled: store activations pooled over tokens, such as their mean. all: also store every token "
+            "(large).",
+        ),
     ] = "pooled"
     captured_calls: Annotated[
         Annotated[int, Field(ge=1, le=MOST_CALLS)] | Literal["all"],
@@ -141,7 +146,8 @@ class Capture(Part):
         LaterViews,
         stored_option(
             "--later-views",
-            help="mean: of the inferences after the first, store the view mean alone, in bfloat16 (small).",
+            help="What to store of the inferences after the first. mean: only the mean over tokens, in bfloat16 "
+            "(small).",
         ),
     ] = "all"
     codec: Annotated[Codec, stored_option("--codec", help="Compression of stored activations.")] = "zstd"
@@ -173,8 +179,9 @@ class AskCapture(Part):
         AskTokens,
         stored_option(
             "--tokens",
-            help="none: store answers only. pooled: also store pooled views, for probes. all: also store every "
-            "token.",
+            help="none: store answers only. pooled: also store activations pooled over tokens, for "
+            "probes. all: also "
+            "store every token.",
         ),
     ] = "none"
     codec: Codec = "zstd"
@@ -331,8 +338,9 @@ class Machine(Part):
         FrameChoice,
         stored_option(
             "--frames",
-            help="ends: store the first and last frame of every episode in small. all: store every frame, for the "
-            "viewer and for data sets.",
+            help="ends: store a small copy of the first and last frame of every episode. all: store "
+            "every frame, for "
+            "the viewer and for data sets.",
         ),
     ] = "ends"
     env_workers: Annotated[Annotated[int, Field(ge=0, le=1024)] | None, option_of(common.EnvWorkers)] = None
@@ -346,7 +354,7 @@ class Machine(Part):
         bool,
         further_option(
             "--accept-ignored-inputs",
-            help="Accept a model that neither another picture nor another instruction changes.",
+            help="Accept a model whose output stays the same whatever picture and instruction it gets.",
         ),
     ] = False
 
@@ -400,7 +408,7 @@ class ActMachine(Machine):
         bool,
         further_option(
             "--accept-units",
-            help="Accept states that lie far outside the statistics of the checkpoint, on any source.",
+            help="Accept states that lie far outside the statistics of the checkpoint.",
         ),
     ] = False
 

@@ -103,7 +103,8 @@ Direction = Annotated[
     ),
 ]
 Controls = Annotated[
-    int | None, _inside_option("--controls", help="Number of matched random directions.", min=0, max=100)
+    int | None,
+    _inside_option("--controls", help="Number of random directions of equal size, as controls.", min=0, max=100),
 ]
 Coefficients = Annotated[
     Numbers | None,
@@ -111,11 +112,12 @@ Coefficients = Annotated[
         "--coefficients",
         parser=Numbers.parse,
         metavar="1,2,…",
-        help="Coefficients, comma-separated: half class-mean differences, or lengths of a file's vector.",
+        help="Strengths of steering, comma-separated. 1 is half the difference of the class means, or the length "
+        "of a file's vector.",
     ),
 ]
 TargetSide = Annotated[
-    str | None, _inside_option("--target-side", help="Target side: wrong, correct, left or right.")
+    str | None, _inside_option("--target-side", help="Side to steer toward: wrong, correct, left or right.")
 ]
 _pairs_option = partial(typer.Option, rich_help_panel="Recordings and your own environment")
 Vary = Annotated[
@@ -123,18 +125,19 @@ Vary = Annotated[
     _pairs_option(
         "--vary",
         metavar="INPUT",
-        help="Input that the source has of another frame: instruction, picture, picture.CAMERA or state.",
+        help="Input that is taken from another frame: instruction, picture, picture.CAMERA or state.",
     ),
 ]
 FramesEach = Annotated[
-    int | None, _pairs_option("--frames", help="Frames of each episode, evenly spaced. Default: 4.", min=1)
+    int | None, _pairs_option("--frames", help="Number of frames per episode, evenly spaced. Default: 4.", min=1)
 ]
 PairTable = Annotated[
     Path | None,
     _pairs_option(
         "--pairs",
         metavar="FILE",
-        help="Table of pairs of your own, with the columns episode, frame, donor_episode, donor_frame.",
+        help="Your own pairs of frames to exchange: a table with the columns episode, frame, donor_episode, "
+        "donor_frame.",
     ),
 ]
 Instructions = Annotated[
@@ -142,8 +145,8 @@ Instructions = Annotated[
     _pairs_option(
         "--instructions",
         metavar="FILE",
-        help="Words of other tasks, where the data set has one task: a line each, or a table with a column "
-        "instruction.",
+        help="Instructions of other tasks, for a data set with a single task: one per line, or a table with a "
+        "column instruction.",
     ),
 ]
 ReadoutName = Annotated[
@@ -388,7 +391,7 @@ def show(
         bool,
         typer.Option(
             "--action-errors",
-            help="Of a run on recordings: compare the actions that the model predicted with the recorded ones.",
+            help="For a run on recordings: compare the actions that the model predicted with the recorded ones.",
         ),
     ] = False,
     partial: Partial = False,

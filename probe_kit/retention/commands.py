@@ -95,10 +95,10 @@ Compare = Annotated[
     typer.Option(
         "--compare",
         metavar="NAME|groups|vlm-vla|stages|steps",
-        help="What is compared. NAME: every other run with this one; default: the first. groups: every two groups "
-        "of models; groups=NAME: every other with this one. vlm-vla: VLM runs with policy runs. stages: VLM_RUN "
-        "and RUN question by question: answer, probe, success. steps: checkpoints of a training, by the step in "
-        "their folders; steps=N,N: by these steps.",
+        help="What to compare. NAME: this run with every other; default: the first run. groups: every two groups "
+        "of models; groups=NAME: this group with every other. vlm-vla: VLM runs with policy runs. stages: "
+        "VLM_RUN and RUN, question by question: answer, probe, success. steps: checkpoints of one training, "
+        "ordered by the step in their folder names; steps=N,N: by these steps.",
     ),
 ]
 COMPARISONS = ("groups", "vlm-vla", "stages", "steps")
@@ -121,7 +121,7 @@ LabelTargets = Annotated[
     typer.Option(
         "--target",
         metavar="COLUMN",
-        help="Retention of a label of your own, by its column; repeat for several in one table. Default: of the "
+        help="Column of your own labels whose retention is shown; repeat for several in one table. Default: the "
         "side of the correct picture.",
         rich_help_panel=RUNS,
     ),
@@ -130,7 +130,7 @@ LabelFamily = Annotated[
     Family,
     typer.Option(
         "--family",
-        help="With several --target, table corrects p for all of them (Holm).",
+        help="With several --target. table: correct p for all targets of the table (Holm).",
         rich_help_panel=RUNS,
     ),
 ]
@@ -158,7 +158,7 @@ IterationChoice = Annotated[
     typer.Option(
         "--iterations",
         metavar="all|best|last|N",
-        help="Iterations of the action stream that count. best: layer curves show the best iteration only.",
+        help="Which iterations of the action stream count. best: layer curves show the best iteration only.",
         rich_help_panel=RUNS,
     ),
 ]
@@ -178,7 +178,9 @@ AbsentBelow = Annotated[
 Rule = Annotated[
     RuleName,
     typer.Option(
-        "--rule", help="What counts as an answer. box: the released evaluation's.", rich_help_panel=RULES
+        "--rule",
+        help="Rule by which an episode counts as answered. box: that of the released evaluation.",
+        rich_help_panel=RULES,
     ),
 ]
 LastSteps = Annotated[
@@ -186,7 +188,8 @@ LastSteps = Annotated[
     typer.Option(
         "--last-steps",
         min=1,
-        help="Control steps at the end that are judged. The released evaluation averages 11.",
+        help="Number of control steps at the end of an episode that the rule judges. The released evaluation "
+        "averages 11.",
         rich_help_panel=RULES,
     ),
 ]
@@ -196,7 +199,7 @@ Epsilons = Annotated[
         "--epsilons",
         parser=Radii.parse,
         metavar="A,B,…",
-        help="Zone radii in metres at which the rule disc is scored again, from stored positions.",
+        help="Radii of the target zone in metres: the rule disc is scored again at each, from stored positions.",
         rich_help_panel=RULES,
     ),
 ]

@@ -45,7 +45,7 @@ File = Annotated[
     typer.Argument(metavar="FILE", help="Study file, or the name of a study of the package: embedded or paper."),
 ]
 Only = Annotated[
-    str | None, typer.Option("--only", metavar="NAME", help="Take the runs of this block or this model only.")
+    str | None, typer.Option("--only", metavar="NAME", help="Play only the runs of this block or this model.")
 ]
 
 
@@ -73,7 +73,7 @@ def run(
     as_json: AsJson = False,
     no_probes: Annotated[bool, typer.Option("--no-probes", help="Fit no probes.")] = False,
     retry_failed: Annotated[
-        bool, typer.Option("--retry-failed", help="Try models and episodes again that failed while they played.")
+        bool, typer.Option("--retry-failed", help="Try again the models and episodes that failed.")
     ] = False,
     slots: Annotated[
         int,
@@ -81,7 +81,7 @@ def run(
             "--slots",
             min=0,
             max=1024,
-            help="Processes with one model each, also for probes. 0: use this process.",
+            help="Number of processes, each with one model; probes use them too. 0: use this process.",
         ),
     ] = 0,
     ray: RayAddress = None,
@@ -309,10 +309,13 @@ def pack(
     out_file: Annotated[
         Path, typer.Option("--out", metavar="PATH", help="Zip file (*.zip), or a folder. A folder for a data set.")
     ],
-    directions: Annotated[bool, typer.Option("--directions", help="With the weights of probes.")] = False,
-    pictures: Annotated[bool, typer.Option("--pictures", help="With frames and videos.")] = False,
+    directions: Annotated[bool, typer.Option("--directions", help="Include the weights of probes.")] = False,
+    pictures: Annotated[bool, typer.Option("--pictures", help="Include frames and videos.")] = False,
     trajectories: Annotated[
-        bool, typer.Option("--trajectories", help="With what happened step by step, for other outcome rules.")
+        bool,
+        typer.Option(
+            "--trajectories", help="Include every control step, so that other outcome rules can be applied."
+        ),
     ] = False,
     data_set: Annotated[
         bool,

@@ -59,7 +59,7 @@ def from_csv(
     attribution: Annotated[
         str, typer.Option(help="Author to credit for the pictures.")
     ] = "the author of the table",
-    category: Annotated[str, typer.Option(help="Category of rows that name none.")] = "questions",
+    category: Annotated[str, typer.Option(help="Category of the rows that name none.")] = "questions",
     name: Annotated[
         str | None, typer.Option(help="Name of the suite. Default: the file name of the table.")
     ] = None,

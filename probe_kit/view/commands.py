@@ -51,7 +51,8 @@ def view(
         typer.Option(
             "--probes-of",
             metavar="RUN",
-            help="Read runs without probes, such as unfinished ones, by the probes of this run of the same model.",
+            help="For runs without probes, such as unfinished ones: use the probes of this run, of the "
+            "same model.",
         ),
     ] = None,
     partial: Partial = False,

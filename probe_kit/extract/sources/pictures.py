@@ -65,14 +65,18 @@ class PictureFolder(SourceSettings):
         str,
         BeforeValidator(str),
         _option(
-            "--pictures", metavar="FOLDER", help="Show pictures of a folder in place of a suite; with --table."
+            "--pictures",
+            metavar="FOLDER",
+            help="Show the pictures of this folder in place of a suite. Needs --table.",
         ),
     ]
     table: Annotated[
         str,
         BeforeValidator(str),
         _option(
-            "--table", metavar="FILE", help="CSV of the pictures: columns picture and instruction, and labels."
+            "--table",
+            metavar="FILE",
+            help="CSV file with the columns picture and instruction; further columns are labels.",
         ),
     ]
     pixels: Pixels = True

@@ -79,7 +79,7 @@ Pixels = Annotated[
     _option(
         " /--no-pixels",
         show_default=False,
-        help="Store no pictures at 32 × 32; two controls of labels are then not possible.",
+        help="Store no thumbnails of 32 × 32 pixels. Two controls of your labels then cannot be run.",
     ),
 ]
 
@@ -116,8 +116,8 @@ Cameras = Annotated[
     _option(
         "--camera",
         metavar="CAMERA=FEATURE",
-        help="Which picture of the data set or environment a camera of the model gets; repeatable. Default: as "
-        "the checkpoint's files map them, else equal names.",
+        help="Which picture of the data set or environment a camera of the model sees; repeatable. Default: the "
+        "mapping in the checkpoint's files, else equal names.",
     ),
 ]
 
@@ -163,8 +163,8 @@ Rotations = Annotated[
     typer.Option(
         "--rotate",
         metavar="[CAMERA=]DEGREES",
-        help="Rotate pictures by 90, 180 or 270 degrees, such as 180 where they stand on their heads. "
-        "CAMERA=DEGREES rotates those of one camera; repeatable.",
+        help="Rotate pictures by 90, 180 or 270 degrees, such as 180 if they are upside down. CAMERA=DEGREES "
+        "rotates those of one camera; repeatable.",
         rich_help_panel="Recordings",
     ),
 ]
@@ -216,7 +216,7 @@ class LeRobotSource(SourceSettings):
             parser=str,
             metavar="every:N",
             show_default=False,
-            help="Frames of an episode, such as every:5. Default: every:1.",
+            help="Which frames of an episode to show, such as every:5. Default: every:1.",
         ),
     ] = 1
     cameras: Cameras = ()
@@ -231,7 +231,8 @@ class LeRobotSource(SourceSettings):
     ] = ()
     rotations: Rotations = ()
     instruction: Annotated[
-        str | None, _option("--instruction", help="What the model reads. Default: the task of each frame.")
+        str | None,
+        _option("--instruction", help="The instruction that the model reads. Default: the task of each frame."),
     ] = None
     pixels: Pixels = True
     single: bool = False
