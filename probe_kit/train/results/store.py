@@ -185,12 +185,9 @@ def load_results(run: RunReader, key: str | None = None, target: str | None = No
         if not run.streams:
             raise NoProbesError(f"{location} has no activations to probe: of {run.model!r} no stream was stored.")
         hint = f" (of {len(stored)} stored, none: other episodes or another target)" if stored else ""
-        advice = (
-            how_to_probe(run)
-            if target in SIDES
-            else f"Run `probe-kit train {as_argument(location)} --target {as_argument(target)}`."
+        raise NoProbesError(
+            f"{location} has no probes for target {target!r} on its episodes{hint}. {how_to_probe(run, target)}"
         )
-        raise NoProbesError(f"{location} has no probes for target {target!r} on its episodes{hint}. {advice}")
     return _read(run, newest)
 
 
@@ -254,14 +251,26 @@ def is_current(settings: ProbeSettings, run: RunReader) -> bool:
     return (settings.run_settings, settings.episodes) == (run.settings_sha256, episodes_sha256(run))
 
 
-def how_to_probe(run: RunReader) -> str:
-    """Return a sentence that says how a run gets probes: the command, or that it has too few groups of items."""
+def how_to_probe(run: RunReader, target: str = CORRECT) -> str:
+    """Return a sentence that says how a run gets probes of a target: the command, or what it has too few of."""
+    from probe_kit.train.builtin_columns import BuiltinColumns
+
+    location = as_argument(run.location)
+    if target not in SIDES and target in BuiltinColumns(run).names:
+        return f"Run `probe-kit train {location} --target {as_argument(target)}`."
+    if target not in SIDES:
+        return (
+            f"It is no built-in column of this run: `probe-kit targets {location}` lists these. If it is a column "
+            f"of your table, run `probe-kit train {location} --labels FILE --target {as_argument(target)}`."
+        )
     if run.recorded or run.in_own_environment:
-        return f"`probe-kit targets {as_argument(run.location)}` lists what can be probed."
+        return f"`probe-kit targets {location}` lists what can be probed."
+    of_target = "" if target == CORRECT else f" --target {target}"
     if not {"category", "group_id"} <= set(run.episodes):
-        return f"Run `probe-kit train {as_argument(run.location)}`."
+        return f"Run `probe-kit train {location}{of_target}`."
     counts = run.episodes.groupby("category", sort=False)["group_id"].nunique().to_dict()
     command = probe_command(run.location, counts)
+    command += of_target if command else ""
     few = [f"{name} has {count}" for name, count in counts.items() if count < GROUPS_FOR_PROBES]
     if not few:
         return f"Run `{command}`."
