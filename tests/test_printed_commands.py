@@ -61,8 +61,8 @@ def test_commands_and_options_that_the_texts_of_the_package_name_exist() -> None
 TASK = "Put the cube on the red shape"
 STARTS: dict[str, list[str]] = {
     "questions": [
-        "extract --model pi0-tiny --categories color --items 12 --max-steps 3 --out 'my runs/of color'",
-        "retention 'my runs/of color' --html 'a report.html'",
+        "extract --model pi0-tiny --categories color --items 12 --max-steps 3 --out 'a run'",
+        "retention 'a run' --html 'a report.html'",
     ],
     "remedies": [
         "extract --model pi0-tiny --categories color --items 12 --no-act --out '-captured only'",
@@ -82,25 +82,28 @@ STARTS: dict[str, list[str]] = {
     ],
     "diagnosis": ["diagnose pi0-tiny --dataset 'a recording' --accept-units --out 'of it' --html 'a page.html'"],
     "asked": ["ask --model vlm-tiny --categories color --items 6 --out 'asked of it'"],
-    "suite": ["suite from-csv 'my questions.csv' 'my suite' --license CC0-1.0"],
+    "suite": ["suite from-csv 'my questions.csv' --out 'my suite' --license CC0-1.0"],
     "environment": ["check-environment tests.support.reach_env:ReachEnv --env-option 'count=12'"],
-    "adapter": ["check-adapter pi0-tiny", "models pi0-tiny"],
     "doctor": ["doctor"],
 }
 NOT_RUN = ("view", "demo", "study run")
 """Commands that do not end, or take minutes: that their options exist is checked."""
 PLACEHOLDERS = re.compile(r"\b[A-Z][A-Z_]{1,}\b|…")
 """Words such as FILE and COLUMN that a user replaces."""
+SILENT = ("diagnosis",)
+"""Starts whose output and page suggest no command; they may come to do so."""
 MOST = 12
 
 
 def printed_commands(text: str) -> list[str]:
     """The commands of ours that a text or a page shows: behind `next:` and `then:`, and between backticks.
 
-    A command's name alone, as in "a run of `probe-kit extract`", says which command is meant and is not typed.
+    A command's name alone, as in "a run of `probe-kit extract`", says which command is meant and is not typed. A
+    page that is passed on names the last folder of a path alone.
     """
+    text = text.replace("--model NAME", "--model pi0-tiny")
     steps = re.findall(r"^(?:next|then): (probe-kit .*)$", text, re.MULTILINE)
-    quoted = [html.unescape(match[1]) for match in A_COMMAND.finditer(text)]
+    quoted = [html.unescape(" ".join(match[1].split())) for match in A_COMMAND.finditer(text)]  # lines are wrapped
     # Two blanks part a command from what it is for; a semicolon parts two commands.
     steps = [part for step in steps for part in re.split(r"  |; ", step) if part.startswith("probe-kit ")]
     quoted = [command for command in quoted if leaf_of(shlex.split(command)[1:])[1]]
@@ -149,10 +152,10 @@ def test_every_command_that_is_printed_runs_as_typed(
         command = waiting.pop(0)
         ran[command] = run_as_typed(command)
         waiting += [each for each in printed_commands(ran[command][1]) if each not in (*ran, *waiting)]
-    assert ran.keys() - {*typed}, f"nothing is suggested: {ran}"
+    assert (ran.keys() > {*typed}) or start in SILENT, f"nothing is suggested: {[*ran]}"
     # 1 says that something was found; 2 and above refuse what was typed, or fail.
     refused = {
-        command: output[-600:]
+        command: output.partition("<!doctype")[0][-600:]
         for command, (code, output) in ran.items()
         if code > 1 and (command not in typed or command == typed[0])
     }

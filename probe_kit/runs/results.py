@@ -376,8 +376,8 @@ class Pieces:
     def read(self, name: str, record: type) -> dict[str, NDArray[Any]] | None:
         """Return the arrays of one piece, or None if the work did not get that far or must be done again.
 
-        A piece whose bytes are not those that were written, such as half of one after a power cut, and one of other
-        commits are as good as none: the work makes them again, and a warning says so.
+        A piece whose bytes are not those that were written, such as half of one after a power cut, and one of
+        other commits are as good as none: the work makes them again, and a warning says so.
 
         Args:
             name: The name of the piece.

@@ -92,6 +92,7 @@ def test_texts_that_differ_in_a_word_a_number_or_a_letter_are_two_instructions(o
 def test_forms_of_unicode_and_letters_with_marks_are_equal() -> None:
     assert normal_form("caf\u00e9") == normal_form("cafe\u0301")
     assert normal_form("STRASSE") == normal_form("straße")
+    assert normal_form("press `A`") == normal_form("press ´A´") == normal_form("Press “a”.")
 
 
 def test_other_words_of_one_meaning_are_one_value_with_the_task_that_they_stand_for() -> None:

@@ -71,7 +71,8 @@ def normal_form(text: str) -> str:
 
 
 def _is_separator(sign: str) -> bool:
-    return sign.isspace() or unicodedata.category(sign).startswith("P")
+    # Sk: accents that stand alone, which are typed as quotation marks.
+    return sign.isspace() or unicodedata.category(sign).startswith(("P", "Sk"))
 
 
 def _kept_of(run: str, before: str, after: str) -> str:
