@@ -16,7 +16,7 @@ import numpy as np
 
 from probe_kit._system.bounded_files import UNREADABLE, open_arrays
 from probe_kit._system.escaping import as_argument, csv_of_frame
-from probe_kit.errors import NoProbesError, RunDamagedError, UsageError
+from probe_kit.errors import NoProbesError, RunDamagedError, UnknownSiteError, UsageError
 from probe_kit.hashing import sha256_json
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.runs.layout import PROBE_DIRECTIONS, PROBES
@@ -24,6 +24,7 @@ from probe_kit.runs.reader import RunReader
 from probe_kit.runs.results import (
     Bundle,
     Pieces,
+    axes_problem,
     bundle_keys,
     complete_key,
     is_complete,
@@ -313,7 +314,9 @@ def _unpack(arrays: Mapping[str, Any]) -> dict[tuple[str, str], ProbeCurve]:
     for name, value in arrays.items():
         category, view, member = name.rsplit("/", 2)  # from the right: a category of one's own may hold a slash
         curves.setdefault((category, view), {})[member] = value
-    for members in curves.values():
+    for (category, view), members in curves.items():
+        if problem := axes_problem(ProbeCurve.AXES, members):
+            raise ValueError(f"{category}/{view} {problem}")
         members["sites"] = tuple(Site.parse(str(name)) for name in members["sites"])
         members |= {name: tuple(map(str, members[name])) for name in _TEXTS}
         members |= {name: members[name].item() for name in _FACTS if name in members}
@@ -377,7 +380,7 @@ def _read(run: RunReader, bundle: Bundle) -> ProbeResults:
     try:
         with open_arrays(bundle.read(DECISIONS)) as arrays:
             curves = _unpack(arrays)
-    except (*UNREADABLE, TypeError) as error:
+    except (*UNREADABLE, TypeError, UnknownSiteError) as error:
         raise RunDamagedError(
             f"{run.location}/{bundle.folder}/{DECISIONS} cannot be read: {error}. Remove {bundle.folder} and run "
             "the same `probe-kit train` again"
