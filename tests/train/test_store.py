@@ -5,10 +5,12 @@ from collections.abc import Callable
 from dataclasses import fields, replace
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
+from numpy.typing import NDArray
 
 from probe_kit.errors import NoProbesError, RunDamagedError, UsageError
 from probe_kit.hashing import sha256_json
@@ -156,7 +158,7 @@ def test_results_of_another_format_are_refused_by_its_name(
             read(run)
 
 
-FORGED: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+FORGED: dict[str, Callable[[NDArray[Any]], NDArray[Any]]] = {
     "another length": lambda array: np.concatenate([array, array[:1]]),
     "an axis more": lambda array: array[None],
     "texts": lambda array: np.full(array.shape, "x") if array.dtype.kind != "U" else np.zeros(array.shape),
