@@ -1,4 +1,4 @@
-"""A folder that is no checkpoint is told where one lies near it, or whose layout it has."""
+"""The refusal of a folder that is no checkpoint names the checkpoint near it, or whose layout it has."""
 
 import json
 from pathlib import Path

@@ -170,7 +170,7 @@ FORGED: dict[str, Callable[[NDArray[Any]], NDArray[Any]]] = {
 def test_arrays_of_probes_that_contradict_each_other_are_damage(
     planted_run: PlantedRun, member: str, forged: str
 ) -> None:
-    """As in a run of someone else whose sums were made anew."""
+    """As in a forged run, whose sums were made anew."""
     run = planted_run()
     results = train_probes(run, permutations=1, controls=())
     name = "directions.npz" if member == "direction" else "decisions.npz"
