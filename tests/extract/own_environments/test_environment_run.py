@@ -85,6 +85,7 @@ class Stateless(ReachEnv):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:the model put out tokens that name no action")
 def test_an_environment_without_a_state_is_stored_without_one(tmp_path: Path) -> None:
     """Zarr has no arrays of length 0."""
     source = EnvSource(f"{__name__}:{Stateless.__name__}", max_steps=2, episodes="0:2")
