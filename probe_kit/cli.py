@@ -6,6 +6,7 @@ stderr.
 
 import sys
 import warnings
+from functools import cache
 from io import TextIOWrapper
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -181,7 +182,13 @@ for group in (app, *(registered.typer_instance for registered in app.registered_
 
 def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
     """Print a warning as a note on stderr, without the place in our code where it was raised."""
-    say(marked("[yellow]warning:[/] {}", message))
+    _say_warning(str(message))
+
+
+@cache
+def _say_warning(text: str) -> None:
+    """Print a text once: Python forgets which it has shown wherever a library catches warnings."""
+    say(marked("[yellow]warning:[/] {}", text))
 
 
 def main() -> None:

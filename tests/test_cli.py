@@ -9,13 +9,14 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
 from probe_kit._terminal import console
-from probe_kit.cli import PANELS, app, commands_of
+from probe_kit.cli import PANELS, _show_warning, app, commands_of
 from probe_kit.suite import Suite, load_suite
 
 # The keys of `retention --format json` are part of the contract (architecture, command line).
@@ -189,6 +190,22 @@ def test_there_are_at_most_thirty_two_commands_with_those_of_groups() -> None:
 
     paths = [path for path, _ in commands_of(typer.main.get_command(app), None)]
     assert len(paths) == len(set(paths)) <= 32, "merge a command into an option of its elder"
+
+
+def test_a_warning_is_printed_once_also_where_a_library_catches_warnings_in_between(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Leaving `catch_warnings` makes Python forget which it has shown."""
+    monkeypatch.setattr(warnings, "showwarning", _show_warning)
+    with warnings.catch_warnings():
+        warnings.simplefilter("default")
+        monkeypatch.setattr(warnings, "showwarning", _show_warning)
+        for text in ("the first one", "the first one", "the second one"):
+            with warnings.catch_warnings():
+                pass
+            warnings.warn(text, stacklevel=1)
+    said = capsys.readouterr().err
+    assert (said.count("the first one"), said.count("the second one")) == (1, 1)
 
 
 def test_the_version_is_that_of_the_package() -> None:

@@ -17,8 +17,12 @@ UNSAFE = re.compile(f"[\x00-\x08\x0b-\x1f\x7f-\x9f{_BIDI}\u2028\u2029\ufeff\ud80
 
 
 def as_argument(path: object) -> str:
-    """Return a path or an address as it is typed behind a command: in quotes where a shell would split it."""
-    return shlex.quote(str(path))
+    """Return a path or an address as it is typed behind a command: in quotes where a shell would split it.
+
+    One that begins with a dash, which would be an option, gets `./` in front.
+    """
+    text = str(path)
+    return shlex.quote(f"./{text}" if text.startswith("-") else text)
 
 
 def terminal_safe(text: str) -> str:

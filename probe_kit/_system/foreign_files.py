@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from probe_kit._system.bounded_files import check_no_pointer
+from probe_kit._system.machine import is_out_of_memory
 from probe_kit.errors import CheckpointError, ProbeKitError
 
 _LONGEST = 500
@@ -29,7 +30,8 @@ def while_reading(
         names: The beginnings of the names of the files that it reads in a folder.
 
     Raises:
-        ProbeKitError: For any error but one of ours, of class `raises`, with the library's reason.
+        ProbeKitError: For any error but one of ours, of class `raises`, with the library's reason. An error of
+            memory that ended is raised as it is.
         LfsPointerError: For a Git LFS pointer; in a folder only where the library fails.
     """
     if not path.is_dir():
@@ -39,6 +41,8 @@ def while_reading(
     except ProbeKitError:
         raise
     except Exception as error:
+        if is_out_of_memory(error):
+            raise  # the file may be whole: the machine is too small for it
         check_no_pointers(path)
         raise raises(f"{_located(path, names)} cannot be read: {reason_of(error)}. {advice}") from error
 

@@ -1,5 +1,6 @@
 """The machine that runs probe_kit: its scheduling, and the facts that results record."""
 
+import errno
 import os
 import re
 import sys
@@ -17,6 +18,8 @@ _KINDS = ("cpu", "cuda", "hpu", "mps", "mtia", "xpu")
 """The kinds of devices of torch that compute."""
 _GPU_NODES = ("nvidia[0-9]*", "nvidiactl", "nvhost-*", "nvgpu*", "nvmap", "dxg", "kfd")
 """Device files of Linux without any of which neither CUDA nor ROCm has a GPU."""
+_OUT_OF_MEMORY = ("can't allocate memory", "MPS backend out of memory")
+"""What torch says of a CPU and of Apple's GPUs in a plain RuntimeError."""
 _NVIDIA = Path("/proc/driver/nvidia/gpus")
 
 
@@ -50,6 +53,19 @@ def cores_here() -> int:
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     share = os.environ.get(CORES, "")
     return min(cores, int(share)) if share.isdecimal() and int(share) else cores
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether memory ended, of the machine or of a device, in Python or in a library that it called.
+
+    The libraries differ: torch has a class for a GPU and raises plain RuntimeError for a CPU, and the system
+    refuses to map a file with an OSError.
+    """
+    if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
+        return True
+    if isinstance(error, OSError):
+        return error.errno == errno.ENOMEM
+    return isinstance(error, RuntimeError) and any(words in str(error) for words in _OUT_OF_MEMORY)
 
 
 def _devices() -> list[str]:

@@ -1,11 +1,11 @@
 """The table that every command prints: text for people, the numbers behind it, and a method per format."""
 
-import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from probe_kit._system.escaping import csv_of_rows
+from probe_kit._system.json_text import json_text
 from probe_kit._tables.content import Cell, Content, Heading, Row, grouped
 from probe_kit._tables.formats import render
 
@@ -49,8 +49,8 @@ class Table(Content):
         return pd.DataFrame(self.texts, columns=self.columns)
 
     def to_json(self) -> str:
-        """Return the numbers as a JSON list of objects."""
-        return json.dumps(self.numbers, indent=1, ensure_ascii=False)
+        """Return the numbers as a JSON list of objects; null for one that is not finite."""
+        return json_text(self.numbers, indent=1)
 
     def to_csv(self) -> str:
         """Return the numbers as comma-separated values with a header.
@@ -73,4 +73,4 @@ def _flat(number: Mapping[str, Any], intervals: set[str]) -> Iterator[tuple[str,
             yield from ((f"{name}_low", low), (f"{name}_high", high))
         else:
             # A cell of CSV that is a table itself has no other form than JSON's.
-            yield name, json.dumps(value, ensure_ascii=False) if isinstance(value, Mapping | list) else value
+            yield name, json_text(value, None) if isinstance(value, Mapping | list) else value

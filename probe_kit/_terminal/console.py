@@ -30,6 +30,7 @@ from rich.segment import Segment
 from rich.text import Text
 
 from probe_kit._system.escaping import UNSAFE, terminal_safe
+from probe_kit._system.json_text import json_text
 
 for _stream in ("stdout", "stderr"):
     if getattr(sys, _stream) is None:  # closed by the caller (`>&-`): its number must not go to the next file
@@ -94,8 +95,8 @@ def whole_number(text: str) -> int | None:
 
 
 def print_json(value: Any) -> None:
-    """Print `value` as JSON on stdout."""
-    print_json_text(json.dumps(value, indent=2, ensure_ascii=False))
+    """Print `value` as JSON on stdout; a number that is not finite, which JSON lacks, as null."""
+    print_json_text(json_text(value))
 
 
 def print_json_text(text: str) -> None:

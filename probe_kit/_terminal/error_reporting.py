@@ -7,6 +7,7 @@ import tempfile
 import traceback
 from pathlib import Path
 
+from probe_kit._system.machine import is_out_of_memory
 from probe_kit._terminal.console import complain, marked, say
 from probe_kit._terminal.interruption import INTERRUPTED
 from probe_kit.errors import FULL_DISK, DiskSpaceError, PolicyFailedError, ProbeKitError, UsageError
@@ -53,7 +54,7 @@ def report_error(error: BaseException) -> int:
                 "must raise an error instead. Completed work is saved"
             )
         )
-    if _is_out_of_memory(error):
+    if is_out_of_memory(error):
         complain(
             "MemoryError",
             f"memory ended in {_frame(error)}: {_first_line(error)}. Use fewer --batch, --workers or --items, a "
@@ -62,15 +63,6 @@ def report_error(error: BaseException) -> int:
         )
         return UNFORESEEN
     return report_unexpected(error)
-
-
-def _is_out_of_memory(error: BaseException) -> bool:
-    """Whether memory ended: torch raises classes of its own, and plain RuntimeError on a CPU."""
-    return (
-        isinstance(error, MemoryError)
-        or type(error).__name__ == "OutOfMemoryError"
-        or (isinstance(error, RuntimeError) and "can't allocate memory" in str(error))
-    )
 
 
 def _frame(error: BaseException) -> str:

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from probe_kit._system.escaping import as_argument
 from probe_kit._terminal import options as common
 from probe_kit._terminal.console import err, marked, out, print_json, say
 from probe_kit.errors import UsageError
@@ -88,5 +89,7 @@ def _print_end(model: str, checkpoint: str | None, outcomes: "list[Outcome]") ->
         say(marked("next: {}. Then run the same command again.", first.change.rstrip(".")))
     else:
         play = "extract" if any(outcome.name == "two_episodes_are_extracted" for outcome in outcomes) else "ask"
-        checkpoint_option = f" --checkpoint {checkpoint}" if checkpoint else ""
-        say(marked("next: [bold]probe-kit {} --model {}[/] --items 24", play, f"{model}{checkpoint_option}"))
+        subject = f"--model {as_argument(model)}"
+        if checkpoint:
+            subject += f" --checkpoint {as_argument(checkpoint)}"
+        say(marked("next: [bold]probe-kit {} {}[/] --items 24", play, subject))

@@ -282,8 +282,7 @@ def _next_command(run: "Run") -> str:
     if run.streams and run.inputs is not None:
         return f"probe-kit targets {as_argument(run.location)}"
     groups = run.episodes.groupby("category")["group_id"].nunique().to_dict() if run.streams else {}
-    location = as_argument(run.location)
-    return probe_command(location, groups) or f"probe-kit retention {location}"
+    return probe_command(run.location, groups) or f"probe-kit retention {as_argument(run.location)}"
 
 
 def print_input_notes(run: "Run") -> None:
@@ -389,5 +388,5 @@ def _print_answers(runs: "Sequence[Run]") -> None:
         step = "targets {}" if runs[0].streams else "labels {}"
         say(marked(f"next: [bold]probe-kit {step}[/]", as_argument(runs[0].location)))
         return
-    places = " ".join(str(run.location) for run in runs)
-    say(marked("next: [bold]probe-kit retention {}[/]  add policy runs of the suite", places))
+    locations = " ".join(as_argument(run.location) for run in runs)
+    say(marked("next: [bold]probe-kit retention {}[/]  add policy runs of the suite", locations))

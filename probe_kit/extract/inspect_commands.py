@@ -425,8 +425,8 @@ def check_environment(
         out.print(f"{len(checks)} passed")
         options = [
             *(f"--env-option {quote(text)}" for text in env_options or ()),
-            *(f"--rotate {turn}" for turn in rotate or ()),
+            *(f"--rotate {quote(turn)}" for turn in rotate or ()),
         ]
-        command = " ".join(["probe-kit extract --model NAME --env", environment, *options, "--out runs/own"])
-        say(marked("next: [bold]{}[/]", command))
+        typed = " ".join([quote(environment), *options])
+        say(marked("next: [bold]probe-kit extract --model NAME --env {} --out runs/own[/]", typed))
     raise typer.Exit(FAILED if failed else 0)

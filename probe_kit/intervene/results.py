@@ -12,6 +12,7 @@ import numpy as np
 
 from probe_kit._system.counting import counted
 from probe_kit._system.escaping import csv_of_frame
+from probe_kit._system.json_text import json_text
 from probe_kit.errors import NoProbesError
 from probe_kit.intervene.evidence import StoredEvidence, which_layer
 from probe_kit.intervene.exchange import TRACE, describe_trace, share_of_variance
@@ -145,7 +146,7 @@ class InterventionResult(Measurement):
             "certificate": self.certificate,
             "effects": json.loads(self.table.to_json(orient="records", double_precision=15)),
         }
-        return json.dumps(content, indent=2, ensure_ascii=False)
+        return json_text(content)
 
     def to_csv(self) -> str:
         """Return the table as comma-separated values with a header.

@@ -129,7 +129,7 @@ def read_direction(text: str) -> FileDirection:
                 f"--direction {text}: {name}.scale has the shape {arrays[f'{name}.scale'].shape}; expected "
                 f"({vectors.shape[1]},), a number for each of the direction's"
             )
-        vectors = vectors * scale
+        vectors = _rows(vectors * scale, text)
     return _direction(name, vectors, about, _rounding(arrays[name]))
 
 
@@ -214,8 +214,9 @@ def _rounding(values: NDArray[Any]) -> float:
 def _of_autoencoder(folder: Path, name: str) -> FileDirection:
     """Return one feature of a sparse autoencoder that SAELens wrote."""
     arrays, _ = _contents(folder / SAE_WEIGHTS)
-    if DECODER not in arrays or not is_count(name) or int(name) >= len(arrays[DECODER]):
-        count = len(arrays.get(DECODER, ()))
+    decoder = arrays.get(DECODER, np.empty((0, 0)))
+    count = len(decoder) if decoder.ndim == 2 else 0
+    if not is_count(name) or int(name) >= count:
         raise UsageError(f"{folder} has {count} features; expected {folder.name}#NUMBER, counted from 0")
     settings = folder / SAE_SETTINGS
     remedy = "Save the autoencoder again with SAELens"
@@ -229,7 +230,7 @@ def _of_autoencoder(folder: Path, name: str) -> FileDirection:
         )
     }
     about["weights"] = str(metadata.get("weights") or "")
-    row = arrays[DECODER][int(name)]
+    row = decoder[int(name)]
     return _direction(f"feature-{name}", _rows(row, folder.name), about, _rounding(row))
 
 
@@ -244,8 +245,15 @@ def _rows(values: NDArray[Any], text: str) -> NDArray[np.float64]:
     rows = np.atleast_2d(np.array(values, np.float64))
     if rows.ndim != 2 or 0 in rows.shape:
         raise UsageError(f"--direction {text}: an array of shape {np.shape(values)}; expected (D,) or (K, D)")
-    if not np.isfinite(rows).all() or (np.linalg.norm(rows, axis=1) == 0).any():
+    with np.errstate(over="ignore"):
+        lengths = np.linalg.norm(rows, axis=1)
+    if not np.isfinite(rows).all() or (lengths == 0).any():
         raise UsageError(f"--direction {text}: it has NaN, infinity or a row of zeros; expected directions")
+    if lengths.min() < (limits := np.finfo(np.float32)).tiny or lengths.max() > limits.max:
+        raise UsageError(
+            f"--direction {text}: its rows are {lengths.min():.3g} to {lengths.max():.3g} long; activations are "
+            f"float32, of {limits.tiny:.3g} to {limits.max:.3g}"
+        )
     return rows
 
 

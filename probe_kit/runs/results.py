@@ -10,6 +10,7 @@ Files are never written over: what changes gets another name, and counts when th
 """
 
 import re
+import warnings
 from collections.abc import Collection, Mapping
 from dataclasses import MISSING, dataclass, fields
 from io import BytesIO
@@ -349,13 +350,17 @@ def axes_problem(axes: Mapping[str, str], arrays: Mapping[str, NDArray[Any]]) ->
 _HEX = 2 * DIGEST_BYTES
 
 
+class RepeatedWorkWarning(UserWarning):
+    """A warning that a stored part of unfinished work cannot be used and is computed again. No number changes."""
+
+
 @dataclass(frozen=True)
 class Pieces:
     """The content of `<home>/.<key>.partial/` until the bundle `key` is complete.
 
     Attributes:
         stamp: The hash of the commits that the work reads.
-        redo: The remedy for a damaged piece, for the message.
+        redo: The remedy for pieces of another version, for the message.
     """
 
     run: Location
@@ -369,7 +374,10 @@ class Pieces:
         return cls(run, f"{home}/.{key}{PARTIAL}", stamp, redo)
 
     def read(self, name: str, record: type) -> dict[str, NDArray[Any]] | None:
-        """Return the arrays of one piece, or None if the work did not get that far.
+        """Return the arrays of one piece, or None if the work did not get that far or must be done again.
+
+        A piece whose bytes are not those that were written, such as half of one after a power cut, and one of
+        other commits are as good as none: the work makes them again, and a warning says so.
 
         Args:
             name: The name of the piece.
@@ -377,8 +385,7 @@ class Pieces:
                 slash in front.
 
         Raises:
-            RunDamagedError: If they were changed, are another piece's or of other commits, or have the fields of
-                another version of probe_kit.
+            RunDamagedError: If they have the fields of another version of probe_kit.
         """
         try:
             stored = self.run.read(self._key(name))
@@ -386,10 +393,13 @@ class Pieces:
             return None
         content, bound = stored[:-_HEX], stored[-_HEX:]
         if self._bound(content, name) != bound:
-            raise RunDamagedError(
+            warnings.warn(
                 f"{self.run}/{self._key(name)} was changed after it was written, or is another piece or of other "
-                f"episodes. Remove it; {self.redo}"
+                "episodes: what it holds is computed again",
+                RepeatedWorkWarning,
+                stacklevel=2,
             )
+            return None
         with open_arrays(stored) as arrays:
             if problem := fields_problem(record, [field.rpartition("/")[2] for field in arrays]):
                 raise RunDamagedError(

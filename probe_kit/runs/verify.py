@@ -17,6 +17,7 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
+from probe_kit._system.escaping import as_argument
 from probe_kit.errors import MissingExtraError, ProbeKitError, RunDamagedError
 from probe_kit.hooks.contract.sites import PADDING
 from probe_kit.hooks.family import imported
@@ -298,7 +299,7 @@ def _check_records(root: Root, commits: Mapping[int, Commit]) -> None:
     if remade := sorted(processes.remade):
         raise RunDamagedError(
             f"{root.location}/{remade[0]} is missing. Other records say the same: `probe-kit run verify "
-            f"{root.location} --seal` writes it again"
+            f"{as_argument(root.location)} --seal` writes it again"
         )
 
 

@@ -115,18 +115,18 @@ SMALLEST_EFFECT_OF_INTEREST = 0.25
 """Net share of episodes below which a category is not acted on, and an edit or erasure is without effect."""
 
 
-def probe_command(run: object, groups: Mapping[Any, int]) -> str:
+def probe_command(location: object, groups: Mapping[Any, int]) -> str:
     """Return the command that fits probes of the categories with enough groups; empty where none has enough.
 
     Args:
-        run: Location of the run.
+        location: Location of the run, as it is.
         groups: Number of independent groups by category.
     """
     enough = [name for name, count in groups.items() if count >= GROUPS_FOR_PROBES]
     if not enough:
         return ""
     option = "" if len(enough) == len(groups) else f" --categories {as_argument(','.join(enough))}"
-    return f"probe-kit train {run}{option}"
+    return f"probe-kit train {as_argument(location)}{option}"
 
 
 def least_probe_p(groups: int) -> float:

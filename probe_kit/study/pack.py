@@ -4,7 +4,6 @@ A data set is a folder in the layout of the hub: card, episodes, tables, archive
 """
 
 import hashlib
-import json
 import os
 import shutil
 import time
@@ -18,6 +17,7 @@ from probe_kit._system.counting import counted
 from probe_kit._system.drafts import draft_of, full_disk_in_words, move_draft
 from probe_kit._system.escaping import markdown_safe
 from probe_kit._system.imports import require
+from probe_kit._system.json_text import json_text
 from probe_kit.errors import (
     DiskSpaceError,
     ProbeKitError,
@@ -110,7 +110,7 @@ def _pack(study: LoadedStudy, folder: Path, partial: bool, extras: Collection[Ex
     tables, no_table = make_each(study.study.tables, lambda name: make_table(study, name, partial), partial)
     missing |= {f"table {name}": why for name, why in no_table.items()}
     for name, table in tables.items():
-        record = json.dumps(table_record(table), indent=1, ensure_ascii=False)
+        record = json_text(table_record(table), indent=1)
         (folder / TABLES / f"{name}.json").write_text(record, encoding="utf-8")
         (folder / TABLES / f"{name}.md").write_text(table.to_markdown() + "\n", encoding="utf-8")
         (folder / TABLES / f"{name}.tex").write_text(table.to_latex(), encoding="utf-8")

@@ -259,7 +259,7 @@ def open_matching(study: LoadedStudy, cell: Cell, partial: bool) -> "Run":
     raise SettingsMismatchError(
         f"{run.location} should hold the run of {cell.name}, and holds another one: "
         f"{'; '.join(problems[:_MOST_PRINTED])}{more}.{owner} Move each folder back to its own name, or remove "
-        f"this one and run `probe-kit study run {study.file}`"
+        f"this one and run `probe-kit study run {study.typed}`"
     )
 
 

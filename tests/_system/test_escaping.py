@@ -4,6 +4,7 @@ import ast
 import csv
 import io
 import re
+import shlex
 import shutil
 import tempfile
 from dataclasses import replace
@@ -17,6 +18,7 @@ from hypothesis import strategies as st
 from markdown_it import MarkdownIt
 
 from probe_kit._system.escaping import (
+    as_argument,
     csv_of_frame,
     csv_of_rows,
     escaped,
@@ -111,6 +113,12 @@ def test_a_frame_keeps_its_numbers_and_marks_its_texts() -> None:
 def test_a_frame_without_such_texts_is_written_as_pandas_writes_it() -> None:
     frame = pd.DataFrame({"a": [None, 1], "b": ["x", "y, z"], "c": [True, False], "d": [[1], [2]]}, dtype=object)
     assert csv_of_frame(frame) == frame.to_csv(index=False)
+
+
+@pytest.mark.parametrize("name", ["runs/a", "my run", "-x", "--out", "it's", "a;b", "s3://bucket/my run#2"])
+def test_a_path_in_a_printed_command_is_one_word_and_no_option(name: str) -> None:
+    (word,) = shlex.split(as_argument(name))
+    assert word == (f"./{name}" if name.startswith("-") else name)
 
 
 def test_every_csv_of_the_package_goes_through_one_function() -> None:

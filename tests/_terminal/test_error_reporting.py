@@ -79,6 +79,8 @@ def test_what_nobody_foresaw_is_one_line_and_a_file(error: Exception, tmp_path: 
         MemoryError(),
         MemoryError("Unable to allocate 7.28 TiB for an array with shape (1000000000000,)"),
         RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 8 bytes"),
+        RuntimeError("MPS backend out of memory (MPS allocated: 9 GB)"),
+        OSError(errno.ENOMEM, os.strerror(errno.ENOMEM)),
     ],
 )
 def test_memory_that_ended_is_no_bug_and_says_what_to_do(error: Exception, tmp_path: Path, monkeypatch) -> None:

@@ -92,6 +92,9 @@ def test_texts_that_differ_in_a_word_a_number_or_a_letter_are_two_instructions(o
 def test_forms_of_unicode_and_letters_with_marks_are_equal() -> None:
     assert normal_form("caf\u00e9") == normal_form("cafe\u0301")
     assert normal_form("STRASSE") == normal_form("straße")
+    assert normal_form("press `A`") == normal_form("press ´A´") == normal_form("Press “a”.")
+    assert normal_form("move −5 cm") == normal_form("move -5 cm") != normal_form("move 5 cm")
+    assert normal_form("cups 2–3") == normal_form("cups 2-3")
 
 
 def test_other_words_of_one_meaning_are_one_value_with_the_task_that_they_stand_for() -> None:

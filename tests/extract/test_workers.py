@@ -5,9 +5,12 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,10 +21,11 @@ from probe_kit.env import SceneSpec
 from probe_kit.errors import EpisodesFailedError, RunIncompleteError, StageDiedError, UsageError
 from probe_kit.extract import ExtractSettings, extract_run, prepare
 from probe_kit.extract.rollout import calibration
-from probe_kit.extract.rollout.calibration import choose, inference_times, largest_batch
+from probe_kit.extract.rollout.calibration import _infer, choose, inference_times, largest_batch
 from probe_kit.extract.rollout.controllers import PolicyController
 from probe_kit.extract.sources.player import ProcessPlayer
 from probe_kit.extract.sources.scene_source import ScenePlayer
+from probe_kit.hooks.checkpoints.third_party import while_acting
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.runs import open_run
 from probe_kit.suite import Suite, build_suite
@@ -187,6 +191,20 @@ def test_batches_are_tried_up_to_the_bound_and_no_further_than_memory() -> None:
     assert set(inference_times(small, 8)) == {1}
     with pytest.raises(MemoryError):
         inference_times(lambda batch: small(batch + 1), 8)
+
+
+def test_a_batch_that_exceeds_a_gpu_ends_the_search_and_not_the_run() -> None:
+    """A policy's error is one of its code, unless memory ended in it."""
+    from torch.cuda import OutOfMemoryError
+
+    def preflight(observations: Sequence[object], _seeds: object) -> None:
+        with while_acting("pi0", "/models/mine"):
+            if len(observations) > 2:
+                raise OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB")
+
+    controller: Any = SimpleNamespace(run_preflight=preflight)
+    example = Observation(np.zeros((4, 4, 3), np.uint8), np.zeros(8, np.float32), "push")
+    assert set(inference_times(partial(_infer, controller, example), 8)) == {1, 2}
 
 
 @pytest.mark.parametrize(

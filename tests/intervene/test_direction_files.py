@@ -152,6 +152,32 @@ def test_a_direction_of_other_than_real_numbers_is_refused(tmp_path: Path, value
         read_direction(str(tmp_path / "some.npz"))
 
 
+@pytest.mark.parametrize("length", [1e300, 1e39, 1e-60])
+def test_a_direction_that_float32_cannot_hold_is_refused(tmp_path: Path, length: float) -> None:
+    """Added to an activation it would be infinite, or nothing."""
+    np.savez(tmp_path / "some.npz", a=np.array([length, 0.0]))
+    with pytest.raises(UsageError, match="activations are float32"):
+        read_direction(str(tmp_path / "some.npz"))
+
+
+@pytest.mark.parametrize(("scale", "named"), [([0.0, 1.0], "a row of zeros"), ([np.inf, 1.0], "infinity")])
+def test_a_scale_that_leaves_no_direction_is_refused(tmp_path: Path, scale: list[float], named: str) -> None:
+    path = tmp_path / "some.npz"
+    values = {"a": np.array([1.0, 0.0]), "a.scale": np.array(scale)}
+    write_directions(path, values, {"a": {"space": "standardised"}})
+    with pytest.raises(UsageError, match=named):
+        read_direction(str(path))
+
+
+@pytest.mark.parametrize("shape", [(), (3,), (2, 2, 3), (0, 3)])
+def test_a_decoder_that_is_no_matrix_has_no_features(tmp_path: Path, shape: tuple[int, ...]) -> None:
+    from safetensors.numpy import save_file
+
+    save_file({"W_dec": np.ones(shape, np.float32)}, tmp_path / "sae_weights.safetensors")
+    with pytest.raises(UsageError, match="has 0 features; expected"):
+        read_direction(f"{tmp_path}#0")
+
+
 def test_a_scale_of_another_shape_than_the_direction_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "some.npz"
     write_directions(path, {"a": np.ones(4), "a.scale": np.ones((5, 4))}, {"a": {"space": "standardised"}})

@@ -41,7 +41,7 @@ from probe_kit.intervene.sessions import ReplaySession
 from probe_kit.intervene.stored import EPISODES
 from probe_kit.retention import retention_table
 from probe_kit.runs import Run, open_run, verify_run
-from probe_kit.runs.results import Pieces
+from probe_kit.runs.results import Pieces, RepeatedWorkWarning
 from tests.intervene.answers import with_parts
 
 if TYPE_CHECKING:
@@ -163,10 +163,13 @@ def test_killed_and_resumed_gives_the_same_bytes(
         assert (folder / name).read_bytes() == (copy.path / "interventions" / effects.key / name).read_bytes()
 
 
-def test_a_damaged_piece_is_not_continued_from(
-    mine: Run, effects: InterventionResult, source: ReplaySource, twin: "Policy"
+@pytest.mark.parametrize("damage", ["cut", "emptied", "another piece"])
+def test_a_damaged_piece_is_said_and_computed_again(
+    damage: str, copy: Run, mine: Run, effects: InterventionResult, source: ReplaySource, twin: "Policy"
 ) -> None:
-    shutil.rmtree(mine.path / "interventions" / effects.key)
+    """As a power cut leaves one: pieces are not flushed."""
+    folder = mine.path / "interventions" / effects.key
+    shutil.rmtree(folder)
 
     def stop(done: int, *_: object) -> None:
         if done == 2:
@@ -175,9 +178,13 @@ def test_a_damaged_piece_is_not_continued_from(
     with pytest.raises(KeyboardInterrupt):
         run_intervention(mine, ImageSwap(items=2), source, load=lambda *_: twin, progress=stop)
     first, second = sorted((mine.path / "interventions" / f".{effects.key}.partial").iterdir())
-    shutil.copy(first, second)
-    with pytest.raises(RunDamagedError, match=second.name):
+    content = second.read_bytes()
+    remains = {"cut": content[: len(content) // 2], "emptied": b"", "another piece": first.read_bytes()}
+    second.write_bytes(remains[damage])
+    with pytest.warns(RepeatedWorkWarning, match=f"{second.name} was changed"):
         run_intervention(mine, ImageSwap(items=2), source, load=lambda *_: twin)
+    for name in FILES:
+        assert (folder / name).read_bytes() == (copy.path / "interventions" / effects.key / name).read_bytes()
 
 
 def test_a_piece_of_another_version_is_refused_with_what_to_do(

@@ -3,16 +3,19 @@
 import shutil
 from collections.abc import Callable
 from dataclasses import fields, replace
+from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
+from numpy.typing import NDArray
 
 from probe_kit.errors import NoProbesError, RunDamagedError, UsageError
 from probe_kit.hashing import sha256_json
 from probe_kit.hooks.contract.sites import Site
-from probe_kit.runs.results import write_bundle
+from probe_kit.runs.results import read_bundle, write_bundle
 from probe_kit.runs.store import locate
 from probe_kit.train import ArrayRun, load_results, save_results, train_probes
 from probe_kit.train.results.inventory import inventory
@@ -153,6 +156,36 @@ def test_results_of_another_format_are_refused_by_its_name(
     for read in (load_results, inventory, stored_targets):
         with pytest.raises(RunDamagedError, match=rf"has format {stored_format}; .* reads format {FORMAT}"):
             read(run)
+
+
+FORGED: dict[str, Callable[[NDArray[Any]], NDArray[Any]]] = {
+    "another length": lambda array: np.concatenate([array, array[:1]]),
+    "an axis more": lambda array: array[None],
+    "texts": lambda array: np.full(array.shape, "x") if array.dtype.kind != "U" else np.zeros(array.shape),
+}
+
+
+@pytest.mark.parametrize("forged", FORGED)
+@pytest.mark.parametrize("member", ["decisions", "labels", "groups", "null", "sites", "direction"])
+def test_arrays_of_probes_that_contradict_each_other_are_damage(
+    planted_run: PlantedRun, member: str, forged: str
+) -> None:
+    """As in a forged run, whose sums were made anew."""
+    run = planted_run()
+    results = train_probes(run, permutations=1, controls=())
+    name = "directions.npz" if member == "direction" else "decisions.npz"
+    bundle = read_bundle(locate(run.path), "probes", results.key)
+    with np.load(BytesIO(bundle.read(name))) as opened:
+        arrays = dict(opened)
+    ending = "/weights" if member == "direction" else f"/{member}"
+    changed = next(array for array in arrays if array.endswith(ending))
+    arrays[changed] = FORGED[forged](arrays[changed])
+    file = BytesIO()
+    np.savez(file, **arrays)
+    write_bundle(locate(run.path), "probes", results.key, bundle.head, {name: file.getvalue()}, bundle.times)
+    stem = name.partition(".")[0]
+    with pytest.raises(RunDamagedError, match=f"{stem}.* has .*{ending[1:]}.*Remove probes/"):
+        dict(load_results(run, results.key).directions)
 
 
 @pytest.mark.slow

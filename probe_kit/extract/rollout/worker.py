@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from probe_kit._system.machine import is_out_of_memory
 from probe_kit.env import save_gif
-from probe_kit.errors import ProbeKitError
 from probe_kit.extract.config_files import origin_of_process
 from probe_kit.extract.rollout.capturing import EpisodeBuffers
 from probe_kit.extract.rollout.controllers import Controller, Inference, Turn, count_lost_words
@@ -197,6 +197,7 @@ class EpisodeLoop:
         if not due:
             return
         # An error here is of the batch: which row caused it is unknown, so all rows are given up and played alone.
+        # So are those of a batch that exceeds the memory; where one row alone does, so would every other.
         try:
             turns = [playing.turn() for _, playing in due]
             started = perf_counter()
@@ -207,7 +208,9 @@ class EpisodeLoop:
                     instruction = turn.observation.instruction
                     playing.instruction_ids = self._controller.instruction_ids(instruction)
                     playing.lost_words = count_lost_words(self._controller.instruction_ids, instruction)
-        except EPISODE_ERRORS as error:
+        except Exception as error:
+            if not isinstance(error, EPISODE_ERRORS) and not (is_out_of_memory(error) and len(due) > 1):
+                raise
             for slot, playing in due:
                 yield self._give_up(slot, playing, error)
             return
@@ -216,7 +219,7 @@ class EpisodeLoop:
             playing.seconds += seconds
             self._go_on(slot, playing, inference)
 
-    def _give_up(self, slot: EpisodeSlot, playing: Playing, error: ProbeKitError) -> Failed:
+    def _give_up(self, slot: EpisodeSlot, playing: Playing, error: Exception) -> Failed:
         playing.buffers.clear()
         self._free.put(playing.buffers)
         self._begin_next(slot)

@@ -770,7 +770,7 @@ class EnvironmentSource(Source[EnvSource]):
         shapes: dict[str, list[int]] = {
             **({"action": [execute, len(self.actions)]} if execute else {}),
             **({"columns": [len(self.columns)]} if self.columns else {}),
-            "state": [int(observation.state.size)],
+            **({"state": [int(observation.state.size)]} if self._state_names else {}),
             **({"pixels": [1 + len(observation.cameras), SIDE, SIDE, 3]} if settings.pixels else {}),
         }
         environment = {
@@ -785,7 +785,7 @@ class EnvironmentSource(Source[EnvSource]):
             "columns": list(self.columns),
             "names": {
                 "action": list(self.actions),
-                "state": self._state_names,
+                **({"state": self._state_names} if self._state_names else {}),
                 **({TRUTHS: self.truths} if self.truths else {}),
             },
         }
@@ -927,7 +927,8 @@ class EnvironmentPlayer(InputsPlayer):
     def _see(self, step: Step) -> Observation:
         observation, most = step.observation, self._played.calls
         self._keep_pictures(_pictures(step), self._settings.pixels, most)
-        self._keep("state", observation.state, most)
+        if observation.state.size:
+            self._keep("state", observation.state, most)
         where = f"{self._settings.name}, step() {self._steps}"
         unknown = self._steps == 0 and not step.facts  # nothing is said of the beginning
         facts = [np.nan] * len(self._facts) if unknown else fact_values(step.facts, self._facts, where)

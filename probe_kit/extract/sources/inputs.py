@@ -61,13 +61,23 @@ def normal_form(text: str) -> str:
     Texts of one normal form are one value of an instruction. Marks inside a number, or in front of it, and spaces
     between two numbers stay: 1.5 is not 15, and -5 not 5. Forms are those of Unicode's NFKC.
     """
-    folded = unicodedata.normalize("NFKC", unicodedata.normalize("NFKC", text).casefold())
+    plain = "".join(map(_typed_plainly, text))
+    folded = unicodedata.normalize("NFKC", unicodedata.normalize("NFKC", plain).casefold())
     visible = "".join(sign for sign in folded if unicodedata.category(sign) not in ("Cf", "Cc") or sign.isspace())
     runs = ["".join(signs) for _, signs in groupby(visible, _is_separator)]
     between = zip(["", *runs], runs, [*runs[1:], ""], strict=False)
     return "".join(
         _kept_of(run, before[-1:], after[:1]) if _is_separator(run[0]) else run for before, run, after in between
     )
+
+
+def _typed_plainly(sign: str) -> str:
+    """Return a character as plain keyboards have it: a dash, or a blank for an accent that stands alone.
+
+    Accents are typed as quotation marks; NFKC would join them to the word before.
+    """
+    kind = unicodedata.category(sign)
+    return "-" if kind == "Pd" or sign == "\N{MINUS SIGN}" else " " if kind == "Sk" else sign
 
 
 def _is_separator(sign: str) -> bool:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit._system.imports import require
+from probe_kit._system.machine import is_out_of_memory
 from probe_kit._system.table_cells import is_count
 from probe_kit.errors import MissingExtraError, OwnEnvironmentError, ProbeKitError, UsageError
 from probe_kit.extract.sources.environment import SUCCESS, EnvEpisode, Step
@@ -67,6 +68,8 @@ class LeRobotEnvironment:
         except ProbeKitError:
             raise
         except Exception as error:
+            if is_out_of_memory(error):
+                raise
             raise UsageError(_refused_options(self._kind, self._config, self._typed, error)) from error
         return {
             f"{suite}-{number}": vector.envs[0]

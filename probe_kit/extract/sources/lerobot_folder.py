@@ -57,7 +57,7 @@ class LeRobotFolder(LeRobotMeta):
         ]
 
     def width(self, feature: str) -> int | None:
-        """Return how many numbers a feature has; None where the data set lacks it."""
+        """Return how many numbers a feature has; None where the data set lacks it, or none is in it."""
         if feature not in self.features:
             return None
         shape = tuple(self.features[feature]["shape"])
@@ -71,7 +71,7 @@ class LeRobotFolder(LeRobotMeta):
                 f"{self.path.name}: meta/info.json gives {feature} {shape[0]:,} numbers; expected at most "
                 f"{_MOST_WIDTH:,}. Copy the data set again, or repair its meta"
             )
-        return int(shape[0])
+        return int(shape[0]) or None
 
     def names(self, feature: str) -> list[str]:
         """Return the names of the numbers of a feature; their positions where the data set names none."""

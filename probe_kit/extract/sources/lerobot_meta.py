@@ -102,6 +102,8 @@ class HashedFiles:
         try:
             with self.open(file) as opened, open_parquet(opened, EXTRA) as parquet:
                 yield parquet
+        except MemoryError:
+            raise  # Arrow's is an ArrowException too
         except (pa.ArrowException, OSError) as error:
             where = f"{self._root.name}: {file.relative_to(self._root)}"
             raise RecordingError(f"{where} cannot be read: {str(error)[:300]}. {remedy}") from error

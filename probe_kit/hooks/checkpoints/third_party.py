@@ -26,6 +26,7 @@ from rich.file_proxy import FileProxy
 from probe_kit._system.bounded_files import recorded_files
 from probe_kit._system.escaping import terminal_safe
 from probe_kit._system.foreign_files import check_no_pointers, reason_of
+from probe_kit._system.machine import is_out_of_memory
 from probe_kit.errors import CheckpointError, InstructionError, PolicyFailedError, ProbeKitError, WeightsError
 from probe_kit.hooks.checkpoints.folders import with_adapters_named
 from probe_kit.hooks.contract.observation import Observation
@@ -227,7 +228,8 @@ def while_acting(model: str, location: str, limit: float | None = None) -> Itera
         limit: Seconds after which the process is ended, as in `contained`; None for no limit.
 
     Raises:
-        PolicyFailedError: For any error but one of ours, which is raised as it is; it names the model.
+        PolicyFailedError: For any error but one of ours, or of memory that ended, which are raised as they are; it
+            names the model.
     """
     with contained(limit) as interruptions:
         try:
@@ -236,7 +238,7 @@ def while_acting(model: str, location: str, limit: float | None = None) -> Itera
         except ProbeKitError:
             raise
         except BaseException as error:  # some of these end a process, and are the policy's own here
-            if isinstance(error, KeyboardInterrupt) and interruptions.asked:
+            if (isinstance(error, KeyboardInterrupt) and interruptions.asked) or is_out_of_memory(error):
                 raise
             raise PolicyFailedError(
                 f"{model} failed while it acted: {in_words(error)}. Its code must give actions or raise an error "
@@ -257,7 +259,8 @@ def while_loading(model: str, location: str) -> Iterator[None]:
         location: The folder or hub id of its checkpoint.
 
     Raises:
-        CheckpointError: For any error but one of ours, which is raised as it is; it names model and checkpoint.
+        CheckpointError: For any error but one of ours, or of memory that ended, which are raised as they are; it
+            names model and checkpoint.
         PolicyFailedError: For a loader that ends the process.
     """
     try:
@@ -272,6 +275,8 @@ def while_loading(model: str, location: str) -> Iterator[None]:
     except SystemExit as error:
         raise PolicyFailedError(f"{model} cannot be loaded: its code called sys.exit({error.code!r})") from error
     except Exception as error:
+        if is_out_of_memory(error):
+            raise
         check_no_pointers(Path(location).expanduser())
         latest = list(dict.fromkeys(path.name for path in reversed(files)))[:_MOST_FILES]
         read = f" (it had read {', '.join(latest)})" if latest else ""

@@ -1,10 +1,10 @@
 """The summary, the same in every format: a row and a short sentence per category, and the next step."""
 
 import re
-import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from probe_kit._system.escaping import as_argument
 from probe_kit._tables.numbers import Limits, points, signed, whole_percent, with_limits
 from probe_kit._tables.table import Cell, Heading, Row, Table
 from probe_kit.intervene.verdict import UseVerdict, describe_readouts, more_groups, size_of_groups
@@ -231,9 +231,10 @@ def next_step(rows: Sequence[RetentionRow]) -> str:
     if not acts:
         return ""
     of_run = [row for row in acts if row.key == acts[0].key]
-    run = shlex.quote(of_run[0].run.location)
+    location = of_run[0].run.location
+    run = as_argument(location)
     has_activations = of_run[0].run.action_stream is not None
-    command = probe_command(run, {row.category: row.success.n_groups or 0 for row in of_run})
+    command = probe_command(location, {row.category: row.success.n_groups or 0 for row in of_run})
     if has_activations and not any(map(is_probed, of_run)) and command:
         return f"next: {command}  where inside the answer can be read"
     if has_activations and any(row.image_swap.use is None for row in of_run) and not of_run[0].run.capture_only:

@@ -33,10 +33,11 @@ from probe_kit.runs.environment_success import EnvironmentSuccess
 from probe_kit.runs.layout import AT_END, ONCE, START
 from probe_kit.runs.store import locate
 from probe_kit.train import Target, train_probes
-from probe_kit.train.builtin_columns import label_frame
+from probe_kit.train.builtin_columns import BuiltinColumns, label_frame
 from probe_kit.train.problem import warn_of_equal_starts
 from probe_kit.train.target_samples import target_samples
 from tests.extract.own_environments.test_contract import EPISODE, SEEN, planned
+from tests.support.every_checkpoint import WRITERS
 from tests.support.made_once import made_once
 from tests.support.reach_env import ReachEnv
 
@@ -73,6 +74,30 @@ def test_a_run_holds_outcomes_states_actions_and_facts_of_the_environment(played
     executed = played.inputs.read("action")[:, 0, :, :3]
     np.testing.assert_allclose(moved, np.abs(np.clip(executed, -0.02, 0.02).sum(axis=1)), atol=1e-5)
     assert played.certificate["hooks_on_equals_hooks_off"]
+
+
+class Stateless(ReachEnv):
+    """The same pictures without a state."""
+
+    def _as_step(self, seen: dict[str, Any], done: bool = False, success: bool = False) -> Step:
+        step = super()._as_step(seen, done, success)
+        return replace(step, observation=replace(step.observation, state=np.zeros(0, np.float32)))
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:the model put out tokens that name no action")
+def test_an_environment_without_a_state_is_stored_without_one(tmp_path: Path) -> None:
+    """Zarr has no arrays of length 0."""
+    source = EnvSource(f"{__name__}:{Stateless.__name__}", max_steps=2, episodes="0:2")
+    checkpoint, options = WRITERS["openvla"][0](tmp_path / "openvla"), WRITERS["openvla"][1]
+    asked = ExtractSettings("openvla", checkpoint=str(checkpoint), options=options, source=source, env_workers=0)
+    prepare(asked).run(tmp_path / "run")
+    run = open_run(tmp_path / "run")
+    assert verify_run(run.path, deep=True).ok
+    assert run.inputs is not None
+    assert "state" not in run.inputs.kinds
+    assert not any(name.startswith("env.state") for name in BuiltinColumns(run).names)
+    assert label_frame(run)["env.left"].notna().all()
 
 
 @pytest.mark.slow

@@ -105,6 +105,17 @@ def test_a_state_of_more_numbers_than_any_robot_has_is_refused_where_it_is_used(
         LeRobotFolder.read(root).width(STATE)
 
 
+def test_a_state_of_no_numbers_is_no_state(written: Path, tmp_path: Path) -> None:
+    """Else a run would store an array of length 0, which Zarr refuses."""
+    root = Path(shutil.copytree(written, tmp_path / "rec"))
+    info = json.loads((root / "meta/info.json").read_bytes())
+    info["features"][STATE]["shape"] = [0]
+    (root / "meta/info.json").write_text(json.dumps(info), encoding="utf-8")
+    folder = LeRobotFolder.read(root)
+    assert folder.width(STATE) is None
+    assert folder.names(STATE) == []
+
+
 def test_episodes_of_more_frames_than_a_recording_has_are_refused(written: Path, tmp_path: Path) -> None:
     root = Path(shutil.copytree(written, tmp_path / "rec"))
     file = root / "meta/episodes/chunk-000/file-000.parquet"

@@ -74,10 +74,12 @@ class Quick:
 class Thinking:
     """A policy that says in `log` which episodes it is asked about."""
 
-    def __init__(self, log: list[tuple[str, int]], capture_only: bool) -> None:
-        self._log, self.capture_only = log, capture_only
+    def __init__(self, log: list[tuple[str, int]], capture_only: bool, room: int = 99) -> None:
+        self._log, self.capture_only, self._room = log, capture_only, room
 
     def infer(self, turns: Any) -> list[Inference]:
+        if len(turns) > self._room:
+            raise MemoryError
         self._log.append(("asked for actions", turns[0].row.policy_seed))
         return [Inference(None if self.capture_only else np.zeros((1, 7), np.float32)) for _ in turns]
 
@@ -86,13 +88,18 @@ class Thinking:
 
 
 def played(
-    episodes: int, batch: int = 1, length: int = 1, bad: set[int] | None = None, capture_only: bool = False
+    episodes: int,
+    batch: int = 1,
+    length: int = 1,
+    bad: set[int] | None = None,
+    capture_only: bool = False,
+    room: int = 99,
 ) -> tuple[list[Ended | Failed], list[tuple[str, int]]]:
     log: list[tuple[str, int]] = []
     left = iter([Row(number, {"policy_seed": number}) for number in range(episodes)])
     free: Any = SimpleNamespace(get=lambda: SimpleNamespace(clear=lambda: None), put=lambda _buffers: None)
     stages: Any = [Quick(log, length, bad or set()) for _ in range(2 * batch)]
-    controller: Any = Thinking(log, capture_only)
+    controller: Any = Thinking(log, capture_only, room)
     next_episode: Callable[[], Any] = lambda: next(left, None)  # noqa: E731
     return list(EpisodeLoop(stages, controller, free, next_episode, lambda _planned: False)), log
 
@@ -126,6 +133,14 @@ def test_what_was_to_follow_a_failed_episode_is_played_all_the_same(batch: int) 
     kept = [result[0].planned.index for result in results if isinstance(result, tuple)]
     assert sorted(failed) == [0, 3, 4, 11]
     assert sorted(failed + kept) == list(range(12)), "every episode once"
+
+
+def test_a_batch_that_exceeds_the_memory_gives_its_episodes_up_and_a_single_one_ends_the_run() -> None:
+    """The episodes of a batch are played alone afterwards; where one alone is too large, every other is."""
+    results, _ = played(4, batch=2, room=1)
+    assert sorted(result.number for result in results if isinstance(result, Failed)) == [0, 1, 2, 3]
+    with pytest.raises(MemoryError):
+        played(4, batch=1, room=0)
 
 
 @pytest.fixture(params=[LocalPlayer, ProcessPlayer])

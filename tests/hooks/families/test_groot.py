@@ -1,9 +1,11 @@
 """What NVIDIA's processor file says of state, actions and pictures is honoured, or refused by name."""
 
 import json
+import re
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import permutations
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +25,10 @@ from probe_kit.errors import CheckpointError, InstructionError, UsageError, Weig
 from probe_kit.hooks import Observation, Site, capture, edit
 from probe_kit.hooks.conformance.subject import examples_for
 from probe_kit.hooks.families.groot.adapter import Groot
+from probe_kit.hooks.families.groot.network import check_version
+from probe_kit.hooks.families.shared.kinds import IMAGES
+from probe_kit.hooks.families.shared.lerobot.pipelines import read_views
+from probe_kit.hooks.registry import find_family
 from tests.support.groot_checkpoints import CHUNK, HORIZON, TAG, write_groot, write_nvidias
 from tests.support.pi05_checkpoints import HIGH, LEAST, LOW, MOST
 
@@ -163,6 +169,53 @@ def test_actions_with_mean_and_deviation_are_restored_by_them(changed: Changed) 
 def test_what_is_not_honoured_is_refused_by_name(changed: Changed, change: dict[str, Any], message: str) -> None:
     with pytest.raises(CheckpointError, match=message):
         _ = changed(**change).state_units
+
+
+VIEWS = ["front", "wrist_image", "top"]
+CAMERAS = ("front", "wrist_image", "image2", "side")
+
+
+@pytest.mark.parametrize("views", [VIEWS, VIEWS[::-1], ["wrist_image"], ["other"], []], ids=" ".join)
+def test_the_cameras_of_a_checkpoint_are_those_whose_pictures_lerobot_packs(views: list[str]) -> None:
+    """One picture for each view, under the other name of a wrist if it has no picture of its own, or else all."""
+    step = processor_groot.GrootN17PackInputsStep.__new__(processor_groot.GrootN17PackInputsStep)
+    step.video_modality_keys, step._warned_image_keys = views, True
+    for shown in (shown for size in range(1, 5) for shown in permutations(CAMERAS, size)):
+        features = [f"{IMAGES}{camera}" for camera in shown]
+        packed = read_views(features, views) if views else features
+        assert packed == [name for name in features if name in packed]
+        assert sorted(packed) == sorted(step._ordered_image_keys(dict.fromkeys(features)))
+
+
+@pytest.mark.parametrize(
+    ("values", "older"),
+    [
+        ({"base_model_path": "nvidia/GR00T-N1-2B"}, "N1;"),
+        ({"base_model_path": "nvidia/GR00T-N1.5-3B"}, "N1.5;"),
+        ({"base_model_path": "me/gr00t_n1_6_kitchen"}, "N1.6;"),
+        ({"model_version": "n1.6"}, "N1.6;"),
+        ({"model_version": "n1_5"}, "N1.5;"),
+        ({"tokenizer_assets_repo": "lerobot/eagle2hg-processor-groot-n1p5"}, "N1.5;"),
+        ({"base_model_path": "nvidia/GR00T-N1.7-3B"}, None),
+        ({"base_model_path": "me/gr00t-n17"}, None),
+        ({"base_model_path": None, "model_version": "n1.7"}, None),
+        ({}, None),
+    ],
+)
+def test_a_fine_tune_of_an_older_groot_is_refused(values: dict[str, Any], older: str | None) -> None:
+    if older is None:
+        check_version(values, Path("config.json"))
+        return
+    with pytest.raises(CheckpointError, match=f"a fine-tune of GR00T {re.escape(older)} lerobot .* reads N1.7"):
+        check_version(values, Path("config.json"))
+
+
+@pytest.mark.parametrize(("kind", "older"), [("gr00t_n1", "N1"), ("gr00t_n1_5", "N1.5"), ("Gr00tN1d6", "N1.6")])
+def test_a_checkpoint_of_the_type_of_an_older_groot_is_named(kind: str, older: str, tmp_path: Path) -> None:
+    (tmp_path / "config.json").write_text(json.dumps({"model_type": kind}), encoding="utf-8")
+    expected = rf"It is a GR00T {re.escape(older)}, and only N1\.7 is read here: take a fine-tune of N1\.7"
+    with pytest.raises(CheckpointError, match=expected):
+        find_family("groot").check(str(tmp_path))
 
 
 @pytest.mark.slow

@@ -29,6 +29,7 @@ from probe_kit.hooks.families.shared.lerobot.pipelines import (
     POSTPROCESSOR,
     PREPROCESSOR,
     check_steps,
+    declared_inputs,
     known_values,
     tokenizer_folder,
 )
@@ -418,14 +419,44 @@ def test_packing_of_another_configuration_is_refused(tmp_path: Path) -> None:
         load_policy("molmoact2", str(folder))
 
 
-def test_pictures_that_a_step_leaves_out_are_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["xvla_imagenet_normalize", "xvla_image_to_float"])
+def test_pictures_that_a_step_leaves_out_are_named(name: str, tmp_path: Path) -> None:
     folder = write_xvla(tmp_path / "checkpoint")
-    steps = steps_of(folder)
-    own = next(step for step in steps if step["registry_name"] == "xvla_imagenet_normalize")
-    own["config"] = {"image_keys": ["observation.images.elsewhere"]}
-    write_steps(folder, steps)
-    with pytest.raises(CheckpointError, match=r"leaves out observation\.images"):
+    steps = [step for step in steps_of(folder) if step["registry_name"] != name]
+    write_steps(
+        folder, [*steps, {"registry_name": name, "config": {"image_keys": ["observation.images.elsewhere"]}}]
+    )
+    with pytest.raises(CheckpointError, match=rf"the step '{name}' leaves out observation\.images"):
         load_policy("xvla", str(folder))
+
+
+@pytest.mark.parametrize(
+    ("of_step", "of_config", "cameras"),
+    [
+        (("wrist", "image"), ("image", "wrist"), ("wrist", "image")),
+        (("wrist",), ("image", "wrist"), ("wrist",)),
+        (None, ("wrist", "image"), ("wrist", "image")),
+        (None, None, ("image", "wrist")),
+    ],
+    ids=["step", "fewer", "configuration", "features"],
+)
+def test_the_cameras_of_molmoact2_are_those_that_are_packed_in_their_order(
+    of_step: tuple[str, ...] | None, of_config: tuple[str, ...] | None, cameras: tuple[str, ...], tmp_path: Path
+) -> None:
+    """Known before anything is loaded: the step of the packing counts, then the configuration."""
+
+    def keys(names: tuple[str, ...] | None) -> dict[str, list[str]]:
+        return {} if names is None else {"image_keys": [f"observation.images.{name}" for name in names]}
+
+    picture = {"type": "VISUAL", "shape": [3, 8, 8]}
+    features = {f"observation.images.{name}": picture for name in ("image", "wrist")}
+    config = {"type": "molmoact2", "input_features": features, **keys(of_config)}
+    (tmp_path / "config.json").write_text(json.dumps(config), encoding="utf-8")
+    step = {"registry_name": "molmoact2_pack_inputs", "config": keys(of_step)}
+    write_steps(tmp_path, [] if of_step is None else [step])
+    inputs = declared_inputs(tmp_path)
+    assert inputs is not None
+    assert inputs.cameras == cameras
 
 
 def test_the_tokenizer_that_a_newer_lerobot_saved_into_the_checkpoint_is_read(

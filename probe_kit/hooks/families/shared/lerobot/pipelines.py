@@ -247,8 +247,9 @@ _OTHER_NAMES = {"wrist_image": "image2"}
 
 
 def read_views(features: Sequence[str], views: Sequence[str]) -> list[str]:
-    """Return the features that lerobot packs for GR00T, in their order: those that are a view, or else all."""
-    packed = {f"{IMAGES}{name}" for view in views for name in (view, _OTHER_NAMES.get(view, view))}
+    """Return the features that lerobot packs for GR00T, in their order: one for each view, or else all."""
+    names = ([f"{IMAGES}{name}" for name in (view, _OTHER_NAMES.get(view, view))] for view in views)
+    packed = {next((name for name in either if name in features), None) for either in names}
     return [name for name in features if name in packed] or list(features)
 
 
