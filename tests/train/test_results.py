@@ -197,7 +197,7 @@ def test_the_untrained_network_of_a_stream_is_its_peak() -> None:
         untrained("expert.00.residual@1", True),
         untrained("backbone.03.residual", True),
     ]
-    controls = Controls().with_untrained(scores)
+    controls = Controls().with_untrained(scores, "0123456789ab")
     assert controls.untrained_peak("color", "mean", "backbone") == scores[2]
     assert controls.untrained_peak("color", "last", "backbone") is None
 
