@@ -1,6 +1,7 @@
 """The content of a table, which renderers read: headings, rows of cells, notes.
 
-A renderer knows no subject: a cell says what is bold, red, coloured or sorted, and a heading says what it means.
+A renderer knows no subject: a cell says what is bold, red, coloured or sorted, and a heading says what it means. A
+cell holds its value, the interval and the format; their text is made when a renderer asks for it.
 """
 
 import re
@@ -8,31 +9,37 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, Self
 
-from probe_kit._tables.numbers import NONE
+from probe_kit._tables.numbers import NONE, Limits, is_missing, limits_text, plain
 
 Number = Mapping[str, Any]
 """A number behind a table with what it describes, or the numbers of a row."""
-_LIMITS = re.compile(r"(?<!^) ?(\[[^\]]*\])")
-"""An interval behind its value."""
 _UNITS = re.compile(r"(,? (%|cm|points))?( \[[^\]]*\])?$")
 """The part of a heading behind its term."""
-_NUMBER = re.compile(r"[-+−±]?\d|< \d|n/a|–|$")
-"""The beginning of a cell of numbers."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A text, and how formats that can show it do.
+    """A value and its format, and how formats that can show it look.
 
     Attributes:
-        sort: The key by which a page sorts, the text by default.
+        value: A number, or a text; None where there is neither.
+        write: The format of the value and of the ends of its interval; it says what stands in place of None.
+        interval: The 95 % interval of the value; None for a cell without one.
+        after: A text behind the value, such as a mark or a number that belongs to it.
+        write_ends: The format of the ends where the interval is of another number than the value, such as that of
+            a difference behind its p.
+        sort: The key by which a page sorts, the value by default.
         heat: A share that colors the ground.
         strong: Whether the text is bold.
         alarm: Whether the text is red.
         note: A text that a page shows if the pointer is on the cell.
     """
 
-    text: str
+    value: float | str | None
+    write: Callable[[Any], str] = plain
+    interval: Limits | None = None
+    after: str = ""
+    write_ends: Callable[[Any], str] | None = None
     sort: float | str | None = None
     heat: float | None = None
     strong: bool = False
@@ -40,15 +47,38 @@ class Cell:
     note: str = ""
 
     @property
-    def limits(self) -> str:
-        """The interval in square brackets behind the value, empty without one."""
-        match = _LIMITS.search(self.text)
-        return match[1] if match else ""
+    def value_text(self) -> str:
+        """The text without the interval."""
+        return self.write(self.value) + self.after
 
     @property
-    def value(self) -> str:
-        """The text without the interval."""
-        return _LIMITS.sub("", self.text, count=1)
+    def interval_text(self) -> str:
+        """The interval in square brackets; empty without one."""
+        if self.interval is None or isinstance(self.value, str):
+            return ""
+        if is_missing(self.value) and self.write_ends is None:
+            return ""
+        return limits_text(self.interval, self.write_ends or self.write)
+
+    @property
+    def text(self) -> str:
+        """The value, its interval, and what follows."""
+        limits = self.interval_text
+        return f"{self.write(self.value)} {limits}{self.after}" if limits else self.value_text
+
+    @property
+    def is_text(self) -> bool:
+        """Whether it holds a text, and neither a number nor a sign that there is none."""
+        return isinstance(self.value, str) and self.value not in ("", NONE)
+
+
+def absent(text: str) -> Cell:
+    """Return a cell with a text in place of a number, such as `n/a`, which is aligned like numbers."""
+    return Cell(None, lambda _: text)
+
+
+Cells = tuple[Cell | str, ...]
+"""The cells of a line; a text is a cell with nothing else."""
 
 
 @dataclass(frozen=True)
@@ -168,9 +198,10 @@ class Content:
     @property
     def are_numeric(self) -> tuple[bool, ...]:
         """A flag per column: whether it holds numbers, which are aligned to the right."""
+        columns = [*zip(*(row.cells for row in self.rows), strict=True)] or [()] * len(self.headings)
         return tuple(
-            at >= self.names and any(texts) and all(map(_NUMBER.match, texts))
-            for at, texts in enumerate(self._by_column)
+            at >= self.names and any(cell.text for cell in cells) and not any(cell.is_text for cell in cells)
+            for at, cells in enumerate(columns)
         )
 
     @property

@@ -73,8 +73,9 @@ def width_of(table: Content) -> int:
 
 def _two_lines(cell: Cell) -> Cell:
     """Return a cell with the interval below its value, and words broken at commas."""
-    text = f"{cell.value}\n{cell.limits}" if cell.limits else cell.text.replace(", ", ",\n")
-    return replace(cell, text=text)
+    limits = cell.interval_text
+    text = f"{cell.value_text}\n{limits}" if limits else cell.text.replace(", ", ",\n")
+    return Cell(text, strong=cell.strong, alarm=cell.alarm)
 
 
 def _fitting(table: Content, width: int) -> tuple[Content, list[str]]:

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 from probe_kit._system.counting import counted
 from probe_kit._system.table_cells import is_count
-from probe_kit._tables.numbers import number, percent, points, with_limits
-from probe_kit._tables.table import Table
+from probe_kit._tables.numbers import number, percent, points
+from probe_kit._tables.table import Cell, Table, absent
 from probe_kit.errors import UsageError
 from probe_kit.retention.columns.text import title_of
 from probe_kit.retention.compare.models import checkpoint_of, split_checkpoint
@@ -153,12 +153,12 @@ def _numbers(
     }
 
 
-def _cells(row: Mapping[str, Any]) -> tuple[str, ...]:
-    shares = (with_limits(row[name], row[f"{name}_ci"], percent) for name in ("sr", "backbone", "action"))
-    ratio = with_limits(row["retention"], row["retention_ci"], number)
+def _cells(row: Mapping[str, Any]) -> tuple[Cell | str, ...]:
+    shares = (Cell(row[name], percent, row[f"{name}_ci"]) for name in ("sr", "backbone", "action"))
+    ratio = Cell(row["retention"], number, row["retention_ci"])
     lacks = row["retention"] is None and row["backbone"] is not None and row["action"] is not None
-    drift = with_limits(row["drift"], row["drift_ci"], points)
-    return (title_of(row["category"]), str(row["step"]), *shares, "n/a" if lacks else ratio, drift)
+    drift = Cell(row["drift"], points, row["drift_ci"])
+    return (title_of(row["category"]), str(row["step"]), *shares, absent("n/a") if lacks else ratio, drift)
 
 
 _PANELS = (

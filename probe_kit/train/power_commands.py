@@ -116,7 +116,8 @@ def _answer(needed: "tuple[Power, int] | None") -> str:
 
 
 def _print(estimates: "list[Power]") -> None:
-    from probe_kit._tables.table import Table
+    from probe_kit._tables.numbers import percent, whole_percent
+    from probe_kit._tables.table import Cell, Cells, Table
     from probe_kit.statistics.significance import detectable
     from probe_kit.statistics.sufficiency import ABSENT_BELOW
 
@@ -131,12 +132,12 @@ def _print(estimates: "list[Power]") -> None:
         "red control from %",
     )
     shares = ("above", "chance", "random_features", "untrained", "absent")
-    rows = [
+    rows: list[Cells] = [
         (
             str(estimate.items),
-            *(f"{100 * getattr(estimate, share):.0f}" for share in shares),
-            f"{100 * estimate.spread:.1f}",
-            f"{100 * detectable(estimate.items):.0f}",
+            *(Cell(getattr(estimate, share), whole_percent) for share in shares),
+            Cell(estimate.spread, percent),
+            Cell(detectable(estimate.items), whole_percent),
         )
         for estimate in estimates
     ]

@@ -33,7 +33,6 @@ from probe_kit.retention.columns.columns import (
     USED,
     Column,
 )
-from probe_kit.retention.estimators import Limits
 from probe_kit.retention.rows.row import StreamPart
 from probe_kit.runs.action_errors import action_error_table, compare_actions, why_not_compared
 from probe_kit.runs.environment_success import EnvironmentSuccess
@@ -254,16 +253,11 @@ def _vlm_cell(vlm: ViewedRun, category: str) -> dict[str, Any]:
 
 def _cell(column: Column, row: RetentionRow) -> dict[str, Any]:
     """Return the text of the table, and value and interval where the page draws them."""
-    drawn: dict[str, tuple[float | None, Limits | None]] = {
-        SR.key: (row.success.sr, row.success.ci),
-        BACKBONE.key: (row.backbone.score, row.backbone.ci),
-        ACTION.key: (row.action.score, row.action.ci),
-    }
-    value, limits = drawn.get(column.key, (None, None))
-    cell: dict[str, Any] = {"text": column.text(row)}
-    if value is not None:
-        cell["value"] = rounded(value)
-        cell["limits"] = None if limits is None else [rounded(limit) for limit in limits]
+    shown = column.cell(row)
+    cell: dict[str, Any] = {"text": shown.text}
+    if column.key in (SR.key, BACKBONE.key, ACTION.key) and isinstance(shown.value, float):
+        cell["value"] = rounded(shown.value)
+        cell["limits"] = None if shown.interval is None else [rounded(limit) for limit in shown.interval]
     return cell
 
 

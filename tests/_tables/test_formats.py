@@ -214,8 +214,11 @@ def test_sections_are_named_and_no_value_is_cut_at_any_width(width: int) -> None
     assert "a policy with a long name" in text
 
 
+RATE = Cell(98, interval=(90, 99), after=" ✓")
+
+
 def test_intervals_fold_below_their_values_before_a_table_is_divided() -> None:
-    table = Table.of("t", ("category", "rate %", "verdict"), [("color", "98 [90, 99] ✓", "a, b")], overflow="fold")
+    table = Table.of("t", ("category", "rate %", "verdict"), [("color", RATE, "a, b")], overflow="fold")
     assert printed(table, 80)[3] == "color     98 [90, 99] ✓  a, b"
     assert printed(table, 30)[3:5] == ["color     98 ✓      a,", "          [90, 99]  b"]
 

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._tables.content import Cell as TableCell
+from probe_kit._tables.numbers import percent, points
 from probe_kit.errors import CaptureChangedActionError, CaptureError, EmptyRoleError, UsageError
 from probe_kit.hooks.contract.declared import InterventionKind
 from probe_kit.hooks.contract.observation import Observation
@@ -142,7 +144,7 @@ class AttentionReadout(Intervention):
         attention = AttentionShares.stored(context)
         means = attention.rows(("block",))
         roles = [role for role in dict.fromkeys(row.role for row in means) if role not in (CORRECT, OTHER)]
-        lines: list[tuple[tuple[str, ...], tuple[dict[str, float], str]]] = []
+        lines: list[tuple[tuple[str, ...], tuple[dict[str, float], TableCell]]] = []
         for category, part in attention.by_category():
             apart = part.correct_minus_other(context.run.seed_text)
             for block in dict.fromkeys(row.block for row in means if row.category == category):
@@ -536,14 +538,12 @@ _LEGEND = (
 
 
 def _share_column(role: str) -> Any:
-    return lambda row: f"{100 * row[0][role]:.1f}" if role in row[0] else "–"
+    return lambda row: TableCell(row[0].get(role), percent)
 
 
-def _difference(apart: tuple[float, tuple[float, float]] | None) -> str:
-    if apart is None:
-        return "–"
-    value, (low, high) = apart
-    return f"{100 * value:+.1f} [{100 * low:+.1f}, {100 * high:+.1f}]"
+def _difference(apart: tuple[float, tuple[float, float]] | None) -> TableCell:
+    value, limits = apart or (None, None)
+    return TableCell(value, points, limits)
 
 
 KIND = AttentionReadout

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._tables.content import Cell as TableCell
 from probe_kit.errors import UsageError
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.declared import InterventionKind
@@ -16,7 +17,7 @@ from probe_kit.intervene.kinds.base import (
     Intervention,
     edits_by_category,
     effect_table,
-    interval_text,
+    interval_cell,
     is_resolved,
     lines_of,
     p_of,
@@ -231,9 +232,9 @@ class AttributionPatching(Intervention):
 
 KIND = AttributionPatching
 _COLUMNS: Mapping[str, Any] = {
-    "rank": lambda row: "–" if row.rank is None else str(row.rank),
-    "estimate [95 %]": lambda row: interval_text(row.estimate, row.estimate_ci),
-    "exact [95 %]": lambda row: interval_text(row.exact, row.exact_ci),
+    "rank": lambda row: TableCell(row.rank),
+    "estimate [95 %]": lambda row: interval_cell(row.estimate, row.estimate_ci),
+    "exact [95 %]": lambda row: interval_cell(row.exact, row.exact_ci),
     "p": lambda row: p_of(row.p_fwe, is_resolved(row.exact)),
     "chosen": lambda row: (
         "anchor" if row.is_anchor else "drawn" if row.is_drawn else "top" if row.p_fwe is not None else ""

@@ -13,7 +13,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit._tables.numbers import number, signed
+from probe_kit._tables.content import Cell as TableCell
+from probe_kit._tables.numbers import NONE as NO_NUMBER
+from probe_kit._tables.numbers import Write, number, percent, signed
 from probe_kit.errors import UsageError
 from probe_kit.extract.sources.inputs import INSTRUCTION
 from probe_kit.hashing import derive_seed
@@ -523,7 +525,7 @@ def effect_table[Row](
     caption: str,
     names: Sequence[str],
     lines: Sequence[tuple[tuple[str, ...], Row]],
-    parts: Mapping[str, Mapping[str, Callable[[Row], str]]],
+    parts: Mapping[str, Mapping[str, Callable[[Row], TableCell | str]]],
     is_bold: Callable[[Row], bool] = lambda _: False,
 ) -> "Table":
     """Return rows of effects as a table.
@@ -533,15 +535,15 @@ def effect_table[Row](
         caption: Note below the table.
         names: Headings of the columns that name a line.
         lines: Names of each line, and its row.
-        parts: By title of a group of columns, the function that gives a row's text in each column.
+        parts: By title of a group of columns, the function that gives a row's cell in each column.
         is_bold: Function that returns whether a row's names are bold.
     """
-    from probe_kit._tables.table import Cell, Heading, Table, grouped
+    from probe_kit._tables.table import Heading, Table, grouped
 
-    rows: list[tuple[Cell | str, ...]] = [
+    rows: list[tuple[TableCell | str, ...]] = [
         (
-            *(Cell(text, strong=is_bold(row)) for text in (category_of(line[0]).title, *line[1:])),
-            *(text(row) for columns in parts.values() for text in columns.values()),
+            *(TableCell(text, strong=is_bold(row)) for text in (category_of(line[0]).title, *line[1:])),
+            *(cell(row) for columns in parts.values() for cell in columns.values()),
         )
         for line, row in lines
     ]
@@ -566,6 +568,16 @@ A test of signs knows no size: an effect that is 0.00 in every episode can have 
 """
 
 
+def rate(value: float | None) -> TableCell:
+    """Return a share in percent."""
+    return TableCell(value, percent)
+
+
+def centimetres(metres: float | None, write: Write = number) -> TableCell:
+    """Return a distance in centimetres."""
+    return TableCell(None if metres is None else 100 * metres, write)
+
+
 def is_resolved(*effects: float | None) -> bool:
     """Return whether any of some effects is as large as the resolution of its measure."""
     return any(effect is not None and abs(effect) >= RESOLUTION for effect in effects)
@@ -575,28 +587,23 @@ UNRESOLVED = f"p –: the effect is below {RESOLUTION}, the resolution of its me
 """The entry of a legend for p-values that are not shown."""
 
 
-def p_of(value: float | None, is_printed: bool = True) -> str:
+def p_of(value: float | None, is_printed: bool = True) -> TableCell:
     """Return a p-value in two digits; a dash for None, and for the p-value of an effect that is not resolved."""
-    if value is None or not is_printed:
-        return "–"
-    text = format(value, ".2g")
-    return text.lstrip("-") if float(text) == 0 else text
+    return TableCell(value if is_printed else None, _two_digits)
 
 
-def interval_text(
-    value: float | None,
-    limits: tuple[float, float] | None,
-    write: Callable[[float | None], str] = number,
-) -> str:
-    """Return `value [low, high]`; a dash without an interval."""
-    if value is None or limits is None:
-        return "–"
-    return f"{write(value)} [{write(limits[0])}, {write(limits[1])}]"
+def _two_digits(value: float | None) -> str:
+    return NO_NUMBER if value is None else format(abs(value), ".2g")
 
 
-def signed_interval(value: float | None, limits: tuple[float, float] | None) -> str:
-    """Return `+value [+low, +high]`."""
-    return interval_text(value, limits, signed)
+def interval_cell(value: float | None, limits: tuple[float, float] | None, write: Write = number) -> TableCell:
+    """Return a value and its interval; a dash without an interval."""
+    return TableCell(None if limits is None else value, write, limits)
+
+
+def signed_interval(value: float | None, limits: tuple[float, float] | None) -> TableCell:
+    """Return a value with its sign and its interval; a dash without an interval."""
+    return interval_cell(value, limits, signed)
 
 
 def count_edits(names: Sequence[str], tried: int, most: int = 3) -> str:

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 import numpy as np
 
-from probe_kit._tables.numbers import percent, signed
+from probe_kit._tables.content import Cell as TableCell
+from probe_kit._tables.numbers import signed
 from probe_kit.env.scoring import DEFAULT_RULE
 from probe_kit.errors import UsageError
 from probe_kit.hooks.capturing.edits import EditLog, Identity, apply_patch
@@ -32,6 +33,7 @@ from probe_kit.intervene.kinds.base import (
     lines_of,
     mean_of,
     p_of,
+    rate,
     share_of_edits,
     signed_interval,
 )
@@ -347,22 +349,22 @@ def closed_loop_effects(outcomes: ConditionOutcomes) -> list[ClosedLoopEffect]:
     return rows
 
 
-def _of_edits(text: Callable[[ClosedLoopEffect], str]) -> Callable[[ClosedLoopEffect], str]:
-    """Return the function that gives a cell's text, with a dash for the identity patch."""
-    return lambda row: "–" if row.sites == CLEAN else text(row)
+def _of_edits(cell: Callable[[ClosedLoopEffect], TableCell]) -> Callable[[ClosedLoopEffect], TableCell]:
+    """Return the function that gives a cell, with a dash for the identity patch."""
+    return lambda row: TableCell(None) if row.sites == CLEAN else cell(row)
 
 
 _ENDS: Mapping[str, Any] = {
-    "correct %": lambda row: percent(row.correct),
-    "wrong %": lambda row: percent(row.wrong),
-    "in a zone %": lambda row: percent(row.in_zone),
-    "wrong of these %": lambda row: percent(row.wrong_in_zone),
+    "correct %": lambda row: rate(row.correct),
+    "wrong %": lambda row: rate(row.wrong),
+    "in a zone %": lambda row: rate(row.in_zone),
+    "wrong of these %": lambda row: rate(row.wrong_in_zone),
 }
 _COMPARED: Mapping[str, Any] = {
     "net flip rate [95 %]": _of_edits(lambda row: signed_interval(row.net, row.net_ci)),
-    "left / right": _of_edits(lambda row: f"{signed(row.net_left)} / {signed(row.net_right)}"),
-    "controls": _of_edits(lambda row: signed(row.control_net)),
-    "only with : only without": _of_edits(lambda row: f"{row.gained} : {row.lost}"),
+    "left / right": _of_edits(lambda row: TableCell(row.net_left, signed, after=f" / {signed(row.net_right)}")),
+    "controls": _of_edits(lambda row: TableCell(row.control_net, signed)),
+    "only with : only without": _of_edits(lambda row: TableCell(row.gained, after=f" : {row.lost}")),
     "p": _of_edits(lambda row: p_of(row.p_fwe)),
     "finding": lambda row: row.finding,
 }

@@ -13,7 +13,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 import numpy as np
 
-from probe_kit._tables.numbers import number, percent
+from probe_kit._tables.content import Cell as TableCell
+from probe_kit._tables.content import absent
+from probe_kit._tables.numbers import number, percent, signed
 from probe_kit.errors import UsageError
 from probe_kit.hooks.capturing.edits import Identity, TokenIndex, apply_patch
 from probe_kit.hooks.contract.sites import Site
@@ -22,6 +24,7 @@ from probe_kit.intervene.kinds.base import (
     ConditionName,
     EffectRow,
     Intervention,
+    centimetres,
     common_columns,
     compare_with_controls,
     count_edits,
@@ -31,6 +34,7 @@ from probe_kit.intervene.kinds.base import (
     lines_of,
     mean_of,
     p_of,
+    rate,
     share_of_edits,
 )
 from probe_kit.intervene.kinds.interchange import cells_at
@@ -404,19 +408,19 @@ def _tried(rows: Sequence[ErasureEffect]) -> tuple[list[ErasureEffect], bool]:
     return tried, not tried or any(row.finding != "no baseline effect" for row in tried)
 
 
-def _accuracies(row: ErasureEffect) -> str:
+def _accuracies(row: ErasureEffect) -> TableCell:
     if row.probe_accuracy_before is None or row.probe_accuracy is None:
-        return "–"
-    return f"{percent(row.probe_accuracy_before)} → {percent(row.probe_accuracy)}"
+        return TableCell(None)
+    return TableCell(row.probe_accuracy_before, percent, after=f" → {percent(row.probe_accuracy)}")
 
 
 _ACTION: Mapping[str, Any] = {
-    "goes there %": lambda row: f"{percent(row.right_before)} → {percent(row.right)}",
-    "controls %": lambda row: percent(None if row.control_net is None else row.right_before - row.control_net),
-    "kept": lambda row: "n/a" if row.share_left is None else number(row.share_left),
-    "controls": lambda row: number(row.control_share_left),
-    "displacement cm": lambda row: f"{-100 * row.mean_displacement:+.2f}",
+    "goes there %": lambda row: TableCell(row.right_before, percent, after=f" → {percent(row.right)}"),
+    "controls %": lambda row: rate(None if row.control_net is None else row.right_before - row.control_net),
+    "kept": lambda row: absent("n/a") if row.share_left is None else TableCell(row.share_left, number),
+    "controls": lambda row: TableCell(row.control_share_left, number),
+    "displacement cm": lambda row: centimetres(-row.mean_displacement, signed),
     "p": lambda row: p_of(row.p, is_resolved(100 * row.mean_displacement, row.right_before - row.right)),
-    "relative change": lambda row: f"{row.relative_change:.2f}",
+    "relative change": lambda row: TableCell(row.relative_change, number),
 }
 _PROBE: Mapping[str, Any] = {"probe accuracy %": _accuracies, "finding": lambda row: row.finding}

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit._system.counting import counted
-from probe_kit._tables.numbers import number, percent
+from probe_kit._tables.content import Cell as TableCell
+from probe_kit._tables.numbers import number
 from probe_kit.hooks.contract.declared import InterventionKind, Readout
 from probe_kit.intervene.exchange import (
     NOTHING,
@@ -28,12 +29,14 @@ from probe_kit.intervene.exchange import (
 )
 from probe_kit.intervene.kinds.base import (
     Intervention,
+    centimetres,
     effect_table,
-    interval_text,
+    interval_cell,
     is_resolved,
     lines_of,
     net_interval,
     p_of,
+    rate,
     signed_interval,
 )
 from probe_kit.intervene.outcomes import CLEAN, CONTROL_INPUT, DONOR, IMAGE_SWAP, NOISE, ConditionOutcomes, Effect
@@ -204,13 +207,13 @@ _VERBS: Mapping[str, str] = {
     "open": "has an effect that remains open",
 }
 _INPUT_COLUMNS: Mapping[str, Any] = {
-    "changed %": lambda row: percent(row.changed),
-    "size": lambda row: number(row.size),
-    "control": lambda row: number(row.control_size),
-    "full": lambda row: number(row.full_size),
-    "share [95 %]": lambda row: interval_text(row.share, row.share_ci),
+    "changed %": lambda row: rate(row.changed),
+    "size": lambda row: TableCell(row.size, number),
+    "control": lambda row: TableCell(row.control_size, number),
+    "full": lambda row: TableCell(row.full_size, number),
+    "share [95 %]": lambda row: interval_cell(row.share, row.share_ci),
     "p": lambda row: p_of(row.p, is_resolved(row.size)),
-    "n (episodes)": lambda row: f"{row.n_episodes} ({row.n_items})",
+    "n (episodes)": lambda row: TableCell(row.n_episodes, after=f" ({row.n_items})"),
     "finding": lambda row: row.finding,
 }
 
@@ -411,12 +414,12 @@ def stored_image_swaps(run: RunReader, readout: str | None = None) -> dict[str, 
 
 SWAP_COLUMNS: Mapping[str, Any] = {
     "moved [95 %]": lambda row: signed_interval(row.reach_share, row.reach_share_ci),
-    "follow %": lambda row: percent(row.follow_rate),
-    "reversal %": lambda row: percent(row.reversal_rate),
+    "follow %": lambda row: rate(row.follow_rate),
+    "reversal %": lambda row: rate(row.reversal_rate),
     "net [95 %]": lambda row: signed_interval(row.net_follow_rate, row.net_follow_rate_ci),
     "p": lambda row: p_of(row.follow_p, row.is_resolved),
-    "median displacement cm": lambda row: f"{100 * row.median_displacement:.2f}",
-    "n (items)": lambda row: f"{row.n_episodes} ({row.n_items})",
+    "median displacement cm": lambda row: centimetres(row.median_displacement),
+    "n (items)": lambda row: TableCell(row.n_episodes, after=f" ({row.n_items})"),
 }
 """The columns of all swaps."""
 
@@ -500,7 +503,9 @@ class ImageSwap(Swap):
         caption = "; ".join(filter(None, (_LEGEND, *dict.fromkeys((context.legend, *reaches)))))
         parts: dict[str, Any] = {
             "Verdict": {
-                "verdict": lambda row: verdicts[row.category].verdict if row.category in verdicts else "–"
+                "verdict": lambda row: TableCell(
+                    verdicts[row.category].verdict if row.category in verdicts else None
+                )
             },
             "Does the action follow the images?": SWAP_COLUMNS,
         }

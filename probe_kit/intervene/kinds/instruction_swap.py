@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from probe_kit._tables.numbers import percent
 from probe_kit.errors import UsageError
-from probe_kit.intervene.kinds.base import effect_table
+from probe_kit.intervene.kinds.base import centimetres, effect_table, rate
 from probe_kit.intervene.kinds.image_swap import (
     SWAP_COLUMNS,
     ImageSwapEffect,
@@ -188,9 +187,9 @@ class InstructionSwap(Swap):
 
 KIND = InstructionSwap
 _STEP_COLUMNS: Mapping[str, Any] = {
-    "instruction cm": lambda row: f"{100 * row.sensitivity.instruction:.2f}",
-    "images cm": lambda row: f"{100 * row.sensitivity.images:.2f}",
-    "noise cm": lambda row: f"{100 * row.sensitivity.noise:.2f}",
-    "instruction changes it %": lambda row: percent(row.sensitivity.instruction_changed),
-    "images change it %": lambda row: percent(row.sensitivity.images_changed),
+    "instruction cm": lambda row: centimetres(row.sensitivity.instruction),
+    "images cm": lambda row: centimetres(row.sensitivity.images),
+    "noise cm": lambda row: centimetres(row.sensitivity.noise),
+    "instruction changes it %": lambda row: rate(row.sensitivity.instruction_changed),
+    "images change it %": lambda row: rate(row.sensitivity.images_changed),
 }

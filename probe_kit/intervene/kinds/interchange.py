@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 
+from probe_kit._tables.content import Cell as TableCell
 from probe_kit._tables.numbers import number, signed
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.sites import KV_STREAM, Site
@@ -27,6 +28,7 @@ from probe_kit.intervene.kinds.base import (
     ConditionName,
     EffectRow,
     Values,
+    centimetres,
     common_columns,
     compare_with_controls,
     count_edits,
@@ -584,26 +586,33 @@ class Interchange(PatchKind):
 
 
 KIND = Interchange
+BY_CONSTRUCTION = "*"
+"""The mark of an effect that an edit has by construction."""
+
+
+def _share(effect: float | None) -> str:
+    """Return a share of the exchange's effect; n/a where that is not beyond chance."""
+    return "n/a" if effect is None else number(effect)
+
+
 _COLUMNS: Mapping[str, Any] = {
-    "effect": lambda row: (
-        ("n/a" if row.effect is None else number(row.effect)) + "*" * (row.is_localised and row.is_by_construction)
+    "effect": lambda row: TableCell(
+        row.effect, _share, after=BY_CONSTRUCTION if row.is_localised and row.is_by_construction else ""
     ),
     "net flip rate [95 %]": lambda row: signed_interval(row.net, row.net_ci),
-    "left / right": lambda row: f"{row.net_left:+.2f} / {row.net_right:+.2f}",
-    "displacement cm": lambda row: f"{100 * row.mean_displacement:+.2f}",
-    "controls cm": lambda row: signed(
-        None if row.control_displacement is None else 100 * row.control_displacement
-    ),
+    "left / right": lambda row: TableCell(row.net_left, signed, after=f" / {signed(row.net_right)}"),
+    "displacement cm": lambda row: centimetres(row.mean_displacement, signed),
+    "controls cm": lambda row: centimetres(row.control_displacement, signed),
     "p": lambda row: p_of(row.p_fwe, row.is_resolved),
-    "relative change": lambda row: f"{row.relative_change:.2f}",
+    "relative change": lambda row: TableCell(row.relative_change, number),
 }
 
 
 _WITHOUT_SIDES: Mapping[str, Any] = {
     "effect": _COLUMNS["effect"],
     "nearer to the source [95 %]": _COLUMNS["net flip rate [95 %]"],
-    "displacement": lambda row: f"{row.mean_displacement:+.2f}",
-    "controls": lambda row: signed(row.control_displacement),
+    "displacement": lambda row: TableCell(row.mean_displacement, signed),
+    "controls": lambda row: TableCell(row.control_displacement, signed),
     "p": _COLUMNS["p"],
     "relative change": _COLUMNS["relative change"],
 }

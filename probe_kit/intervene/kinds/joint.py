@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from probe_kit._tables.content import Cell as TableCell
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.sites import KV_STREAM
 from probe_kit.intervene.exchange import CARRIES, NOTHING, SwapShare, carries_nothing, pooled_share, share_fields
 from probe_kit.intervene.kinds.base import (
     Intervention,
     effect_table,
-    interval_text,
+    interval_cell,
     is_resolved,
     lines_of,
     p_of,
@@ -238,10 +239,10 @@ class JointPlaces(Intervention):
 
 KIND = JointPlaces
 _COLUMNS: Mapping[str, Any] = {
-    "alone [95 %]": lambda row: interval_text(row.alone, row.alone_ci),
-    "needed [95 %]": lambda row: interval_text(row.needed, row.needed_ci),
+    "alone [95 %]": lambda row: interval_cell(row.alone, row.alone_ci),
+    "needed [95 %]": lambda row: interval_cell(row.needed, row.needed_ci),
     "p": lambda row: p_of(row.p if row.p_fwe is None else row.p_fwe, row.alone is None or is_resolved(row.alone)),
-    "groups": lambda row: str(row.n_groups),
+    "groups": lambda row: TableCell(row.n_groups),
     "finding": lambda row: row.finding,
 }
 

@@ -5,8 +5,8 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from probe_kit._tables.numbers import Limits, points, signed, whole_percent, with_limits
-from probe_kit._tables.table import Cell, Heading, Row, Table
+from probe_kit._tables.numbers import Limits, points, signed, whole_percent
+from probe_kit._tables.table import Cell, Heading, Row, Table, absent
 from probe_kit.intervene.verdict import UseVerdict, describe_readouts, more_groups, size_of_groups
 from probe_kit.retention.behaviour import Regime
 from probe_kit.retention.columns.text import (
@@ -291,21 +291,21 @@ class CategorySummary:
         return name_of(self.row)
 
     @property
-    def cells(self) -> tuple[str, ...]:
-        """The texts under `HEADINGS`."""
+    def cells(self) -> tuple[Cell, ...]:
+        """The cells under `HEADINGS`."""
         row, vlm = self.row, self.row if is_vlm(self.row) else self.vlm
         acts = None if is_vlm(row) else row
         if not row.is_side:
-            label = row.metric, *map(_above, (row.backbone, row.action))
-            return (*label, *["–"] * 4, _retention(row), "")
+            label = Cell(row.metric), *map(_above, (row.backbone, row.action))
+            return (*label, *[Cell(None)] * 4, _retention(row), Cell(""))
         return (
-            *["–"] * 3,
-            "–" if vlm is None else _share(vlm.success.sr, vlm.success.ci, knows(vlm)),
+            *[Cell(None)] * 3,
+            Cell(None) if vlm is None else _share(vlm.success.sr, vlm.success.ci, knows(vlm)),
             _share(row.backbone.score, row.backbone.ci, _is_marked(row.backbone)),
             _share(row.action.score, row.action.ci, _is_marked(row.action)),
-            "–" if acts is None else _share(acts.success.sr, acts.success.ci, knows(acts)),
+            Cell(None) if acts is None else _share(acts.success.sr, acts.success.ci, knows(acts)),
             _retention(row),
-            "" if row.category == MEAN else str(verdict(row)),
+            Cell("" if row.category == MEAN else str(verdict(row))),
         )
 
     @property
@@ -333,19 +333,18 @@ def _is_marked(part: StreamPart) -> bool:
     return part.has_signal and part.is_controlled
 
 
-def _share(value: float | None, limits: Limits | None, marked: bool) -> str:
-    text = with_limits(value, limits, whole_percent)
-    return f"{text} {MARK}" if marked and value is not None else text
+def _share(value: float | None, limits: Limits | None, marked: bool) -> Cell:
+    return Cell(value, whole_percent, limits, after=f" {MARK}" if marked and value is not None else "")
 
 
-def _above(part: StreamPart) -> str:
+def _above(part: StreamPart) -> Cell:
     """Return the score of a label above chance with its interval, marked where there is signal."""
-    return f"{above_chance(part)} {MARK}" if _is_marked(part) else above_chance(part)
+    return replace(above_chance(part), after=f" {MARK}" if _is_marked(part) else "")
 
 
-def _retention(row: RetentionRow) -> str:
+def _retention(row: RetentionRow) -> Cell:
     if any(part.score is None and part.above is None for part in (row.backbone, row.action)):
-        return "–"
+        return Cell(None)
     return retention_value(row)
 
 
@@ -400,8 +399,8 @@ def summary_table(summaries: Sequence[RunSummary], differences: Sequence[Differe
             lines += [_row(summary, run.run) for summary in of_name]
         for row in differences:
             if title_of(row.category) == name:
-                texts = (name, f"{row.group} − {row.minus}", "", *_difference_cells(row))
-                lines.append(Row(tuple(map(Cell, texts)), row.category == MEAN, is_difference=True))
+                cells = (Cell(name), Cell(f"{row.group} − {row.minus}"), Cell(""), *_difference_cells(row))
+                lines.append(Row(cells, row.category == MEAN, is_difference=True))
     is_of_sides = all(category.row.is_side for category in every)
     headings = ("category" if is_of_sides else "label", "run", "view", *HEADINGS, *_TESTS)
     title = " · ".join(dict.fromkeys(run.title for run in summaries))
@@ -426,8 +425,8 @@ def summary_table(summaries: Sequence[RunSummary], differences: Sequence[Differe
 
 
 def _row(category: CategorySummary, run: str) -> Row:
-    texts = (category.name, run, category.row.view or "", *category.cells, *[""] * len(_TESTS))
-    return Row(tuple(map(Cell, texts)), category.row.category == MEAN)
+    names = map(Cell, (category.name, run, category.row.view or ""))
+    return Row((*names, *category.cells, *[Cell("")] * len(_TESTS)), category.row.category == MEAN)
 
 
 def _marks(summaries: Sequence[RunSummary], table: Table) -> list[str]:
@@ -439,16 +438,16 @@ def _marks(summaries: Sequence[RunSummary], table: Table) -> list[str]:
     return [f"{MARK} above chance, and above every control that was run"] * marked + [warning] * bool(warning)
 
 
-def _difference_cells(row: Difference) -> tuple[str, ...]:
+def _difference_cells(row: Difference) -> tuple[Cell, ...]:
     sr, backbone, action = (
-        with_limits(value, limits, points)
+        Cell(value, points, limits)
         for value, limits in ((row.sr, row.sr_ci), (row.backbone, row.backbone_ci), (row.action, row.action_ci))
     )
-    answered, acted = (sr, "") if row.mode == "answers" else ("", sr)
-    ratio = with_limits(row.retention, row.retention_ci, signed)
-    over_models = "" if row.sr_models is None else models_p(row.sr_models)
-    test = "" if over_models else difference_test(row)
-    return "", "", "", answered, backbone, action, acted, ratio, "", test, over_models
+    none = absent("")
+    answered, acted = (sr, none) if row.mode == "answers" else (none, sr)
+    ratio = Cell(row.retention, signed, row.retention_ci)
+    test, over_models = (difference_test(row), none) if row.sr_models is None else (none, models_p(row.sr_models))
+    return none, none, none, answered, backbone, action, acted, ratio, none, test, over_models
 
 
 def summarise_runs(all_rows: Sequence[RetentionRow]) -> list[RunSummary]:
