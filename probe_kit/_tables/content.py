@@ -4,17 +4,14 @@ A renderer knows no subject: a cell says what is bold, red, coloured or sorted, 
 cell holds its value, the interval and the format; their text is made when a renderer asks for it.
 """
 
-import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Self
 
 from probe_kit._tables.numbers import NONE, Limits, is_missing, limits_text, plain
 
 Number = Mapping[str, Any]
 """A number behind a table with what it describes, or the numbers of a row."""
-_UNITS = re.compile(r"(,? (%|cm|points))?( \[[^\]]*\])?$")
-"""The part of a heading behind its term."""
 
 
 @dataclass(frozen=True)
@@ -87,12 +84,14 @@ class Heading:
 
     Attributes:
         help: Its entry in a glossary; empty for none.
+        term: Its entry in the legend below the table, `name: meaning`; empty for none.
         group: A name over adjoining columns; empty for none.
         is_detail: Whether the column needs room, and is left out of terminals and LaTeX.
     """
 
     text: str
     help: str = ""
+    term: str = ""
     group: str = ""
     is_detail: bool = False
 
@@ -112,12 +111,28 @@ class Row:
 
 
 @dataclass(frozen=True)
+class Legend:
+    """The parts of a legend beside the terms of the columns that are shown.
+
+    Attributes:
+        before: Remarks in front of the terms.
+        marks: The meaning of signs that cells have, by sign; one that no cell has is left out.
+        after: Remarks behind all of them.
+    """
+
+    before: tuple[str, ...] = ()
+    marks: Mapping[str, str] = field(default_factory=dict)
+    after: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class Content:
     """The part of a table that a renderer reads: its text, and the numbers behind it.
 
     Attributes:
         names: The number of first columns that name the rows.
-        notes: Sentences below the table, which need no capital letter and no period.
+        legend: Remarks and the meaning of marks, which are shown with the terms of the columns.
+        notes: Sentences below the legend, which need no capital letter and no period.
         numbers: An object per row or per number, shares in [0, 1], None where unknown.
         is_partial: Whether runs are missing that could be played; a note names them.
         overflow: The way in which a terminal shows columns that do not fit. `split`: in further tables. `leave
@@ -129,6 +144,7 @@ class Content:
     headings: tuple[Heading, ...]
     rows: tuple[Row, ...]
     names: int = 1
+    legend: Legend = field(default_factory=Legend)
     notes: tuple[str, ...] = ()
     numbers: tuple[Number, ...] = ()
     is_partial: bool = False
@@ -161,6 +177,10 @@ class Content:
         heads = tuple(heading if isinstance(heading, Heading) else Heading(heading) for heading in headings)
         return cls(title, heads, tuple(lines), notes=tuple(filter(None, notes)), **more)
 
+    def with_remarks(self, remarks: Sequence[str]) -> Self:
+        """Return the table with more remarks at the end of its legend."""
+        return replace(self, legend=replace(self.legend, after=(*self.legend.after, *remarks)))
+
     def with_notes(self, sentences: Sequence[str]) -> Self:
         """Return the table with more sentences below it."""
         return replace(self, notes=(*self.notes, *sentences))
@@ -185,15 +205,21 @@ class Content:
         return tuple(tuple(cell.text for cell in row.cells) for row in self.rows)
 
     @property
+    def all_notes(self) -> tuple[str, ...]:
+        """The legend, where there is anything to explain, and the notes."""
+        shown = {mark for mark in self.legend.marks for row in self.texts for text in row if mark in text}
+        parts = (
+            *self.legend.before,
+            *(heading.term for heading in self.headings),
+            *(f"{mark}: {meaning}" for mark, meaning in self.legend.marks.items() if mark in shown),
+            *self.legend.after,
+        )
+        return tuple(filter(None, ("; ".join(filter(None, parts)), *self.notes)))
+
+    @property
     def sentences(self) -> tuple[str, ...]:
-        """The notes as sentences, without the terms of marks such as `*` that no cell has."""
-        text = " ".join(cell for row in self.texts for cell in row)
-
-        def is_unused_mark(term: str) -> bool:
-            return not any(map(str.isalnum, term)) and term not in text
-
-        notes = (_without_terms(note, is_unused_mark) for note in self.notes)
-        return tuple(map(_sentence, filter(None, notes)))
+        """The legend and the notes as sentences."""
+        return tuple(map(_sentence, self.all_notes))
 
     @property
     def are_numeric(self) -> tuple[bool, ...]:
@@ -213,12 +239,7 @@ class Content:
         """Return the table with some of its columns, those that name the rows first."""
         rows = tuple(replace(row, cells=tuple(row.cells[at] for at in columns)) for row in self.rows)
         headings = tuple(self.headings[at] for at in columns)
-        texts = {heading.text for heading in self.headings} - {heading.text for heading in headings}
-        absent = {_UNITS.sub("", text).lower() for text in texts}
-        notes = tuple(filter(None, (_without_terms(note, absent.__contains__) for note in self.notes)))
-        return replace(
-            self, headings=headings, rows=rows, notes=notes, names=sum(at < self.names for at in columns)
-        )
+        return replace(self, headings=headings, rows=rows, names=sum(at < self.names for at in columns))
 
     def filled(self, *empty: str) -> Self:
         """Return the table without columns in which every row has a dash, nothing, or one of the texts `empty`."""
@@ -241,20 +262,6 @@ class Content:
 def grouped(*groups: tuple[str, Sequence[str]]) -> tuple[Heading, ...]:
     """Return headings under names over adjoining columns."""
     return tuple(Heading(text, group=group) for group, texts in groups for text in texts)
-
-
-def _without_terms(legend: str, is_unused: Callable[[str], bool]) -> str:
-    """Return a legend, `term: meaning; term: meaning`, without the terms that a table does not use.
-
-    A part without a term belongs to the one before it.
-    """
-    parts, is_absent = [], False
-    for part in legend.split("; "):
-        term, colon, _ = part.partition(": ")
-        is_absent = is_unused(term.lower()) if colon else is_absent
-        if not is_absent:
-            parts.append(part)
-    return "; ".join(parts)
 
 
 def _sentence(note: str) -> str:

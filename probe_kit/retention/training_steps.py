@@ -1,14 +1,13 @@
 """Retention, success and drift of several checkpoints of one training, against the training step."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from probe_kit._system.counting import counted
 from probe_kit._system.table_cells import is_count
 from probe_kit._tables.numbers import number, percent, points
-from probe_kit._tables.table import Cell, Table, absent
+from probe_kit._tables.table import Cell, Heading, Table, absent
 from probe_kit.errors import UsageError
 from probe_kit.retention.columns.text import title_of
 from probe_kit.retention.compare.models import checkpoint_of, split_checkpoint
@@ -34,7 +33,7 @@ _COLUMNS = {
     "drift of the backbone, points": "drift: the backbone's accuracy minus that of the first step, paired by "
     "items where both ran the same",
 }
-"""The meaning of each column; a note lists it for the columns that are shown."""
+"""The entry of each column in the legend."""
 
 
 def training_step(run: RunReader) -> int:
@@ -107,19 +106,19 @@ def step_table(table: RetentionTable, steps: Mapping[str, int]) -> Table:
     numbers = [_numbers(row, steps, drifts) for row in ordered]
     means = [row for row in ordered if row.category == MEAN]
     views = {steps[row.run.location]: row.view for row in means if row.view is not None}
+    headings = [Heading(name, term=term) for name, term in _COLUMNS.items()]
+    cells = [_cells(row) for row in numbers]
     steps_table = Table.of(
-        "Training steps", tuple(_COLUMNS), [_cells(row) for row in numbers], names=2, numbers=tuple(numbers),
-        mean=title_of(MEAN),
-    ).filled("n/a")  # fmt: skip
-    notes = [
-        *(_COLUMNS[name] for name in steps_table.columns if _COLUMNS[name]),
+        "Training steps", headings, cells, names=2, numbers=tuple(numbers), mean=title_of(MEAN)
+    ).filled("n/a")
+    remarks = [
         "each with its 95 % interval",
         _by_step("view", {step: str(view) for step, view in views.items()}),
         _by_step(
             "mean over", {steps[row.run.location]: ", ".join(map(title_of, row.categories)) for row in means}
         ),
     ]
-    return replace(steps_table, notes=("; ".join(filter(None, notes)),))
+    return steps_table.with_remarks(remarks)
 
 
 def _by_step(name: str, values: Mapping[int, str]) -> str:

@@ -324,7 +324,7 @@ def table_record(table: Table) -> dict[str, Any]:
     """Return a table as plain values, from which `table_of_record` makes it again."""
     return {
         "title": table.title,
-        "notes": list(table.notes),
+        "notes": list(table.all_notes),
         "names": table.names,
         "headings": [[heading.group, heading.text] for heading in table.headings],
         "are_numeric": list(table.are_numeric),

@@ -254,7 +254,7 @@ def table(
 def _print_tables(tables: "dict[str, Table]", style: str, single: bool) -> None:
     if style == "json":
         records = {
-            name: {"table": printed.title, "note": "; ".join(printed.notes), "numbers": list(printed.numbers)}
+            name: {"table": printed.title, "note": "; ".join(printed.all_notes), "numbers": list(printed.numbers)}
             for name, printed in tables.items()
         }
         print_json(next(iter(records.values())) if single else records)

@@ -7,8 +7,8 @@ from itertools import groupby
 from statistics import fmean
 
 from probe_kit._system.counting import spanned
-from probe_kit._tables.content import Heading, Number
-from probe_kit._tables.numbers import number, percent, plain
+from probe_kit._tables.content import Heading, Legend, Number
+from probe_kit._tables.numbers import NONE, number, percent, plain
 from probe_kit._tables.table import Cell, Cells, Table
 from probe_kit.retention.behaviour import Regime, normalised_score
 from probe_kit.retention.columns.tables import once_per_category
@@ -203,15 +203,19 @@ def probing_table(table: RetentionTable) -> Table:
         }
         for row in table.all_rows
     ]
-    note = [
-        "cross-fitted scores of the best sites",
-        "n/a: the backbone's signal is not shown; such categories are not in the mean of retention",
-        "–: no site where the action is made has the view",
-        "published: the paper's ratio of best accuracies, in the mean its mean over categories",
-    ]
-    columns = ("system", "view", "category", "backbone %", "action %", "retention [95 %]", "published")
-    notes = [caption(table, note)]
-    return Table.of("Probes", columns, cells, names=3, mean=MEAN, notes=notes, numbers=tuple(numbers))
+    legend = Legend(
+        before=(
+            "cross-fitted scores of the best sites",
+            "n/a: the backbone's signal is not shown; such categories are not in the mean of retention",
+        ),
+        marks={NONE: "no site where the action is made has the view"},
+        after=(caption(table, []),),
+    )
+    published = Heading(
+        "published", term="published: the paper's ratio of best accuracies, in the mean its mean over categories"
+    )
+    columns = ("system", "view", "category", "backbone %", "action %", "retention [95 %]", published)
+    return Table.of("Probes", columns, cells, names=3, mean=MEAN, legend=legend, numbers=tuple(numbers))
 
 
 def domain_scores(table: RetentionTable) -> dict[str, dict[str, float]]:

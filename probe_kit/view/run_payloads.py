@@ -471,7 +471,7 @@ def _result_table(kind: str, key: str, table: Table, findings: Sequence[str]) ->
             {"text": heading.text, "help": heading.help, "group": heading.group} for heading in table.headings
         ],
         "rows": [_row(row) for row in table.rows],
-        "notes": list(table.notes),
+        "notes": list(table.all_notes),
         "findings": list(findings),
     }
 

@@ -18,7 +18,7 @@ from probe_kit.errors import CaptureChangedActionError, CaptureError, EmptyRoleE
 from probe_kit.hooks.contract.declared import InterventionKind
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.sites import first_of
-from probe_kit.intervene.kinds.base import Intervention, effect_table
+from probe_kit.intervene.kinds.base import EffectColumn, Intervention, effect_table
 from probe_kit.intervene.outcomes import (
     RECORDED,
     ConditionOutcomes,
@@ -150,11 +150,20 @@ class AttentionReadout(Intervention):
             for block in dict.fromkeys(row.block for row in means if row.category == category):
                 shares = {row.role: row.share for row in means if (row.category, row.block) == (category, block)}
                 lines.append(((category, f"block {block:02d}"), (shares, _difference(apart.get(block or 0)))))
-        parts: dict[str, Any] = {"Where the attention lies, %": {role: _share_column(role) for role in roles}}
+        parts: dict[str, list[EffectColumn[Any]]] = {
+            "Where the attention lies, %": [_share_column(role) for role in roles]
+        }
         if set(TILE_ROLES) <= set(roles):
-            parts["Tiles by answer"] = {"correct − other [95 %]": lambda row: row[1]}
+            parts["Tiles by answer"] = [EffectColumn("correct − other [95 %]", lambda row: row[1], _BY_ANSWER)]
         title = f"What does it attend to? {context.subject}, attention"
-        return effect_table(title, _LEGEND, ("category", "read"), lines, parts)
+        return effect_table(
+            title,
+            ("category", "read"),
+            lines,
+            parts,
+            before=[_LEGEND],
+            after=["by iteration and head: --format csv"],
+        )
 
     @staticmethod
     def notes(rows: "Sequence[AttentionRow]") -> list[str]:
@@ -531,14 +540,19 @@ def _mean(values: Shares, axes: tuple[int, ...]) -> Shares:
 
 _LEGEND = (
     "Descriptive, in no verdict: attended tokens need not be used. Percent of the acting stream's attention, "
-    "means over heads, iterations and inferences: all: on the backbone's tokens, action: on its own; image.left, "
-    "image.right: on patches that see a tile; correct − other: on the correct picture's tile less the other's, by "
-    "groups of items. By iteration and head: --format csv"
+    "means over heads, iterations and inferences"
 )
+_ROLE_TERMS = {
+    ALL: "all: on the backbone's tokens",
+    "action": "action: on its own",
+    TILE_ROLES[0]: f"{', '.join(TILE_ROLES)}: on patches that see a tile",
+}
+"""The entries of the legend by role."""
+_BY_ANSWER = "correct − other: on the correct picture's tile less the other's, by groups of items"
 
 
-def _share_column(role: str) -> Any:
-    return lambda row: TableCell(row[0].get(role), percent)
+def _share_column(role: str) -> EffectColumn[Any]:
+    return EffectColumn(role, lambda row: TableCell(row[0].get(role), percent), _ROLE_TERMS.get(role, ""))
 
 
 def _difference(apart: tuple[float, tuple[float, float]] | None) -> TableCell:

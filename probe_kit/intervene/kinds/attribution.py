@@ -14,6 +14,7 @@ from probe_kit.hooks.contract.declared import InterventionKind
 from probe_kit.hooks.contract.sites import KV_STREAM
 from probe_kit.intervene.exchange import pooled_share
 from probe_kit.intervene.kinds.base import (
+    EffectColumn,
     Intervention,
     edits_by_category,
     effect_table,
@@ -57,12 +58,6 @@ TOP = 20
 
 As many are drawn from the others.
 """
-_LEGEND = (
-    "estimate: share of the image swap by gradients; exact: with these tokens patched; anchor: a complete cut, "
-    f"patched exactly; a screen that misses an anchor by more than a factor of {AGREEMENT:.0f} is void and shows "
-    "no order; drawn: chosen at random from the rest; p: of the exact patch, max-T over those of the "
-    "category; a screen enters no verdict"
-)
 
 
 def _estimated(cell: Cell, by_row: Mapping[tuple[int, int], float]) -> Condition:
@@ -207,11 +202,11 @@ class AttributionPatching(Intervention):
         ]
         return effect_table(
             "; ".join([f"Which places to patch? {context.subject}, gradients", *void]),
-            context.in_words(_LEGEND),
             ("category", "cell"),
             lines_of(rows, lambda row: row.name),
-            {context.in_words("Share of the image swap"): _COLUMNS},
+            {f"Share of the {context.exchange}": _columns(context.exchange)},
             lambda row: row.is_anchor,
+            after=["a screen enters no verdict"],
         )
 
     sentence = staticmethod(describe_screen)
@@ -231,15 +226,36 @@ class AttributionPatching(Intervention):
 
 
 KIND = AttributionPatching
-_COLUMNS: Mapping[str, Any] = {
-    "rank": lambda row: TableCell(row.rank),
-    "estimate [95 %]": lambda row: interval_cell(row.estimate, row.estimate_ci),
-    "exact [95 %]": lambda row: interval_cell(row.exact, row.exact_ci),
-    "p": lambda row: p_of(row.p_fwe, is_resolved(row.exact)),
-    "chosen": lambda row: (
-        "anchor" if row.is_anchor else "drawn" if row.is_drawn else "top" if row.p_fwe is not None else ""
-    ),
-}
+
+
+def _columns(exchange: str) -> tuple[EffectColumn[AttributionEffect], ...]:
+    """Return the columns of a screen; `exchange` is the change of inputs of which effects are shares."""
+    return (
+        EffectColumn("rank", lambda row: TableCell(row.rank)),
+        EffectColumn(
+            "estimate [95 %]",
+            lambda row: interval_cell(row.estimate, row.estimate_ci),
+            f"estimate: share of the {exchange} by gradients",
+        ),
+        EffectColumn(
+            "exact [95 %]",
+            lambda row: interval_cell(row.exact, row.exact_ci),
+            "exact: with these tokens patched",
+        ),
+        EffectColumn(
+            "p",
+            lambda row: p_of(row.p_fwe, is_resolved(row.exact)),
+            "p: of the exact patch, max-T over those of the category",
+        ),
+        EffectColumn(
+            "chosen",
+            lambda row: (
+                "anchor" if row.is_anchor else "drawn" if row.is_drawn else "top" if row.p_fwe is not None else ""
+            ),
+            "anchor: a complete cut, patched exactly; a screen that misses an anchor by more than a factor of "
+            f"{AGREEMENT:.0f} is void and shows no order; drawn: chosen at random from the rest",
+        ),
+    )
 
 
 def _rows(outcomes: ConditionOutcomes, drawn: Collection[str]) -> list[AttributionEffect]:

@@ -520,35 +520,62 @@ def frame_of(rows: Sequence[Effect]) -> "pd.DataFrame":
 # -- tables and sentences ------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True)
+class EffectColumn[Row]:
+    """A column of a table of effects.
+
+    Attributes:
+        cell: Makes the cell of a row.
+        term: Its entry in the legend, `name: meaning`; empty for none.
+    """
+
+    heading: str
+    cell: Callable[[Row], TableCell | str]
+    term: str = ""
+
+
 def effect_table[Row](
     title: str,
-    caption: str,
     names: Sequence[str],
     lines: Sequence[tuple[tuple[str, ...], Row]],
-    parts: Mapping[str, Mapping[str, Callable[[Row], TableCell | str]]],
+    parts: Mapping[str, Sequence[EffectColumn[Row]]],
     is_bold: Callable[[Row], bool] = lambda _: False,
+    *,
+    before: Iterable[str] = (),
+    marks: Mapping[str, str] = MappingProxyType({}),
+    after: Iterable[str] = (),
 ) -> "Table":
     """Return rows of effects as a table.
 
     Args:
         title: Title of the table.
-        caption: Note below the table.
         names: Headings of the columns that name a line.
         lines: Names of each line, and its row.
-        parts: By title of a group of columns, the function that gives a row's cell in each column.
+        parts: The columns by the title of their group.
         is_bold: Function that returns whether a row's names are bold.
+        before: Remarks of the legend in front of the terms of the columns; empty ones are left out.
+        marks: The meaning of signs that cells have.
+        after: Remarks behind them; empty ones are left out.
     """
-    from probe_kit._tables.table import Heading, Table, grouped
+    from probe_kit._tables.table import Heading, Legend, Table
 
     rows: list[tuple[TableCell | str, ...]] = [
         (
             *(TableCell(text, strong=is_bold(row)) for text in (category_of(line[0]).title, *line[1:])),
-            *(cell(row) for columns in parts.values() for cell in columns.values()),
+            *(column.cell(row) for columns in parts.values() for column in columns),
         )
         for line, row in lines
     ]
-    headings = (*map(Heading, names), *grouped(*((part, tuple(columns)) for part, columns in parts.items())))
-    return Table.of(title, headings, rows, names=len(names), notes=[caption])
+    headings = [
+        *map(Heading, names),
+        *(
+            Heading(column.heading, term=column.term, group=part)
+            for part, columns in parts.items()
+            for column in columns
+        ),
+    ]
+    legend = Legend(tuple(before), marks, tuple(after))
+    return Table.of(title, headings, rows, names=len(names), legend=legend)
 
 
 def lines_of[Row: Effect](rows: Iterable[Row], name: Callable[[Row], str]) -> list[tuple[tuple[str, ...], Row]]:

@@ -24,6 +24,7 @@ from probe_kit.intervene.kinds.base import (
     NONE,
     AlongDirection,
     ConditionName,
+    EffectColumn,
     EffectRow,
     common_columns,
     compare_with_controls,
@@ -59,13 +60,6 @@ MIN_IN_ZONE_RATIO = 0.5
 CORRECT, WRONG = "correct", "wrong"
 """Outcomes of `env.scoring` with the cube in a zone; the third, `oob`, is outside both."""
 Finding = Literal["identity patch", "control", "task disrupted", "confirmed", "not confirmed"]
-_LEGEND = (
-    "every episode played again, same scene and seeds, with the edit at every inference; in a zone: whichever "
-    "picture; net flip rate: share of episodes that end on the wrong picture, minus that with the identity patch; "
-    "p: family-wise, of what goes beyond the controls, one-sided; confirmed: p < 0.05 and "
-    f"{SMALLEST_EFFECT_OF_INTEREST} beyond the controls; task disrupted: in a zone less than "
-    f"{MIN_IN_ZONE_RATIO:g} times as often as with the identity patch, and then in no verdict"
-)
 
 
 def identity_patch(sites: Sequence[Site]) -> Condition:
@@ -209,11 +203,11 @@ class ClosedLoop(AlongDirection):
         """Return one line per category and condition, the identity patch first."""
         return effect_table(
             f"Is it so in closed loop? {context.subject}",
-            _LEGEND,
             ("category", "edit"),
             lines_of(rows, lambda row: "identity patch" if row.sites == CLEAN else row.name),
             {"Where the cube ends": _ENDS, "Compared with the identity patch": _COMPARED},
             lambda row: row.finding == "confirmed",
+            before=["every episode played again, same scene and seeds, with the edit at every inference"],
         )
 
     @staticmethod
@@ -354,17 +348,35 @@ def _of_edits(cell: Callable[[ClosedLoopEffect], TableCell]) -> Callable[[Closed
     return lambda row: TableCell(None) if row.sites == CLEAN else cell(row)
 
 
-_ENDS: Mapping[str, Any] = {
-    "correct %": lambda row: rate(row.correct),
-    "wrong %": lambda row: rate(row.wrong),
-    "in a zone %": lambda row: rate(row.in_zone),
-    "wrong of these %": lambda row: rate(row.wrong_in_zone),
-}
-_COMPARED: Mapping[str, Any] = {
-    "net flip rate [95 %]": _of_edits(lambda row: signed_interval(row.net, row.net_ci)),
-    "left / right": _of_edits(lambda row: TableCell(row.net_left, signed, after=f" / {signed(row.net_right)}")),
-    "controls": _of_edits(lambda row: TableCell(row.control_net, signed)),
-    "only with : only without": _of_edits(lambda row: TableCell(row.gained, after=f" : {row.lost}")),
-    "p": _of_edits(lambda row: p_of(row.p_fwe)),
-    "finding": lambda row: row.finding,
-}
+_ENDS = (
+    EffectColumn[ClosedLoopEffect]("correct %", lambda row: rate(row.correct)),
+    EffectColumn[ClosedLoopEffect]("wrong %", lambda row: rate(row.wrong)),
+    EffectColumn[ClosedLoopEffect]("in a zone %", lambda row: rate(row.in_zone), "in a zone: whichever picture"),
+    EffectColumn[ClosedLoopEffect]("wrong of these %", lambda row: rate(row.wrong_in_zone)),
+)
+_COMPARED = (
+    EffectColumn[ClosedLoopEffect](
+        "net flip rate [95 %]",
+        _of_edits(lambda row: signed_interval(row.net, row.net_ci)),
+        "net flip rate: share of episodes that end on the wrong picture, minus that with the identity patch",
+    ),
+    EffectColumn[ClosedLoopEffect](
+        "left / right",
+        _of_edits(lambda row: TableCell(row.net_left, signed, after=f" / {signed(row.net_right)}")),
+    ),
+    EffectColumn[ClosedLoopEffect]("controls", _of_edits(lambda row: TableCell(row.control_net, signed))),
+    EffectColumn[ClosedLoopEffect](
+        "only with : only without", _of_edits(lambda row: TableCell(row.gained, after=f" : {row.lost}"))
+    ),
+    EffectColumn[ClosedLoopEffect](
+        "p",
+        _of_edits(lambda row: p_of(row.p_fwe)),
+        "p: family-wise, of what goes beyond the controls, one-sided",
+    ),
+    EffectColumn[ClosedLoopEffect](
+        "finding",
+        lambda row: row.finding,
+        f"confirmed: p < 0.05 and {SMALLEST_EFFECT_OF_INTEREST} beyond the controls; task disrupted: in a zone "
+        f"less than {MIN_IN_ZONE_RATIO:g} times as often as with the identity patch, and then in no verdict",
+    ),
+)

@@ -22,6 +22,7 @@ from probe_kit.hooks.contract.sites import Site
 from probe_kit.intervene.erasers import Eraser, Method
 from probe_kit.intervene.kinds.base import (
     ConditionName,
+    EffectColumn,
     EffectRow,
     Intervention,
     centimetres,
@@ -71,12 +72,6 @@ CHANCE_LIKE = 0.6
 
 Chance is 0.5; an accuracy of a few dozen episodes varies by about 0.1.
 """
-_LEGEND = (
-    "goes there: share of episodes whose action goes to the correct picture; kept: of how far, n/a where it does "
-    "not; controls: the mean of random subspaces of the same rank; p: exact, that the action moves away farther "
-    "than under the controls, by item and by group, the larger one; probe accuracy: a fresh probe on the mean "
-    "over tokens; relative change: how far tokens were moved, in their own norms. Weaker evidence than interchange"
-)
 
 
 # -- the intervention --------------------------------------------------------------------------------------
@@ -187,11 +182,11 @@ class ConceptErasure(Intervention):
         edits = [row for row in rows if row.finding not in ("control", "identity patch")]
         return effect_table(
             f"What is lost without it? {context.subject}, erase",
-            _LEGEND,
             ("category", "erased"),
             lines_of(edits, lambda row: row.name),
             {"What the action does": _ACTION, "What a probe reads": _PROBE},
             lambda row: row.finding == "effect",
+            after=["Weaker evidence than interchange"],
         )
 
     @staticmethod
@@ -414,13 +409,41 @@ def _accuracies(row: ErasureEffect) -> TableCell:
     return TableCell(row.probe_accuracy_before, percent, after=f" → {percent(row.probe_accuracy)}")
 
 
-_ACTION: Mapping[str, Any] = {
-    "goes there %": lambda row: TableCell(row.right_before, percent, after=f" → {percent(row.right)}"),
-    "controls %": lambda row: rate(None if row.control_net is None else row.right_before - row.control_net),
-    "kept": lambda row: absent("n/a") if row.share_left is None else TableCell(row.share_left, number),
-    "controls": lambda row: TableCell(row.control_share_left, number),
-    "displacement cm": lambda row: centimetres(-row.mean_displacement, signed),
-    "p": lambda row: p_of(row.p, is_resolved(100 * row.mean_displacement, row.right_before - row.right)),
-    "relative change": lambda row: TableCell(row.relative_change, number),
-}
-_PROBE: Mapping[str, Any] = {"probe accuracy %": _accuracies, "finding": lambda row: row.finding}
+_ACTION = (
+    EffectColumn[ErasureEffect](
+        "goes there %",
+        lambda row: TableCell(row.right_before, percent, after=f" → {percent(row.right)}"),
+        "goes there: share of episodes whose action goes to the correct picture",
+    ),
+    EffectColumn[ErasureEffect](
+        "controls %", lambda row: rate(None if row.control_net is None else row.right_before - row.control_net)
+    ),
+    EffectColumn[ErasureEffect](
+        "kept",
+        lambda row: absent("n/a") if row.share_left is None else TableCell(row.share_left, number),
+        "kept: of how far, n/a where it does not",
+    ),
+    EffectColumn[ErasureEffect](
+        "controls",
+        lambda row: TableCell(row.control_share_left, number),
+        "controls: the mean of random subspaces of the same rank",
+    ),
+    EffectColumn[ErasureEffect]("displacement cm", lambda row: centimetres(-row.mean_displacement, signed)),
+    EffectColumn[ErasureEffect](
+        "p",
+        lambda row: p_of(row.p, is_resolved(100 * row.mean_displacement, row.right_before - row.right)),
+        "p: exact, that the action moves away farther than under the controls, by item and by group, the larger "
+        "one",
+    ),
+    EffectColumn[ErasureEffect](
+        "relative change",
+        lambda row: TableCell(row.relative_change, number),
+        "relative change: how far tokens were moved, in their own norms",
+    ),
+)
+_PROBE = (
+    EffectColumn[ErasureEffect](
+        "probe accuracy %", _accuracies, "probe accuracy: a fresh probe on the mean over tokens"
+    ),
+    EffectColumn[ErasureEffect]("finding", lambda row: row.finding),
+)

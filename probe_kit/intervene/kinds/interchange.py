@@ -26,6 +26,7 @@ from probe_kit.intervene.kinds.base import (
     UNRESOLVED,
     AlongDirection,
     ConditionName,
+    EffectColumn,
     EffectRow,
     Values,
     centimetres,
@@ -55,13 +56,6 @@ if TYPE_CHECKING:
     from probe_kit._tables.table import Table
     from probe_kit.intervene.directions import Directions
     from probe_kit.intervene.sessions import ReplaySession
-
-_LEGEND = (
-    "effect: share of what the whole image swap does, n/a where that is not beyond chance; net flip rate: share "
-    "of episodes that flip to the target side, minus those that flip away from it; p: family-wise over all edits "
-    "of the category, one-sided; relative change: how far tokens were moved, in their own norms; *: carries the "
-    "effect by construction and locates nothing; unread: nothing that acts reads this place"
-)
 
 
 # -- effects of edits at places ------------------------------------------------------------------------------
@@ -478,11 +472,12 @@ class PatchKind(AlongDirection):
         edits = [row for row in rows if not row.is_control]
         return effect_table(
             f"Where is it used? {context.subject}, {context.kind}",
-            context.in_words("; ".join(filter(None, (_LEGEND, legend_of_doses(edits), legend_of_p(edits))))),
             ("category", "edit"),
             lines_of(edits, lambda row: f"{row.name}{' (unread)' * (row.sites in unread)}"),
-            {"What the action does": _WITHOUT_SIDES if context.lacks_sides else _COLUMNS},
+            {"What the action does": _columns(context.exchange, not context.lacks_sides)},
             lambda row: row.is_localised and not row.is_by_construction,
+            marks={BY_CONSTRUCTION: "carries the effect by construction and locates nothing"},
+            after=["unread: nothing that acts reads this place", legend_of_doses(edits), legend_of_p(edits)],
         )
 
     @staticmethod
@@ -595,28 +590,64 @@ def _share(effect: float | None) -> str:
     return "n/a" if effect is None else number(effect)
 
 
-_COLUMNS: Mapping[str, Any] = {
-    "effect": lambda row: TableCell(
-        row.effect, _share, after=BY_CONSTRUCTION if row.is_localised and row.is_by_construction else ""
-    ),
-    "net flip rate [95 %]": lambda row: signed_interval(row.net, row.net_ci),
-    "left / right": lambda row: TableCell(row.net_left, signed, after=f" / {signed(row.net_right)}"),
-    "displacement cm": lambda row: centimetres(row.mean_displacement, signed),
-    "controls cm": lambda row: centimetres(row.control_displacement, signed),
-    "p": lambda row: p_of(row.p_fwe, row.is_resolved),
-    "relative change": lambda row: TableCell(row.relative_change, number),
-}
+def _columns(exchange: str, has_sides: bool) -> list[EffectColumn[PatchEffect]]:
+    """Return the columns of edits.
+
+    Args:
+        exchange: The change of inputs of which effects are shares.
+        has_sides: Whether displacements are in cm toward a side. Else they are in spreads of clean actions, toward
+            the source's action.
+    """
+    effect = EffectColumn[PatchEffect](
+        "effect",
+        lambda row: TableCell(
+            row.effect, _share, after=BY_CONSTRUCTION if row.is_localised and row.is_by_construction else ""
+        ),
+        f"effect: share of what the whole {exchange} does, n/a where that is not beyond chance",
+    )
+    p = EffectColumn[PatchEffect](
+        "p",
+        lambda row: p_of(row.p_fwe, row.is_resolved),
+        "p: family-wise over all edits of the category, one-sided",
+    )
+    change = EffectColumn[PatchEffect](
+        "relative change",
+        lambda row: TableCell(row.relative_change, number),
+        "relative change: how far tokens were moved, in their own norms",
+    )
+    if not has_sides:
+        return [
+            effect,
+            EffectColumn(
+                "nearer to the source [95 %]",
+                _net,
+                "nearer to the source: share of episodes whose action is nearer to the source's than to the clean "
+                "one",
+            ),
+            EffectColumn("displacement", lambda row: TableCell(row.mean_displacement, signed)),
+            EffectColumn("controls", lambda row: TableCell(row.control_displacement, signed)),
+            p,
+            change,
+        ]
+    return [
+        effect,
+        EffectColumn(
+            "net flip rate [95 %]",
+            _net,
+            "net flip rate: share of episodes that flip to the target side, minus those that flip away from it",
+        ),
+        EffectColumn(
+            "left / right", lambda row: TableCell(row.net_left, signed, after=f" / {signed(row.net_right)}")
+        ),
+        EffectColumn("displacement cm", lambda row: centimetres(row.mean_displacement, signed)),
+        EffectColumn("controls cm", lambda row: centimetres(row.control_displacement, signed)),
+        p,
+        change,
+    ]
 
 
-_WITHOUT_SIDES: Mapping[str, Any] = {
-    "effect": _COLUMNS["effect"],
-    "nearer to the source [95 %]": _COLUMNS["net flip rate [95 %]"],
-    "displacement": lambda row: TableCell(row.mean_displacement, signed),
-    "controls": lambda row: TableCell(row.control_displacement, signed),
-    "p": _COLUMNS["p"],
-    "relative change": _COLUMNS["relative change"],
-}
-"""Columns of a run without sides; displacements are in spreads of clean actions, toward the source's action."""
+def _net(row: PatchEffect) -> TableCell:
+    return signed_interval(row.net, row.net_ci)
 
 
 HALF_DIFFERENCE, VECTOR = "half class-mean differences", "lengths of the file's vector"

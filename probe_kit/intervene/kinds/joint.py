@@ -14,6 +14,7 @@ from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.sites import KV_STREAM
 from probe_kit.intervene.exchange import CARRIES, NOTHING, SwapShare, carries_nothing, pooled_share, share_fields
 from probe_kit.intervene.kinds.base import (
+    EffectColumn,
     Intervention,
     effect_table,
     interval_cell,
@@ -47,13 +48,6 @@ WORTH_SEARCHING = 0.5
 """Effect of all cells together from which on a smallest set is searched: of less, hardly any carries half."""
 MOST_PLACES = 3
 """Number of places that a short sentence names."""
-_LEGEND = (
-    "alone: share of the image swap with only these cells patched; needed: what all cells lose without them; "
-    "read here: both at least 0.5; enough alone: another copy is read as well; needed, not enough: one part of "
-    "several; nothing alone: neither, which leaves a part of a set; opposes it: both below -0.1; smallest set: "
-    "searched in one half of the groups, scored in the other; p: that the action moves toward the target side, of "
-    "cells max-T over all"
-)
 _PARTS = {EVERY: "all cells of", MINIMAL: "smallest set:", SECOND: "without it:"}
 
 
@@ -192,10 +186,9 @@ class JointPlaces(Intervention):
         """Return one line per category and set."""
         return effect_table(
             f"Where is it read, alone and jointly? {context.subject}, joint places",
-            context.in_words(_LEGEND),
             ("category", "cells"),
             lines_of(rows, lambda row: f"{_PARTS.get(row.part, '')} {row.cells}".lstrip()),
-            {context.in_words("Share of the image swap"): _COLUMNS},
+            {f"Share of the {context.exchange}": _columns(context.exchange)},
             lambda row: row.finding.startswith("read"),
         )
 
@@ -238,13 +231,38 @@ class JointPlaces(Intervention):
 
 
 KIND = JointPlaces
-_COLUMNS: Mapping[str, Any] = {
-    "alone [95 %]": lambda row: interval_cell(row.alone, row.alone_ci),
-    "needed [95 %]": lambda row: interval_cell(row.needed, row.needed_ci),
-    "p": lambda row: p_of(row.p if row.p_fwe is None else row.p_fwe, row.alone is None or is_resolved(row.alone)),
-    "groups": lambda row: TableCell(row.n_groups),
-    "finding": lambda row: row.finding,
-}
+
+
+def _columns(exchange: str) -> "tuple[EffectColumn[JointEffect], ...]":
+    """Return the columns of a search; `exchange` is the change of inputs of which effects are shares."""
+    return (
+        EffectColumn(
+            "alone [95 %]",
+            lambda row: interval_cell(row.alone, row.alone_ci),
+            f"alone: share of the {exchange} with only these cells patched",
+        ),
+        EffectColumn(
+            "needed [95 %]",
+            lambda row: interval_cell(row.needed, row.needed_ci),
+            "needed: what all cells lose without them",
+        ),
+        EffectColumn(
+            "p",
+            lambda row: p_of(
+                row.p if row.p_fwe is None else row.p_fwe, row.alone is None or is_resolved(row.alone)
+            ),
+            "p: that the action moves toward the target side, of cells max-T over all",
+        ),
+        EffectColumn("groups", lambda row: TableCell(row.n_groups)),
+        EffectColumn("finding", lambda row: row.finding, _FINDINGS),
+    )
+
+
+_FINDINGS = (
+    "read here: both at least 0.5; enough alone: another copy is read as well; needed, not enough: one part of "
+    "several; nothing alone: neither, which leaves a part of a set; opposes it: both below -0.1; smallest set: "
+    "searched in one half of the groups, scored in the other"
+)
 
 
 # -- effects -------------------------------------------------------------------------------------------------

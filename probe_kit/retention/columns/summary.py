@@ -248,29 +248,38 @@ def next_step(rows: Sequence[RetentionRow]) -> str:
 
 MARK = "✓"
 """Mark after a share: the stream exceeds chance and a control, or the regime of the behaviour is knowledge."""
-_LEGENDS = {
-    "metric": "Metric: of a label, balanced accuracy of classes, R² of quantities",
-    "backbone above chance": "Above chance: score of sites that other groups chose minus its mean score with "
-    "permuted labels, 95 % intervals over groups",
-    "VLM %": "VLM: share of its answers that are right; its name ends on the prompt and the size of the picture",
-    "backbone %": "Backbone: accuracy of probes in the backbone, at sites that other questions chose",
-    "action %": "Action: the same at the action's sites",
-    "success %": "Success: the cube ends on the correct picture",
-    "retention": "Retention: share of the backbone's signal left in the action; a mean is of the scores, not of "
-    "these shares",
+_TERMS = {
+    "metric": ("Metric", "of a label, balanced accuracy of classes, R² of quantities"),
+    "backbone above chance": (
+        "Above chance",
+        "score of sites that other groups chose minus its mean score with permuted labels, 95 % intervals over "
+        "groups",
+    ),
+    "VLM %": (
+        "VLM",
+        "share of its answers that are right; its name ends on the prompt and the size of the picture",
+    ),
+    "backbone %": ("Backbone", "accuracy of probes in the backbone, at sites that other questions chose"),
+    "action %": ("Action", "the same at the action's sites"),
+    "success %": ("Success", "the cube ends on the correct picture"),
+    "retention": (
+        "Retention",
+        "share of the backbone's signal left in the action; a mean is of the scores, not of these shares",
+    ),
+    "p (Holm)": (
+        "p",
+        f"exact, of a difference in success or answers, (corrected for all categories and pairs); {P_DECIDES}",
+    ),
+    "p over models (least)": (
+        "p over models",
+        "exact, models as the unit (the least that so few models allow)",
+    ),
 }
-"""The meaning of a column."""
-_TESTS = {
-    "p (Holm)": "p: exact, of a difference in success or answers, (corrected for all categories and pairs); "
-    f"{P_DECIDES}",
-    "p over models (least)": "p over models: exact, models as the unit (the least that so few models allow)",
+"""The name and the meaning of a column in the legend; the last two are of differences."""
+_TESTS = ("p (Holm)", "p over models (least)")
+HEADING_HELP = {heading: f"{meaning[:1].upper()}{meaning[1:]}." for heading, (_, meaning) in _TERMS.items()} | {
+    "verdict": "What all numbers of the category say together."
 }
-"""The meaning of a column of differences."""
-HEADING_HELP = {
-    heading: f"{meaning[:1].upper()}{meaning[1:]}."
-    for heading, legend in (_LEGENDS | _TESTS).items()
-    for meaning in [legend.partition(": ")[2]]
-} | {"verdict": "What all numbers of the category say together."}
 """The meanings of the columns as entries of the glossary."""
 
 
@@ -414,8 +423,7 @@ def summary_table(summaries: Sequence[RunSummary], differences: Sequence[Differe
     has_views = not is_of_sides and len({category.row.view for category in every}) > 1
     left_out = [*[1] * (len(summaries) < 2 and not differences), *[2] * (not has_views)]
     table = table.only([at for at in range(len(headings)) if at not in left_out]).filled()
-    legends = _LEGENDS | _TESTS
-    legend = [legends[name] for name in table.columns if name in legends]
+    legend = [": ".join(_TERMS[name]) for name in table.columns if name in _TERMS]
     readouts = describe_readouts(summary.row.image_swap.use for run in summaries for summary in run.categories)
     counts = [(summary.row.success.n_items, summary.row.success.n_groups) for summary in every]
     size = size_of_groups(

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from probe_kit._system.counting import counted
 from probe_kit._tables.numbers import NONE, number, percent, plain, points, span
-from probe_kit._tables.table import Cell, Cells, Heading, Row, Table, absent
+from probe_kit._tables.table import Cell, Cells, Heading, Legend, Row, Table, absent
 from probe_kit.retention.behaviour import rule_sentence
 from probe_kit.retention.choices import Section
 from probe_kit.retention.columns.columns import TABLES, Column, ColumnGroup, radius_columns
@@ -437,12 +437,9 @@ def _vlm_vla_table(vlm: str, policy: str, rows: Sequence[Difference]) -> Table:
 
 # -- answer, probe, success --------------------------------------------------------------------------------------
 
-Columns = Sequence[tuple[str, Callable[[CategoryCounts], Cell]]]
+Columns = Sequence[tuple[Heading | str, Callable[[CategoryCounts], Cell]]]
 _p4 = partial(number, digits=4)
-_LEGEND = (
-    "answer: the VLM answers right; probe: its held-out decision is right; success: the cube ends right; each in "
-    "both layouts of an item, which a coin manages in 25 %"
-)
+_BOTH_LAYOUTS = "each in both layouts of an item, which a coin manages in 25 %"
 _NAMES = {"answered": "answer", "encoded": "probe", "acted": "success"}
 _CODES = "a capital letter for what is right, a small one for what is not"
 _TESTS = "p: exact McNemar over items or over whole groups, the larger; (Holm) over all categories and pairs shown"
@@ -455,7 +452,9 @@ def known_used_tables(joined: KnownUsedTable) -> list[Table]:
     rows = joined.rows
     which = "Which of them: VLM · probe · success (expected of coins)"
     return [
-        _counts(title, f"{_LEGEND}; {probes}", rows, ("Items", _SHARES), ("Answer right, without success", _LOST)),
+        _counts(
+            title, f"{_BOTH_LAYOUTS}; {probes}", rows, ("Items", _SHARES), ("Answer right, without success", _LOST)
+        ),
         _counts(which, _CODES, rows, ("", _codes(rows))),
         _counts("Equally many?", _TESTS, rows, ("", _TESTED)),
         _counts("Single episodes (nothing is tested)", "", rows, ("", _episodes(rows))),
@@ -463,11 +462,16 @@ def known_used_tables(joined: KnownUsedTable) -> list[Table]:
 
 
 def _counts(title: str, note: str, rows: Sequence[CategoryCounts], *groups: tuple[str, Columns]) -> Table:
-    headings = [Heading(name, group=group) for group, columns in groups for name, _ in columns]
+    headings = [
+        replace(heading if isinstance(heading, Heading) else Heading(heading), group=group)
+        for group, columns in groups
+        for heading, _ in columns
+    ]
     cells: list[Cells] = [
         (row.category, *(cell(row) for _, columns in groups for _, cell in columns)) for row in rows
     ]
-    return Table.of(title, ("category", *headings), cells, mean=OVERALL, notes=[note]).filled()
+    legend = Legend(after=(note,))
+    return Table.of(title, ("category", *headings), cells, mean=OVERALL, legend=legend).filled()
 
 
 def _share(count: int | None, row: CategoryCounts) -> Cell:
@@ -476,9 +480,12 @@ def _share(count: int | None, row: CategoryCounts) -> Cell:
 
 _SHARES: Columns = [
     ("items (groups)", lambda row: Cell(row.n_items, after=f" ({row.n_groups})")),
-    ("answer right", lambda row: _share(row.answered_correctly, row)),
-    ("probe right", lambda row: _share(row.encoded, row)),
-    ("success", lambda row: _share(row.acted_correctly, row)),
+    (
+        Heading("answer right", term="answer: the VLM answers right"),
+        lambda row: _share(row.answered_correctly, row),
+    ),
+    (Heading("probe right", term="probe: its held-out decision is right"), lambda row: _share(row.encoded, row)),
+    (Heading("success", term="success: the cube ends right"), lambda row: _share(row.acted_correctly, row)),
     ("shown", lambda row: Cell({True: "yes", False: "no", None: None}[row.has_signal])),
 ]
 _LOST: Columns = [

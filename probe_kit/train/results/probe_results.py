@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from probe_kit._system.bounded_files import UNREADABLE, open_arrays
 from probe_kit._tables.numbers import Limits, number, p_text, percent
-from probe_kit._tables.table import Cell, Table
+from probe_kit._tables.table import Cell, Legend, Table
 from probe_kit.errors import UnknownSiteError
 from probe_kit.hashing import sha256_json
 from probe_kit.hooks.contract.sites import Site, label_of
@@ -482,7 +482,7 @@ def episodes_sha256(run: RunReader) -> str:
 
 # -- the table of best sites -------------------------------------------------------------------------------------
 
-_TIES = "+: as many other sites tie with it"
+_TIES = {"+": "as many other sites tie with it"}
 _LEGEND = "the score of a chosen site is too high"
 _OF_SIDE = "; `retention` corrects it"
 _OF_LABEL = ". Chance: mean score of this site with exchanged labels"
@@ -527,9 +527,16 @@ def best_sites_table(fitted: Sequence[ProbeResults], splits: bool = True) -> Tab
         "n",
         "first iteration",
     )
-    notes = [_TIES, _LEGEND + (_OF_SIDE if first.is_side else _OF_LABEL)]
+    notes = [_LEGEND + (_OF_SIDE if first.is_side else _OF_LABEL)]
     overflow = "split" if splits else "leave out"
-    return Table.of(", ".join(_title(fitted, several_views)), headings, rows, notes=notes, overflow=overflow)
+    return Table.of(
+        ", ".join(_title(fitted, several_views)),
+        headings,
+        rows,
+        legend=Legend(marks=_TIES),
+        notes=notes,
+        overflow=overflow,
+    )
 
 
 def _title(fitted: Sequence[ProbeResults], several_views: bool) -> Iterator[str]:

@@ -397,10 +397,10 @@ def test_an_effect_below_the_resolution_of_its_measure_is_significant_of_nothing
     ]
     table = Steering.table(doses, context(None))
     assert [row[table.columns.index("p")] for row in table.texts] == ["–", "–", "–"]
-    assert "lengths of the file's vector" in table.notes[0]
-    assert "significant of nothing" in table.notes[0]
+    assert "lengths of the file's vector" in table.all_notes[0]
+    assert "significant of nothing" in table.all_notes[0]
     found = Steering.table([replace(patch("backbone.02", 0.6, 0.004), coefficient="1")], context(None))
-    assert "significant of nothing" not in found.notes[0]
+    assert "significant of nothing" not in found.all_notes[0]
     assert unit_of_doses("mean-difference:1") == unit_of_doses("probe") == "half class-mean differences"
 
 
