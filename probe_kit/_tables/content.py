@@ -84,16 +84,16 @@ class Heading:
 
     Attributes:
         help: Its entry in a glossary; empty for none.
-        term: Its entry in the legend below the table, `name: meaning`; empty for none.
         group: A name over adjoining columns; empty for none.
         is_detail: Whether the column needs room, and is left out of terminals and LaTeX.
+        term: Its entry in the legend below the table, `name: meaning`; empty for none.
     """
 
     text: str
     help: str = ""
-    term: str = ""
     group: str = ""
     is_detail: bool = False
+    term: str = ""
 
 
 @dataclass(frozen=True)
@@ -131,24 +131,24 @@ class Content:
 
     Attributes:
         names: The number of first columns that name the rows.
-        legend: Remarks and the meaning of marks, which are shown with the terms of the columns.
         notes: Sentences below the legend, which need no capital letter and no period.
         numbers: An object per row or per number, shares in [0, 1], None where unknown.
         is_partial: Whether runs are missing that could be played; a note names them.
         overflow: The way in which a terminal shows columns that do not fit. `split`: in further tables. `leave
             out`: by name only. `fold`: first with intervals below their values. `wrap`: with wrapped text, for
             columns of words.
+        legend: Remarks and the meaning of marks, which are shown with the terms of the columns.
     """
 
     title: str
     headings: tuple[Heading, ...]
     rows: tuple[Row, ...]
     names: int = 1
-    legend: Legend = field(default_factory=Legend)
     notes: tuple[str, ...] = ()
     numbers: tuple[Number, ...] = ()
     is_partial: bool = False
     overflow: Literal["split", "leave out", "fold", "wrap"] = "split"
+    legend: Legend = field(default_factory=Legend)
 
     @classmethod
     def of(

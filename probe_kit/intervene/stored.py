@@ -167,10 +167,6 @@ class Measurement:
         """The change of inputs of which effects are shares, in words."""
         return f"exchange of the {self.settings.get('vary') or ''}" if self.lacks_sides else "image swap"
 
-    def in_words(self, text: str) -> str:
-        """Return a text about the image swap, with the change of inputs of this run in its place."""
-        return text.replace("image swap", self.exchange)
-
     @property
     def verdicts(self) -> Mapping[str, Any]:
         """The `UseVerdict` by category: those of an `InterventionResult`, here none."""

@@ -209,7 +209,11 @@ class AttributionPatching(Intervention):
             after=["a screen enters no verdict"],
         )
 
-    sentence = staticmethod(describe_screen)
+    @staticmethod
+    def sentence(rows: Sequence[AttributionEffect], context: Measurement) -> str:
+        """Return what the screen ranks first, and whether it holds."""
+        del context
+        return describe_screen(rows)
 
     @staticmethod
     def finding(rows: Sequence[AttributionEffect], context: Measurement) -> str:

@@ -212,8 +212,8 @@ class Intervention(Choice, ABC):
     @classmethod
     def sentences(cls, rows: Sequence[Any], context: Measurement) -> list[str]:
         """Return the findings with their numbers, a sentence per category; none of a kind that only describes."""
-        parts = [(name, cls.sentence(part)) for name, part in edits_by_category(rows).items()]
-        return [f"{category_of(name).title}: {context.in_words(text)}." for name, text in parts if text]
+        parts = [(name, cls.sentence(part, context)) for name, part in edits_by_category(rows).items()]
+        return [f"{category_of(name).title}: {text}." for name, text in parts if text]
 
     @classmethod
     def findings(cls, rows: Sequence[Any], context: Measurement) -> list[str]:
@@ -222,12 +222,12 @@ class Intervention(Choice, ABC):
             (category_of(name).title, cls.finding(part, context)) for name, part in edits_by_category(rows).items()
         ]
         width = max((len(title) for title, _ in parts), default=0)
-        return [f"{title.ljust(width)}  {context.in_words(text)}." for title, text in parts if text]
+        return [f"{title.ljust(width)}  {text}." for title, text in parts if text]
 
     @staticmethod
-    def sentence(rows: Sequence[Any]) -> str:
+    def sentence(rows: Sequence[Any], context: Measurement) -> str:
         """Return the finding in one category with its numbers; `rows` are without controls."""
-        del rows
+        del rows, context
         return ""
 
     @staticmethod

@@ -211,8 +211,9 @@ class ClosedLoop(AlongDirection):
         )
 
     @staticmethod
-    def sentence(rows: "Sequence[ClosedLoopEffect]") -> str:
+    def sentence(rows: "Sequence[ClosedLoopEffect]", context: Measurement) -> str:
         """Return at which places the cube turns to the other picture."""
+        del context
         edits = [row for row in rows if row.sites != CLEAN]
         confirmed = [f"{row.name} {row.net:+.2f}" for row in edits if row.finding == "confirmed"]
         disrupted = [row.name for row in edits if row.finding == "task disrupted"]

@@ -190,8 +190,9 @@ class ConceptErasure(Intervention):
         )
 
     @staticmethod
-    def sentence(rows: "Sequence[ErasureEffect]") -> str:
+    def sentence(rows: "Sequence[ErasureEffect]", context: Measurement) -> str:
         """Return which erasures take the answer from the action."""
+        del context
         tried, has_answer = _tried(rows)
         if not has_answer:
             return "the unedited action does not go to the correct picture, so that nothing can be lost"

@@ -481,7 +481,7 @@ class PatchKind(AlongDirection):
         )
 
     @staticmethod
-    def sentence(rows: Sequence[PatchEffect]) -> str:
+    def sentence(rows: Sequence[PatchEffect], context: Measurement) -> str:
         """Return which edits carry half of the swap, or move the action at all."""
         edits, localised, apart = _carriers(rows)
         if all(row.effect is None for row in edits):
@@ -494,25 +494,28 @@ class PatchKind(AlongDirection):
         verb = "have" if any(row.is_dose for row in edits) else "carry"
         by_construction = f"; {apart} more {verb} it by construction and locate nothing (*)" * (apart > 0)
         count = count_edits(names, len(edits) - apart)
-        return f"edits that {verb} half of the image swap's effect: {count}{by_construction}"
+        return f"edits that {verb} half of the {context.exchange}'s effect: {count}{by_construction}"
 
     @staticmethod
     def finding(rows: Sequence[PatchEffect], context: Measurement) -> str:
         """Return where half of the swap's effect was found, or that no edit has it."""
-        del context
         edits, localised, apart = _carriers(rows)
         tried, steered = len(edits) - apart, any(row.is_dose for row in edits)
         if all(row.effect is None for row in edits):
             moving = _moving(edits)
-            nothing = "not moved: neither the image swap nor any edit moves the action beyond chance"
+            nothing = f"not moved: neither the {context.exchange} nor any edit moves the action beyond chance"
             return f"moved: to the target side by {share_of_edits(moving, tried)}" if moving else nothing
         if localised:
-            what = "steered: half of the image swap's effect by" if steered else "located: half of it passes in"
+            what = (
+                f"steered: half of the {context.exchange}'s effect by"
+                if steered
+                else "located: half of it passes in"
+            )
             return f"{what} {share_of_edits(localised, tried)}"
         if not tried:
             return "not located: all edits carry the effect by construction, which locates nothing"
         verdict = "not steered" if steered else "not located"
-        return f"{verdict}: no edit of {tried} has half of the image swap's effect"
+        return f"{verdict}: no edit of {tried} has half of the {context.exchange}'s effect"
 
     @staticmethod
     def keys_in_use(run: RunReader) -> set[str]:

@@ -193,8 +193,9 @@ class JointPlaces(Intervention):
         )
 
     @staticmethod
-    def sentence(rows: "Sequence[JointEffect]") -> str:
+    def sentence(rows: "Sequence[JointEffect]", context: Measurement) -> str:
         """Return which cells carry the answer, alone or together."""
+        del context
         places = describe_joint_places(rows) or "where the answer is read remains open"
         return "; ".join(filter(None, (places, describe_remainder(rows))))
 
