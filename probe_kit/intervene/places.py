@@ -22,7 +22,7 @@ ALL = "all"
 """Role of every token but padding."""
 RESIDUAL = "residual"
 SEPARATOR = "|"
-"""Separator between the parts of a condition's name, such as `backbone.02|image`."""
+"""Separator between place and role, such as `backbone.02|image`, in options and in names of conditions."""
 SHORTEST_RANGE = 3
 """Number of consecutive layers from which on they are named by their first and last."""
 _POSITIONS = re.compile(r"(?P<first>\d{1,18})(-(?P<last>\d{1,18}))?")
@@ -264,7 +264,8 @@ def unread_places(
             parsed = PlaceName.parse(name)
             is_last = parsed.quantity in ("", RESIDUAL) and parsed.layer == streams[stream].layers - 1
             # The final norm lies behind the last layer, whatever number its site has.
-            unread += [name] * (is_last or parsed.quantity == FINAL_NORM)
+            if is_last or parsed.quantity == FINAL_NORM:
+                unread.append(name)
     return tuple(dict.fromkeys(unread))
 
 

@@ -23,6 +23,7 @@ import numpy as np
 from probe_kit._system.bounded_files import UNREADABLE, parse_json
 from probe_kit._system.escaping import as_argument
 from probe_kit.errors import NoInterventionsError, RunDamagedError
+from probe_kit.intervene.edited_cells import NO_CELL, EditedCell, columns_of
 from probe_kit.intervene.outcomes import (
     BY_CONDITION,
     CLEAN,
@@ -216,10 +217,9 @@ def stored_interventions(run: RunReader, kind: str | None = None) -> list[Measur
     Raises:
         RunDamagedError: If any of the run was changed, lost its settings or has another format.
     """
-    required = {
-        "stamp": run.stamp, "run_settings": run.settings_sha256,
-        "wording": run.wording, **({} if kind is None else {"kind": kind}),
-    }  # fmt: skip
+    required = {"stamp": run.stamp, "run_settings": run.settings_sha256, "wording": run.wording}
+    if kind is not None:
+        required["kind"] = kind
     fitting = [
         Measurement.of(run, bundle)
         for bundle in read_interventions(run.location).values()
@@ -320,10 +320,12 @@ class PooledConditions:
     Attributes:
         like: One of the results.
         sources: By condition, the result it is from; without conditions in which nothing was changed.
+        cells: The cell that each of these conditions edits.
     """
 
     like: StoredResult
     sources: dict[str, StoredResult]
+    cells: dict[str, EditedCell]
 
     def outcomes(self, conditions: Sequence[str]) -> ConditionOutcomes:
         """Return some of the conditions, in the requested order, behind the unchanged ones."""
@@ -338,7 +340,8 @@ class PooledConditions:
             stacked[array] = (
                 np.stack([value[row] for value, row in zip(values, rows, strict=True)]) if has_all else None
             )
-        return replace(base, conditions=tuple(name for _, name in every), **stacked)
+        cells = [self.cells.get(name, NO_CELL) for _, name in every]
+        return replace(base, conditions=tuple(name for _, name in every), **columns_of(cells), **stacked)
 
 
 def pool_conditions(results: Iterable[StoredResult], setting: Sequence[str] = ()) -> list[PooledConditions]:
@@ -355,6 +358,8 @@ def pool_conditions(results: Iterable[StoredResult], setting: Sequence[str] = ()
         # Bytes, not closeness: another device or batch rounds otherwise, and effects are differences of actions.
         unchanged = [outcomes.of(name).tobytes() for name in (CLEAN, IMAGE_SWAP) if name in outcomes.conditions]
         same = (result.category, *agreed, tuple(outcomes.episodes.tolist()), *unchanged)
-        sources = pooled.setdefault(same, PooledConditions(result, {})).sources
-        sources.update({name: result for name in outcomes.conditions if name not in UNCHANGED})
+        together = pooled.setdefault(same, PooledConditions(result, {}, {}))
+        for name, cell in zip(outcomes.conditions, outcomes.cells, strict=True):
+            if name not in UNCHANGED:
+                together.sources[name], together.cells[name] = result, cell
     return list(pooled.values())

@@ -22,11 +22,12 @@ from probe_kit.hashing import derive_seed
 from probe_kit.hooks.capturing.edits import LOG_FIELDS
 from probe_kit.hooks.contract.declared import InterventionKind
 from probe_kit.hooks.contract.sites import KV_STREAM
+from probe_kit.intervene.edited_cells import EditedCell
 from probe_kit.intervene.further_instructions import check_further_instructions
 from probe_kit.intervene.outcomes import ConditionOutcomes, Effect
 from probe_kit.intervene.pairs import Pair
 from probe_kit.intervene.patching.patch import Cell
-from probe_kit.intervene.places import SEPARATOR, TILES
+from probe_kit.intervene.places import TILES
 from probe_kit.intervene.replay import Condition, replay
 from probe_kit.intervene.settings import FIRST_CHUNK, PER_STEP, Choice, categories_in, has_sides
 from probe_kit.intervene.stored import Measurement
@@ -45,8 +46,6 @@ if TYPE_CHECKING:
     from probe_kit.intervene.sessions import ReplaySession
 
 Values = NDArray[np.float64]
-CONTROL = "control-"
-"""Beginning of the names of random directions, which distinguishes them in stored results."""
 OPTIONS = ("sites", "roles", "direction", "controls", "coefficients", "target_side", "seed")
 """Options of the command that a kind may take."""
 
@@ -323,38 +322,6 @@ class AlongDirection(Intervention):
             )
 
 
-# -- names of conditions -------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class ConditionName:
-    """The parts of a condition's stored name, `site|role|direction|coefficient`; the last ones may be missing."""
-
-    site: str
-    role: str = ""
-    direction: str = ""
-    coefficient: str = ""
-
-    @classmethod
-    def parse(cls, condition: str) -> "ConditionName":
-        """Split a stored name into its parts."""
-        return cls(*condition.split(SEPARATOR))
-
-    def __str__(self) -> str:
-        parts = (self.site, self.role, self.direction, self.coefficient)
-        return SEPARATOR.join(filter(None, parts))
-
-    @property
-    def is_control(self) -> bool:
-        """Whether its direction is a random one that another is compared with."""
-        return self.direction.startswith(CONTROL)
-
-    def is_control_of(self, other: "ConditionName") -> bool:
-        """Whether `other`, no control itself, is compared with this one."""
-        same = (self.site, self.role, self.coefficient) == (other.site, other.role, other.coefficient)
-        return self.is_control and bool(other.direction) and not other.is_control and same
-
-
 # -- effects -------------------------------------------------------------------------------------------------
 
 
@@ -398,13 +365,13 @@ class EffectRow(Effect):
         return " ".join(filter(None, (self.sites, self.role, self.direction)))
 
 
-def common_columns(outcomes: ConditionOutcomes, row: int, name: ConditionName, gains: Values) -> dict[str, Any]:
+def common_columns(outcomes: ConditionOutcomes, row: int, cell: EditedCell, gains: Values) -> dict[str, Any]:
     """Return the columns of `EffectRow` for one condition.
 
     Args:
         outcomes: Outcomes of one category.
         row: Row of the condition in them.
-        name: Name of the condition, in its parts.
+        cell: The cell that the condition edits.
         gains: (E,) 1 where an episode has the change that the kind counts with the edit only, −1 for the reverse.
     """
     logged = dict(zip(LOG_FIELDS, outcomes.edit_log[row].T, strict=True))
@@ -412,10 +379,10 @@ def common_columns(outcomes: ConditionOutcomes, row: int, name: ConditionName, g
     counts = {column: value for column, value in outcomes.counts.items() if column != "n_groups"}
     return {
         **counts,
-        "sites": name.site,
-        "role": name.role,
-        "direction": name.direction,
-        "is_control": name.is_control,
+        "sites": cell.site,
+        "role": cell.role,
+        "direction": cell.direction,
+        "is_control": cell.is_control,
         "net": float(gains.mean()),
         "net_ci": net_interval(gains, outcomes),
         "max_action_change": float(outcomes.max_action_change[row].max()),
@@ -454,7 +421,7 @@ class ControlTest(NamedTuple):
 
 def compare_with_controls(
     values: Values,
-    names: Sequence[ConditionName],
+    cells: Sequence[EditedCell],
     outcomes: ConditionOutcomes,
     *,
     skipped: Collection[int] = (),
@@ -464,17 +431,17 @@ def compare_with_controls(
 
     Args:
         values: (K, E) values that are tested to be above zero.
-        names: Names of the K conditions.
+        cells: The cells that the K conditions edit.
         outcomes: Outcomes of one category.
         skipped: Rows that are not tested though they are no controls, such as an identity patch.
         broken_controls: Rows of controls that nothing is compared with, such as those that disrupt the task.
     """
     controls = [
-        [at for at, other in enumerate(names) if other.is_control_of(name) and at not in broken_controls]
-        for name in names
+        [at for at, other in enumerate(cells) if other.is_control_of(cell) and at not in broken_controls]
+        for cell in cells
     ]
     tests = [ControlTest(rows) for rows in controls]
-    tested = [at for at, name in enumerate(names) if not name.is_control and at not in skipped]
+    tested = [at for at, cell in enumerate(cells) if not cell.is_control and at not in skipped]
     if not tested:
         return tests
     # Without controls an effect is compared with zero.
@@ -652,4 +619,4 @@ def share_of_edits(rows: Sequence[EffectRow], tried: int, subject: str = "edits"
         subject: Noun for the edits.
     """
     first = f"{rows[0].sites} {rows[0].role}".rstrip()
-    return f"{len(rows)} of {tried} {subject}, {'most ' * (len(rows) > 1)}at {first}"
+    return f"{len(rows)} of {tried} {subject}, {'most ' if len(rows) > 1 else ''}at {first}"

@@ -20,10 +20,10 @@ from probe_kit.env.scoring import DEFAULT_RULE
 from probe_kit.errors import UsageError
 from probe_kit.hooks.capturing.edits import EditLog, Identity, apply_patch
 from probe_kit.hooks.contract.sites import Site
+from probe_kit.intervene.edited_cells import EditedCell
 from probe_kit.intervene.kinds.base import (
     NONE,
     AlongDirection,
-    ConditionName,
     EffectColumn,
     EffectRow,
     common_columns,
@@ -128,7 +128,7 @@ class ClosedLoop(AlongDirection):
         if options.get("direction") == NONE:
             options.setdefault("controls", 0)
         if sites:
-            targets = tuple(str(ConditionName(site, role)) for site in sites for role in roles or (ALL,))
+            targets = tuple(f"{site}{SEPARATOR}{role}" for site in sites for role in roles or (ALL,))
         else:
             targets = best_patch_targets(run, categories_in(run, options.get("categories")))
         return cls(**options, targets=targets)
@@ -136,8 +136,8 @@ class ClosedLoop(AlongDirection):
     @property
     def patterns(self) -> tuple[tuple[str, tuple[str, ...]], ...]:
         """The place and role of every target."""
-        names = map(ConditionName.parse, self.targets)
-        return tuple((name.site, (name.role,)) for name in names)
+        targets = (target.split(SEPARATOR) for target in self.targets)
+        return tuple((site, (role,)) for site, role in targets)
 
     def parameters(self) -> dict[str, Any]:
         """Return its own settings; the readout is where the cube ends."""
@@ -311,20 +311,20 @@ class ClosedLoopEffect(EffectRow):
 def closed_loop_effects(outcomes: ConditionOutcomes) -> list[ClosedLoopEffect]:
     """Return one row per condition of one category, the identity patch first."""
     assert outcomes.episode_outcomes is not None
-    names = [ConditionName.parse(condition) for condition in outcomes.conditions]
+    clean = [at for at, name in enumerate(outcomes.conditions) if name == CLEAN]
+    cells = [EditedCell(CLEAN) if at in clean else cell for at, cell in enumerate(outcomes.cells)]
     wrong = (outcomes.episode_outcomes == WRONG).astype(float)
     in_zone = np.isin(outcomes.episode_outcomes, (CORRECT, WRONG)).mean(axis=1)
     disrupted = in_zone < MIN_IN_ZONE_RATIO * in_zone[0]
     net = wrong - wrong[0]
     left_out = set(np.flatnonzero(disrupted).tolist())
-    clean = {at for at, name in enumerate(names) if name.site == CLEAN}
-    tests = compare_with_controls(net, names, outcomes, skipped=left_out | clean, broken_controls=left_out)
+    tests = compare_with_controls(net, cells, outcomes, skipped=left_out | set(clean), broken_controls=left_out)
     rows = []
-    for at, (name, test) in enumerate(zip(names, tests, strict=True)):
+    for at, (cell, test) in enumerate(zip(cells, tests, strict=True)):
         gained, lost = int((net[at] > 0).sum()), int((net[at] < 0).sum())
         rows.append(
             ClosedLoopEffect(
-                **common_columns(outcomes, at, name, net[at]),
+                **common_columns(outcomes, at, cell, net[at]),
                 correct=float((outcomes.episode_outcomes[at] == CORRECT).mean()),
                 wrong=float(wrong[at].mean()),
                 in_zone=float(in_zone[at]),

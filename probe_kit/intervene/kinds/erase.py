@@ -19,9 +19,9 @@ from probe_kit._tables.numbers import number, percent, signed
 from probe_kit.errors import UsageError
 from probe_kit.hooks.capturing.edits import Identity, TokenIndex, apply_patch
 from probe_kit.hooks.contract.sites import Site
+from probe_kit.intervene.edited_cells import EditedCell
 from probe_kit.intervene.erasers import Eraser, Method
 from probe_kit.intervene.kinds.base import (
-    ConditionName,
     EffectColumn,
     EffectRow,
     Intervention,
@@ -158,7 +158,7 @@ class ConceptErasure(Intervention):
                     by_name.setdefault(name, {}).update(of_episode)
                     # What is readable with each eraser, and without; untouched comes first.
                     fitted = [(fold, by_fold[name] if of_episode else None) for fold, by_fold in fits]
-                    of_condition = accuracies.setdefault(_name_of(cell, name), {})
+                    of_condition = accuracies.setdefault(str(_edited(cell, name)), {})
                     of_condition[category] = _probe_accuracy(features, fitted)
         conditions = [
             erased(cell, name, of_episode)
@@ -228,9 +228,8 @@ class ConceptErasure(Intervention):
 KIND = ConceptErasure
 
 
-def _name_of(cell: Cell, name: str) -> str:
-    coefficient = ZERO if name == UNTOUCHED else ""
-    return str(ConditionName(cell.site_group.name, cell.role, name, coefficient))
+def _edited(cell: Cell, name: str) -> EditedCell:
+    return EditedCell(cell.site_group.name, cell.role, name, ZERO if name == UNTOUCHED else "")
 
 
 def erased(cell: Cell, name: str, erasers: Mapping[str, Eraser]) -> Condition:
@@ -249,7 +248,7 @@ def erased(cell: Cell, name: str, erasers: Mapping[str, Eraser]) -> Condition:
         with apply_patch(session.policy, site_group.sites, tokens, change) as edit_log:
             return ConditionResult(context.act(), edit_log)
 
-    return Condition(_name_of(cell, name), play, (cell.site_group.name,))
+    return Condition.of_cell(_edited(cell, name), play)
 
 
 @dataclass(frozen=True)
@@ -367,21 +366,22 @@ def erasure_effects(
     """
     sign, category = outcomes.correct_sign, str(outcomes.categories[0])
     clean = sign * outcomes.of(CLEAN)
-    conditions = [name for name in outcomes.conditions if name != CLEAN]
-    names = [ConditionName.parse(condition) for condition in conditions]
+    conditions = dict(zip(outcomes.conditions, outcomes.cells, strict=True))
+    del conditions[CLEAN]
+    cells = list(conditions.values())
     values = np.array([sign * outcomes.of(condition) for condition in conditions])
     away = clean - values
-    untouched = [at for at, name in enumerate(names) if name.coefficient]
-    tests = compare_with_controls(away, names, outcomes, skipped=untouched)
+    untouched = [at for at, cell in enumerate(cells) if cell.coefficient]
+    tests = compare_with_controls(away, cells, outcomes, skipped=untouched)
     goes_there = paired_greater_p(clean, outcomes.items, outcomes.groups) < SIGNIFICANCE
     share = values.sum(axis=1) / clean.sum() if goes_there else None
     net = (clean > 0).astype(float) - (values > 0)
     rows = []
-    for at, (condition, name, test) in enumerate(zip(conditions, names, tests, strict=True)):
-        before = str(ConditionName(name.site, name.role, UNTOUCHED, ZERO))
+    for at, ((condition, cell), test) in enumerate(zip(conditions.items(), tests, strict=True)):
+        before = str(EditedCell(cell.site, cell.role, UNTOUCHED, ZERO))
         rows.append(
             ErasureEffect(
-                **common_columns(outcomes, outcomes.conditions.index(condition), name, net[at]),
+                **common_columns(outcomes, outcomes.conditions.index(condition), cell, net[at]),
                 right_before=float((clean > 0).mean()),
                 right=float((values[at] > 0).mean()),
                 share_left=None if share is None else float(share[at]),

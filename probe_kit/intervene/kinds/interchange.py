@@ -20,12 +20,12 @@ from probe_kit._tables.content import Cell as TableCell
 from probe_kit._tables.numbers import number, signed
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.sites import KV_STREAM, Site
+from probe_kit.intervene.edited_cells import EditedCell
 from probe_kit.intervene.exchange import share_fields, share_of_whole
 from probe_kit.intervene.kinds.base import (
     NONE,
     UNRESOLVED,
     AlongDirection,
-    ConditionName,
     EffectColumn,
     EffectRow,
     Values,
@@ -45,7 +45,7 @@ from probe_kit.intervene.kinds.image_swap import SMALLEST_REACH
 from probe_kit.intervene.outcomes import CLEAN, IMAGE_SWAP, UNCHANGED, ConditionOutcomes
 from probe_kit.intervene.patching.attribution import LOCALISATION_SHARE
 from probe_kit.intervene.patching.patch import Cell, sites_of_cells
-from probe_kit.intervene.places import ALL, RESIDUAL, TILES, PlaceName, SiteGroup, resolve_all, roles_of
+from probe_kit.intervene.places import ALL, RESIDUAL, SEPARATOR, TILES, PlaceName, SiteGroup, resolve_all, roles_of
 from probe_kit.intervene.replay import CLEAN_RUN, SOURCE_RUN, Condition, patched_run
 from probe_kit.intervene.stored import Measurement, PooledConditions, Rank, pool_conditions, stored_results
 from probe_kit.runs.reader import RunReader
@@ -167,13 +167,13 @@ def patch_effects(outcomes: ConditionOutcomes, target_side: str = IMAGE_SWAP) ->
     # Above zero on the left; without sides, where the action is nearer to the source's.
     middle = 0.0 if outcomes.has_sides or not has_swap else outcomes.of(IMAGE_SWAP) / 2
     toward = None if outcomes.toward is None or not has_swap else outcomes.toward
-    names = [ConditionName.parse(outcomes.conditions[row]) for row in rows]
+    cells = [outcomes.cells[row] for row in rows]
     displacements = push * (outcomes.displacement[rows] - clean)
     exchange = outcomes.exchange()
     sign = 1.0 if exchange is None or target_side != IMAGE_SWAP else exchange.sign
-    tests = compare_with_controls(sign * displacements, names, outcomes)
+    tests = compare_with_controls(sign * displacements, cells, outcomes)
     effects = []
-    for row, name, test, moved in zip(rows, names, tests, displacements, strict=True):
+    for row, cell, test, moved in zip(rows, cells, tests, displacements, strict=True):
         # 1 where the action flips to the target side, −1 where it flips away from it.
         is_over = push * (outcomes.displacement[row] - middle) > 0
         flips = is_over.astype(float) - (push * (clean - middle) > 0)
@@ -185,8 +185,8 @@ def patch_effects(outcomes: ConditionOutcomes, target_side: str = IMAGE_SWAP) ->
             exchanged = share_of_whole(toward[row], full, outcomes.groups, outcomes.seed_text)
         effects.append(
             PatchEffect(
-                **common_columns(outcomes, row, name, flips),
-                coefficient=name.coefficient,
+                **common_columns(outcomes, row, cell, flips),
+                coefficient=cell.coefficient,
                 **share_fields("effect", share),
                 net_left=mean_of(flips[push > 0]) or 0.0,
                 net_right=mean_of(flips[push < 0]) or 0.0,
@@ -235,10 +235,11 @@ def stored_steering(run: RunReader) -> dict[str, dict[str, list[PatchEffect]]]:
     """
     steering: dict[str, dict[str, list[PatchEffect]]] = {}
     for selection, rows in _rows_of(_steering(run)):
-        name, settings = ConditionName.parse(selection.conditions[0]), selection.group.like.stored.settings
+        cell, settings = selection.first, selection.group.like.stored.settings
         direction, side = str(settings.get("direction", USUAL)), str(settings.get("target_side", WRONG))
-        qualifiers = [direction] * (direction != USUAL) + [f"toward {side}"] * (side != WRONG)
-        subject = ", ".join([f"{name.site} {name.role}", *qualifiers])
+        along = "" if direction == USUAL else direction
+        toward = "" if side == WRONG else f"toward {side}"
+        subject = ", ".join(filter(None, (f"{cell.site} {cell.role}", along, toward)))
         steering.setdefault(selection.group.like.category, {})[subject] = rows
     return steering
 
@@ -309,6 +310,11 @@ class _Selection(NamedTuple):
     conditions: tuple[str, ...]
     merit: tuple[Rank, int, tuple[str, str]]
 
+    @property
+    def first(self) -> EditedCell:
+        """The cell of its first condition; all are of one place and role."""
+        return self.group.cells[self.conditions[0]]
+
 
 def _maps(run: RunReader) -> list[_Selection]:
     results = stored_results(run, Interchange.kind)
@@ -335,8 +341,8 @@ def _selections(groups: Sequence[PooledConditions], setting: Sequence[str]) -> l
         by_subject = selected.setdefault(group.like.category, {})
         by_place: dict[tuple[str, str], list[str]] = {}
         for condition in sorted(group.sources):  # controls and coefficients among them
-            name = ConditionName.parse(condition)
-            by_place.setdefault((name.site, name.role), []).append(condition)
+            cell = group.cells[condition]
+            by_place.setdefault((cell.site, cell.role), []).append(condition)
         for subject, conditions in by_place.items():
             newest = max(group.sources[name].stored.newest for name in conditions)
             candidate = _Selection(group, tuple(conditions), (group.like.rank, len(conditions), newest))
@@ -350,10 +356,12 @@ def _rows_of(selections: Sequence[_Selection]) -> Iterator[tuple[_Selection, lis
     """Yield each selection with its effects, tested against all that its group tried in the same stream."""
     tested: dict[tuple[int, str], dict[str, PatchEffect]] = {}
     for selection in selections:
-        group, stream = selection.group, selection.conditions[0].partition(".")[0]
+        group, stream = selection.group, PlaceName.parse(selection.first.site).stream
         at = id(group), stream
         if at not in tested:
-            conditions = sorted(name for name in group.sources if name.partition(".")[0] == stream)
+            conditions = sorted(
+                name for name in group.sources if PlaceName.parse(group.cells[name].site).stream == stream
+            )
             target_side = str(group.like.stored.settings.get("target_side", IMAGE_SWAP))
             rows = patch_effects(group.outcomes(conditions), target_side)
             keys = [group.sources[name].stored.key for name in conditions]
@@ -390,7 +398,7 @@ def best_patch_targets(run: RunReader, categories: Sequence[str]) -> tuple[str, 
     """
     stored = stored_site_effects(run)
     best = [best_cell(stored.get(category, [])) for category in categories]
-    cells = tuple(dict.fromkeys(str(ConditionName(cell.sites, cell.role)) for cell in best if cell is not None))
+    cells = tuple(dict.fromkeys(f"{cell.sites}{SEPARATOR}{cell.role}" for cell in best if cell is not None))
     if not cells:
         raise UsageError(
             f"no stored interchange of {run.location} located a place of {', '.join(categories)}: run "
@@ -421,15 +429,15 @@ def cells_at(session: "ReplaySession", places: Iterable[SiteGroup], roles: Seque
     ]
 
 
-def patch_of(cell: Cell, source_sites: tuple[Site, ...], prefix: str = "") -> Condition:
+def patch_of(cell: Cell, source_sites: tuple[Site, ...], part: str = "") -> Condition:
     """Return the patch of one cell in full.
 
     Args:
         cell: Cell that is patched.
         source_sites: Sites at which the source is captured.
-        prefix: Beginning of the condition's name.
+        part: What the kind does with it, see `EditedCell`.
     """
-    return patched_run(f"{prefix}{ConditionName(cell.site_group.name, cell.role)}", {"": (cell,)}, source_sites)
+    return patched_run(EditedCell(cell.site_group.name, cell.role, part=part), {"": (cell,)}, source_sites)
 
 
 def patches_within(
@@ -437,9 +445,7 @@ def patches_within(
 ) -> list[Condition]:
     """Return the patch along a direction, and along each of its controls."""
     return [
-        patched_run(
-            str(ConditionName(cell.site_group.name, cell.role, name)), {"": (cell,)}, source_sites, name, bases
-        )
+        patched_run(EditedCell(cell.site_group.name, cell.role, name), {"": (cell,)}, source_sites, name, bases)
         for name in (direction, *bases.control_names)
     ]
 
@@ -473,7 +479,7 @@ class PatchKind(AlongDirection):
         return effect_table(
             f"Where is it used? {context.subject}, {context.kind}",
             ("category", "edit"),
-            lines_of(edits, lambda row: f"{row.name}{' (unread)' * (row.sites in unread)}"),
+            lines_of(edits, lambda row: f"{row.name}{' (unread)' if row.sites in unread else ''}"),
             {"What the action does": _columns(context.exchange, not context.lacks_sides)},
             lambda row: row.is_localised and not row.is_by_construction,
             marks={BY_CONSTRUCTION: "carries the effect by construction and locates nothing"},
@@ -492,7 +498,7 @@ class PatchKind(AlongDirection):
             )
         names = [f"{row.name} {row.effect:.2f}" for row in localised]
         verb = "have" if any(row.is_dose for row in edits) else "carry"
-        by_construction = f"; {apart} more {verb} it by construction and locate nothing (*)" * (apart > 0)
+        by_construction = f"; {apart} more {verb} it by construction and locate nothing (*)" if apart else ""
         count = count_edits(names, len(edits) - apart)
         return f"edits that {verb} half of the {context.exchange}'s effect: {count}{by_construction}"
 
