@@ -191,7 +191,7 @@ def describe_passage(passage: Sequence[SitePassage], verdict: Verdict) -> str:
         reach, loss = ", the last site", "behind it"
     else:
         reach, loss = f" and reaches {last.name} ({last.difference:.2g})", "in the action part itself"
-    return f"{largest}{reach}" + f": the loss is {loss}" * (verdict == "no effect")
+    return f"{largest}{reach}: the loss is {loss}" if verdict == "no effect" else f"{largest}{reach}"
 
 
 @dataclass(frozen=True)
@@ -381,7 +381,8 @@ def diagnosis_table(diagnosis: "Diagnosis") -> Table:
     headings = (*_HEADINGS, *_OF_BASE) if diagnosis.base else _HEADINGS
     rows = [_row(diagnosed, headings) for diagnosed in diagnosis.inputs]
     title = f"Inputs of {diagnosis.label}: {diagnosis.n_frames} frames of {diagnosis.n_groups} groups"
-    title += f"; base {diagnosis.base}" * bool(diagnosis.base)
+    if diagnosis.base:
+        title += f"; base {diagnosis.base}"
     numbers = tuple(diagnosis.to_json()["inputs"])
     notes = [*sentences(diagnosis), *describe_origin(diagnosis)]
     return Table.of(title, headings, rows, notes=notes, numbers=numbers)
@@ -392,7 +393,7 @@ def describe_origin(diagnosis: "Diagnosis") -> list[str]:
     if not diagnosis.weights_sha256:
         return []
     settings = diagnosis.settings
-    random = " (random weights)" * diagnosis.random_weights
+    random = " (random weights)" if diagnosis.random_weights else ""
     base = settings.get("base")
     parts = [
         f"inputs {', '.join(settings['inputs'])}" if settings.get("inputs") else "all inputs",

@@ -451,7 +451,7 @@ def transfer_table(results: TransferResults, splits: bool = True) -> Table:
     several, metric = len(results.curves) > 1, METRICS[results.task]
     rows = [
         (
-            " · ".join([label_of(row["stream"]), *[row["view"]] * several]),
+            " · ".join([label_of(row["stream"]), *([row["view"]] if several else [])]),
             str(row["site"]),
             score_cell(row["score"], False, (row["ci_low"], row["ci_high"])),
             score_cell(row["chance"], False),
@@ -462,7 +462,8 @@ def transfer_table(results: TransferResults, splits: bool = True) -> Table:
         for row in _best(results)
     ]
     title = [f"{results.target}: {metric}", f"{results.model} to {results.other_model}"]
-    title += ["OTHER WEIGHTS"] * (not results.same_weights)
+    if not results.same_weights:
+        title.append("OTHER WEIGHTS")
     headings = (
         "stream",
         "best site",

@@ -119,8 +119,9 @@ def _in_action(row: RetentionRow) -> str:
 
 def _head(row: RetentionRow, vlm: RetentionRow | None, used: str) -> str:
     """Return the verdict: whether the VLM knows the answer, the policy encodes it, and the action uses it."""
-    stages = ["known"] * (vlm is not None and knows(vlm)) + ["encoded"] * _is_encoded(row)
-    return ", ".join(filter(None, (" and ".join(stages), used)))
+    known = "known" if vlm is not None and knows(vlm) else ""
+    encoded = "encoded" if _is_encoded(row) else ""
+    return ", ".join(filter(None, (" and ".join(filter(None, (known, encoded))), used)))
 
 
 def _of_use(row: RetentionRow, vlm: RetentionRow | None, use: UseVerdict) -> str:
@@ -325,7 +326,7 @@ class CategorySummary:
     @property
     def details(self) -> str:
         """The conclusion from all numbers of the row, and what to do next; the numbers are in tables."""
-        return f"{self.name}{':' * self.row.is_side} {conclusion(self.row)}"
+        return f"{self.name}{':' if self.row.is_side else ''} {conclusion(self.row)}"
 
 
 HEADINGS = (
@@ -421,8 +422,8 @@ def summary_table(summaries: Sequence[RunSummary], differences: Sequence[Differe
         overflow="fold",
     )
     has_views = not is_of_sides and len({category.row.view for category in every}) > 1
-    left_out = [*[1] * (len(summaries) < 2 and not differences), *[2] * (not has_views)]
-    table = table.only([at for at in range(len(headings)) if at not in left_out]).filled()
+    is_needed = {"run": len(summaries) > 1 or bool(differences), "view": has_views}
+    table = table.only([at for at, name in enumerate(headings) if is_needed.get(name, True)]).filled()
     legend = [": ".join(_TERMS[name]) for name in table.columns if name in _TERMS]
     readouts = describe_readouts(summary.row.image_swap.use for run in summaries for summary in run.categories)
     counts = [(summary.row.success.n_items, summary.row.success.n_groups) for summary in every]
@@ -439,11 +440,13 @@ def _row(category: CategorySummary, run: str) -> Row:
 
 def _marks(summaries: Sequence[RunSummary], table: Table) -> list[str]:
     """Return the meaning of the mark if a cell has it, and a warning where no control allows it."""
-    marked = any(MARK in text for line in table.texts for text in line)
+    notes = []
+    if any(MARK in text for line in table.texts for text in line):
+        notes.append(f"{MARK} above chance, and above every control that was run")
     warning = chance_only(
         [category.row for run in summaries for category in run.categories if category.row.is_side]
     )
-    return [f"{MARK} above chance, and above every control that was run"] * marked + [warning] * bool(warning)
+    return [*notes, warning] if warning else notes
 
 
 def _difference_cells(row: Difference) -> tuple[Cell, ...]:

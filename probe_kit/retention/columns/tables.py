@@ -86,7 +86,7 @@ def retention_tables(
 
 def _groups(title: str, rows: Sequence[RetentionRow]) -> list[ColumnGroup]:
     radii = radius_columns(rows) if title in BEHAVIOUR else ()
-    return [*TABLES[title], *[ColumnGroup("By zone radius", radii, True)] * bool(radii)]
+    return [*TABLES[title], ColumnGroup("By zone radius", radii, True)] if radii else list(TABLES[title])
 
 
 def _differences(
@@ -205,7 +205,7 @@ def _title(title: str, rows: Sequence[RetentionRow]) -> str:
     view = f", view {rows[0].view}" if title not in BEHAVIOUR and len(views) == 1 else ""
     model = f"{next(iter(runs))} on " if len(runs) == 1 else ""
     targets = list(dict.fromkeys(row.target for row in rows if not row.is_side))
-    of_label = f" of {targets[0]}" if len(targets) == 1 else " of labels" * bool(targets)
+    of_label = f" of {'labels' if len(targets) > 1 else targets[0]}" if targets else ""
     return f"{title}{of_label}{view}: {model}{', '.join(dict.fromkeys(row.run.suite for row in rows))}"
 
 
@@ -284,17 +284,19 @@ def _difference_legend(differences: Sequence[Difference], has_tests: bool) -> st
     """Return how differences and their intervals are made; empty without any."""
     if not differences:
         return ""
-    parts = [
-        "groups of items as pairs" * any(row.paired for row in differences),
-        "of other items: each side's own groups" * (not all(row.paired for row in differences)),
-    ]
+    parts = []
+    if any(row.paired for row in differences):
+        parts.append("groups of items as pairs")
+    if not all(row.paired for row in differences):
+        parts.append("of other items: each side's own groups")
     if has_tests and any(row.p is not None for row in differences):
         parts.append(
             "p of the share right: exact, signs of groups flipped, in means over all items (Holm: all categories "
             f"and pairs); {P_DECIDES}"
         )
-    parts.append("these models, other items" * any(row.sr_models for row in differences))
-    return "differences: 95 %, " + "; ".join(filter(None, parts))
+    if any(row.sr_models for row in differences):
+        parts.append("these models, other items")
+    return f"differences: 95 %, {'; '.join(parts)}"
 
 
 def _sizes(rows: Sequence[RetentionRow]) -> list[str]:
@@ -302,14 +304,15 @@ def _sizes(rows: Sequence[RetentionRow]) -> list[str]:
     sizes: dict[str, list[str]] = {}
     for of_run in by_run([row for row in rows if row.category != MEAN]):
         sizes.setdefault(_size(of_run), []).append(Path(of_run[0].run.location).name)
-    return [f"run{'s' * (len(names) > 1)} {', '.join(names)}: {size}" for size, names in sizes.items()]
+    return [f"run{'s' if len(names) > 1 else ''} {', '.join(names)}: {size}" for size, names in sizes.items()]
 
 
 def _size(rows: Sequence[RetentionRow]) -> str:
     is_of_sides = all(row.is_side for row in rows)
     samples = [row.success.n_episodes if is_of_sides else row.controls.n_samples or 0 for row in rows]
     parts = [f"{span(samples)} {'episodes' if is_of_sides else 'samples'}"]
-    parts += [f"{span([row.success.n_items for row in rows])} items"] * is_of_sides
+    if is_of_sides:
+        parts.append(f"{span([row.success.n_items for row in rows])} items")
     if groups := [row.controls.n_groups for row in rows if row.controls.n_groups is not None]:
         parts.append(f"{span(groups)} groups")
     return f"per {'category' if is_of_sides else 'label'} {', '.join(parts)}"

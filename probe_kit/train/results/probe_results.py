@@ -500,19 +500,19 @@ def best_sites_table(fitted: Sequence[ProbeResults], splits: bool = True) -> Tab
     several_views, metric = len(first.views) > 1, "accuracy %" if first.is_side else METRICS[first.task]
     rows: list[tuple[Cell | str, ...]] = []
     for results in fitted:
-        call = [f"call {results.settings.call}"] * several_calls
+        call = f"call {results.settings.call}" if several_calls else ""
         for row in best_sites(results.scores, first.is_side):
-            view = [str(row["view"])] * several_views
-            name = " · ".join([_name(results, row["category"], row["stream"]), *view, *call])
+            view = str(row["view"]) if several_views else ""
+            name = " · ".join(filter(None, (_name(results, row["category"], row["stream"]), view, call)))
             met, missed = exceeded_controls(results, row)
-            parts = [", ".join(met)] * bool(met) + [f"not shown: {', '.join(missed)}"] * bool(missed)
+            not_shown = f"not shown: {', '.join(missed)}" if missed else ""
             begin = score_cell(row["first"], first.is_side)
-            exceeds = Cell("; ".join(parts) or None)
+            exceeds = Cell("; ".join(filter(None, (", ".join(met), not_shown))) or None)
             rows.append((name, *site_cells(row, first.is_side), exceeds, Cell(int(row["n"])), begin))
         for control in results.controls.scores if splits or not first.is_side else ():
-            view = [control.view] * (several_views and bool(control.view))
+            view = control.view if several_views else ""
             where = _name(results, control.category, control.stream)
-            name = " · ".join(filter(None, [f"control {control.name}", where, *view, *call]))
+            name = " · ".join(filter(None, [f"control {control.name}", where, view, call]))
             score = score_cell(control.score, first.is_side, control.ci)
             chance = score_cell(control.chance, first.is_side)
             p = Cell(control.p, p_text, after="" if control.p is None else " (this control alone)")
