@@ -54,6 +54,7 @@ class Column:
         strong: Whether a row is bold; None for no row.
         note: Text that the report shows on pointing at the cell.
         answers: Heading and help where the rows are of models that were asked, if these differ.
+        both: Heading where the rows are of both, if it is not the one behind the other.
     """
 
     key: str
@@ -68,6 +69,7 @@ class Column:
     strong: Callable[[RetentionRow], bool] | None = None
     note: Callable[[RetentionRow], str] | None = None
     answers: tuple[str, str] | None = None
+    both: str = ""
 
     def worded(self, modes: Modes) -> "Column":
         """Return the column with the words for rows of policies, of models that were asked, or of both."""
@@ -76,7 +78,7 @@ class Column:
         heading, meaning = self.answers
         if modes == "answers":
             return replace(self, heading=heading, help=meaning)
-        both = self.heading if heading == self.heading else f"{self.heading.removesuffix(' %')} / {heading}"
+        both = self.heading if heading == self.heading else self.both or f"{self.heading} / {heading}"
         return replace(
             self, heading=both, help=f"{self.help} Of a model that was asked: {meaning[:1].lower()}{meaning[1:]}"
         )
@@ -300,6 +302,7 @@ GOES_LEFT = share(
         "answers left %",
         "Among the answers that could be read, the share that named the left one. 50 %: no habit.",
     ),
+    both="goes left / answers left %",
 )
 
 
@@ -479,6 +482,7 @@ PROBE_MINUS_SR = share(
         "probe − accuracy %",
         "Backbone score minus the accuracy of the answers, in points: what can be read but is not said.",
     ),
+    both="probe − SR / probe − accuracy %",
 )
 _P = (
     "Probability that the best layer of a stream looks this good when the labels are permuted at random. It "
@@ -570,6 +574,7 @@ ACTION_PEAK = share(
     _PEAK,
     cell=lambda row: Cell(row.action.peak if row.is_side else None, percent),
     answers=("answer peak %", _PEAK),
+    both="action peak / answer peak %",
 )
 FIRST_ITERATION = share(
     "action.first_peak",
