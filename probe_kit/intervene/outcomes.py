@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from probe_kit._system.bounded_files import open_arrays
 from probe_kit.hashing import derive_seed
-from probe_kit.intervene.edited_cells import COLUMNS, NO_CELL, EditedCell, columns_of, read_former_name
+from probe_kit.intervene.edited_cells import COLUMNS, NO_CELL, EditedCell, read_former_name
 from probe_kit.intervene.exchange import Exchange
 
 CLEAN, IMAGE_SWAP, INSTRUCTION_SWAP, NOISE = "clean", "image_swap", "instruction_swap", "noise"
@@ -174,17 +174,16 @@ class ConditionOutcomes:
     parts: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
-        columns: dict[str, Any] = {name: getattr(self, name) for name in ("conditions", *COLUMNS)}
-        if self.sites is None:
-            edited = (NO_CELL if name in UNCHANGED else read_former_name(name) for name in self.conditions)
-            columns |= columns_of(list(edited))
-        for name, texts in columns.items():
-            # Stored texts are an array, and comparisons with one are element by element.
-            object.__setattr__(self, name, tuple(map(str, texts)))
+        for name in ("conditions", *COLUMNS):
+            if (texts := getattr(self, name)) is not None:
+                # Stored texts are an array, and comparisons with one are element by element.
+                object.__setattr__(self, name, tuple(map(str, texts)))
 
     @property
     def cells(self) -> tuple[EditedCell, ...]:
         """The cell that each of the K conditions edits."""
+        if self.sites is None:
+            return tuple(NO_CELL if name in UNCHANGED else read_former_name(name) for name in self.conditions)
         return tuple(EditedCell(*cell) for cell in zip(*(getattr(self, name) for name in COLUMNS), strict=True))
 
     @property

@@ -1,7 +1,8 @@
 """Stored interventions of a run, `RUN/interventions/<key>/`, and the choice among them.
 
 settings.json      the head: what was asked, of which commits, and the hashes of the rest; written last
-episodes.npz       per condition and episode where the action would go, and how far it changed
+episodes.npz       per condition and episode where the action would go, and how far it changed; per condition its
+                   cell in columns: place, role, direction, coefficient, part
 effects.csv        the same in numbers per category, for people and other programs
 attention.npz      of the kind `attention`: shares per inference, block, iteration, head and role
 attention_patches.npz  of it, where the family says which token sees what: shares per inference, block and patch
@@ -23,7 +24,7 @@ import numpy as np
 from probe_kit._system.bounded_files import UNREADABLE, parse_json
 from probe_kit._system.escaping import as_argument
 from probe_kit.errors import NoInterventionsError, RunDamagedError
-from probe_kit.intervene.edited_cells import NO_CELL, EditedCell, columns_of
+from probe_kit.intervene.edited_cells import COLUMNS, NO_CELL, EditedCell, columns_of
 from probe_kit.intervene.outcomes import (
     BY_CONDITION,
     CLEAN,
@@ -103,6 +104,9 @@ class Measurement:
         stored = self.arrays(EPISODES, ConditionOutcomes, ConditionOutcomes.AXES)
         if (first := str(stored["conditions"][:1])) != f"[{CLEAN!r}]":
             raise self._damaged(EPISODES, f"has {first} as its first condition; expected {CLEAN!r}")
+        # Runs of version 0.2 have none of these columns.
+        if (lost := [name for name in COLUMNS if name not in stored]) and len(lost) < len(COLUMNS):
+            raise self._damaged(EPISODES, f"lacks {', '.join(lost)} beside the other columns of its conditions")
         return ConditionOutcomes(**stored, seed_text=self.run.seed_text)
 
     def arrays(self, name: str, record: type, axes: Mapping[str, str]) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """Changes inside a real network: what is put in, along what, and what the ledger says of it."""
 
+import io
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from probe_kit.errors import EmptyRoleError, UnknownSiteError, UsageError
+from probe_kit.errors import EmptyRoleError, RunDamagedError, UnknownSiteError, UsageError
 from probe_kit.hooks import Site
 from probe_kit.hooks.capturing.edits import EditLog, ReplaceInSubspace, ReplaceWith, _ActiveEdits
 from probe_kit.intervene import (
@@ -37,7 +38,7 @@ from probe_kit.intervene.tokens import token_mask
 from probe_kit.intervene.verdict import Places
 from probe_kit.runs import Run
 from probe_kit.train import ArrayRun, train_probes
-from tests.intervene.answers import follower, habit, outcomes_of, patches_of, store_outcomes, swaps_of
+from tests.intervene.answers import follower, habit, measured, outcomes_of, patches_of, store_outcomes, swaps_of
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
@@ -535,8 +536,15 @@ def test_cells_of_conditions_are_stored_as_columns_and_read_from_the_names_of_an
     assert made.by_category()[0][1].cells == CELLS
     former = {name: values for name, values in stored.items() if name not in COLUMNS}
     assert ConditionOutcomes(**former).cells == CELLS
-    renamed = {**stored, "conditions": np.array([f"{number}|x" for number in range(len(names))])}
+    renamed = {**stored, "conditions": np.array(["clean", *(f"{number}|x" for number in range(1, len(names)))])}
     assert ConditionOutcomes(**renamed).cells == CELLS
+    assert measured(ConditionOutcomes(**renamed), "").outcomes.cells == CELLS
+    file = io.BytesIO()
+    np.savez(file, **{name: values for name, values in stored.items() if name != "roles"})
+    halved = replace(measured(made, ""), read=lambda _: file.getvalue())
+    halved.run.location = "RUN"
+    with pytest.raises(RunDamagedError, match="lacks roles"):
+        _ = halved.outcomes
 
 
 def test_the_place_is_said_beside_the_behaviour_and_does_not_change_it() -> None:
