@@ -207,11 +207,12 @@ class Content:
     @property
     def all_notes(self) -> tuple[str, ...]:
         """The legend, where there is anything to explain, and the notes."""
-        shown = {mark for mark in self.legend.marks for row in self.texts for text in row if mark in text}
+        texts = [text for row in self.texts for text in row]
+        marks = [mark for mark in self.legend.marks if any(mark in text for text in texts)]
         parts = (
             *self.legend.before,
             *(heading.term for heading in self.headings),
-            *(f"{mark}: {meaning}" for mark, meaning in self.legend.marks.items() if mark in shown),
+            *(f"{mark}: {self.legend.marks[mark]}" for mark in marks),
             *self.legend.after,
         )
         return tuple(filter(None, ("; ".join(filter(None, parts)), *self.notes)))

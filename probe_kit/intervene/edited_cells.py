@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from dataclasses import astuple, dataclass, replace
 from typing import Any
 
-from probe_kit.intervene.places import SEPARATOR
-
+SEPARATOR = "|"
+"""Separator between place and role, such as `backbone.02|image`, in options and in names of conditions."""
 CONTROL = "control-"
 """Beginning of the names of random directions, which distinguishes them in stored results."""
 EXACT, ESTIMATE = "exact", "estimate"

@@ -21,8 +21,6 @@ TILES: Mapping[str, Side] = dict(zip(TILE_ROLES, ("left", "right"), strict=True)
 ALL = "all"
 """Role of every token but padding."""
 RESIDUAL = "residual"
-SEPARATOR = "|"
-"""Separator between place and role, such as `backbone.02|image`, in options and in names of conditions."""
 SHORTEST_RANGE = 3
 """Number of consecutive layers from which on they are named by their first and last."""
 _POSITIONS = re.compile(r"(?P<first>\d{1,18})(-(?P<last>\d{1,18}))?")

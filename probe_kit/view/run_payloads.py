@@ -253,12 +253,12 @@ def _vlm_cell(vlm: ViewedRun, category: str) -> dict[str, Any]:
 
 def _cell(column: Column, row: RetentionRow) -> dict[str, Any]:
     """Return the text of the table, and value and interval where the page draws them."""
-    shown = column.cell(row)
-    cell: dict[str, Any] = {"text": shown.text}
-    if column.key in (SR.key, BACKBONE.key, ACTION.key) and isinstance(shown.value, float):
-        cell["value"] = rounded(shown.value)
-        cell["limits"] = None if shown.interval is None else [rounded(limit) for limit in shown.interval]
-    return cell
+    cell = column.cell(row)
+    payload: dict[str, Any] = {"text": cell.text}
+    if column.key in (SR.key, BACKBONE.key, ACTION.key) and isinstance(cell.value, float):
+        payload["value"] = rounded(cell.value)
+        payload["limits"] = None if cell.interval is None else [rounded(limit) for limit in cell.interval]
+    return payload
 
 
 # -- site maps ---------------------------------------------------------------------------------------------------

@@ -20,7 +20,7 @@ from probe_kit.env.scoring import DEFAULT_RULE
 from probe_kit.errors import UsageError
 from probe_kit.hooks.capturing.edits import EditLog, Identity, apply_patch
 from probe_kit.hooks.contract.sites import Site
-from probe_kit.intervene.edited_cells import EditedCell
+from probe_kit.intervene.edited_cells import SEPARATOR, EditedCell
 from probe_kit.intervene.kinds.base import (
     NONE,
     AlongDirection,
@@ -42,7 +42,7 @@ from probe_kit.intervene.kinds.interchange import best_patch_targets, patch_of, 
 from probe_kit.intervene.outcomes import CLEAN, ConditionOutcomes
 from probe_kit.intervene.pairs import Pair
 from probe_kit.intervene.patching.patch import Cell, sites_of_cells
-from probe_kit.intervene.places import ALL, SEPARATOR, TILES, resolve_sites
+from probe_kit.intervene.places import ALL, TILES, resolve_sites
 from probe_kit.intervene.replay import SOURCE_RUN, Condition, ConditionContext, ConditionResult
 from probe_kit.intervene.settings import FIRST_CHUNK, categories_in
 from probe_kit.intervene.stored import Measurement

@@ -20,7 +20,7 @@ from probe_kit._tables.content import Cell as TableCell
 from probe_kit._tables.numbers import number, signed
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.sites import KV_STREAM, Site
-from probe_kit.intervene.edited_cells import EditedCell
+from probe_kit.intervene.edited_cells import SEPARATOR, EditedCell
 from probe_kit.intervene.exchange import share_fields, share_of_whole
 from probe_kit.intervene.kinds.base import (
     NONE,
@@ -45,7 +45,7 @@ from probe_kit.intervene.kinds.image_swap import SMALLEST_REACH
 from probe_kit.intervene.outcomes import CLEAN, IMAGE_SWAP, UNCHANGED, ConditionOutcomes
 from probe_kit.intervene.patching.attribution import LOCALISATION_SHARE
 from probe_kit.intervene.patching.patch import Cell, sites_of_cells
-from probe_kit.intervene.places import ALL, RESIDUAL, SEPARATOR, TILES, PlaceName, SiteGroup, resolve_all, roles_of
+from probe_kit.intervene.places import ALL, RESIDUAL, TILES, PlaceName, SiteGroup, resolve_all, roles_of
 from probe_kit.intervene.replay import CLEAN_RUN, SOURCE_RUN, Condition, patched_run
 from probe_kit.intervene.stored import Measurement, PooledConditions, Rank, pool_conditions, stored_results
 from probe_kit.runs.reader import RunReader

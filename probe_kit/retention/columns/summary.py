@@ -119,9 +119,9 @@ def _in_action(row: RetentionRow) -> str:
 
 def _head(row: RetentionRow, vlm: RetentionRow | None, used: str) -> str:
     """Return the verdict: whether the VLM knows the answer, the policy encodes it, and the action uses it."""
-    known = "known" if vlm is not None and knows(vlm) else ""
-    encoded = "encoded" if _is_encoded(row) else ""
-    return ", ".join(filter(None, (" and ".join(filter(None, (known, encoded))), used)))
+    stages = {"known": vlm is not None and knows(vlm), "encoded": _is_encoded(row)}
+    reached = " and ".join(stage for stage, is_reached in stages.items() if is_reached)
+    return ", ".join(filter(None, (reached, used)))
 
 
 def _of_use(row: RetentionRow, vlm: RetentionRow | None, use: UseVerdict) -> str:
