@@ -39,7 +39,7 @@ from probe_kit.intervene.kinds.base import (
     signed_interval,
 )
 from probe_kit.intervene.kinds.interchange import best_patch_targets, patch_of, patches_within
-from probe_kit.intervene.outcomes import CLEAN, ConditionOutcomes
+from probe_kit.intervene.outcomes import CLEAN, UNCHANGED, ConditionOutcomes
 from probe_kit.intervene.pairs import Pair
 from probe_kit.intervene.patching.patch import Cell, sites_of_cells
 from probe_kit.intervene.places import ALL, TILES, resolve_sites
@@ -311,14 +311,16 @@ class ClosedLoopEffect(EffectRow):
 def closed_loop_effects(outcomes: ConditionOutcomes) -> list[ClosedLoopEffect]:
     """Return one row per condition of one category, the identity patch first."""
     assert outcomes.episode_outcomes is not None
-    clean = [at for at, name in enumerate(outcomes.conditions) if name == CLEAN]
-    cells = [EditedCell(CLEAN) if at in clean else cell for at, cell in enumerate(outcomes.cells)]
+    clean = {at for at, name in enumerate(outcomes.conditions) if name == CLEAN}
+    # What edits no cell is listed under its name: the identity patch, and the image swap.
+    named = zip(outcomes.conditions, outcomes.cells, strict=True)
+    cells = [EditedCell(name) if name in UNCHANGED else cell for name, cell in named]
     wrong = (outcomes.episode_outcomes == WRONG).astype(float)
     in_zone = np.isin(outcomes.episode_outcomes, (CORRECT, WRONG)).mean(axis=1)
     disrupted = in_zone < MIN_IN_ZONE_RATIO * in_zone[0]
     net = wrong - wrong[0]
     left_out = set(np.flatnonzero(disrupted).tolist())
-    tests = compare_with_controls(net, cells, outcomes, skipped=left_out | set(clean), broken_controls=left_out)
+    tests = compare_with_controls(net, cells, outcomes, skipped=left_out | clean, broken_controls=left_out)
     rows = []
     for at, (cell, test) in enumerate(zip(cells, tests, strict=True)):
         gained, lost = int((net[at] > 0).sum()), int((net[at] < 0).sum())
