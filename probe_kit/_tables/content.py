@@ -161,7 +161,7 @@ class Content:
         notes: Sequence[str] = (),
         **more: Any,
     ) -> Self:
-        """Return a table of text.
+        """Return a table.
 
         Args:
             title: The title, without a period.

@@ -313,8 +313,8 @@ def closed_loop_effects(outcomes: ConditionOutcomes) -> list[ClosedLoopEffect]:
     assert outcomes.episode_outcomes is not None
     clean = {at for at, name in enumerate(outcomes.conditions) if name == CLEAN}
     # What edits no cell is listed under its name: the identity patch, and the image swap.
-    named = zip(outcomes.conditions, outcomes.cells, strict=True)
-    cells = [EditedCell(name) if name in UNCHANGED else cell for name, cell in named]
+    pairs = zip(outcomes.conditions, outcomes.cells, strict=True)
+    cells = [EditedCell(name) if name in UNCHANGED else cell for name, cell in pairs]
     wrong = (outcomes.episode_outcomes == WRONG).astype(float)
     in_zone = np.isin(outcomes.episode_outcomes, (CORRECT, WRONG)).mean(axis=1)
     disrupted = in_zone < MIN_IN_ZONE_RATIO * in_zone[0]
