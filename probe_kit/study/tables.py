@@ -40,16 +40,20 @@ from probe_kit.study.schema import ComparisonTable, DriftTable, TableTable, unkn
 from probe_kit.study.stored import StoredRun, StoredRuns, probe_key, stored_runs, study_probes
 from probe_kit.suite.categories import category_of
 
-_TEST = (
-    "p: exact, signs of whole groups of items flipped; (Holm) over all categories and pairs of this comparison; "
-    f"{P_DECIDES}"
-)
 FEWEST_GROUPS = 10
 """Number of groups of items from which a difference is tested, and counts for Holm's correction of the others.
 
 Signs of 10 groups give no p below 2⁻⁹ = 0.002, two-sided: enough for Holm's correction over two dozen tests.
 """
 _FEW = "!"
+
+
+def _note_on_tests(family: str) -> str:
+    """Return how differences are tested; `family` holds the tests that Holm's correction counts."""
+    return (
+        f"p: exact, signs of whole groups of items flipped; (Holm) over all categories and pairs of {family}; "
+        f"{P_DECIDES}"
+    )
 
 
 def difference_table(table: RetentionTable, title: str) -> Table:
@@ -69,7 +73,11 @@ def difference_table(table: RetentionTable, title: str) -> Table:
         for row in rows
     ]
     columns = ("systems", "category", "difference, points [95 %]", "p (Holm)", "items")
-    notes = [caption(table, [_TEST]), *_remarks(rows), *(text.removesuffix(".") for text in table.unpaired)]
+    notes = [
+        caption(table, [_note_on_tests("this comparison")]),
+        *_remarks(rows),
+        *(text.removesuffix(".") for text in table.unpaired),
+    ]
     numbers = tuple(map(_difference_numbers, rows))
     return Table.of(title, columns, cells, names=2, mean=MEAN, notes=notes, numbers=numbers)
 
@@ -152,7 +160,7 @@ def vlm_vla_table(differences: Sequence[Difference]) -> Table:
         for row in rows
     ]
     other = "; some pairs began with OTHER first frames" if any(row.same_frames is False for row in rows) else ""
-    notes = [f"{_TEST.replace('this comparison', 'the table')}{other}", *_remarks(rows)]
+    notes = [f"{_note_on_tests('the table')}{other}", *_remarks(rows)]
     columns = ("systems", "category", "VLM %", "VLA %", "VLM − VLA [95 %]", "p (Holm)", "items")
     return Table.of("VLM − VLA", columns, cells, names=2, mean=MEAN, notes=notes, numbers=tuple(numbers))
 
