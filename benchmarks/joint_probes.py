@@ -189,7 +189,7 @@ def together(
     once = processor_seconds(lambda: sites.append(JointSite.of(samples, folds)))
     console.print(f"machine: {single:.0f} GFLOP/s in float32, {double:.0f} in float64; {once:.1f} s once")
     found: list[FittedFold] = []
-    with patch("probe_kit.train.crossval.joint.JointProblems", Counted):  # every product is made, and counted
+    with patch.object(probe, "JointProblems", Counted):  # every product is made, and counted
         solving = processor_seconds(lambda: found.extend(cross_validate_jointly(sites[0], samples, labels, folds)))
     count, width = samples.features.shape
     moments = 4 * count * width**2 / 1e9

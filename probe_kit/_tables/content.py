@@ -1,38 +1,42 @@
 """The content of a table, which renderers read: headings, rows of cells, notes.
 
-A renderer knows no subject: a cell says what is bold, red, coloured or sorted, and a heading says what it means.
+A renderer knows no subject: a cell says what is bold, red, coloured or sorted, and a heading says what it means. A
+cell holds its value, the interval and the format; their text is made when a renderer asks for it.
 """
 
-import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Self
 
-from probe_kit._tables.numbers import NONE
+from probe_kit._tables.numbers import NONE, Limits, is_missing, limits_text, plain
 
 Number = Mapping[str, Any]
 """A number behind a table with what it describes, or the numbers of a row."""
-_LIMITS = re.compile(r"(?<!^) ?(\[[^\]]*\])")
-"""An interval behind its value."""
-_UNITS = re.compile(r"(,? (%|cm|points))?( \[[^\]]*\])?$")
-"""The part of a heading behind its term."""
-_NUMBER = re.compile(r"[-+−±]?\d|< \d|n/a|–|$")
-"""The beginning of a cell of numbers."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A text, and how formats that can show it do.
+    """A value and its format, and how formats that can show it look.
 
     Attributes:
-        sort: The key by which a page sorts, the text by default.
+        value: A number, or a text; None where there is neither.
+        write: The format of the value and of the ends of its interval; it says what stands in place of None.
+        interval: The 95 % interval of the value; None for a cell without one.
+        after: A text behind the value, such as a mark or a number that belongs to it.
+        write_ends: The format of the ends where the interval is of another number than the value, such as that of
+            a difference behind its p.
+        sort: The key by which a page sorts, the value by default.
         heat: A share that colors the ground.
         strong: Whether the text is bold.
         alarm: Whether the text is red.
         note: A text that a page shows if the pointer is on the cell.
     """
 
-    text: str
+    value: float | str | None
+    write: Callable[[Any], str] = plain
+    interval: Limits | None = None
+    after: str = ""
+    write_ends: Callable[[Any], str] | None = None
     sort: float | str | None = None
     heat: float | None = None
     strong: bool = False
@@ -40,15 +44,38 @@ class Cell:
     note: str = ""
 
     @property
-    def limits(self) -> str:
-        """The interval in square brackets behind the value, empty without one."""
-        match = _LIMITS.search(self.text)
-        return match[1] if match else ""
+    def value_text(self) -> str:
+        """The text without the interval."""
+        return self.write(self.value) + self.after
 
     @property
-    def value(self) -> str:
-        """The text without the interval."""
-        return _LIMITS.sub("", self.text, count=1)
+    def interval_text(self) -> str:
+        """The interval in square brackets; empty without one."""
+        if self.interval is None or isinstance(self.value, str):
+            return ""
+        if is_missing(self.value) and self.write_ends is None:
+            return ""
+        return limits_text(self.interval, self.write_ends or self.write)
+
+    @property
+    def text(self) -> str:
+        """The value, its interval, and what follows."""
+        limits = self.interval_text
+        return f"{self.write(self.value)} {limits}{self.after}" if limits else self.value_text
+
+    @property
+    def is_text(self) -> bool:
+        """Whether it holds a text, and neither a number nor a sign that there is none."""
+        return isinstance(self.value, str) and self.value not in ("", NONE)
+
+
+def absent(text: str) -> Cell:
+    """Return a cell with a text in place of a number, such as `n/a`, which is aligned like numbers."""
+    return Cell(None, lambda _: text)
+
+
+Cells = tuple[Cell | str, ...]
+"""The cells of a line; a text is a cell with nothing else."""
 
 
 @dataclass(frozen=True)
@@ -59,12 +86,14 @@ class Heading:
         help: Its entry in a glossary; empty for none.
         group: A name over adjoining columns; empty for none.
         is_detail: Whether the column needs room, and is left out of terminals and LaTeX.
+        term: Its entry in the legend below the table, `name: meaning`; empty for none.
     """
 
     text: str
     help: str = ""
     group: str = ""
     is_detail: bool = False
+    term: str = ""
 
 
 @dataclass(frozen=True)
@@ -82,17 +111,33 @@ class Row:
 
 
 @dataclass(frozen=True)
+class Legend:
+    """The parts of a legend beside the terms of the columns that are shown.
+
+    Attributes:
+        before: Remarks in front of the terms.
+        marks: The meaning of signs that cells have, by sign; one that no cell has is left out.
+        after: Remarks behind all of them.
+    """
+
+    before: tuple[str, ...] = ()
+    marks: Mapping[str, str] = field(default_factory=dict)
+    after: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class Content:
     """The part of a table that a renderer reads: its text, and the numbers behind it.
 
     Attributes:
         names: The number of first columns that name the rows.
-        notes: Sentences below the table, which need no capital letter and no period.
+        notes: Sentences below the legend, which need no capital letter and no period.
         numbers: An object per row or per number, shares in [0, 1], None where unknown.
         is_partial: Whether runs are missing that could be played; a note names them.
         overflow: The way in which a terminal shows columns that do not fit. `split`: in further tables. `leave
             out`: by name only. `fold`: first with intervals below their values. `wrap`: with wrapped text, for
             columns of words.
+        legend: Remarks and the meaning of marks, which are shown with the terms of the columns.
     """
 
     title: str
@@ -103,6 +148,7 @@ class Content:
     numbers: tuple[Number, ...] = ()
     is_partial: bool = False
     overflow: Literal["split", "leave out", "fold", "wrap"] = "split"
+    legend: Legend = field(default_factory=Legend)
 
     @classmethod
     def of(
@@ -115,7 +161,7 @@ class Content:
         notes: Sequence[str] = (),
         **more: Any,
     ) -> Self:
-        """Return a table of text.
+        """Return a table.
 
         Args:
             title: The title, without a period.
@@ -130,6 +176,10 @@ class Content:
         lines = [Row(row, mean is not None and mean in [cell.text for cell in row[:names]]) for row in cells]
         heads = tuple(heading if isinstance(heading, Heading) else Heading(heading) for heading in headings)
         return cls(title, heads, tuple(lines), notes=tuple(filter(None, notes)), **more)
+
+    def with_remarks(self, remarks: Sequence[str]) -> Self:
+        """Return the table with more remarks at the end of its legend."""
+        return replace(self, legend=replace(self.legend, after=(*self.legend.after, *remarks)))
 
     def with_notes(self, sentences: Sequence[str]) -> Self:
         """Return the table with more sentences below it."""
@@ -155,22 +205,30 @@ class Content:
         return tuple(tuple(cell.text for cell in row.cells) for row in self.rows)
 
     @property
+    def all_notes(self) -> tuple[str, ...]:
+        """The legend, where there is anything to explain, and the notes."""
+        texts = [text for row in self.texts for text in row]
+        marks = [mark for mark in self.legend.marks if any(mark in text for text in texts)]
+        parts = (
+            *self.legend.before,
+            *(heading.term for heading in self.headings),
+            *(f"{mark}: {self.legend.marks[mark]}" for mark in marks),
+            *self.legend.after,
+        )
+        return tuple(filter(None, ("; ".join(filter(None, parts)), *self.notes)))
+
+    @property
     def sentences(self) -> tuple[str, ...]:
-        """The notes as sentences, without the terms of marks such as `*` that no cell has."""
-        text = " ".join(cell for row in self.texts for cell in row)
-
-        def is_unused_mark(term: str) -> bool:
-            return not any(map(str.isalnum, term)) and term not in text
-
-        notes = (_without_terms(note, is_unused_mark) for note in self.notes)
-        return tuple(map(_sentence, filter(None, notes)))
+        """The legend and the notes as sentences."""
+        return tuple(map(_sentence, self.all_notes))
 
     @property
     def are_numeric(self) -> tuple[bool, ...]:
         """A flag per column: whether it holds numbers, which are aligned to the right."""
+        columns = [*zip(*(row.cells for row in self.rows), strict=True)] or [()] * len(self.headings)
         return tuple(
-            at >= self.names and any(texts) and all(map(_NUMBER.match, texts))
-            for at, texts in enumerate(self._by_column)
+            at >= self.names and any(cell.text for cell in cells) and not any(cell.is_text for cell in cells)
+            for at, cells in enumerate(columns)
         )
 
     @property
@@ -182,12 +240,7 @@ class Content:
         """Return the table with some of its columns, those that name the rows first."""
         rows = tuple(replace(row, cells=tuple(row.cells[at] for at in columns)) for row in self.rows)
         headings = tuple(self.headings[at] for at in columns)
-        texts = {heading.text for heading in self.headings} - {heading.text for heading in headings}
-        absent = {_UNITS.sub("", text).lower() for text in texts}
-        notes = tuple(filter(None, (_without_terms(note, absent.__contains__) for note in self.notes)))
-        return replace(
-            self, headings=headings, rows=rows, notes=notes, names=sum(at < self.names for at in columns)
-        )
+        return replace(self, headings=headings, rows=rows, names=sum(at < self.names for at in columns))
 
     def filled(self, *empty: str) -> Self:
         """Return the table without columns in which every row has a dash, nothing, or one of the texts `empty`."""
@@ -210,20 +263,6 @@ class Content:
 def grouped(*groups: tuple[str, Sequence[str]]) -> tuple[Heading, ...]:
     """Return headings under names over adjoining columns."""
     return tuple(Heading(text, group=group) for group, texts in groups for text in texts)
-
-
-def _without_terms(legend: str, is_unused: Callable[[str], bool]) -> str:
-    """Return a legend, `term: meaning; term: meaning`, without the terms that a table does not use.
-
-    A part without a term belongs to the one before it.
-    """
-    parts, is_absent = [], False
-    for part in legend.split("; "):
-        term, colon, _ = part.partition(": ")
-        is_absent = is_unused(term.lower()) if colon else is_absent
-        if not is_absent:
-            parts.append(part)
-    return "; ".join(parts)
 
 
 def _sentence(note: str) -> str:

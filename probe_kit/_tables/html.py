@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from probe_kit._system.escaping import without_folders
 from probe_kit._tables.content import Cell, Content, heat_colour
-from probe_kit._tables.numbers import NONE
+from probe_kit._tables.numbers import NONE, is_missing
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -60,13 +60,9 @@ def sort_key(cell: Cell, is_numeric: bool) -> float | str | None:
     """Return what a page sorts a cell by: a number, text, or None for last."""
     if cell.sort is not None:
         return cell.sort
-    if not is_numeric or cell.text in ("", NONE):
-        return cell.text if cell.text not in ("", NONE) else None
-    start, *_ = cell.text.replace("−", "-").split() or [""]
-    try:
-        return float(start)
-    except ValueError:
-        return None
+    if is_numeric and not isinstance(cell.value, str):
+        return None if is_missing(cell.value) else cell.value
+    return cell.text if cell.text not in ("", NONE) else None
 
 
 def unbroken(heading: str) -> str:

@@ -2,12 +2,18 @@
 
 from collections.abc import Callable, Sequence
 from math import isfinite
+from typing import Any
 
 NONE = "–"
 """The sign in place of a missing number."""
 Limits = tuple[float | None, float | None]
 """A 95 % interval; (None, None) where the data set no limits."""
 Write = Callable[[float | None], str]
+
+
+def plain(value: Any) -> str:
+    """Return a count or a text as it is; a dash for None."""
+    return NONE if value is None else str(value)
 
 
 def percent(value: float | None, digits: int = 1) -> str:
@@ -22,12 +28,12 @@ def whole_percent(value: float | None) -> str:
 
 def number(value: float | None, digits: int = 2) -> str:
     """Return a number, by default with two decimals, and zero without a sign; a dash for None and NaN."""
-    return NONE if value is None or value != value else f"{value:z.{digits}f}"
+    return NONE if value is None or is_missing(value) else f"{value:z.{digits}f}"
 
 
 def signed(value: float | None, digits: int = 2) -> str:
     """Return a number with its sign, by default with two decimals; a dash for None and NaN."""
-    return NONE if value is None or value != value else f"{value:+z.{digits}f}"
+    return NONE if value is None or is_missing(value) else f"{value:+z.{digits}f}"
 
 
 def points(value: float | None) -> str:
@@ -46,11 +52,21 @@ def span(values: Sequence[int]) -> str:
     return str(low) if low == high else f"{low}–{high}"
 
 
-def with_limits(value: float | None, limits: Limits | None, write: Write) -> str:
-    """Return a value with its interval in brackets, if it has one, both in the format `write`."""
-    if limits is None or value is None or value != value:
-        return write(value)
+def is_missing(value: float | None) -> bool:
+    """Whether there is no number: None or NaN."""
+    return value is None or value != value
+
+
+def limits_text(limits: Limits, write: Write) -> str:
+    """Return an interval in brackets, both ends in the format `write`."""
     low, high = limits
     if low is None or high is None or not (isfinite(low) and isfinite(high)):
-        return f"{write(value)} [no limits]"
-    return f"{write(value)} [{write(low)}, {write(high)}]"
+        return "[no limits]"
+    return f"[{write(low)}, {write(high)}]"
+
+
+def with_limits(value: float | None, limits: Limits | None, write: Write) -> str:
+    """Return a value with its interval in brackets, if it has one, both in the format `write`."""
+    if limits is None or is_missing(value):
+        return write(value)
+    return f"{write(value)} {limits_text(limits, write)}"

@@ -32,7 +32,9 @@ def lines(table: Content, width: int) -> "Iterator[RenderableType]":
         table = replace(table, rows=tuple(folded))
     yield Text(table.title, style="italic")
     yield from [_wrapped(table)] if table.overflow == "wrap" and _can_wrap(table, width) else _tables(table, width)
-    notes = [*table.sentences, *[f"With --details or more room: {', '.join(left_out)}."] * bool(left_out)]
+    notes = list(table.sentences)
+    if left_out:
+        notes.append(f"With --details or more room: {', '.join(left_out)}.")
     if notes:
         yield Text("\n".join(notes), style="dim")
     yield Text()
@@ -73,8 +75,9 @@ def width_of(table: Content) -> int:
 
 def _two_lines(cell: Cell) -> Cell:
     """Return a cell with the interval below its value, and words broken at commas."""
-    text = f"{cell.value}\n{cell.limits}" if cell.limits else cell.text.replace(", ", ",\n")
-    return replace(cell, text=text)
+    limits = cell.interval_text
+    text = f"{cell.value_text}\n{limits}" if limits else cell.text.replace(", ", ",\n")
+    return Cell(text, strong=cell.strong, alarm=cell.alarm)
 
 
 def _fitting(table: Content, width: int) -> tuple[Content, list[str]]:
@@ -215,7 +218,9 @@ def _text(cell: Cell) -> "Text":
 
 
 def _style(row: Row) -> str:
-    return " ".join(["bold"] * row.is_mean + ["italic"] * row.is_difference)
+    if row.is_difference:
+        return "bold italic" if row.is_mean else "italic"
+    return "bold" if row.is_mean else ""
 
 
 def _lists(table: Content) -> "Iterator[RenderableType]":

@@ -11,6 +11,7 @@ import shlex
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -256,8 +257,9 @@ def _cells(finding: Finding) -> tuple[Cell | str, ...]:
     return (
         finding.organism, finding.category, finding.expected, finding.measured,
         Cell(finding.agreement, alarm=finding.agreement == "wrong"),
-        percent(row.success.sr), MARGIN.text(row), FOLLOWS.text(row), percent(row.backbone.score),
-        number(row.backbone.p_fwe, 3), exceeds_text(row.backbone), percent(row.action.score), retention_value(row),
+        Cell(row.success.sr, percent), MARGIN.cell(row), FOLLOWS.cell(row), Cell(row.backbone.score, percent),
+        Cell(row.backbone.p_fwe, partial(number, digits=3)), exceeds_text(row.backbone),
+        Cell(row.action.score, percent), retention_value(row),
     )  # fmt: skip
 
 

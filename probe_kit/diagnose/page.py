@@ -64,7 +64,7 @@ def write_page(diagnosis: "Diagnosis", file: Path) -> None:
     from probe_kit.retention.displays.shown_figure import picture_of
 
     table = diagnosis_table(diagnosis)
-    items = Markup("").join(Markup("<li>{}</li>").format(line) for line in table.notes)
+    items = Markup("").join(Markup("<li>{}</li>").format(line) for line in table.all_notes)
     parts = [_HEAD.format(title=escape(table.title)), replace(table, title="", notes=())._repr_html_()]
     parts.append(Markup("<ul>{}</ul>").format(items))
     if any(diagnosed.passage for diagnosed in diagnosis.inputs):

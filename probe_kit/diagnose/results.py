@@ -1,7 +1,7 @@
 """The results of a diagnosis, input by input: as they are stored, their table and sentences. Loads no model."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from math import isfinite, nan
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import BeforeValidator, PlainSerializer
 
 from probe_kit._system.counting import counted
-from probe_kit._tables.numbers import p_text, whole_percent, with_limits
+from probe_kit._tables.numbers import p_text, whole_percent
 from probe_kit._tables.table import Cell, Heading, Table
 from probe_kit.errors import UsageError
 from probe_kit.intervene.exchange import describe_seed, does_seed_decide
@@ -191,7 +191,7 @@ def describe_passage(passage: Sequence[SitePassage], verdict: Verdict) -> str:
         reach, loss = ", the last site", "behind it"
     else:
         reach, loss = f" and reaches {last.name} ({last.difference:.2g})", "in the action part itself"
-    return f"{largest}{reach}" + f": the loss is {loss}" * (verdict == "no effect")
+    return f"{largest}{reach}: the loss is {loss}" if verdict == "no effect" else f"{largest}{reach}"
 
 
 @dataclass(frozen=True)
@@ -381,7 +381,8 @@ def diagnosis_table(diagnosis: "Diagnosis") -> Table:
     headings = (*_HEADINGS, *_OF_BASE) if diagnosis.base else _HEADINGS
     rows = [_row(diagnosed, headings) for diagnosed in diagnosis.inputs]
     title = f"Inputs of {diagnosis.label}: {diagnosis.n_frames} frames of {diagnosis.n_groups} groups"
-    title += f"; base {diagnosis.base}" * bool(diagnosis.base)
+    if diagnosis.base:
+        title += f"; base {diagnosis.base}"
     numbers = tuple(diagnosis.to_json()["inputs"])
     notes = [*sentences(diagnosis), *describe_origin(diagnosis)]
     return Table.of(title, headings, rows, notes=notes, numbers=numbers)
@@ -392,7 +393,7 @@ def describe_origin(diagnosis: "Diagnosis") -> list[str]:
     if not diagnosis.weights_sha256:
         return []
     settings = diagnosis.settings
-    random = " (random weights)" * diagnosis.random_weights
+    random = " (random weights)" if diagnosis.random_weights else ""
     base = settings.get("base")
     parts = [
         f"inputs {', '.join(settings['inputs'])}" if settings.get("inputs") else "all inputs",
@@ -415,27 +416,28 @@ def _words_of(instructions: Sequence[str]) -> list[str]:
 
 def _row(diagnosed: "InputDiagnosis", headings: Sequence[Heading]) -> Sequence[Cell]:
     tested = diagnosed.matters is not None
-    texts = [
-        diagnosed.name,
-        ("yes" if diagnosed.arrives else "no") if tested else "–",
-        diagnosed.verdict,
-        with_limits(diagnosed.share, diagnosed.share_ci, whole_percent),
-        whole_percent(diagnosed.control),
-        whole_percent(diagnosed.every),
-        p_text(diagnosed.p),
+    arrives = "yes" if diagnosed.arrives else "no"
+    cells = [
+        Cell(diagnosed.name),
+        Cell(arrives if tested else None),
+        Cell(diagnosed.verdict),
+        Cell(diagnosed.share, whole_percent, diagnosed.share_ci),
+        Cell(diagnosed.control, whole_percent),
+        Cell(diagnosed.every, whole_percent),
+        Cell(diagnosed.p, p_text),
     ]
     if (base := diagnosed.base) is not None:
-        texts += [
-            whole_percent(base.share),
-            with_limits(base.difference, base.ci, whole_percent),
-            p_text(base.p),
-            base.change,
+        cells += [
+            Cell(base.share, whole_percent),
+            Cell(base.difference, whole_percent, base.ci),
+            Cell(base.p, p_text),
+            Cell(base.change),
         ]
-    texts += ["–"] * (len(headings) - len(texts))
+    cells += [Cell(None)] * (len(headings) - len(cells))
     alarms = {"arrives", "effect"} if diagnosed.matters is False else set()
     if base is not None and base.change == "lost in fine-tuning":
         alarms.add("change")
-    return [Cell(text, alarm=heading.text in alarms) for heading, text in zip(headings, texts, strict=True)]
+    return [replace(cell, alarm=heading.text in alarms) for heading, cell in zip(headings, cells, strict=True)]
 
 
 def sentences(diagnosis: "Diagnosis") -> list[str]:

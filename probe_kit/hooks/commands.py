@@ -65,8 +65,8 @@ def _print_verification(verification: "Verification") -> None:
 
     rows = []
     for c in verification.comparisons:
-        error = "–" if c.error is None else f"{c.error:.2e}"
+        error = Cell(None) if c.error is None else Cell(c.error, "{:.2e}".format)
         status = Cell(c.status, alarm=c.status == "over", strong=c.status == "not compared")
-        rows.append((c.output, error, f"{c.tolerance:.0e}", status, c.note))
+        rows.append((c.output, error, Cell(c.tolerance, "{:.0e}".format), status, c.note))
     columns = ("output", "max abs error", "tolerance", "", "note")
     out.print(Table.of(verification.family, columns, rows, overflow="wrap"))

@@ -18,7 +18,7 @@ from probe_kit._system.counting import counted
 from probe_kit._system.escaping import as_argument
 from probe_kit._tables.numbers import whole_percent
 from probe_kit._tables.printing import Format, print_table
-from probe_kit._tables.table import Table
+from probe_kit._tables.table import Cell, Table
 from probe_kit._terminal import options as common
 from probe_kit._terminal.console import counter, marked, out, print_json, progress, say, say_note, split
 from probe_kit._terminal.field_options import PanelledHelp, command_with
@@ -370,8 +370,8 @@ def _table(lines: list[dict[str, Any]], folder: Path) -> Table:
         if "error" not in line:
             # Hashes stay in the numbers: they would take the room of names.
             suite = line["suite"].partition("#")[0]
-            texts = {**line, "correct": whole_percent(line["correct"]), "suite": suite}
-            rows.append([str(texts[name]) for name in _COLUMNS])
+            cells = {**line, "correct": Cell(line["correct"], whole_percent), "suite": suite}
+            rows.append([cells[name] for name in _COLUMNS])
     headings = ["correct %" if name == "correct" else name for name in _COLUMNS]
     return Table.of(f"runs below {folder}", headings, rows, numbers=tuple(lines), overflow="wrap")
 

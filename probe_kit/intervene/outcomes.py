@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from probe_kit._system.bounded_files import open_arrays
 from probe_kit.hashing import derive_seed
+from probe_kit.intervene.edited_cells import COLUMNS, NO_CELL, EditedCell, read_former_name
 from probe_kit.intervene.exchange import Exchange
 
 CLEAN, IMAGE_SWAP, INSTRUCTION_SWAP, NOISE = "clean", "image_swap", "instruction_swap", "noise"
@@ -131,12 +132,18 @@ class ConditionOutcomes:
         mass: (N, B, I, H, R) attention of N inferences; None where it was not recorded.
         inferences: (N, 2) rows of these inferences in the run's episodes, and their calls; None likewise.
         patches: (N, B, P) attention on single patches; None where it is not known.
+        sites: (K,) place that each condition edits, empty for a condition that edits no single cell; so are all
+            columns of `EditedCell`. None, as in outcomes of earlier versions, reads them from the names.
+        roles: (K,) role of the edited tokens.
+        directions: (K,) name of the direction.
+        coefficients: (K,) coefficient of steering, as text.
+        parts: (K,) what is done with the cell.
     """
 
     AXES: ClassVar[Mapping[str, str]] = {
         **dict.fromkeys(("episodes", "items", "groups", "categories", "sides"), "U E"),
         **dict.fromkeys(("displacement", "max_action_change", "toward", "size"), "f KE"),
-        "conditions": "U K",
+        **dict.fromkeys(("conditions", *COLUMNS), "U K"),
         "edit_log": "f KEL",
         "replay_error": "f E",
         "episode_outcomes": "U KE",
@@ -160,10 +167,24 @@ class ConditionOutcomes:
     mass: NDArray[np.float32] | None = None
     inferences: NDArray[np.int64] | None = None
     patches: NDArray[np.float32] | None = None
+    sites: tuple[str, ...] | None = None
+    roles: tuple[str, ...] | None = None
+    directions: tuple[str, ...] | None = None
+    coefficients: tuple[str, ...] | None = None
+    parts: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
-        # Stored names are an array, and comparisons with one are element by element.
-        object.__setattr__(self, "conditions", tuple(map(str, self.conditions)))
+        for name in ("conditions", *COLUMNS):
+            if (texts := getattr(self, name)) is not None:
+                # Stored texts are an array, and comparisons with one are element by element.
+                object.__setattr__(self, name, tuple(map(str, texts)))
+
+    @property
+    def cells(self) -> tuple[EditedCell, ...]:
+        """The cell that each of the K conditions edits."""
+        if self.sites is None:
+            return tuple(NO_CELL if name in UNCHANGED else read_former_name(name) for name in self.conditions)
+        return tuple(EditedCell(*cell) for cell in zip(*(getattr(self, name) for name in COLUMNS), strict=True))
 
     @property
     def has_sides(self) -> bool:

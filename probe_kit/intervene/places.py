@@ -21,8 +21,6 @@ TILES: Mapping[str, Side] = dict(zip(TILE_ROLES, ("left", "right"), strict=True)
 ALL = "all"
 """Role of every token but padding."""
 RESIDUAL = "residual"
-SEPARATOR = "|"
-"""Separator between the parts of a condition's name, such as `backbone.02|image`."""
 SHORTEST_RANGE = 3
 """Number of consecutive layers from which on they are named by their first and last."""
 _POSITIONS = re.compile(r"(?P<first>\d{1,18})(-(?P<last>\d{1,18}))?")
@@ -264,7 +262,8 @@ def unread_places(
             parsed = PlaceName.parse(name)
             is_last = parsed.quantity in ("", RESIDUAL) and parsed.layer == streams[stream].layers - 1
             # The final norm lies behind the last layer, whatever number its site has.
-            unread += [name] * (is_last or parsed.quantity == FINAL_NORM)
+            if is_last or parsed.quantity == FINAL_NORM:
+                unread.append(name)
     return tuple(dict.fromkeys(unread))
 
 

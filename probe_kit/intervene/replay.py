@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.capturing.edits import LOG_FIELDS, EditLog
 from probe_kit.hooks.contract.sites import Site
+from probe_kit.intervene.edited_cells import NO_CELL, EditedCell, columns_of
 from probe_kit.intervene.outcomes import CLEAN, CONTROL_INPUT, DONOR, IMAGE_SWAP, NOISE, ConditionOutcomes
 from probe_kit.intervene.pairs import Chunk, Given, Pair
 from probe_kit.intervene.patching.patch import Cell, patched
@@ -83,12 +84,19 @@ class Condition:
         play: Function that makes the inference.
         places: Names of the places that it edits, by which it is known whether anything reads them.
         details: Values for `Intervention.extra_files`.
+        cell: The one cell that it edits, whose columns are stored; empty for any other condition.
     """
 
     name: str
     play: Callable[[ConditionContext], ConditionResult] = field(repr=False)
     places: tuple[str, ...] = ()
     details: Any = field(default=None, repr=False)
+    cell: EditedCell = NO_CELL
+
+    @classmethod
+    def of_cell(cls, cell: EditedCell, play: Callable[[ConditionContext], ConditionResult]) -> Self:
+        """Return the condition that edits one cell, and has its name."""
+        return cls(str(cell), play, (cell.site,), cell=cell)
 
 
 def _of_input(name: str, which: str) -> Condition:
@@ -122,7 +130,7 @@ NOISE_RUN = Condition(NOISE, _resample_noise)
 
 
 def patched_run(
-    name: str,
+    name: str | EditedCell,
     cells: Mapping[str, tuple[Cell, ...]],
     source_sites: tuple[Site, ...],
     direction: str = "",
@@ -131,7 +139,7 @@ def patched_run(
     """Return the clean inference with activations of cells from the source's: one inference for all cells.
 
     Args:
-        name: Name of the condition.
+        name: Name of the condition, or the cell that it edits.
         cells: Cells by category, and for all other categories under the empty name.
         source_sites: All sites at which the source's inference is captured, once for all conditions.
         direction: Name of one of `bases`; empty to patch tokens in full.
@@ -147,7 +155,8 @@ def patched_run(
             return ConditionResult(context.act(), edit_log)
 
     places = (cell.site_group.name for together in cells.values() for cell in together)
-    return Condition(name, play, tuple(dict.fromkeys(places)))
+    cell = name if isinstance(name, EditedCell) else NO_CELL
+    return Condition(str(name), play, tuple(dict.fromkeys(places)), cell=cell)
 
 
 AttentionRecord = tuple[int, int, NDArray[np.float32], NDArray[np.float32] | None]
@@ -166,6 +175,7 @@ def room_for(pairs: Sequence[Pair], conditions: Sequence[Condition]) -> Conditio
     }  # fmt: skip
     return ConditionOutcomes(
         conditions=tuple(condition.name for condition in conditions),
+        **columns_of([condition.cell for condition in conditions]),
         **columns,
         displacement=np.empty(shape),
         max_action_change=np.zeros(shape),

@@ -180,7 +180,7 @@ class InterventionResult(Measurement):
             for name, verdict in (self.verdicts if self._kind.has_verdict else {}).items()
             if verdict.explanation
         ]
-        return replace(table, overflow="split", notes=("; ".join([*table.notes, *reasons]),))
+        return replace(table, overflow="split").with_remarks(reasons)
 
     @property
     def legend(self) -> str:

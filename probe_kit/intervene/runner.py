@@ -10,7 +10,7 @@ from probe_kit._terminal.notebook import notebook_progress
 from probe_kit.errors import CaptureChangedActionError, UsageError
 from probe_kit.hooks.capturing.edits import LOG_FIELDS
 from probe_kit.hooks.registry import get_family
-from probe_kit.intervene.kinds.base import ConditionName, Intervention
+from probe_kit.intervene.kinds.base import Intervention
 from probe_kit.intervene.kinds.image_swap import ImageSwap
 from probe_kit.intervene.open_session import open_session
 from probe_kit.intervene.outcomes import ConditionOutcomes, arrays_of
@@ -180,14 +180,16 @@ def _replay_items(
 def _replay_check(outcomes: ConditionOutcomes) -> dict[str, Any]:
     """Return how many clean inferences are the run's, bit for bit."""
     errors = outcomes.replay_error[~np.isnan(outcomes.replay_error)]
-    return {
+    check: dict[str, Any] = {
         "episodes": int(outcomes.replay_error.size),
         "compared": int(errors.size),
         "equal": int((errors == 0).sum()),
         "largest_difference": float(errors.max(initial=0.0)),
-        # All of them: `play` raises for an outcome that differs from the run's.
-        **({} if outcomes.episode_outcomes is None else {"outcomes_equal": int(outcomes.replay_error.size)}),
     }
+    if outcomes.episode_outcomes is not None:
+        # All of them: `play` raises for an outcome that differs from the run's.
+        check["outcomes_equal"] = int(outcomes.replay_error.size)
+    return check
 
 
 def _ledgers(outcomes: ConditionOutcomes) -> dict[str, dict[str, float]]:
@@ -197,7 +199,7 @@ def _ledgers(outcomes: ConditionOutcomes) -> dict[str, dict[str, float]]:
         CaptureChangedActionError: If coefficient 0 changed an action.
     """
     ledgers = {}
-    for number, name in enumerate(outcomes.conditions):
+    for number, (name, cell) in enumerate(zip(outcomes.conditions, outcomes.cells, strict=True)):
         rows = dict(zip(LOG_FIELDS, outcomes.edit_log[number].T, strict=True))
         fires = float(rows["fires"].sum())
         if not fires:
@@ -208,7 +210,7 @@ def _ledgers(outcomes: ConditionOutcomes) -> dict[str, dict[str, float]]:
             "largest_change": float(rows["largest_change"].max()),
             "max_action_change": float(outcomes.max_action_change[number].max()),
         }  # fmt: skip
-        if ConditionName.parse(name).coefficient == "0" and outcomes.max_action_change[number].any():
+        if cell.coefficient == "0" and outcomes.max_action_change[number].any():
             raise CaptureChangedActionError(
                 f"{name} adds nothing and changed an action by "
                 f"{outcomes.max_action_change[number].max():.3g}; "

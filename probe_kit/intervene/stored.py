@@ -1,7 +1,8 @@
 """Stored interventions of a run, `RUN/interventions/<key>/`, and the choice among them.
 
 settings.json      the head: what was asked, of which commits, and the hashes of the rest; written last
-episodes.npz       per condition and episode where the action would go, and how far it changed
+episodes.npz       per condition and episode where the action would go, and how far it changed; per condition its
+                   cell in columns: place, role, direction, coefficient, part
 effects.csv        the same in numbers per category, for people and other programs
 attention.npz      of the kind `attention`: shares per inference, block, iteration, head and role
 attention_patches.npz  of it, where the family says which token sees what: shares per inference, block and patch
@@ -23,6 +24,7 @@ import numpy as np
 from probe_kit._system.bounded_files import UNREADABLE, parse_json
 from probe_kit._system.escaping import as_argument
 from probe_kit.errors import NoInterventionsError, RunDamagedError
+from probe_kit.intervene.edited_cells import COLUMNS, NO_CELL, EditedCell, columns_of
 from probe_kit.intervene.outcomes import (
     BY_CONDITION,
     CLEAN,
@@ -102,6 +104,9 @@ class Measurement:
         stored = self.arrays(EPISODES, ConditionOutcomes, ConditionOutcomes.AXES)
         if (first := str(stored["conditions"][:1])) != f"[{CLEAN!r}]":
             raise self._damaged(EPISODES, f"has {first} as its first condition; expected {CLEAN!r}")
+        # Runs of version 0.2 have none of these columns.
+        if (lost := [name for name in COLUMNS if name not in stored]) and len(lost) < len(COLUMNS):
+            raise self._damaged(EPISODES, f"lacks {', '.join(lost)} beside the other columns of its conditions")
         return ConditionOutcomes(**stored, seed_text=self.run.seed_text)
 
     def arrays(self, name: str, record: type, axes: Mapping[str, str]) -> dict[str, Any]:
@@ -167,10 +172,6 @@ class Measurement:
         """The change of inputs of which effects are shares, in words."""
         return f"exchange of the {self.settings.get('vary') or ''}" if self.lacks_sides else "image swap"
 
-    def in_words(self, text: str) -> str:
-        """Return a text about the image swap, with the change of inputs of this run in its place."""
-        return text.replace("image swap", self.exchange)
-
     @property
     def verdicts(self) -> Mapping[str, Any]:
         """The `UseVerdict` by category: those of an `InterventionResult`, here none."""
@@ -220,10 +221,9 @@ def stored_interventions(run: RunReader, kind: str | None = None) -> list[Measur
     Raises:
         RunDamagedError: If any of the run was changed, lost its settings or has another format.
     """
-    required = {
-        "stamp": run.stamp, "run_settings": run.settings_sha256,
-        "wording": run.wording, **({} if kind is None else {"kind": kind}),
-    }  # fmt: skip
+    required = {"stamp": run.stamp, "run_settings": run.settings_sha256, "wording": run.wording}
+    if kind is not None:
+        required["kind"] = kind
     fitting = [
         Measurement.of(run, bundle)
         for bundle in read_interventions(run.location).values()
@@ -324,10 +324,12 @@ class PooledConditions:
     Attributes:
         like: One of the results.
         sources: By condition, the result it is from; without conditions in which nothing was changed.
+        cells: The cell that each of these conditions edits.
     """
 
     like: StoredResult
     sources: dict[str, StoredResult]
+    cells: dict[str, EditedCell]
 
     def outcomes(self, conditions: Sequence[str]) -> ConditionOutcomes:
         """Return some of the conditions, in the requested order, behind the unchanged ones."""
@@ -342,7 +344,8 @@ class PooledConditions:
             stacked[array] = (
                 np.stack([value[row] for value, row in zip(values, rows, strict=True)]) if has_all else None
             )
-        return replace(base, conditions=tuple(name for _, name in every), **stacked)
+        cells = [self.cells.get(name, NO_CELL) for _, name in every]
+        return replace(base, conditions=tuple(name for _, name in every), **columns_of(cells), **stacked)
 
 
 def pool_conditions(results: Iterable[StoredResult], setting: Sequence[str] = ()) -> list[PooledConditions]:
@@ -359,6 +362,8 @@ def pool_conditions(results: Iterable[StoredResult], setting: Sequence[str] = ()
         # Bytes, not closeness: another device or batch rounds otherwise, and effects are differences of actions.
         unchanged = [outcomes.of(name).tobytes() for name in (CLEAN, IMAGE_SWAP) if name in outcomes.conditions]
         same = (result.category, *agreed, tuple(outcomes.episodes.tolist()), *unchanged)
-        sources = pooled.setdefault(same, PooledConditions(result, {})).sources
-        sources.update({name: result for name in outcomes.conditions if name not in UNCHANGED})
+        together = pooled.setdefault(same, PooledConditions(result, {}, {}))
+        for name, cell in zip(outcomes.conditions, outcomes.cells, strict=True):
+            if name not in UNCHANGED:
+                together.sources[name], together.cells[name] = result, cell
     return list(pooled.values())

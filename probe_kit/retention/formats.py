@@ -7,7 +7,7 @@ from statistics import fmean
 from typing import TYPE_CHECKING, Any, get_args, get_type_hints
 
 from probe_kit._tables.numbers import number, percent
-from probe_kit._tables.table import Table
+from probe_kit._tables.table import Cell, Table, absent
 from probe_kit.retention.behaviour import Regime, normalised_score, regime
 from probe_kit.retention.columns.summary import finding
 from probe_kit.retention.columns.tables import once_per_category
@@ -281,12 +281,12 @@ def _table(numbers: Sequence[dict[str, Any]], outcome_rule: str) -> Table:
         (
             row["model"] if row["view"] is None else f"{row['model']} · {row['view']}",
             row["category"],
-            NOT_ACTED if row["sr"] is None else percent(row["sr"]),
-            percent(row["margin"]),
+            absent(NOT_ACTED) if row["sr"] is None else Cell(row["sr"], percent),
+            Cell(row["margin"], percent),
             f"score {number(row['normalised_score'], 1)}" if row["category"] == MEAN else row["regime"] or "–",
-            percent(row["backbone"]),
-            percent(row["action"]),
-            number(row["retention"]),
+            Cell(row["backbone"], percent),
+            Cell(row["action"], percent),
+            Cell(row["retention"], number),
         )
         for row in numbers
     ]

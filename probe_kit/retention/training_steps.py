@@ -1,14 +1,13 @@
 """Retention, success and drift of several checkpoints of one training, against the training step."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from probe_kit._system.counting import counted
 from probe_kit._system.table_cells import is_count
-from probe_kit._tables.numbers import number, percent, points, with_limits
-from probe_kit._tables.table import Table
+from probe_kit._tables.numbers import number, percent, points
+from probe_kit._tables.table import Cell, Heading, Table, absent
 from probe_kit.errors import UsageError
 from probe_kit.retention.columns.text import title_of
 from probe_kit.retention.compare.models import checkpoint_of, split_checkpoint
@@ -34,7 +33,7 @@ _COLUMNS = {
     "drift of the backbone, points": "drift: the backbone's accuracy minus that of the first step, paired by "
     "items where both ran the same",
 }
-"""The meaning of each column; a note lists it for the columns that are shown."""
+"""The entry of each column in the legend."""
 
 
 def training_step(run: RunReader) -> int:
@@ -107,19 +106,19 @@ def step_table(table: RetentionTable, steps: Mapping[str, int]) -> Table:
     numbers = [_numbers(row, steps, drifts) for row in ordered]
     means = [row for row in ordered if row.category == MEAN]
     views = {steps[row.run.location]: row.view for row in means if row.view is not None}
+    headings = [Heading(name, term=term) for name, term in _COLUMNS.items()]
+    cells = [_cells(row) for row in numbers]
     steps_table = Table.of(
-        "Training steps", tuple(_COLUMNS), [_cells(row) for row in numbers], names=2, numbers=tuple(numbers),
-        mean=title_of(MEAN),
-    ).filled("n/a")  # fmt: skip
-    notes = [
-        *(_COLUMNS[name] for name in steps_table.columns if _COLUMNS[name]),
+        "Training steps", headings, cells, names=2, numbers=tuple(numbers), mean=title_of(MEAN)
+    ).filled("n/a")
+    remarks = [
         "each with its 95 % interval",
         _by_step("view", {step: str(view) for step, view in views.items()}),
         _by_step(
             "mean over", {steps[row.run.location]: ", ".join(map(title_of, row.categories)) for row in means}
         ),
     ]
-    return replace(steps_table, notes=("; ".join(filter(None, notes)),))
+    return steps_table.with_remarks(remarks)
 
 
 def _by_step(name: str, values: Mapping[int, str]) -> str:
@@ -153,12 +152,12 @@ def _numbers(
     }
 
 
-def _cells(row: Mapping[str, Any]) -> tuple[str, ...]:
-    shares = (with_limits(row[name], row[f"{name}_ci"], percent) for name in ("sr", "backbone", "action"))
-    ratio = with_limits(row["retention"], row["retention_ci"], number)
+def _cells(row: Mapping[str, Any]) -> tuple[Cell | str, ...]:
+    shares = (Cell(row[name], percent, row[f"{name}_ci"]) for name in ("sr", "backbone", "action"))
+    ratio = Cell(row["retention"], number, row["retention_ci"])
     lacks = row["retention"] is None and row["backbone"] is not None and row["action"] is not None
-    drift = with_limits(row["drift"], row["drift_ci"], points)
-    return (title_of(row["category"]), str(row["step"]), *shares, "n/a" if lacks else ratio, drift)
+    drift = Cell(row["drift"], points, row["drift_ci"])
+    return (title_of(row["category"]), str(row["step"]), *shares, absent("n/a") if lacks else ratio, drift)
 
 
 _PANELS = (

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit._tables.table import Table
+from probe_kit._tables.numbers import number
+from probe_kit._tables.table import Cell, Table
 from probe_kit.errors import UsageError
 from probe_kit.runs.layout import DATASET, OTHER_ACTIONS
 from probe_kit.runs.reader import RunReader
@@ -137,9 +138,9 @@ def action_error_table(errors: ActionErrors) -> Table:
         [
             (
                 str(row["number"]),
-                f"{row['deviation']:.3g}",
+                Cell(row["deviation"], "{:.3g}".format),
                 *(
-                    "constant" if np.isnan(row[name]) else f"{row[name]:.2f}"
+                    Cell("constant") if np.isnan(row[name]) else Cell(row[name], number)
                     for name in ("bias", "first", "chunk")
                 ),
             )

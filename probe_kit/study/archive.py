@@ -28,7 +28,7 @@ from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, ValidationErr
 
 from probe_kit._system.bounded_files import check_no_pointer, parse_json, read_regular
 from probe_kit._system.complaints import in_words
-from probe_kit._tables.content import Cell, Heading, Row
+from probe_kit._tables.content import Cell, Heading, Row, absent
 from probe_kit._tables.table import Table
 from probe_kit.errors import DiskSpaceError, RunDamagedError, UsageError
 
@@ -324,9 +324,10 @@ def table_record(table: Table) -> dict[str, Any]:
     """Return a table as plain values, from which `table_of_record` makes it again."""
     return {
         "title": table.title,
-        "notes": list(table.notes),
+        "notes": list(table.all_notes),
         "names": table.names,
         "headings": [[heading.group, heading.text] for heading in table.headings],
+        "are_numeric": list(table.are_numeric),
         "rows": [
             {"cells": cells, "is_mean": row.is_mean} for cells, row in zip(table.texts, table.rows, strict=True)
         ],
@@ -342,10 +343,18 @@ def table_of_record(record: dict[str, Any]) -> Table:
         TypeError: If a part has another type.
         ValueError: If a part has another form.
     """
+    headings = tuple(Heading(str(text), group=str(group)) for group, text in record["headings"])
+    # An older archive has texts alone, without a flag per column.
+    are_numeric = record.get("are_numeric", [False] * len(headings))
+
+    def row(cells: list[Any], is_mean: bool) -> Row:
+        texts = zip(map(str, cells), are_numeric, strict=True)
+        return Row(tuple(absent(text) if is_numeric else Cell(text) for text, is_numeric in texts), is_mean)
+
     return Table(
         title=str(record["title"]),
-        headings=tuple(Heading(str(text), group=str(group)) for group, text in record["headings"]),
-        rows=tuple(Row(tuple(map(Cell, map(str, row["cells"]))), bool(row["is_mean"])) for row in record["rows"]),
+        headings=headings,
+        rows=tuple(row(each["cells"], bool(each["is_mean"])) for each in record["rows"]),
         names=int(record["names"]),
         notes=tuple(map(str, record["notes"])),
         numbers=tuple(record["numbers"]),

@@ -138,7 +138,7 @@ def run(
 
 
 def _print(plan: "StudyPlan", as_json: bool) -> None:
-    from probe_kit._tables.table import Table
+    from probe_kit._tables.table import Cell, Table
 
     if as_json:
         print_json(plan.to_json())
@@ -147,9 +147,9 @@ def _print(plan: "StudyPlan", as_json: bool) -> None:
     rows = []
     for planned in plan.cells:
         cell = planned.cell
-        inferences = "–" if cell.asks else f"{cell.inferences:,}"
-        texts = (cell.model, planned.run_text, ", ".join(cell.selections), f"{cell.episodes:,}", inferences)
-        rows.append((*texts, planned.words))
+        blocks, episodes = ", ".join(cell.selections), Cell(cell.episodes, "{:,}".format)
+        inferences = Cell(None) if cell.asks else Cell(cell.inferences, "{:,}".format)
+        rows.append((cell.model, planned.run_text, blocks, episodes, inferences, planned.words))
     out.print(Table.of(f"study {plan.study.study.name}", columns, rows, overflow="wrap"))
     for line in plan.lines():
         _print_plain(line)
@@ -254,7 +254,7 @@ def table(
 def _print_tables(tables: "dict[str, Table]", style: str, single: bool) -> None:
     if style == "json":
         records = {
-            name: {"table": printed.title, "note": "; ".join(printed.notes), "numbers": list(printed.numbers)}
+            name: {"table": printed.title, "note": "; ".join(printed.all_notes), "numbers": list(printed.numbers)}
             for name, printed in tables.items()
         }
         print_json(next(iter(records.values())) if single else records)

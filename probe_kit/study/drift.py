@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit._tables.content import Number, grouped
-from probe_kit._tables.numbers import number, p_text, percent, points, with_limits
-from probe_kit._tables.table import Table
+from probe_kit._tables.numbers import number, p_text, percent, points
+from probe_kit._tables.table import Cell, Cells, Table
 from probe_kit.errors import UsageError
 from probe_kit.extract.rollout.answers import side_expected
 from probe_kit.hashing import derive_seed
@@ -435,7 +435,7 @@ def drift_table(pairs: Mapping[tuple[str, str], Sequence[CategoryDrift]], title:
     """
     drifts = [(names, drift) for names, of_pair in pairs.items() for drift in of_pair]
     has_lens = any(site.lens for _, drift in drifts for site in drift.sites)
-    cells = tuple(
+    cells: tuple[Cells, ...] = tuple(
         (f"{names[0]} → {names[1]}", category_of(drift.category).title, drift.verdict, *_cells(drift, has_lens))
         for names, drift in drifts
     )
@@ -449,26 +449,26 @@ def drift_table(pairs: Mapping[tuple[str, str], Sequence[CategoryDrift]], title:
     return Table.of(heading, grouped(*groups), cells, names=2, notes=note, numbers=numbers)
 
 
-def _cells(drift: CategoryDrift, has_lens: bool) -> tuple[str, ...]:
+def _cells(drift: CategoryDrift, has_lens: bool) -> tuple[Cell, ...]:
     gap = drift.difference
     accuracies = (
-        *(with_limits(row.backbone.score, row.backbone.ci, percent) for row in (drift.before, drift.after)),
-        "–" if gap is None else with_limits(gap.backbone, gap.backbone_ci, points),
+        *(Cell(row.backbone.score, percent, row.backbone.ci) for row in (drift.before, drift.after)),
+        Cell(None) if gap is None else Cell(gap.backbone, points, gap.backbone_ci),
     )
     if not drift.sites:
-        return (*accuracies, *["–"] * (8 + 2 * has_lens))
+        return (*accuracies, *[Cell(None)] * (10 if has_lens else 8))
     site = drift.sites[drift.best]
-    lens = ("–", "–") if site.lens is None else tuple(map(percent, site.lens))
+    lens = [Cell(share, percent) for share in site.lens or (None, None)]
     return (
         *accuracies,
-        str(site.site.layer),
-        percent(site.raw),
-        percent(site.recentred),
-        p_text(drift.p_transfer),
-        percent(site.raw_back),
-        percent(site.recentred_back),
-        "–" if site.cosine is None else f"{number(site.cosine)} ({number(site.ceiling)})",
-        number(site.cka),
+        Cell(site.site.layer),
+        Cell(site.raw, percent),
+        Cell(site.recentred, percent),
+        Cell(drift.p_transfer, p_text),
+        Cell(site.raw_back, percent),
+        Cell(site.recentred_back, percent),
+        Cell(site.cosine, number, after="" if site.cosine is None else f" ({number(site.ceiling)})"),
+        Cell(site.cka, number),
         *(lens if has_lens else ()),
     )
 

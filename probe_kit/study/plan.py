@@ -7,7 +7,6 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from math import isclose
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -26,9 +25,8 @@ from probe_kit.study.reading import LoadedStudy
 from probe_kit.study.schema import ProbesTable, unknown
 from probe_kit.study.stored import open_matching, part_of, probe_key_of
 from probe_kit.study.study_folder import changed_settings
-from probe_kit.train.results.control_scores import Controls, UntrainedScore
-from probe_kit.train.results.probe_curve import ProbeCurve
-from probe_kit.train.results.store import load_results, read_controls, read_probes, settings_of
+from probe_kit.train.results.control_scores import Controls
+from probe_kit.train.results.store import read_controls, read_probes, settings_of
 
 if TYPE_CHECKING:
     from probe_kit.runs import Run
@@ -86,28 +84,15 @@ def _why_missing(study: LoadedStudy, table: ProbesTable, cell: Cell, run: "Run",
 def _why_other_network(
     study: LoadedStudy, table: ProbesTable, network: Cell, selection: Selection, controls: Controls
 ) -> str:
-    """Return why probes are to be compared with their untrained network again, empty if they are.
-
-    Stored comparisons do not name the run of the network: they are of it if accuracies are those of its probes.
-    """
+    """Return why probes are to be compared with their untrained network again, empty if they are."""
+    if not controls.untrained_probes:
+        return "without the control untrained"
     try:
         run = part_of(open_matching(study, network, partial=True), network, selection).in_wording()
-        curves = load_results(run, probe_key_of(table, run)).curves
+        key = probe_key_of(table, run)
     except ProbeKitError:
         return "not compared with its untrained network"
-    if not all(is_of_network(score, curves) for score in controls.untrained):
-        return "compared with another untrained network"
-    return "" if controls.untrained else "without the control untrained"
-
-
-def is_of_network(score: UntrainedScore, curves: Mapping[tuple[str, str], ProbeCurve]) -> bool:
-    """Whether a comparison may be with the network of these curves, which may lack its category or its site."""
-    curve = curves.get((score.category, score.view))
-    rows = {} if curve is None else {str(site): row for row, site in enumerate(curve.sites)}
-    row = rows.get(score.untrained_site)
-    if curve is None or row is None:
-        return False
-    return isclose(curve.correct[row].astype(float).mean(), score.untrained_accuracy)
+    return "" if controls.untrained_probes == key else "compared with another untrained network"
 
 
 def _text(value: object) -> str:

@@ -2,13 +2,14 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import groupby
 from statistics import fmean
 
 from probe_kit._system.counting import spanned
-from probe_kit._tables.content import Heading, Number
-from probe_kit._tables.numbers import number, percent, with_limits
-from probe_kit._tables.table import Table
+from probe_kit._tables.content import Heading, Legend, Number
+from probe_kit._tables.numbers import NONE, number, percent, plain
+from probe_kit._tables.table import Cell, Cells, Table
 from probe_kit.retention.behaviour import Regime, normalised_score
 from probe_kit.retention.columns.tables import once_per_category
 from probe_kit.retention.columns.text import published_value, retention_value
@@ -32,12 +33,12 @@ class _Column:
     Attributes:
         heading: Heading of the column.
         domain: The heading over it, empty for none.
-        cell: Makes the text of a system.
+        cell: Makes the cell of a system.
     """
 
     heading: str
     domain: str
-    cell: Callable[[OfSystem], str]
+    cell: Callable[[OfSystem], Cell]
 
 
 def success_table(table: RetentionTable) -> Table:
@@ -53,21 +54,18 @@ def success_table(table: RetentionTable) -> Table:
 def vlm_table(table: RetentionTable) -> Table:
     """Return shares right of VLMs by prompt, size of the picture and category."""
     of_prompt = [
-        _Column("prompt", "", lambda rows: rows[MEAN].answers.prompt or "–"),
-        _Column("picture", "", lambda rows: rows[MEAN].answers.picture_size or "–"),
+        _Column("prompt", "", lambda rows: Cell(rows[MEAN].answers.prompt or None)),
+        _Column("picture", "", lambda rows: Cell(rows[MEAN].answers.picture_size or None)),
     ]
     columns = [*of_prompt, *_by_category(table, success_cell)]
     return _pivot(table, "Share right %", [_MARKED, *_disagreement(table), _MEAN], columns)
 
 
-def success_cell(row: RetentionRow) -> str:
+def success_cell(row: RetentionRow) -> Cell:
     """Return the rate in percent with the mark of its regime; a mean has none."""
     success = row.success
-    if success.sr is None:
-        return "–"
-    if success.regime is None:
-        return percent(success.sr)
-    return percent(success.sr) + MARKS.get(success.regime, "") + (f" {DISAGREES}" if _disagrees(row) else "")
+    mark = "" if success.regime is None else MARKS.get(success.regime, "")
+    return Cell(success.sr, percent, after=mark + (f" {DISAGREES}" if _disagrees(row) else ""))
 
 
 def _disagrees(row: RetentionRow) -> bool:
@@ -95,15 +93,15 @@ def _disagreement(table: RetentionTable) -> list[str]:
 
 def sides_table(table: RetentionTable) -> Table:
     """Return success rates by side of the correct picture, left and right, then by layout of the pictures."""
-    by_side = _Column("half", "", lambda _: "left / right")
-    by_layout = _Column("half", "", lambda _: "original / swapped")
+    by_side = _Column("half", "", lambda _: Cell("left / right"))
+    by_layout = _Column("half", "", lambda _: Cell("original / swapped"))
     note = ["left, right: side of the correct picture", _MEAN]
     title = "Success rate % by side and layout"
 
-    def of_sides(row: RetentionRow) -> str:
+    def of_sides(row: RetentionRow) -> Cell:
         return _two(row.success.sr_left, row.success.sr_right)
 
-    def of_layouts(row: RetentionRow) -> str:
+    def of_layouts(row: RetentionRow) -> Cell:
         return _two(row.success.sr_original, row.success.sr_swapped)
 
     sides = _pivot(table, title, note, [by_side, *_by_category(table, of_sides)])
@@ -112,11 +110,11 @@ def sides_table(table: RetentionTable) -> Table:
     return replace(sides, rows=rows, names=2)
 
 
-def _two(first: float | None, second: float | None) -> str:
-    return "–" if first is None and second is None else f"{percent(first)} / {percent(second)}"
+def _two(first: float | None, second: float | None) -> Cell:
+    return Cell(first, percent, after="" if first is None and second is None else f" / {percent(second)}")
 
 
-_SCORE = _Column("score", "", lambda rows: number(rows[MEAN].success.normalised_score))
+_SCORE = _Column("score", "", lambda rows: Cell(rows[MEAN].success.normalised_score, number))
 
 
 def score_table(
@@ -132,17 +130,13 @@ def score_table(
     """
     means = [row for row in once_per_category(table.means) if row.success.sr is not None]
     other_scores = {} if elsewhere is None else elsewhere
-    cells = tuple(
+    cells: tuple[Cells, ...] = tuple(
         (
             row.run.label,
-            with_limits(row.success.normalised_score, _score_limits(row), number),
-            percent(row.success.sr),
-            str(len(row.categories)),
-            *(
-                []
-                if elsewhere is None
-                else [f"{other_scores[location]:g}" if (location := row.run.location) in other_scores else "–"]
-            ),
+            Cell(row.success.normalised_score, number, _score_limits(row)),
+            Cell(row.success.sr, percent),
+            Cell(len(row.categories)),
+            *([] if elsewhere is None else [Cell(other_scores.get(row.run.location), _as_given)]),
         )
         for row in means
     )
@@ -165,6 +159,11 @@ def score_table(
     return Table.of("Normalised score", columns, cells, notes=notes, numbers=tuple(numbers))
 
 
+def _as_given(value: float | None) -> str:
+    """Return a number of another source with the digits that it has there."""
+    return plain(value) if value is None else f"{value:g}"
+
+
 def _score_limits(row: RetentionRow) -> tuple[float | None, float | None] | None:
     """Return the interval of the mean on the scale of the score, which is linear in it."""
     if row.success.ci is None:
@@ -181,9 +180,9 @@ def probing_table(table: RetentionTable) -> Table:
             row.run.label,
             row.view or "–",
             row.category if row.category == MEAN else category_of(row.category).title,
-            percent(row.backbone.score),
-            percent(row.action.score),
-            "–" if row.action.score is None else retention_value(row),
+            Cell(row.backbone.score, percent),
+            Cell(row.action.score, percent),
+            Cell(None) if row.action.score is None else retention_value(row),
             published_value(row),
         )
         for row in rows
@@ -204,15 +203,19 @@ def probing_table(table: RetentionTable) -> Table:
         }
         for row in table.all_rows
     ]
-    note = [
-        "cross-fitted scores of the best sites",
-        "n/a: the backbone's signal is not shown; such categories are not in the mean of retention",
-        "–: no site where the action is made has the view",
-        "published: the paper's ratio of best accuracies, in the mean its mean over categories",
-    ]
-    columns = ("system", "view", "category", "backbone %", "action %", "retention [95 %]", "published")
-    notes = [caption(table, note)]
-    return Table.of("Probes", columns, cells, names=3, mean=MEAN, notes=notes, numbers=tuple(numbers))
+    legend = Legend(
+        before=(
+            "cross-fitted scores of the best sites",
+            "n/a: the backbone's signal is not shown; such categories are not in the mean of retention",
+        ),
+        marks={NONE: "no site where the action is made has the view"},
+        after=(caption(table, []),),
+    )
+    published = Heading(
+        "published", term="published: the paper's ratio of best accuracies, in the mean its mean over categories"
+    )
+    columns = ("system", "view", "category", "backbone %", "action %", "retention [95 %]", published)
+    return Table.of("Probes", columns, cells, names=3, mean=MEAN, legend=legend, numbers=tuple(numbers))
 
 
 def domain_scores(table: RetentionTable) -> dict[str, dict[str, float]]:
@@ -246,20 +249,23 @@ def episodes_per_category(table: RetentionTable) -> str:
 
 
 def _by_category(
-    table: RetentionTable, cell: Callable[[RetentionRow], str], domain_means: bool = False
+    table: RetentionTable, cell: Callable[[RetentionRow], Cell], domain_means: bool = False
 ) -> Iterator[_Column]:
     """Yield a column per category under its domain, then the mean."""
 
-    def of(category: str) -> Callable[[OfSystem], str]:
-        return lambda rows: cell(rows[category]) if category in rows else "–"
+    def of(category: str) -> Callable[[OfSystem], Cell]:
+        return lambda rows: cell(rows[category]) if category in rows else Cell(None)
 
     for domain, members in _domains(table):
         for name in members:
             yield _Column(category_of(name).title, domain, of(name))
         if domain_means and domain and len(members) > 1:
-            # A default binds the members of this domain.
-            yield _Column(domain, domain, lambda rows, inside=tuple(members): percent(_mean_of(rows, inside)))  # type: ignore[misc]
+            yield _Column(domain, domain, partial(_mean_cell, tuple(members)))
     yield _Column(MEAN, "", of(MEAN))
+
+
+def _mean_cell(categories: Sequence[str], rows: OfSystem) -> Cell:
+    return Cell(_mean_of(rows, categories), percent)
 
 
 def _domains(table: RetentionTable) -> list[tuple[str, list[str]]]:
@@ -285,7 +291,7 @@ def _systems(table: RetentionTable) -> dict[str, OfSystem]:
 
 
 def _pivot(table: RetentionTable, title: str, note: Sequence[str], columns: Sequence[_Column]) -> Table:
-    cells = tuple(
+    cells: tuple[Cells, ...] = tuple(
         (name, *(column.cell(of_system) for column in columns)) for name, of_system in _systems(table).items()
     )
     headings = [Heading("system"), *(Heading(column.heading, group=column.domain) for column in columns)]

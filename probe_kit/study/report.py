@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from probe_kit._system.bounded_files import read_regular
 from probe_kit._system.drafts import write_whole
-from probe_kit._tables.table import Table
+from probe_kit._tables.table import Cell, Table
 from probe_kit.errors import UsageError
 from probe_kit.intervene.kinds.interchange import stored_steering
 from probe_kit.retention.displays import curves_side_by_side, dose_response, layer_curve
@@ -177,7 +177,7 @@ def study_report(study: LoadedStudy, partial: bool = False) -> StudyReport:
     plan = plan_study(study)
     paths = tuple(name for stored in runs.runs for name in (stored.run.location.address, stored.location))
     rows = [
-        (run.cell.model, run.run_text, ", ".join(run.cell.selections), str(run.cell.episodes), run.words)
+        (run.cell.model, run.run_text, ", ".join(run.cell.selections), Cell(run.cell.episodes), run.words)
         for run in plan.cells
     ]
     state = Table.of("Runs", ("model", "run", "blocks", "episodes", "state"), rows, names=2)

@@ -10,8 +10,8 @@ from typing import Any
 
 from probe_kit._system.bounded_files import load_json
 from probe_kit._tables.content import Number
-from probe_kit._tables.numbers import p_text, percent, points, with_limits
-from probe_kit._tables.table import Table
+from probe_kit._tables.numbers import p_text, percent, points
+from probe_kit._tables.table import Cell, Table
 from probe_kit.errors import ProbeKitError, RunDamagedError, UsageError
 from probe_kit.retention import retention_table
 from probe_kit.retention.behaviour import scored
@@ -30,7 +30,8 @@ from probe_kit.retention.rows.row import MEAN
 from probe_kit.retention.table import RetentionTable
 from probe_kit.runs.provenance import differences
 from probe_kit.study.archive import TABLES, Pack, table_of_record
-from probe_kit.study.cells import Cell, Selection, slugs
+from probe_kit.study.cells import Cell as PlannedRun
+from probe_kit.study.cells import Selection, slugs
 from probe_kit.study.drift import CategoryDrift, drift_table, measure_drift
 from probe_kit.study.expansion import of_side
 from probe_kit.study.rates import caption, probing_table, score_table, sides_table, success_table, vlm_table
@@ -39,16 +40,20 @@ from probe_kit.study.schema import ComparisonTable, DriftTable, TableTable, unkn
 from probe_kit.study.stored import StoredRun, StoredRuns, probe_key, stored_runs, study_probes
 from probe_kit.suite.categories import category_of
 
-_TEST = (
-    "p: exact, signs of whole groups of items flipped; (Holm) over all categories and pairs of this comparison; "
-    f"{P_DECIDES}"
-)
 FEWEST_GROUPS = 10
 """Number of groups of items from which a difference is tested, and counts for Holm's correction of the others.
 
 Signs of 10 groups give no p below 2⁻⁹ = 0.002, two-sided: enough for Holm's correction over two dozen tests.
 """
 _FEW = "!"
+
+
+def _note_on_tests(family: str) -> str:
+    """Return how differences are tested; `family` holds the tests that Holm's correction counts."""
+    return (
+        f"p: exact, signs of whole groups of items flipped; (Holm) over all categories and pairs of {family}; "
+        f"{P_DECIDES}"
+    )
 
 
 def difference_table(table: RetentionTable, title: str) -> Table:
@@ -61,14 +66,18 @@ def difference_table(table: RetentionTable, title: str) -> Table:
         (
             f"{row.group} − {row.minus}",
             _title(row.category),
-            with_limits(row.sr, row.sr_ci, points),
+            Cell(row.sr, points, row.sr_ci),
             difference_test(row),
             _items(row.n_items, row.of_items),
         )
         for row in rows
     ]
     columns = ("systems", "category", "difference, points [95 %]", "p (Holm)", "items")
-    notes = [caption(table, [_TEST]), *_remarks(rows), *(text.removesuffix(".") for text in table.unpaired)]
+    notes = [
+        caption(table, [_note_on_tests("this comparison")]),
+        *_remarks(rows),
+        *(text.removesuffix(".") for text in table.unpaired),
+    ]
     numbers = tuple(map(_difference_numbers, rows))
     return Table.of(title, columns, cells, names=2, mean=MEAN, notes=notes, numbers=numbers)
 
@@ -78,13 +87,13 @@ def _tested(rows: Sequence[Difference]) -> list[Difference]:
     return with_holm([row if (row.n_groups or 0) >= FEWEST_GROUPS else replace(row, p=None) for row in rows])
 
 
-def _items(count: int | None, of_count: int | None) -> str:
+def _items(count: int | None, of_count: int | None) -> Cell:
     """Return the items in common, of how many where some are left out, marked where that is more than a fifth."""
     if count is None or of_count is None:
-        return "other items" if count is None else str(count)
+        return Cell("other items" if count is None else count)
     if count == of_count:
-        return str(count)
-    return f"{count} of {of_count}" + (f" {_FEW}" if count < MANY * of_count else "")
+        return Cell(count)
+    return Cell(count, after=f" of {of_count}" + (f" {_FEW}" if count < MANY * of_count else ""))
 
 
 def _remarks(rows: Sequence[Difference]) -> list[str]:
@@ -102,7 +111,7 @@ def group_table(table: RetentionTable, title: str) -> Table:
             f"{row.group} − {row.minus}",
             _title(row.category),
             models_test(row.sr_models, points),
-            with_limits(row.sr, row.sr_ci, points),
+            Cell(row.sr, points, row.sr_ci),
         )
         for row in rows
     ]
@@ -123,10 +132,10 @@ def vlm_vla_table(differences: Sequence[Difference]) -> Table:
         (
             f"{row.group} − {row.minus}",
             _title(row.category),
-            percent(row.sr_group),
-            percent(row.sr_minus),
-            with_limits(row.sr, row.sr_ci, percent),
-            p_text(row.p_holm),
+            Cell(row.sr_group, percent),
+            Cell(row.sr_minus, percent),
+            Cell(row.sr, percent, row.sr_ci),
+            Cell(row.p_holm, p_text),
             _items(row.n_items, row.of_items),
         )
         for row in rows
@@ -151,7 +160,7 @@ def vlm_vla_table(differences: Sequence[Difference]) -> Table:
         for row in rows
     ]
     other = "; some pairs began with OTHER first frames" if any(row.same_frames is False for row in rows) else ""
-    notes = [f"{_TEST.replace('this comparison', 'the table')}{other}", *_remarks(rows)]
+    notes = [f"{_note_on_tests('the table')}{other}", *_remarks(rows)]
     columns = ("systems", "category", "VLM %", "VLA %", "VLM − VLA [95 %]", "p (Holm)", "items")
     return Table.of("VLM − VLA", columns, cells, names=2, mean=MEAN, notes=notes, numbers=tuple(numbers))
 
@@ -162,20 +171,16 @@ def stages_table(joins: Sequence[KnownUsedTable]) -> Table:
     Items with the probe right are counted where the answer is shown.
     """
     pairs = [(join, row) for join in joins for row in join.rows]
-
-    def count(number: int | None) -> str:
-        return "–" if number is None else str(number)
-
     cells = [
         (
             f"{join.vlm} · {join.policy}",
             row.category if row.category == OVERALL else category_of(row.category).title,
-            str(row.n_items),
-            count(row.answered_correctly),
-            "not shown" if row.has_signal is False else count(_encoded(join, row)),
-            count(row.acted_correctly),
-            count(row.answered_and_encoded),
-            with_limits(row.share_not_acted_on, row.share_not_acted_on_ci or (None, None), percent),
+            Cell(row.n_items),
+            Cell(row.answered_correctly),
+            Cell("not shown" if row.has_signal is False else _encoded(join, row)),
+            Cell(row.acted_correctly),
+            Cell(row.answered_and_encoded),
+            Cell(row.share_not_acted_on, percent, row.share_not_acted_on_ci or (None, None)),
         )
         for join, row in pairs
     ]
@@ -393,7 +398,7 @@ def _of_kind(study: LoadedStudy, table: TableTable, stored: StoredRuns, name: st
     )
 
 
-def _selection(study: LoadedStudy, table: TableTable) -> Callable[[Cell], Selection | None]:
+def _selection(study: LoadedStudy, table: TableTable) -> Callable[[PlannedRun], Selection | None]:
     if table.kind == "drift":
         pairs = study.study.drift[table.drift or ""].pairs
         names = {cell.name for pair in pairs for side in pair for cell in of_side(study.cells, side)}
@@ -404,7 +409,7 @@ def _selection(study: LoadedStudy, table: TableTable) -> Callable[[Cell], Select
     models, ways = _compared(study, comparison)
     asks = comparison.pairs is not None  # a chain and groups are of policies
 
-    def select(cell: Cell) -> Selection | None:
+    def select(cell: PlannedRun) -> Selection | None:
         blocks = table.runs is None or cell.selected(table.runs) is not None
         is_compared = cell.model in models and cell.way in ways and (asks or not cell.asks) and blocks
         return cell.selection if is_compared else None

@@ -371,7 +371,7 @@ def add_untrained(results: ProbeResults, untrained: ProbeResults) -> ProbeResult
                 best = other.only(other.best(stream))
                 scores.append(replace(control_score(UNTRAINED, key[0], best, stream, key[1]), chance=None, p=None))
             compared += _compared(results, UNTRAINED, key, stream, other.scores[other_rows])
-    controls = results.controls.with_untrained(gains).with_scores(scores, compared)
+    controls = results.controls.with_untrained(gains, untrained.settings.key).with_scores(scores, compared)
     return replace(results, controls=controls)
 
 

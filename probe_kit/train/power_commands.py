@@ -116,7 +116,8 @@ def _answer(needed: "tuple[Power, int] | None") -> str:
 
 
 def _print(estimates: "list[Power]") -> None:
-    from probe_kit._tables.table import Table
+    from probe_kit._tables.numbers import percent, whole_percent
+    from probe_kit._tables.table import Cell, Cells, Heading, Legend, Table
     from probe_kit.statistics.significance import detectable
     from probe_kit.statistics.sufficiency import ABSENT_BELOW
 
@@ -126,26 +127,25 @@ def _print(estimates: "list[Power]") -> None:
         "against chance %",
         "against random-features %",
         "against an untrained network %",
-        "absent if nothing %",
-        "± (standard error)",
-        "red control from %",
+        Heading(
+            "absent if nothing %",
+            term=f"absent: how often a stream without signal is called absent, below {100 * ABSENT_BELOW:g} %",
+        ),
+        Heading("± (standard error)", term="±: of the four, the largest, measured over seeds"),
+        Heading("red control from %", term="a leaking control of that accuracy is red in 80 % of suites"),
     )
     shares = ("above", "chance", "random_features", "untrained", "absent")
-    rows = [
+    rows: list[Cells] = [
         (
             str(estimate.items),
-            *(f"{100 * getattr(estimate, share):.0f}" for share in shares),
-            f"{100 * estimate.spread:.1f}",
-            f"{100 * detectable(estimate.items):.0f}",
+            *(Cell(getattr(estimate, share), whole_percent) for share in shares),
+            Cell(estimate.spread, percent),
+            Cell(detectable(estimate.items), whole_percent),
         )
         for estimate in estimates
     ]
-    notes = [
-        "random-features and the untrained network at chance; absent: how often a stream without signal is called "
-        f"absent, below {100 * ABSENT_BELOW:g} %; ±: of the four, the largest, measured over seeds; a leaking "
-        "control of that accuracy is red in 80 % of suites"
-    ]
-    out.print(Table.of("Power: how often a signal is seen", headings, rows, notes=notes))
+    legend = Legend(before=("random-features and the untrained network at chance",))
+    out.print(Table.of("Power: how often a signal is seen", headings, rows, legend=legend))
 
 
 def _whole_number_argument(text: str) -> int:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from probe_kit._system.counting import counted
 from probe_kit._system.table_cells import alike
 from probe_kit._tables.numbers import p_text
-from probe_kit._tables.table import Table
+from probe_kit._tables.table import Cell, Table
 from probe_kit._terminal.notebook import notebook_progress
 from probe_kit.errors import SettingsMismatchError, TooFewGroupsError, UsageError
 from probe_kit.hooks.contract.sites import Site, label_of
@@ -32,7 +32,7 @@ from probe_kit.train.probe_sweep import (
 )
 from probe_kit.train.problem import Problem, make_problem, smallest_p_of_labels
 from probe_kit.train.results.probe_curve import ProbeCurve
-from probe_kit.train.results.probe_results import best_sites, score_text
+from probe_kit.train.results.probe_results import best_sites, score_cell
 from probe_kit.train.samples import Samples, read_samples, sites_of
 from probe_kit.train.solver.arrays import RowSubset
 from probe_kit.train.target import Target
@@ -451,18 +451,19 @@ def transfer_table(results: TransferResults, splits: bool = True) -> Table:
     several, metric = len(results.curves) > 1, METRICS[results.task]
     rows = [
         (
-            " · ".join([label_of(row["stream"]), *[row["view"]] * several]),
+            " · ".join([label_of(row["stream"]), *([row["view"]] if several else [])]),
             str(row["site"]),
-            f"{row['score']:.3f} [{row['ci_low']:.3f}, {row['ci_high']:.3f}]",
-            score_text(row["chance"], is_side=False),
-            p_text(row["p_fwe"]),
-            score_text(row["recentred"], is_side=False),
-            f"{row['refitted']:.3f} [{row['refitted_ci_low']:.3f}, {row['refitted_ci_high']:.3f}]",
+            score_cell(row["score"], False, (row["ci_low"], row["ci_high"])),
+            score_cell(row["chance"], False),
+            Cell(row["p_fwe"], p_text),
+            score_cell(row["recentred"], False),
+            score_cell(row["refitted"], False, (row["refitted_ci_low"], row["refitted_ci_high"])),
         )
         for row in _best(results)
     ]
     title = [f"{results.target}: {metric}", f"{results.model} to {results.other_model}"]
-    title += ["OTHER WEIGHTS"] * (not results.same_weights)
+    if not results.same_weights:
+        title.append("OTHER WEIGHTS")
     headings = (
         "stream",
         "best site",

@@ -33,7 +33,6 @@ from probe_kit.retention.columns.columns import (
     USED,
     Column,
 )
-from probe_kit.retention.estimators import Limits
 from probe_kit.retention.rows.row import StreamPart
 from probe_kit.runs.action_errors import action_error_table, compare_actions, why_not_compared
 from probe_kit.runs.environment_success import EnvironmentSuccess
@@ -254,17 +253,12 @@ def _vlm_cell(vlm: ViewedRun, category: str) -> dict[str, Any]:
 
 def _cell(column: Column, row: RetentionRow) -> dict[str, Any]:
     """Return the text of the table, and value and interval where the page draws them."""
-    drawn: dict[str, tuple[float | None, Limits | None]] = {
-        SR.key: (row.success.sr, row.success.ci),
-        BACKBONE.key: (row.backbone.score, row.backbone.ci),
-        ACTION.key: (row.action.score, row.action.ci),
-    }
-    value, limits = drawn.get(column.key, (None, None))
-    cell: dict[str, Any] = {"text": column.text(row)}
-    if value is not None:
-        cell["value"] = rounded(value)
-        cell["limits"] = None if limits is None else [rounded(limit) for limit in limits]
-    return cell
+    cell = column.cell(row)
+    payload: dict[str, Any] = {"text": cell.text}
+    if column.key in (SR.key, BACKBONE.key, ACTION.key) and isinstance(cell.value, float):
+        payload["value"] = rounded(cell.value)
+        payload["limits"] = None if cell.interval is None else [rounded(limit) for limit in cell.interval]
+    return payload
 
 
 # -- site maps ---------------------------------------------------------------------------------------------------
@@ -477,7 +471,7 @@ def _result_table(kind: str, key: str, table: Table, findings: Sequence[str]) ->
             {"text": heading.text, "help": heading.help, "group": heading.group} for heading in table.headings
         ],
         "rows": [_row(row) for row in table.rows],
-        "notes": list(table.notes),
+        "notes": list(table.all_notes),
         "findings": list(findings),
     }
 

@@ -1,10 +1,12 @@
 """Every format shows every cell of a table as the text that it is: a parser of each format reads it."""
 
+import ast
 import csv
 import io
 import json
 import re
 from html.parser import HTMLParser
+from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
@@ -13,9 +15,12 @@ from markdown_it import MarkdownIt
 from rich.console import Console
 
 from probe_kit._system.escaping import without_folders
+from probe_kit._tables import content
 from probe_kit._tables.formats import names, render
 from probe_kit._tables.formats.latex import _SPECIAL, MOST_COLUMNS
-from probe_kit._tables.table import Cell, Heading, Row, Table, grouped
+from probe_kit._tables.html import sort_key
+from probe_kit._tables.numbers import number
+from probe_kit._tables.table import Cell, Heading, Legend, Row, Table, absent, grouped
 
 HOSTILE = [
     "<img src=x onerror=alert(1)>", "</script><b>", "[text](https://evil.example)", "**bold**", "a | b",
@@ -214,8 +219,34 @@ def test_sections_are_named_and_no_value_is_cut_at_any_width(width: int) -> None
     assert "a policy with a long name" in text
 
 
+def test_a_column_of_numbers_stands_right_whatever_its_texts_look_like() -> None:
+    """Not by the text: a name may begin with a digit, and a number with a letter."""
+    rows = [
+        ("a", Cell(3.0, "n = {:.0f}".format), "3 of 4", Cell(None), absent("n/a"), Cell(0.5, interval=(0.1, 0.9))),
+        ("b", Cell(None), "[1, 2]", Cell("–"), Cell(7, after=" of 9"), Cell(float("nan"), number, (0.1, 0.9))),
+    ]
+    table = Table.of("t", tuple("abcdef"), rows)
+    assert table.are_numeric == (False, True, False, True, True, True)
+    assert table.texts[0] == ("a", "n = 3", "3 of 4", "–", "n/a", "0.5 [0.1, 0.9]")
+    assert table.texts[1] == ("b", "–", "[1, 2]", "–", "7 of 9", "–")
+    assert "{lrlrrr}" in table.to_latex()
+    assert '<span class="limits">[0.1, 0.9]</span>' in table._repr_html_()
+    assert '<span class="limits">[1, 2]</span>' not in table._repr_html_()
+    assert [sort_key(cell, True) for cell in (rows[0][1], rows[1][1], rows[1][5])] == [3.0, None, None]
+
+
+def test_no_table_searches_a_text_for_its_values() -> None:
+    """LaTeX alone uses expressions, to escape texts and to spell its label."""
+    for file in Path(content.__file__).parent.rglob("*.py"):
+        imports = [node for node in ast.walk(ast.parse(file.read_text("utf-8"))) if isinstance(node, ast.Import)]
+        assert file.stem == "latex" or "re" not in [name.name for node in imports for name in node.names], file
+
+
+RATE = Cell(98, interval=(90, 99), after=" ✓")
+
+
 def test_intervals_fold_below_their_values_before_a_table_is_divided() -> None:
-    table = Table.of("t", ("category", "rate %", "verdict"), [("color", "98 [90, 99] ✓", "a, b")], overflow="fold")
+    table = Table.of("t", ("category", "rate %", "verdict"), [("color", RATE, "a, b")], overflow="fold")
     assert printed(table, 80)[3] == "color     98 [90, 99] ✓  a, b"
     assert printed(table, 30)[3:5] == ["color     98 ✓      a,", "          [90, 99]  b"]
 
@@ -232,7 +263,7 @@ def test_a_wide_tabular_is_divided_between_groups_and_each_has_its_lines_width()
     heads = (("a", 6), ("b", 6), ("c", 2), ("", 2))
     names = iter(f"c{at}" for at in range(1, 17))
     columns = (Heading("c0"), *grouped(*((head, [next(names) for _ in range(count)]) for head, count in heads)))
-    text = Table.of("wide", columns, [tuple(map(str, range(17)))]).to_latex()
+    text = Table.of("wide", columns, [("0", *map(Cell, range(1, 17)))]).to_latex()
     counts = [line.count("&") + 1 for line in text.splitlines() if line.startswith(("c0", "0 "))]
     assert counts == [MOST_COLUMNS, MOST_COLUMNS, 5, 5]
     assert text.count(r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%") == 2
@@ -272,19 +303,25 @@ def test_formats_are_the_files_of_their_folder() -> None:
 
 
 def test_a_legend_explains_only_the_columns_that_are_there() -> None:
-    legend = "effect: share, n/a without one; net rate: flips; minus returns; p: exact; *: by construction"
-    table = Table.of(
-        "Edits", ("edit", "effect", "net rate, % [95 %]", "p"), [("a", "1", "2", "3")], notes=[legend]
+    headings = (
+        "edit",
+        Heading("effect", term="effect: share: n/a without one"),
+        Heading("net rate, % [95 %]", term="net rate: flips; minus returns"),
+        Heading("p", term="p: exact"),
     )
-    assert table.only([0, 1, 3]).notes == ("effect: share, n/a without one; p: exact; *: by construction",)
-    assert table.only([0, 2]).notes == ("net rate: flips; minus returns; *: by construction",)
-    assert table.only([0, 1, 2, 3]).notes == (legend,)
+    legend = Legend(("every edit",), {"*": "by construction"}, ("no verdict",))
+    table = Table.of("Edits", headings, [("a", Cell(1, after="*"), "2", "3")], legend=legend, notes=["a note"])
+    effect, rate, p = (heading.term for heading in table.headings[1:])
+    every = f"every edit; {effect}; {rate}; {p}; *: by construction; no verdict"
+    assert table.all_notes == (every, "a note")
+    assert table.sentences == (f"E{every[1:]}.", "A note.")
+    assert table.only([0, 2]).all_notes == (f"every edit; {rate}; no verdict", "a note")
 
 
 def test_a_mark_that_no_cell_has_is_not_explained() -> None:
     for cell, notes in (("0.9*", ("*: by construction.",)), ("0.9", ())):
-        legend = ["*: by construction", "net rate: flips"]
-        table = Table.of("Edits", ("edit", "net rate"), [("a", cell)], notes=legend)
+        legend = Legend(marks={"*": "by construction"})
+        table = Table.of("Edits", ("edit", "net rate"), [("a", cell)], legend=legend, notes=["net rate: flips"])
         assert table.sentences == (*notes, "Net rate: flips.")
 
 

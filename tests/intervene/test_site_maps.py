@@ -1,5 +1,6 @@
 """Changes inside a real network: what is put in, along what, and what the ledger says of it."""
 
+import io
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from probe_kit.errors import EmptyRoleError, UnknownSiteError, UsageError
+from probe_kit.errors import EmptyRoleError, RunDamagedError, UnknownSiteError, UsageError
 from probe_kit.hooks import Site
 from probe_kit.hooks.capturing.edits import EditLog, ReplaceInSubspace, ReplaceWith, _ActiveEdits
 from probe_kit.intervene import (
@@ -27,8 +28,9 @@ from probe_kit.intervene import (
     stored_site_effects,
 )
 from probe_kit.intervene.directions import fit_pooled_directions
-from probe_kit.intervene.kinds.base import ConditionName
+from probe_kit.intervene.edited_cells import COLUMNS, EditedCell, columns_of
 from probe_kit.intervene.kinds.interchange import localised_sites, target_sign
+from probe_kit.intervene.outcomes import arrays_from_bytes
 from probe_kit.intervene.places import resolve_sites
 from probe_kit.intervene.sessions import ReplaySession
 from probe_kit.intervene.settings import FORMAT
@@ -36,7 +38,7 @@ from probe_kit.intervene.tokens import token_mask
 from probe_kit.intervene.verdict import Places
 from probe_kit.runs import Run
 from probe_kit.train import ArrayRun, train_probes
-from tests.intervene.answers import follower, habit, outcomes_of, patches_of, store_outcomes, swaps_of
+from tests.intervene.answers import follower, habit, measured, outcomes_of, patches_of, store_outcomes, swaps_of
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
@@ -498,16 +500,51 @@ def test_the_ledger_is_summed_and_norms_are_compared() -> None:
     assert (row.fires, row.no_op_fires, row.relative_change) == (8, 0, 0.5)
 
 
-def test_names_are_taken_apart() -> None:
-    assert ConditionName.parse("backbone.02|image|control-1|2") == ConditionName(
-        "backbone.02", "image", "control-1", "2"
-    )
-    whole, along = ConditionName.parse("backbone.02|image"), ConditionName.parse("backbone.02|image|probe")
-    control = ConditionName.parse("backbone.02|image|control-1")
+def test_controls_are_of_the_same_cell_and_coefficient() -> None:
+    whole, along, control = (EditedCell("backbone.02", "image", name) for name in ("", "probe", "control-1"))
     assert control.is_control_of(along)
-    assert [str(name) for name in (whole, along)] == ["backbone.02|image", "backbone.02|image|probe"]
     assert not control.is_control_of(whole)
     assert not along.is_control_of(along)
+    assert not replace(control, coefficient="2").is_control_of(along)
+    assert not replace(control, role="language").is_control_of(along)
+
+
+CELLS = (
+    EditedCell(),
+    EditedCell("backbone.02", "image"),
+    EditedCell("backbone.02", "image", "probe"),
+    EditedCell("backbone.02", "image", "control-1", "2"),
+    EditedCell("kv.00", "language", part="alone"),
+    EditedCell("expert.01@0-1", "all", part="exact"),
+)
+
+
+def test_cells_of_conditions_are_stored_as_columns_and_read_from_the_names_of_an_earlier_version() -> None:
+    """The columns decide: a name is read only where there are none."""
+    (plain, *_) = np.zeros((1, 4))
+    names = ("clean", *map(str, CELLS[1:]))
+    numbers = np.zeros((len(names), 4))
+    episodes = np.array(list("abcd"))
+    made = ConditionOutcomes(
+        names, episodes, episodes, episodes, episodes, np.full(4, "left"), numbers, numbers,
+        np.zeros((len(names), 4, 5)), plain, **columns_of(CELLS),
+    )  # fmt: skip
+    assert made.cells == CELLS
+    stored = arrays_from_bytes(made.to_bytes())
+    assert stored["coefficients"].tolist() == ["", "", "", "2", "", ""]
+    assert ConditionOutcomes(**stored).cells == CELLS
+    assert made.by_category()[0][1].cells == CELLS
+    former = {name: values for name, values in stored.items() if name not in COLUMNS}
+    assert ConditionOutcomes(**former).cells == CELLS
+    renamed = {**stored, "conditions": np.array(["clean", *(f"{number}|x" for number in range(1, len(names)))])}
+    assert ConditionOutcomes(**renamed).cells == CELLS
+    assert measured(ConditionOutcomes(**renamed), "").outcomes.cells == CELLS
+    file = io.BytesIO()
+    np.savez(file, **{name: values for name, values in stored.items() if name != "roles"})
+    halved = replace(measured(made, ""), read=lambda _: file.getvalue())
+    halved.run.location = "RUN"
+    with pytest.raises(RunDamagedError, match="lacks roles"):
+        _ = halved.outcomes
 
 
 def test_the_place_is_said_beside_the_behaviour_and_does_not_change_it() -> None:

@@ -284,7 +284,7 @@ def test_a_row_has_the_numbers_of_its_run_and_drift_is_that_from_the_first_step(
     assert color[1]["drift"] == pytest.approx(color[1]["backbone"] - color[0]["backbone"]), (
         "the later minus the first"
     )
-    assert made.notes[0].endswith(
+    assert made.all_notes[0].endswith(
         "drift: the backbone's accuracy minus that of the first step, paired by items where "
         "both ran the same; each with its 95 % interval; view mean; mean over Color, Shape"
     )
@@ -307,13 +307,13 @@ def test_a_mean_over_other_categories_stands_last_and_is_named_and_absent_column
     late = probed_run({"color": SIGNAL_TRAINING_STEPS, "shape": NONE}, "late")
     made = step_table(retention_table([early, late]), {str(early.location): 500, str(late.location): 2000})
     assert [one["category"] for one in made.numbers] == ["color", "color", "shape", "mean", "mean"]
-    assert made.notes[0].endswith("mean over Color (step 500), Color, Shape (step 2000)")
+    assert made.all_notes[0].endswith("mean over Color (step 500), Color, Shape (step 2000)")
     bare = step_table(
         retention_table([early, late], keys=["", ""]), {str(early.location): 500, str(late.location): 2000}
     )
     assert made.columns[3:] == ("backbone %", "action %", "retention", "drift of the backbone, points")
     assert bare.columns == ("category", "step", "success %")
-    assert bare.notes[0] == (
+    assert bare.all_notes[0] == (
         "step: of the training; success: the cube ends on the correct picture; each with its 95 % interval; "
         "mean over Color (step 500), Color, Shape (step 2000)"
     )

@@ -187,6 +187,20 @@ def test_the_probes_of_an_untrained_network_are_read_only_where_no_others_were_a
     assert load_results(other).settings.permutations == 2
 
 
+def test_controls_name_the_untrained_network_even_where_two_networks_are_equally_accurate(
+    planted_run: PlantedRun,
+) -> None:
+    run = planted_run({PLANTED: 2.0})
+    networks = [named(planted_run(), name, random_weights=True) for name in ("first random", "second random")]
+    controls = [train_probes(run, permutations=0, untrained=network).controls for network in networks]
+    accuracies = [[score.untrained_accuracy for score in of_network.untrained] for of_network in controls]
+    assert accuracies[0] == accuracies[1]
+    keys = [load_results(network).key for network in networks]
+    assert [of_network.untrained_probes for of_network in controls] == keys
+    assert keys[0] != keys[1]
+    assert load_results(run).controls.untrained_probes == keys[1]
+
+
 FAILURES = {
     "a control that needs a suite": {"controls": ("pixels",)},
     "an unknown control": {"controls": ("position", "smell")},

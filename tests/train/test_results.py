@@ -197,7 +197,7 @@ def test_the_untrained_network_of_a_stream_is_its_peak() -> None:
         untrained("expert.00.residual@1", True),
         untrained("backbone.03.residual", True),
     ]
-    controls = Controls().with_untrained(scores)
+    controls = Controls().with_untrained(scores, "0123456789ab")
     assert controls.untrained_peak("color", "mean", "backbone") == scores[2]
     assert controls.untrained_peak("color", "last", "backbone") is None
 
@@ -286,10 +286,10 @@ def results_of() -> ProbeResults:
 
 def test_the_first_of_the_best_is_named_with_its_ties_and_the_first_iteration(results_of: ProbeResults) -> None:
     backbone, expert = best_sites(results_of.scores, True)
-    assert site_cells(backbone, True)[0] == "backbone.01.residual +1"
-    assert site_cells(backbone, True)[1].startswith("90.0 [")
-    assert site_cells(backbone, True)[2:] == ("50.0", "0.100")
-    assert site_cells(expert, True)[0] == "expert.00.residual@1"
+    assert site_cells(backbone, True)[0].text == "backbone.01.residual +1"
+    assert site_cells(backbone, True)[1].text.startswith("90.0 [")
+    assert [cell.text for cell in site_cells(backbone, True)[2:]] == ["50.0", "0.100"]
+    assert site_cells(expert, True)[0].text == "expert.00.residual@1"
     assert expert["first"] == pytest.approx(0.6)
     assert backbone["first"] != backbone["first"], "the stream runs once"
 

@@ -41,9 +41,11 @@ _FITTED = r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%"
 def _preamble(tables: Sequence[Content]) -> str:
     """Return the packages that the tables need as a comment, and their colors."""
     coloured = any(_css(cell) for table in tables for row in table.rows for cell in row.cells)
-    needs = r"% needs: \usepackage{booktabs} \usepackage{graphicx}" + r" \usepackage[table]{xcolor}" * coloured
-    colours = [rf"\definecolor{{{name}}}{{HTML}}{{{rgb}}}" for _, name, rgb in HEAT] if coloured else []
-    return "\n".join([needs, *colours])
+    needs = r"% needs: \usepackage{booktabs} \usepackage{graphicx}"
+    if not coloured:
+        return needs
+    colours = [rf"\definecolor{{{name}}}{{HTML}}{{{rgb}}}" for _, name, rgb in HEAT]
+    return "\n".join([rf"{needs} \usepackage[table]{{xcolor}}", *colours])
 
 
 def render(tables: Sequence[Content], sentences: Sequence[str] = (), notes: Sequence[str] = ()) -> str:
@@ -128,8 +130,9 @@ def _tabular(table: Content) -> list[str]:
 
 def _css(cell: Cell) -> str:
     """Return the commands around a cell as Styler spells them."""
-    heat = [] if cell.heat is None else [f"cellcolor:{{{heat_name(cell.heat)}}}"]
-    return ";".join([*heat, *["textcolor:{red}--rwrap"] * cell.alarm])
+    heat = "" if cell.heat is None else f"cellcolor:{{{heat_name(cell.heat)}}}"
+    alarm = "textcolor:{red}--rwrap" if cell.alarm else ""
+    return ";".join(filter(None, (heat, alarm)))
 
 
 def heat_name(value: float) -> str:

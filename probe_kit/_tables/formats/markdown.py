@@ -9,7 +9,9 @@ from probe_kit._tables.content import Cell, Content
 def render(tables: Sequence[Content], sentences: Sequence[str] = (), notes: Sequence[str] = ()) -> str:
     """Return the first table, the sentences as a list, the other tables, and the notes as quotations."""
     first, *following = map(_table, tables)
-    items = [*(f"* {markdown_safe(sentence)}" for sentence in sentences), *[""] * bool(sentences)]
+    items = [f"* {markdown_safe(sentence)}" for sentence in sentences]
+    if items:
+        items.append("")
     return "\n".join([first, *items, *following, *(f"> {markdown_safe(note)}\n" for note in notes)])
 
 

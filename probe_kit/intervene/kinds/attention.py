@@ -12,11 +12,13 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._tables.content import Cell as TableCell
+from probe_kit._tables.numbers import percent, points
 from probe_kit.errors import CaptureChangedActionError, CaptureError, EmptyRoleError, UsageError
 from probe_kit.hooks.contract.declared import InterventionKind
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.sites import first_of
-from probe_kit.intervene.kinds.base import Intervention, effect_table
+from probe_kit.intervene.kinds.base import EffectColumn, Intervention, effect_table
 from probe_kit.intervene.outcomes import (
     RECORDED,
     ConditionOutcomes,
@@ -142,17 +144,26 @@ class AttentionReadout(Intervention):
         attention = AttentionShares.stored(context)
         means = attention.rows(("block",))
         roles = [role for role in dict.fromkeys(row.role for row in means) if role not in (CORRECT, OTHER)]
-        lines: list[tuple[tuple[str, ...], tuple[dict[str, float], str]]] = []
+        lines: list[tuple[tuple[str, ...], tuple[dict[str, float], TableCell]]] = []
         for category, part in attention.by_category():
             apart = part.correct_minus_other(context.run.seed_text)
             for block in dict.fromkeys(row.block for row in means if row.category == category):
                 shares = {row.role: row.share for row in means if (row.category, row.block) == (category, block)}
                 lines.append(((category, f"block {block:02d}"), (shares, _difference(apart.get(block or 0)))))
-        parts: dict[str, Any] = {"Where the attention lies, %": {role: _share_column(role) for role in roles}}
+        parts: dict[str, list[EffectColumn[Any]]] = {
+            "Where the attention lies, %": [_share_column(role) for role in roles]
+        }
         if set(TILE_ROLES) <= set(roles):
-            parts["Tiles by answer"] = {"correct − other [95 %]": lambda row: row[1]}
+            parts["Tiles by answer"] = [EffectColumn("correct − other [95 %]", lambda row: row[1], _BY_ANSWER)]
         title = f"What does it attend to? {context.subject}, attention"
-        return effect_table(title, _LEGEND, ("category", "read"), lines, parts)
+        return effect_table(
+            title,
+            ("category", "read"),
+            lines,
+            parts,
+            before=[_LEGEND],
+            after=["by iteration and head: --format csv"],
+        )
 
     @staticmethod
     def notes(rows: "Sequence[AttentionRow]") -> list[str]:
@@ -529,21 +540,24 @@ def _mean(values: Shares, axes: tuple[int, ...]) -> Shares:
 
 _LEGEND = (
     "Descriptive, in no verdict: attended tokens need not be used. Percent of the acting stream's attention, "
-    "means over heads, iterations and inferences: all: on the backbone's tokens, action: on its own; image.left, "
-    "image.right: on patches that see a tile; correct − other: on the correct picture's tile less the other's, by "
-    "groups of items. By iteration and head: --format csv"
+    "means over heads, iterations and inferences"
 )
+_ROLE_TERMS = {
+    ALL: "all: on the backbone's tokens",
+    "action": "action: on its own",
+    TILE_ROLES[0]: f"{', '.join(TILE_ROLES)}: on patches that see a tile",
+}
+"""The entries of the legend by role."""
+_BY_ANSWER = "correct − other: on the correct picture's tile less the other's, by groups of items"
 
 
-def _share_column(role: str) -> Any:
-    return lambda row: f"{100 * row[0][role]:.1f}" if role in row[0] else "–"
+def _share_column(role: str) -> EffectColumn[Any]:
+    return EffectColumn(role, lambda row: TableCell(row[0].get(role), percent), _ROLE_TERMS.get(role, ""))
 
 
-def _difference(apart: tuple[float, tuple[float, float]] | None) -> str:
-    if apart is None:
-        return "–"
-    value, (low, high) = apart
-    return f"{100 * value:+.1f} [{100 * low:+.1f}, {100 * high:+.1f}]"
+def _difference(apart: tuple[float, tuple[float, float]] | None) -> TableCell:
+    value, limits = apart or (None, None)
+    return TableCell(value, points, limits)
 
 
 KIND = AttentionReadout

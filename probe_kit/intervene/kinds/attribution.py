@@ -7,16 +7,19 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._tables.content import Cell as TableCell
 from probe_kit.errors import UsageError
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.declared import InterventionKind
 from probe_kit.hooks.contract.sites import KV_STREAM
+from probe_kit.intervene.edited_cells import ESTIMATE, EXACT, EditedCell
 from probe_kit.intervene.exchange import pooled_share
 from probe_kit.intervene.kinds.base import (
+    EffectColumn,
     Intervention,
     edits_by_category,
     effect_table,
-    interval_text,
+    interval_cell,
     is_resolved,
     lines_of,
     p_of,
@@ -37,7 +40,7 @@ from probe_kit.intervene.patching.attribution import (
     worst_anchor,
 )
 from probe_kit.intervene.patching.patch import Cell, sites_of_cells
-from probe_kit.intervene.places import ALL, SEPARATOR, resolve_all
+from probe_kit.intervene.places import ALL, resolve_all
 from probe_kit.intervene.replay import CLEAN_RUN, SOURCE_RUN, Condition, ConditionContext, ConditionResult
 from probe_kit.intervene.settings import FIRST_CHUNK
 from probe_kit.intervene.stored import Measurement
@@ -49,19 +52,12 @@ if TYPE_CHECKING:
 
 NAME = "attribution"
 SITES = (f"{KV_STREAM}.*", "backbone.*")
-EXACT, ESTIMATE = "exact", "estimate"
 """Beginnings of the names of conditions, such as `exact|kv.02|image`."""
 TOP = 20
 """Number of cells of each kind and category with the largest estimates, which are patched exactly.
 
 As many are drawn from the others.
 """
-_LEGEND = (
-    "estimate: share of the image swap by gradients; exact: with these tokens patched; anchor: a complete cut, "
-    f"patched exactly; a screen that misses an anchor by more than a factor of {AGREEMENT:.0f} is void and shows "
-    "no order; drawn: chosen at random from the rest; p: of the exact patch, max-T over those of the "
-    "category; a screen enters no verdict"
-)
 
 
 def _estimated(cell: Cell, by_row: Mapping[tuple[int, int], float]) -> Condition:
@@ -75,8 +71,7 @@ def _estimated(cell: Cell, by_row: Mapping[tuple[int, int], float]) -> Condition
     def play(context: ConditionContext) -> ConditionResult:
         return ConditionResult(context.clean, estimated=by_row[context.pair.row, context.pair.step])
 
-    name = cell.site_group.name
-    return Condition(f"{ESTIMATE}|{name}|{cell.role}", play, (name,))
+    return Condition.of_cell(EditedCell(cell.site_group.name, cell.role, part=ESTIMATE), play)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,12 +137,12 @@ class AttributionPatching(Intervention):
         rows, shares = self._estimates(session, every)
         top, drawn = self._select(cells, [values[len(anchors) :] for values in shares])
         patched, sites = {*anchors, *top, *drawn}, sites_of_cells(every)
-        exact = [patch_of(cell, sites, f"{EXACT}|") for cell in every if cell in patched]
+        exact = [patch_of(cell, sites, EXACT) for cell in every if cell in patched]
         estimated = [
             _estimated(cell, {at_row: float(by_cell[at]) for at_row, by_cell in rows.items()})
             for at, cell in enumerate(every)
         ]
-        names = [f"{EXACT}|{cell.site_group.name}|{cell.role}" for cell in every if cell in drawn]
+        names = [str(EditedCell(cell.site_group.name, cell.role, part=EXACT)) for cell in every if cell in drawn]
         session.certificate[NAME] = {"drawn": names}
         return [CLEAN_RUN, SOURCE_RUN, *exact, *estimated]
 
@@ -206,14 +201,18 @@ class AttributionPatching(Intervention):
         ]
         return effect_table(
             "; ".join([f"Which places to patch? {context.subject}, gradients", *void]),
-            context.in_words(_LEGEND),
             ("category", "cell"),
             lines_of(rows, lambda row: row.name),
-            {context.in_words("Share of the image swap"): _COLUMNS},
+            {f"Share of the {context.exchange}": _columns(context.exchange)},
             lambda row: row.is_anchor,
+            after=["a screen enters no verdict"],
         )
 
-    sentence = staticmethod(describe_screen)
+    @staticmethod
+    def sentence(rows: Sequence[AttributionEffect], context: Measurement) -> str:
+        """Return what the screen ranks first, and whether it holds."""
+        del context
+        return describe_screen(rows)
 
     @staticmethod
     def finding(rows: Sequence[AttributionEffect], context: Measurement) -> str:
@@ -230,15 +229,36 @@ class AttributionPatching(Intervention):
 
 
 KIND = AttributionPatching
-_COLUMNS: Mapping[str, Any] = {
-    "rank": lambda row: "–" if row.rank is None else str(row.rank),
-    "estimate [95 %]": lambda row: interval_text(row.estimate, row.estimate_ci),
-    "exact [95 %]": lambda row: interval_text(row.exact, row.exact_ci),
-    "p": lambda row: p_of(row.p_fwe, is_resolved(row.exact)),
-    "chosen": lambda row: (
-        "anchor" if row.is_anchor else "drawn" if row.is_drawn else "top" if row.p_fwe is not None else ""
-    ),
-}
+
+
+def _columns(exchange: str) -> tuple[EffectColumn[AttributionEffect], ...]:
+    """Return the columns of a screen; `exchange` is the change of inputs of which effects are shares."""
+    return (
+        EffectColumn("rank", lambda row: TableCell(row.rank)),
+        EffectColumn(
+            "estimate [95 %]",
+            lambda row: interval_cell(row.estimate, row.estimate_ci),
+            f"estimate: share of the {exchange} by gradients",
+        ),
+        EffectColumn(
+            "exact [95 %]",
+            lambda row: interval_cell(row.exact, row.exact_ci),
+            "exact: with these tokens patched",
+        ),
+        EffectColumn(
+            "p",
+            lambda row: p_of(row.p_fwe, is_resolved(row.exact)),
+            "p: of the exact patch, max-T over those of the category",
+        ),
+        EffectColumn(
+            "chosen",
+            lambda row: (
+                "anchor" if row.is_anchor else "drawn" if row.is_drawn else "top" if row.p_fwe is not None else ""
+            ),
+            "anchor: a complete cut, patched exactly; a screen that misses an anchor by more than a factor of "
+            f"{AGREEMENT:.0f} is void and shows no order; drawn: chosen at random from the rest",
+        ),
+    )
 
 
 def _rows(outcomes: ConditionOutcomes, drawn: Collection[str]) -> list[AttributionEffect]:
@@ -246,11 +266,9 @@ def _rows(outcomes: ConditionOutcomes, drawn: Collection[str]) -> list[Attributi
     clean, exchange = outcomes.of(CLEAN), outcomes.exchange()
     assert exchange is not None
     moved: dict[str, dict[CellName, NDArray[np.float64]]] = {ESTIMATE: {}, EXACT: {}}
-    for name in outcomes.conditions:
-        part, _, cell = name.partition(SEPARATOR)
-        if part in moved:
-            site, _, role = cell.partition(SEPARATOR)
-            moved[part][site, role] = outcomes.of(name) - clean
+    for name, cell in zip(outcomes.conditions, outcomes.cells, strict=True):
+        if cell.part:
+            moved[cell.part][cell.site, cell.role] = outcomes.of(name) - clean
     anchors = [cell for cell in moved[ESTIMATE] if cell[1] == ALL]
-    at_random = [cell for cell in moved[EXACT] if SEPARATOR.join((EXACT, *cell)) in drawn]
+    at_random = [cell for cell in moved[EXACT] if str(EditedCell(*cell, part=EXACT)) in drawn]
     return screen_rows(exchange, moved[ESTIMATE], moved[EXACT], anchors, at_random, str(outcomes.categories[0]))

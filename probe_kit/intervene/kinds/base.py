@@ -13,18 +13,21 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit._tables.numbers import number, signed
+from probe_kit._tables.content import Cell as TableCell
+from probe_kit._tables.numbers import NONE as NO_NUMBER
+from probe_kit._tables.numbers import Write, number, percent, signed
 from probe_kit.errors import UsageError
 from probe_kit.extract.sources.inputs import INSTRUCTION
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.capturing.edits import LOG_FIELDS
 from probe_kit.hooks.contract.declared import InterventionKind
 from probe_kit.hooks.contract.sites import KV_STREAM
+from probe_kit.intervene.edited_cells import EditedCell
 from probe_kit.intervene.further_instructions import check_further_instructions
 from probe_kit.intervene.outcomes import ConditionOutcomes, Effect
 from probe_kit.intervene.pairs import Pair
 from probe_kit.intervene.patching.patch import Cell
-from probe_kit.intervene.places import SEPARATOR, TILES
+from probe_kit.intervene.places import TILES
 from probe_kit.intervene.replay import Condition, replay
 from probe_kit.intervene.settings import FIRST_CHUNK, PER_STEP, Choice, categories_in, has_sides
 from probe_kit.intervene.stored import Measurement
@@ -43,8 +46,6 @@ if TYPE_CHECKING:
     from probe_kit.intervene.sessions import ReplaySession
 
 Values = NDArray[np.float64]
-CONTROL = "control-"
-"""Beginning of the names of random directions, which distinguishes them in stored results."""
 OPTIONS = ("sites", "roles", "direction", "controls", "coefficients", "target_side", "seed")
 """Options of the command that a kind may take."""
 
@@ -210,8 +211,8 @@ class Intervention(Choice, ABC):
     @classmethod
     def sentences(cls, rows: Sequence[Any], context: Measurement) -> list[str]:
         """Return the findings with their numbers, a sentence per category; none of a kind that only describes."""
-        parts = [(name, cls.sentence(part)) for name, part in edits_by_category(rows).items()]
-        return [f"{category_of(name).title}: {context.in_words(text)}." for name, text in parts if text]
+        parts = [(name, cls.sentence(part, context)) for name, part in edits_by_category(rows).items()]
+        return [f"{category_of(name).title}: {text}." for name, text in parts if text]
 
     @classmethod
     def findings(cls, rows: Sequence[Any], context: Measurement) -> list[str]:
@@ -220,12 +221,12 @@ class Intervention(Choice, ABC):
             (category_of(name).title, cls.finding(part, context)) for name, part in edits_by_category(rows).items()
         ]
         width = max((len(title) for title, _ in parts), default=0)
-        return [f"{title.ljust(width)}  {context.in_words(text)}." for title, text in parts if text]
+        return [f"{title.ljust(width)}  {text}." for title, text in parts if text]
 
     @staticmethod
-    def sentence(rows: Sequence[Any]) -> str:
+    def sentence(rows: Sequence[Any], context: Measurement) -> str:
         """Return the finding in one category with its numbers; `rows` are without controls."""
-        del rows
+        del rows, context
         return ""
 
     @staticmethod
@@ -321,38 +322,6 @@ class AlongDirection(Intervention):
             )
 
 
-# -- names of conditions -------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class ConditionName:
-    """The parts of a condition's stored name, `site|role|direction|coefficient`; the last ones may be missing."""
-
-    site: str
-    role: str = ""
-    direction: str = ""
-    coefficient: str = ""
-
-    @classmethod
-    def parse(cls, condition: str) -> "ConditionName":
-        """Split a stored name into its parts."""
-        return cls(*condition.split(SEPARATOR))
-
-    def __str__(self) -> str:
-        parts = (self.site, self.role, self.direction, self.coefficient)
-        return SEPARATOR.join(filter(None, parts))
-
-    @property
-    def is_control(self) -> bool:
-        """Whether its direction is a random one that another is compared with."""
-        return self.direction.startswith(CONTROL)
-
-    def is_control_of(self, other: "ConditionName") -> bool:
-        """Whether `other`, no control itself, is compared with this one."""
-        same = (self.site, self.role, self.coefficient) == (other.site, other.role, other.coefficient)
-        return self.is_control and bool(other.direction) and not other.is_control and same
-
-
 # -- effects -------------------------------------------------------------------------------------------------
 
 
@@ -396,13 +365,13 @@ class EffectRow(Effect):
         return " ".join(filter(None, (self.sites, self.role, self.direction)))
 
 
-def common_columns(outcomes: ConditionOutcomes, row: int, name: ConditionName, gains: Values) -> dict[str, Any]:
+def common_columns(outcomes: ConditionOutcomes, row: int, cell: EditedCell, gains: Values) -> dict[str, Any]:
     """Return the columns of `EffectRow` for one condition.
 
     Args:
         outcomes: Outcomes of one category.
         row: Row of the condition in them.
-        name: Name of the condition, in its parts.
+        cell: The cell that the condition edits.
         gains: (E,) 1 where an episode has the change that the kind counts with the edit only, −1 for the reverse.
     """
     logged = dict(zip(LOG_FIELDS, outcomes.edit_log[row].T, strict=True))
@@ -410,10 +379,10 @@ def common_columns(outcomes: ConditionOutcomes, row: int, name: ConditionName, g
     counts = {column: value for column, value in outcomes.counts.items() if column != "n_groups"}
     return {
         **counts,
-        "sites": name.site,
-        "role": name.role,
-        "direction": name.direction,
-        "is_control": name.is_control,
+        "sites": cell.site,
+        "role": cell.role,
+        "direction": cell.direction,
+        "is_control": cell.is_control,
         "net": float(gains.mean()),
         "net_ci": net_interval(gains, outcomes),
         "max_action_change": float(outcomes.max_action_change[row].max()),
@@ -452,7 +421,7 @@ class ControlTest(NamedTuple):
 
 def compare_with_controls(
     values: Values,
-    names: Sequence[ConditionName],
+    cells: Sequence[EditedCell],
     outcomes: ConditionOutcomes,
     *,
     skipped: Collection[int] = (),
@@ -462,17 +431,17 @@ def compare_with_controls(
 
     Args:
         values: (K, E) values that are tested to be above zero.
-        names: Names of the K conditions.
+        cells: The cells that the K conditions edit.
         outcomes: Outcomes of one category.
         skipped: Rows that are not tested though they are no controls, such as an identity patch.
         broken_controls: Rows of controls that nothing is compared with, such as those that disrupt the task.
     """
     controls = [
-        [at for at, other in enumerate(names) if other.is_control_of(name) and at not in broken_controls]
-        for name in names
+        [at for at, other in enumerate(cells) if other.is_control_of(cell) and at not in broken_controls]
+        for cell in cells
     ]
     tests = [ControlTest(rows) for rows in controls]
-    tested = [at for at, name in enumerate(names) if not name.is_control and at not in skipped]
+    tested = [at for at, cell in enumerate(cells) if not cell.is_control and at not in skipped]
     if not tested:
         return tests
     # Without controls an effect is compared with zero.
@@ -518,35 +487,62 @@ def frame_of(rows: Sequence[Effect]) -> "pd.DataFrame":
 # -- tables and sentences ------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True)
+class EffectColumn[Row]:
+    """A column of a table of effects.
+
+    Attributes:
+        cell: Makes the cell of a row.
+        term: Its entry in the legend, `name: meaning`; empty for none.
+    """
+
+    heading: str
+    cell: Callable[[Row], TableCell | str]
+    term: str = ""
+
+
 def effect_table[Row](
     title: str,
-    caption: str,
     names: Sequence[str],
     lines: Sequence[tuple[tuple[str, ...], Row]],
-    parts: Mapping[str, Mapping[str, Callable[[Row], str]]],
+    parts: Mapping[str, Sequence[EffectColumn[Row]]],
     is_bold: Callable[[Row], bool] = lambda _: False,
+    *,
+    before: Iterable[str] = (),
+    marks: Mapping[str, str] = MappingProxyType({}),
+    after: Iterable[str] = (),
 ) -> "Table":
     """Return rows of effects as a table.
 
     Args:
         title: Title of the table.
-        caption: Note below the table.
         names: Headings of the columns that name a line.
         lines: Names of each line, and its row.
-        parts: By title of a group of columns, the function that gives a row's text in each column.
+        parts: The columns by the title of their group.
         is_bold: Function that returns whether a row's names are bold.
+        before: Remarks of the legend in front of the terms of the columns; empty ones are left out.
+        marks: The meaning of signs that cells have.
+        after: Remarks behind them; empty ones are left out.
     """
-    from probe_kit._tables.table import Cell, Heading, Table, grouped
+    from probe_kit._tables.table import Heading, Legend, Table
 
-    rows: list[tuple[Cell | str, ...]] = [
+    rows: list[tuple[TableCell | str, ...]] = [
         (
-            *(Cell(text, strong=is_bold(row)) for text in (category_of(line[0]).title, *line[1:])),
-            *(text(row) for columns in parts.values() for text in columns.values()),
+            *(TableCell(text, strong=is_bold(row)) for text in (category_of(line[0]).title, *line[1:])),
+            *(column.cell(row) for columns in parts.values() for column in columns),
         )
         for line, row in lines
     ]
-    headings = (*map(Heading, names), *grouped(*((part, tuple(columns)) for part, columns in parts.items())))
-    return Table.of(title, headings, rows, names=len(names), notes=[caption])
+    headings = [
+        *map(Heading, names),
+        *(
+            Heading(column.heading, term=column.term, group=part)
+            for part, columns in parts.items()
+            for column in columns
+        ),
+    ]
+    legend = Legend(tuple(before), marks, tuple(after))
+    return Table.of(title, headings, rows, names=len(names), legend=legend)
 
 
 def lines_of[Row: Effect](rows: Iterable[Row], name: Callable[[Row], str]) -> list[tuple[tuple[str, ...], Row]]:
@@ -566,6 +562,16 @@ A test of signs knows no size: an effect that is 0.00 in every episode can have 
 """
 
 
+def rate(value: float | None) -> TableCell:
+    """Return a share in percent."""
+    return TableCell(value, percent)
+
+
+def centimetres(metres: float | None, write: Write = number) -> TableCell:
+    """Return a distance in centimetres."""
+    return TableCell(None if metres is None else 100 * metres, write)
+
+
 def is_resolved(*effects: float | None) -> bool:
     """Return whether any of some effects is as large as the resolution of its measure."""
     return any(effect is not None and abs(effect) >= RESOLUTION for effect in effects)
@@ -575,28 +581,23 @@ UNRESOLVED = f"p –: the effect is below {RESOLUTION}, the resolution of its me
 """The entry of a legend for p-values that are not shown."""
 
 
-def p_of(value: float | None, is_printed: bool = True) -> str:
+def p_of(value: float | None, is_printed: bool = True) -> TableCell:
     """Return a p-value in two digits; a dash for None, and for the p-value of an effect that is not resolved."""
-    if value is None or not is_printed:
-        return "–"
-    text = format(value, ".2g")
-    return text.lstrip("-") if float(text) == 0 else text
+    return TableCell(value if is_printed else None, _two_digits)
 
 
-def interval_text(
-    value: float | None,
-    limits: tuple[float, float] | None,
-    write: Callable[[float | None], str] = number,
-) -> str:
-    """Return `value [low, high]`; a dash without an interval."""
-    if value is None or limits is None:
-        return "–"
-    return f"{write(value)} [{write(limits[0])}, {write(limits[1])}]"
+def _two_digits(value: float | None) -> str:
+    return NO_NUMBER if value is None else format(abs(value), ".2g")
 
 
-def signed_interval(value: float | None, limits: tuple[float, float] | None) -> str:
-    """Return `+value [+low, +high]`."""
-    return interval_text(value, limits, signed)
+def interval_cell(value: float | None, limits: tuple[float, float] | None, write: Write = number) -> TableCell:
+    """Return a value and its interval; a dash without an interval."""
+    return TableCell(None if limits is None else value, write, limits)
+
+
+def signed_interval(value: float | None, limits: tuple[float, float] | None) -> TableCell:
+    """Return a value with its sign and its interval; a dash without an interval."""
+    return interval_cell(value, limits, signed)
 
 
 def count_edits(names: Sequence[str], tried: int, most: int = 3) -> str:
@@ -618,4 +619,4 @@ def share_of_edits(rows: Sequence[EffectRow], tried: int, subject: str = "edits"
         subject: Noun for the edits.
     """
     first = f"{rows[0].sites} {rows[0].role}".rstrip()
-    return f"{len(rows)} of {tried} {subject}, {'most ' * (len(rows) > 1)}at {first}"
+    return f"{len(rows)} of {tried} {subject}, {'most ' if len(rows) > 1 else ''}at {first}"

@@ -14,15 +14,17 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 import numpy as np
 
-from probe_kit._tables.numbers import percent, signed
+from probe_kit._tables.content import Cell as TableCell
+from probe_kit._tables.numbers import signed
 from probe_kit.env.scoring import DEFAULT_RULE
 from probe_kit.errors import UsageError
 from probe_kit.hooks.capturing.edits import EditLog, Identity, apply_patch
 from probe_kit.hooks.contract.sites import Site
+from probe_kit.intervene.edited_cells import SEPARATOR, EditedCell
 from probe_kit.intervene.kinds.base import (
     NONE,
     AlongDirection,
-    ConditionName,
+    EffectColumn,
     EffectRow,
     common_columns,
     compare_with_controls,
@@ -32,14 +34,15 @@ from probe_kit.intervene.kinds.base import (
     lines_of,
     mean_of,
     p_of,
+    rate,
     share_of_edits,
     signed_interval,
 )
 from probe_kit.intervene.kinds.interchange import best_patch_targets, patch_of, patches_within
-from probe_kit.intervene.outcomes import CLEAN, ConditionOutcomes
+from probe_kit.intervene.outcomes import CLEAN, UNCHANGED, ConditionOutcomes
 from probe_kit.intervene.pairs import Pair
 from probe_kit.intervene.patching.patch import Cell, sites_of_cells
-from probe_kit.intervene.places import ALL, SEPARATOR, TILES, resolve_sites
+from probe_kit.intervene.places import ALL, TILES, resolve_sites
 from probe_kit.intervene.replay import SOURCE_RUN, Condition, ConditionContext, ConditionResult
 from probe_kit.intervene.settings import FIRST_CHUNK, categories_in
 from probe_kit.intervene.stored import Measurement
@@ -57,13 +60,6 @@ MIN_IN_ZONE_RATIO = 0.5
 CORRECT, WRONG = "correct", "wrong"
 """Outcomes of `env.scoring` with the cube in a zone; the third, `oob`, is outside both."""
 Finding = Literal["identity patch", "control", "task disrupted", "confirmed", "not confirmed"]
-_LEGEND = (
-    "every episode played again, same scene and seeds, with the edit at every inference; in a zone: whichever "
-    "picture; net flip rate: share of episodes that end on the wrong picture, minus that with the identity patch; "
-    "p: family-wise, of what goes beyond the controls, one-sided; confirmed: p < 0.05 and "
-    f"{SMALLEST_EFFECT_OF_INTEREST} beyond the controls; task disrupted: in a zone less than "
-    f"{MIN_IN_ZONE_RATIO:g} times as often as with the identity patch, and then in no verdict"
-)
 
 
 def identity_patch(sites: Sequence[Site]) -> Condition:
@@ -132,7 +128,7 @@ class ClosedLoop(AlongDirection):
         if options.get("direction") == NONE:
             options.setdefault("controls", 0)
         if sites:
-            targets = tuple(str(ConditionName(site, role)) for site in sites for role in roles or (ALL,))
+            targets = tuple(f"{site}{SEPARATOR}{role}" for site in sites for role in roles or (ALL,))
         else:
             targets = best_patch_targets(run, categories_in(run, options.get("categories")))
         return cls(**options, targets=targets)
@@ -140,8 +136,8 @@ class ClosedLoop(AlongDirection):
     @property
     def patterns(self) -> tuple[tuple[str, tuple[str, ...]], ...]:
         """The place and role of every target."""
-        names = map(ConditionName.parse, self.targets)
-        return tuple((name.site, (name.role,)) for name in names)
+        targets = (target.split(SEPARATOR) for target in self.targets)
+        return tuple((site, (role,)) for site, role in targets)
 
     def parameters(self) -> dict[str, Any]:
         """Return its own settings; the readout is where the cube ends."""
@@ -207,16 +203,17 @@ class ClosedLoop(AlongDirection):
         """Return one line per category and condition, the identity patch first."""
         return effect_table(
             f"Is it so in closed loop? {context.subject}",
-            _LEGEND,
             ("category", "edit"),
             lines_of(rows, lambda row: "identity patch" if row.sites == CLEAN else row.name),
             {"Where the cube ends": _ENDS, "Compared with the identity patch": _COMPARED},
             lambda row: row.finding == "confirmed",
+            before=["every episode played again, same scene and seeds, with the edit at every inference"],
         )
 
     @staticmethod
-    def sentence(rows: "Sequence[ClosedLoopEffect]") -> str:
+    def sentence(rows: "Sequence[ClosedLoopEffect]", context: Measurement) -> str:
         """Return at which places the cube turns to the other picture."""
+        del context
         edits = [row for row in rows if row.sites != CLEAN]
         confirmed = [f"{row.name} {row.net:+.2f}" for row in edits if row.finding == "confirmed"]
         disrupted = [row.name for row in edits if row.finding == "task disrupted"]
@@ -314,20 +311,22 @@ class ClosedLoopEffect(EffectRow):
 def closed_loop_effects(outcomes: ConditionOutcomes) -> list[ClosedLoopEffect]:
     """Return one row per condition of one category, the identity patch first."""
     assert outcomes.episode_outcomes is not None
-    names = [ConditionName.parse(condition) for condition in outcomes.conditions]
+    clean = {at for at, name in enumerate(outcomes.conditions) if name == CLEAN}
+    # What edits no cell is listed under its name: the identity patch, and the image swap.
+    pairs = zip(outcomes.conditions, outcomes.cells, strict=True)
+    cells = [EditedCell(name) if name in UNCHANGED else cell for name, cell in pairs]
     wrong = (outcomes.episode_outcomes == WRONG).astype(float)
     in_zone = np.isin(outcomes.episode_outcomes, (CORRECT, WRONG)).mean(axis=1)
     disrupted = in_zone < MIN_IN_ZONE_RATIO * in_zone[0]
     net = wrong - wrong[0]
     left_out = set(np.flatnonzero(disrupted).tolist())
-    clean = {at for at, name in enumerate(names) if name.site == CLEAN}
-    tests = compare_with_controls(net, names, outcomes, skipped=left_out | clean, broken_controls=left_out)
+    tests = compare_with_controls(net, cells, outcomes, skipped=left_out | clean, broken_controls=left_out)
     rows = []
-    for at, (name, test) in enumerate(zip(names, tests, strict=True)):
+    for at, (cell, test) in enumerate(zip(cells, tests, strict=True)):
         gained, lost = int((net[at] > 0).sum()), int((net[at] < 0).sum())
         rows.append(
             ClosedLoopEffect(
-                **common_columns(outcomes, at, name, net[at]),
+                **common_columns(outcomes, at, cell, net[at]),
                 correct=float((outcomes.episode_outcomes[at] == CORRECT).mean()),
                 wrong=float(wrong[at].mean()),
                 in_zone=float(in_zone[at]),
@@ -347,22 +346,40 @@ def closed_loop_effects(outcomes: ConditionOutcomes) -> list[ClosedLoopEffect]:
     return rows
 
 
-def _of_edits(text: Callable[[ClosedLoopEffect], str]) -> Callable[[ClosedLoopEffect], str]:
-    """Return the function that gives a cell's text, with a dash for the identity patch."""
-    return lambda row: "–" if row.sites == CLEAN else text(row)
+def _of_edits(cell: Callable[[ClosedLoopEffect], TableCell]) -> Callable[[ClosedLoopEffect], TableCell]:
+    """Return the function that gives a cell, with a dash for the identity patch."""
+    return lambda row: TableCell(None) if row.sites == CLEAN else cell(row)
 
 
-_ENDS: Mapping[str, Any] = {
-    "correct %": lambda row: percent(row.correct),
-    "wrong %": lambda row: percent(row.wrong),
-    "in a zone %": lambda row: percent(row.in_zone),
-    "wrong of these %": lambda row: percent(row.wrong_in_zone),
-}
-_COMPARED: Mapping[str, Any] = {
-    "net flip rate [95 %]": _of_edits(lambda row: signed_interval(row.net, row.net_ci)),
-    "left / right": _of_edits(lambda row: f"{signed(row.net_left)} / {signed(row.net_right)}"),
-    "controls": _of_edits(lambda row: signed(row.control_net)),
-    "only with : only without": _of_edits(lambda row: f"{row.gained} : {row.lost}"),
-    "p": _of_edits(lambda row: p_of(row.p_fwe)),
-    "finding": lambda row: row.finding,
-}
+_ENDS = (
+    EffectColumn[ClosedLoopEffect]("correct %", lambda row: rate(row.correct)),
+    EffectColumn[ClosedLoopEffect]("wrong %", lambda row: rate(row.wrong)),
+    EffectColumn[ClosedLoopEffect]("in a zone %", lambda row: rate(row.in_zone), "in a zone: whichever picture"),
+    EffectColumn[ClosedLoopEffect]("wrong of these %", lambda row: rate(row.wrong_in_zone)),
+)
+_COMPARED = (
+    EffectColumn[ClosedLoopEffect](
+        "net flip rate [95 %]",
+        _of_edits(lambda row: signed_interval(row.net, row.net_ci)),
+        "net flip rate: share of episodes that end on the wrong picture, minus that with the identity patch",
+    ),
+    EffectColumn[ClosedLoopEffect](
+        "left / right",
+        _of_edits(lambda row: TableCell(row.net_left, signed, after=f" / {signed(row.net_right)}")),
+    ),
+    EffectColumn[ClosedLoopEffect]("controls", _of_edits(lambda row: TableCell(row.control_net, signed))),
+    EffectColumn[ClosedLoopEffect](
+        "only with : only without", _of_edits(lambda row: TableCell(row.gained, after=f" : {row.lost}"))
+    ),
+    EffectColumn[ClosedLoopEffect](
+        "p",
+        _of_edits(lambda row: p_of(row.p_fwe)),
+        "p: family-wise, of what goes beyond the controls, one-sided",
+    ),
+    EffectColumn[ClosedLoopEffect](
+        "finding",
+        lambda row: row.finding,
+        f"confirmed: p < 0.05 and {SMALLEST_EFFECT_OF_INTEREST} beyond the controls; task disrupted: in a zone "
+        f"less than {MIN_IN_ZONE_RATIO:g} times as often as with the identity patch, and then in no verdict",
+    ),
+)

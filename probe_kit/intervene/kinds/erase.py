@@ -13,15 +13,19 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 import numpy as np
 
-from probe_kit._tables.numbers import number, percent
+from probe_kit._tables.content import Cell as TableCell
+from probe_kit._tables.content import absent
+from probe_kit._tables.numbers import number, percent, signed
 from probe_kit.errors import UsageError
 from probe_kit.hooks.capturing.edits import Identity, TokenIndex, apply_patch
 from probe_kit.hooks.contract.sites import Site
+from probe_kit.intervene.edited_cells import EditedCell
 from probe_kit.intervene.erasers import Eraser, Method
 from probe_kit.intervene.kinds.base import (
-    ConditionName,
+    EffectColumn,
     EffectRow,
     Intervention,
+    centimetres,
     common_columns,
     compare_with_controls,
     count_edits,
@@ -31,6 +35,7 @@ from probe_kit.intervene.kinds.base import (
     lines_of,
     mean_of,
     p_of,
+    rate,
     share_of_edits,
 )
 from probe_kit.intervene.kinds.interchange import cells_at
@@ -67,12 +72,6 @@ CHANCE_LIKE = 0.6
 
 Chance is 0.5; an accuracy of a few dozen episodes varies by about 0.1.
 """
-_LEGEND = (
-    "goes there: share of episodes whose action goes to the correct picture; kept: of how far, n/a where it does "
-    "not; controls: the mean of random subspaces of the same rank; p: exact, that the action moves away farther "
-    "than under the controls, by item and by group, the larger one; probe accuracy: a fresh probe on the mean "
-    "over tokens; relative change: how far tokens were moved, in their own norms. Weaker evidence than interchange"
-)
 
 
 # -- the intervention --------------------------------------------------------------------------------------
@@ -159,7 +158,7 @@ class ConceptErasure(Intervention):
                     by_name.setdefault(name, {}).update(of_episode)
                     # What is readable with each eraser, and without; untouched comes first.
                     fitted = [(fold, by_fold[name] if of_episode else None) for fold, by_fold in fits]
-                    of_condition = accuracies.setdefault(_name_of(cell, name), {})
+                    of_condition = accuracies.setdefault(str(_edited(cell, name)), {})
                     of_condition[category] = _probe_accuracy(features, fitted)
         conditions = [
             erased(cell, name, of_episode)
@@ -183,16 +182,17 @@ class ConceptErasure(Intervention):
         edits = [row for row in rows if row.finding not in ("control", "identity patch")]
         return effect_table(
             f"What is lost without it? {context.subject}, erase",
-            _LEGEND,
             ("category", "erased"),
             lines_of(edits, lambda row: row.name),
             {"What the action does": _ACTION, "What a probe reads": _PROBE},
             lambda row: row.finding == "effect",
+            after=["Weaker evidence than interchange"],
         )
 
     @staticmethod
-    def sentence(rows: "Sequence[ErasureEffect]") -> str:
+    def sentence(rows: "Sequence[ErasureEffect]", context: Measurement) -> str:
         """Return which erasures take the answer from the action."""
+        del context
         tried, has_answer = _tried(rows)
         if not has_answer:
             return "the unedited action does not go to the correct picture, so that nothing can be lost"
@@ -228,9 +228,8 @@ class ConceptErasure(Intervention):
 KIND = ConceptErasure
 
 
-def _name_of(cell: Cell, name: str) -> str:
-    coefficient = ZERO if name == UNTOUCHED else ""
-    return str(ConditionName(cell.site_group.name, cell.role, name, coefficient))
+def _edited(cell: Cell, name: str) -> EditedCell:
+    return EditedCell(cell.site_group.name, cell.role, name, ZERO if name == UNTOUCHED else "")
 
 
 def erased(cell: Cell, name: str, erasers: Mapping[str, Eraser]) -> Condition:
@@ -249,7 +248,7 @@ def erased(cell: Cell, name: str, erasers: Mapping[str, Eraser]) -> Condition:
         with apply_patch(session.policy, site_group.sites, tokens, change) as edit_log:
             return ConditionResult(context.act(), edit_log)
 
-    return Condition(_name_of(cell, name), play, (cell.site_group.name,))
+    return Condition.of_cell(_edited(cell, name), play)
 
 
 @dataclass(frozen=True)
@@ -367,21 +366,22 @@ def erasure_effects(
     """
     sign, category = outcomes.correct_sign, str(outcomes.categories[0])
     clean = sign * outcomes.of(CLEAN)
-    conditions = [name for name in outcomes.conditions if name != CLEAN]
-    names = [ConditionName.parse(condition) for condition in conditions]
+    conditions = dict(zip(outcomes.conditions, outcomes.cells, strict=True))
+    del conditions[CLEAN]
+    cells = list(conditions.values())
     values = np.array([sign * outcomes.of(condition) for condition in conditions])
     away = clean - values
-    untouched = [at for at, name in enumerate(names) if name.coefficient]
-    tests = compare_with_controls(away, names, outcomes, skipped=untouched)
+    untouched = [at for at, cell in enumerate(cells) if cell.coefficient]
+    tests = compare_with_controls(away, cells, outcomes, skipped=untouched)
     goes_there = paired_greater_p(clean, outcomes.items, outcomes.groups) < SIGNIFICANCE
     share = values.sum(axis=1) / clean.sum() if goes_there else None
     net = (clean > 0).astype(float) - (values > 0)
     rows = []
-    for at, (condition, name, test) in enumerate(zip(conditions, names, tests, strict=True)):
-        before = str(ConditionName(name.site, name.role, UNTOUCHED, ZERO))
+    for at, ((condition, cell), test) in enumerate(zip(conditions.items(), tests, strict=True)):
+        before = str(EditedCell(cell.site, cell.role, UNTOUCHED, ZERO))
         rows.append(
             ErasureEffect(
-                **common_columns(outcomes, outcomes.conditions.index(condition), name, net[at]),
+                **common_columns(outcomes, outcomes.conditions.index(condition), cell, net[at]),
                 right_before=float((clean > 0).mean()),
                 right=float((values[at] > 0).mean()),
                 share_left=None if share is None else float(share[at]),
@@ -404,19 +404,47 @@ def _tried(rows: Sequence[ErasureEffect]) -> tuple[list[ErasureEffect], bool]:
     return tried, not tried or any(row.finding != "no baseline effect" for row in tried)
 
 
-def _accuracies(row: ErasureEffect) -> str:
+def _accuracies(row: ErasureEffect) -> TableCell:
     if row.probe_accuracy_before is None or row.probe_accuracy is None:
-        return "–"
-    return f"{percent(row.probe_accuracy_before)} → {percent(row.probe_accuracy)}"
+        return TableCell(None)
+    return TableCell(row.probe_accuracy_before, percent, after=f" → {percent(row.probe_accuracy)}")
 
 
-_ACTION: Mapping[str, Any] = {
-    "goes there %": lambda row: f"{percent(row.right_before)} → {percent(row.right)}",
-    "controls %": lambda row: percent(None if row.control_net is None else row.right_before - row.control_net),
-    "kept": lambda row: "n/a" if row.share_left is None else number(row.share_left),
-    "controls": lambda row: number(row.control_share_left),
-    "displacement cm": lambda row: f"{-100 * row.mean_displacement:+.2f}",
-    "p": lambda row: p_of(row.p, is_resolved(100 * row.mean_displacement, row.right_before - row.right)),
-    "relative change": lambda row: f"{row.relative_change:.2f}",
-}
-_PROBE: Mapping[str, Any] = {"probe accuracy %": _accuracies, "finding": lambda row: row.finding}
+_ACTION = (
+    EffectColumn[ErasureEffect](
+        "goes there %",
+        lambda row: TableCell(row.right_before, percent, after=f" → {percent(row.right)}"),
+        "goes there: share of episodes whose action goes to the correct picture",
+    ),
+    EffectColumn[ErasureEffect](
+        "controls %", lambda row: rate(None if row.control_net is None else row.right_before - row.control_net)
+    ),
+    EffectColumn[ErasureEffect](
+        "kept",
+        lambda row: absent("n/a") if row.share_left is None else TableCell(row.share_left, number),
+        "kept: of how far, n/a where it does not",
+    ),
+    EffectColumn[ErasureEffect](
+        "controls",
+        lambda row: TableCell(row.control_share_left, number),
+        "controls: the mean of random subspaces of the same rank",
+    ),
+    EffectColumn[ErasureEffect]("displacement cm", lambda row: centimetres(-row.mean_displacement, signed)),
+    EffectColumn[ErasureEffect](
+        "p",
+        lambda row: p_of(row.p, is_resolved(100 * row.mean_displacement, row.right_before - row.right)),
+        "p: exact, that the action moves away farther than under the controls, by item and by group, the larger "
+        "one",
+    ),
+    EffectColumn[ErasureEffect](
+        "relative change",
+        lambda row: TableCell(row.relative_change, number),
+        "relative change: how far tokens were moved, in their own norms",
+    ),
+)
+_PROBE = (
+    EffectColumn[ErasureEffect](
+        "probe accuracy %", _accuracies, "probe accuracy: a fresh probe on the mean over tokens"
+    ),
+    EffectColumn[ErasureEffect]("finding", lambda row: row.finding),
+)

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit._system.counting import counted
-from probe_kit._tables.numbers import number, percent
+from probe_kit._tables.content import Cell as TableCell
+from probe_kit._tables.numbers import number
 from probe_kit.hooks.contract.declared import InterventionKind, Readout
 from probe_kit.intervene.exchange import (
     NOTHING,
@@ -27,13 +28,16 @@ from probe_kit.intervene.exchange import (
     share_of_whole,
 )
 from probe_kit.intervene.kinds.base import (
+    EffectColumn,
     Intervention,
+    centimetres,
     effect_table,
-    interval_text,
+    interval_cell,
     is_resolved,
     lines_of,
     net_interval,
     p_of,
+    rate,
     signed_interval,
 )
 from probe_kit.intervene.outcomes import CLEAN, CONTROL_INPUT, DONOR, IMAGE_SWAP, NOISE, ConditionOutcomes, Effect
@@ -65,13 +69,6 @@ It is chosen, as the bound within which *not used* must lie.
 """
 FOLLOWS, REVERSES = 1, -1
 """Responses of an episode to a swap; 0 is neither."""
-_LEGEND = (
-    "moved: displacement toward the correct picture in units of the policy's own reach, "
-    f"{SMALLEST_SHARE_OF_INTEREST} of which count; follow: goes to the correct picture, and to the other side "
-    "once the two are swapped; reversal: the reverse; "
-    f"net: follow − reversal, {SMALLEST_EFFECT_OF_INTEREST} of which count; p: exact, by item and by group, the "
-    "larger one"
-)
 _REACH = {
     "actions": "reach: {:.1f} cm between the actions that go left and those that go right",
     "tiles": "reach: {:.1f} cm, the distance between the tiles, since too few actions go to one of the sides",
@@ -191,28 +188,42 @@ def _finding(share: SwapShare | None, p: float, ratio: float, by_seed: bool, is_
     return "moves" if beyond else "open"
 
 
-_INPUT_LEGEND = (
-    "size: mean change of the action in spreads of clean actions, by the donor's input; control: by a change of "
-    "it that means nothing; full: by all of the donor's inputs; share: displacement toward the donor's action, of "
-    f"the full exchange; decides: from {DECIDES}; no effect: within ±{NOTHING}; p: exact, that the change is "
-    "larger than the control's, by item and by group, the larger one"
-)
 _VERBS: Mapping[str, str] = {
     "decides": "decides the action",
     "moves": "moves the action and does not decide it",
     "no effect": "has no effect",
     "open": "has an effect that remains open",
 }
-_INPUT_COLUMNS: Mapping[str, Any] = {
-    "changed %": lambda row: percent(row.changed),
-    "size": lambda row: number(row.size),
-    "control": lambda row: number(row.control_size),
-    "full": lambda row: number(row.full_size),
-    "share [95 %]": lambda row: interval_text(row.share, row.share_ci),
-    "p": lambda row: p_of(row.p, is_resolved(row.size)),
-    "n (episodes)": lambda row: f"{row.n_episodes} ({row.n_items})",
-    "finding": lambda row: row.finding,
-}
+_INPUT_COLUMNS = (
+    EffectColumn[InputEffect]("changed %", lambda row: rate(row.changed)),
+    EffectColumn[InputEffect](
+        "size",
+        lambda row: TableCell(row.size, number),
+        "size: mean change of the action in spreads of clean actions, by the donor's input",
+    ),
+    EffectColumn[InputEffect](
+        "control",
+        lambda row: TableCell(row.control_size, number),
+        "control: by a change of it that means nothing",
+    ),
+    EffectColumn[InputEffect](
+        "full", lambda row: TableCell(row.full_size, number), "full: by all of the donor's inputs"
+    ),
+    EffectColumn[InputEffect](
+        "share [95 %]",
+        lambda row: interval_cell(row.share, row.share_ci),
+        "share: displacement toward the donor's action, of the full exchange",
+    ),
+    EffectColumn[InputEffect](
+        "p",
+        lambda row: p_of(row.p, is_resolved(row.size)),
+        "p: exact, that the change is larger than the control's, by item and by group, the larger one",
+    ),
+    EffectColumn[InputEffect]("n (episodes)", lambda row: TableCell(row.n_episodes, after=f" ({row.n_items})")),
+    EffectColumn[InputEffect](
+        "finding", lambda row: row.finding, f"decides: from {DECIDES}; no effect: within ±{NOTHING}"
+    ),
+)
 
 
 def _find_input(row: InputEffect) -> str:
@@ -409,15 +420,32 @@ def stored_image_swaps(run: RunReader, readout: str | None = None) -> dict[str, 
 # -- the kind ------------------------------------------------------------------------------------------------
 
 
-SWAP_COLUMNS: Mapping[str, Any] = {
-    "moved [95 %]": lambda row: signed_interval(row.reach_share, row.reach_share_ci),
-    "follow %": lambda row: percent(row.follow_rate),
-    "reversal %": lambda row: percent(row.reversal_rate),
-    "net [95 %]": lambda row: signed_interval(row.net_follow_rate, row.net_follow_rate_ci),
-    "p": lambda row: p_of(row.follow_p, row.is_resolved),
-    "median displacement cm": lambda row: f"{100 * row.median_displacement:.2f}",
-    "n (items)": lambda row: f"{row.n_episodes} ({row.n_items})",
-}
+SWAP_COLUMNS = (
+    EffectColumn[ImageSwapEffect](
+        "moved [95 %]",
+        lambda row: signed_interval(row.reach_share, row.reach_share_ci),
+        "moved: displacement toward the correct picture in units of the policy's own reach, "
+        f"{SMALLEST_SHARE_OF_INTEREST} of which count",
+    ),
+    EffectColumn[ImageSwapEffect](
+        "follow %",
+        lambda row: rate(row.follow_rate),
+        "follow: goes to the correct picture, and to the other side once the two are swapped",
+    ),
+    EffectColumn[ImageSwapEffect]("reversal %", lambda row: rate(row.reversal_rate), "reversal: the reverse"),
+    EffectColumn[ImageSwapEffect](
+        "net [95 %]",
+        lambda row: signed_interval(row.net_follow_rate, row.net_follow_rate_ci),
+        f"net: follow − reversal, {SMALLEST_EFFECT_OF_INTEREST} of which count",
+    ),
+    EffectColumn[ImageSwapEffect](
+        "p",
+        lambda row: p_of(row.follow_p, row.is_resolved),
+        "p: exact, by item and by group, the larger one",
+    ),
+    EffectColumn[ImageSwapEffect]("median displacement cm", lambda row: centimetres(row.median_displacement)),
+    EffectColumn[ImageSwapEffect]("n (items)", lambda row: TableCell(row.n_episodes, after=f" ({row.n_items})")),
+)
 """The columns of all swaps."""
 
 
@@ -443,7 +471,7 @@ class Swap(Intervention):
         title = f"Does the input decide? {context.subject}, {context.exchange}"
         lines = lines_of(rows, lambda row: str(row.vary))
         parts = {"Does the action follow it?": _INPUT_COLUMNS}
-        return effect_table(title, _INPUT_LEGEND, ("category", "input"), lines, parts)
+        return effect_table(title, ("category", "input"), lines, parts)
 
     @classmethod
     def sentences(cls, rows: Sequence[Any], context: Measurement) -> list[str]:
@@ -497,16 +525,17 @@ class ImageSwap(Swap):
             return super().table(rows, context)
         verdicts = context.verdicts
         reaches = [_REACH[row.reach_source].format(100 * row.reach) for row in rows]
-        caption = "; ".join(filter(None, (_LEGEND, *dict.fromkeys((context.legend, *reaches)))))
-        parts: dict[str, Any] = {
-            "Verdict": {
-                "verdict": lambda row: verdicts[row.category].verdict if row.category in verdicts else "–"
-            },
+
+        def verdict(row: ImageSwapEffect) -> TableCell:
+            return TableCell(verdicts[row.category].verdict if row.category in verdicts else None)
+
+        parts = {
+            "Verdict": [EffectColumn("verdict", verdict)],
             "Does the action follow the images?": SWAP_COLUMNS,
         }
         lines = [((row.category,), row) for row in rows]
         title = f"Is it used? {context.subject}, images swapped"
-        return effect_table(title, caption, ("category",), lines, parts)
+        return effect_table(title, ("category",), lines, parts, after=dict.fromkeys((context.legend, *reaches)))
 
     @classmethod
     def describe(cls, row: ImageSwapEffect, context: Measurement) -> str:

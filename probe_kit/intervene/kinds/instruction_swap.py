@@ -4,15 +4,14 @@ If the action follows the images, they are read; if it follows the instruction, 
 one and not the other: it can have learnt what to look for, whatever is asked.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from probe_kit._tables.numbers import percent
 from probe_kit.errors import UsageError
-from probe_kit.intervene.kinds.base import effect_table
+from probe_kit.intervene.kinds.base import EffectColumn, centimetres, effect_table, rate
 from probe_kit.intervene.kinds.image_swap import (
     SWAP_COLUMNS,
     ImageSwapEffect,
@@ -41,10 +40,13 @@ if TYPE_CHECKING:
     from probe_kit.intervene.sessions import ReplaySession
 
 _CONDITIONS = {"instruction": INSTRUCTION_SWAP, "images": IMAGE_SWAP, "noise": NOISE}
-_LEGEND = (
+_FOLLOW = (
     "follow: goes to the correct picture, and to the other one with the counterpart's instruction and the same "
-    "images, state and noise; one step: median lateral distance between where the two actions bring the hand, and "
-    "in how many episodes any number changed; with the noise drawn anew for comparison"
+    "images, state and noise"
+)
+_ONE_STEP = (
+    "one step: median lateral distance between where the two actions bring the hand, and in how many episodes any "
+    "number changed; with the noise drawn anew for comparison"
 )
 
 
@@ -162,9 +164,11 @@ class InstructionSwap(Swap):
         """Return one line per category with the sensitivity of one step."""
         if context.lacks_sides:
             return super().table(rows, context)
-        parts = {"Does the action follow the instruction?": SWAP_COLUMNS, "What one step owes to": _STEP_COLUMNS}
+        swap = [replace(each, term=_FOLLOW if each.heading == "follow %" else "") for each in SWAP_COLUMNS]
+        parts = {"Does the action follow the instruction?": swap, "What one step owes to": _STEP_COLUMNS}
         lines = [((row.category,), row) for row in rows]
-        return effect_table(f"Is the instruction read? {context.subject}", _LEGEND, ("category",), lines, parts)
+        title = f"Is the instruction read? {context.subject}"
+        return effect_table(title, ("category",), lines, parts, after=[_ONE_STEP])
 
     @classmethod
     def describe(cls, row: InstructionSwapEffect, context: Measurement) -> str:
@@ -187,10 +191,10 @@ class InstructionSwap(Swap):
 
 
 KIND = InstructionSwap
-_STEP_COLUMNS: Mapping[str, Any] = {
-    "instruction cm": lambda row: f"{100 * row.sensitivity.instruction:.2f}",
-    "images cm": lambda row: f"{100 * row.sensitivity.images:.2f}",
-    "noise cm": lambda row: f"{100 * row.sensitivity.noise:.2f}",
-    "instruction changes it %": lambda row: percent(row.sensitivity.instruction_changed),
-    "images change it %": lambda row: percent(row.sensitivity.images_changed),
-}
+_STEP_COLUMNS = [
+    EffectColumn[Any]("instruction cm", lambda row: centimetres(row.sensitivity.instruction)),
+    EffectColumn[Any]("images cm", lambda row: centimetres(row.sensitivity.images)),
+    EffectColumn[Any]("noise cm", lambda row: centimetres(row.sensitivity.noise)),
+    EffectColumn[Any]("instruction changes it %", lambda row: rate(row.sensitivity.instruction_changed)),
+    EffectColumn[Any]("images change it %", lambda row: rate(row.sensitivity.images_changed)),
+]

@@ -16,17 +16,20 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 
+from probe_kit._tables.content import Cell as TableCell
 from probe_kit._tables.numbers import number, signed
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.sites import KV_STREAM, Site
+from probe_kit.intervene.edited_cells import SEPARATOR, EditedCell
 from probe_kit.intervene.exchange import share_fields, share_of_whole
 from probe_kit.intervene.kinds.base import (
     NONE,
     UNRESOLVED,
     AlongDirection,
-    ConditionName,
+    EffectColumn,
     EffectRow,
     Values,
+    centimetres,
     common_columns,
     compare_with_controls,
     count_edits,
@@ -53,13 +56,6 @@ if TYPE_CHECKING:
     from probe_kit._tables.table import Table
     from probe_kit.intervene.directions import Directions
     from probe_kit.intervene.sessions import ReplaySession
-
-_LEGEND = (
-    "effect: share of what the whole image swap does, n/a where that is not beyond chance; net flip rate: share "
-    "of episodes that flip to the target side, minus those that flip away from it; p: family-wise over all edits "
-    "of the category, one-sided; relative change: how far tokens were moved, in their own norms; *: carries the "
-    "effect by construction and locates nothing; unread: nothing that acts reads this place"
-)
 
 
 # -- effects of edits at places ------------------------------------------------------------------------------
@@ -171,13 +167,13 @@ def patch_effects(outcomes: ConditionOutcomes, target_side: str = IMAGE_SWAP) ->
     # Above zero on the left; without sides, where the action is nearer to the source's.
     middle = 0.0 if outcomes.has_sides or not has_swap else outcomes.of(IMAGE_SWAP) / 2
     toward = None if outcomes.toward is None or not has_swap else outcomes.toward
-    names = [ConditionName.parse(outcomes.conditions[row]) for row in rows]
+    cells = [outcomes.cells[row] for row in rows]
     displacements = push * (outcomes.displacement[rows] - clean)
     exchange = outcomes.exchange()
     sign = 1.0 if exchange is None or target_side != IMAGE_SWAP else exchange.sign
-    tests = compare_with_controls(sign * displacements, names, outcomes)
+    tests = compare_with_controls(sign * displacements, cells, outcomes)
     effects = []
-    for row, name, test, moved in zip(rows, names, tests, displacements, strict=True):
+    for row, cell, test, moved in zip(rows, cells, tests, displacements, strict=True):
         # 1 where the action flips to the target side, −1 where it flips away from it.
         is_over = push * (outcomes.displacement[row] - middle) > 0
         flips = is_over.astype(float) - (push * (clean - middle) > 0)
@@ -189,8 +185,8 @@ def patch_effects(outcomes: ConditionOutcomes, target_side: str = IMAGE_SWAP) ->
             exchanged = share_of_whole(toward[row], full, outcomes.groups, outcomes.seed_text)
         effects.append(
             PatchEffect(
-                **common_columns(outcomes, row, name, flips),
-                coefficient=name.coefficient,
+                **common_columns(outcomes, row, cell, flips),
+                coefficient=cell.coefficient,
                 **share_fields("effect", share),
                 net_left=mean_of(flips[push > 0]) or 0.0,
                 net_right=mean_of(flips[push < 0]) or 0.0,
@@ -239,10 +235,11 @@ def stored_steering(run: RunReader) -> dict[str, dict[str, list[PatchEffect]]]:
     """
     steering: dict[str, dict[str, list[PatchEffect]]] = {}
     for selection, rows in _rows_of(_steering(run)):
-        name, settings = ConditionName.parse(selection.conditions[0]), selection.group.like.stored.settings
+        cell, settings = selection.first, selection.group.like.stored.settings
         direction, side = str(settings.get("direction", USUAL)), str(settings.get("target_side", WRONG))
-        qualifiers = [direction] * (direction != USUAL) + [f"toward {side}"] * (side != WRONG)
-        subject = ", ".join([f"{name.site} {name.role}", *qualifiers])
+        along = "" if direction == USUAL else direction
+        toward = "" if side == WRONG else f"toward {side}"
+        subject = ", ".join(filter(None, (f"{cell.site} {cell.role}", along, toward)))
         steering.setdefault(selection.group.like.category, {})[subject] = rows
     return steering
 
@@ -313,6 +310,11 @@ class _Selection(NamedTuple):
     conditions: tuple[str, ...]
     merit: tuple[Rank, int, tuple[str, str]]
 
+    @property
+    def first(self) -> EditedCell:
+        """The cell of its first condition; all are of one place and role."""
+        return self.group.cells[self.conditions[0]]
+
 
 def _maps(run: RunReader) -> list[_Selection]:
     results = stored_results(run, Interchange.kind)
@@ -339,8 +341,8 @@ def _selections(groups: Sequence[PooledConditions], setting: Sequence[str]) -> l
         by_subject = selected.setdefault(group.like.category, {})
         by_place: dict[tuple[str, str], list[str]] = {}
         for condition in sorted(group.sources):  # controls and coefficients among them
-            name = ConditionName.parse(condition)
-            by_place.setdefault((name.site, name.role), []).append(condition)
+            cell = group.cells[condition]
+            by_place.setdefault((cell.site, cell.role), []).append(condition)
         for subject, conditions in by_place.items():
             newest = max(group.sources[name].stored.newest for name in conditions)
             candidate = _Selection(group, tuple(conditions), (group.like.rank, len(conditions), newest))
@@ -354,10 +356,12 @@ def _rows_of(selections: Sequence[_Selection]) -> Iterator[tuple[_Selection, lis
     """Yield each selection with its effects, tested against all that its group tried in the same stream."""
     tested: dict[tuple[int, str], dict[str, PatchEffect]] = {}
     for selection in selections:
-        group, stream = selection.group, selection.conditions[0].partition(".")[0]
+        group, stream = selection.group, PlaceName.parse(selection.first.site).stream
         at = id(group), stream
         if at not in tested:
-            conditions = sorted(name for name in group.sources if name.partition(".")[0] == stream)
+            conditions = sorted(
+                name for name in group.sources if PlaceName.parse(group.cells[name].site).stream == stream
+            )
             target_side = str(group.like.stored.settings.get("target_side", IMAGE_SWAP))
             rows = patch_effects(group.outcomes(conditions), target_side)
             keys = [group.sources[name].stored.key for name in conditions]
@@ -394,7 +398,7 @@ def best_patch_targets(run: RunReader, categories: Sequence[str]) -> tuple[str, 
     """
     stored = stored_site_effects(run)
     best = [best_cell(stored.get(category, [])) for category in categories]
-    cells = tuple(dict.fromkeys(str(ConditionName(cell.sites, cell.role)) for cell in best if cell is not None))
+    cells = tuple(dict.fromkeys(f"{cell.sites}{SEPARATOR}{cell.role}" for cell in best if cell is not None))
     if not cells:
         raise UsageError(
             f"no stored interchange of {run.location} located a place of {', '.join(categories)}: run "
@@ -425,15 +429,15 @@ def cells_at(session: "ReplaySession", places: Iterable[SiteGroup], roles: Seque
     ]
 
 
-def patch_of(cell: Cell, source_sites: tuple[Site, ...], prefix: str = "") -> Condition:
+def patch_of(cell: Cell, source_sites: tuple[Site, ...], part: str = "") -> Condition:
     """Return the patch of one cell in full.
 
     Args:
         cell: Cell that is patched.
         source_sites: Sites at which the source is captured.
-        prefix: Beginning of the condition's name.
+        part: What the kind does with it, see `EditedCell`.
     """
-    return patched_run(f"{prefix}{ConditionName(cell.site_group.name, cell.role)}", {"": (cell,)}, source_sites)
+    return patched_run(EditedCell(cell.site_group.name, cell.role, part=part), {"": (cell,)}, source_sites)
 
 
 def patches_within(
@@ -441,9 +445,7 @@ def patches_within(
 ) -> list[Condition]:
     """Return the patch along a direction, and along each of its controls."""
     return [
-        patched_run(
-            str(ConditionName(cell.site_group.name, cell.role, name)), {"": (cell,)}, source_sites, name, bases
-        )
+        patched_run(EditedCell(cell.site_group.name, cell.role, name), {"": (cell,)}, source_sites, name, bases)
         for name in (direction, *bases.control_names)
     ]
 
@@ -476,15 +478,16 @@ class PatchKind(AlongDirection):
         edits = [row for row in rows if not row.is_control]
         return effect_table(
             f"Where is it used? {context.subject}, {context.kind}",
-            context.in_words("; ".join(filter(None, (_LEGEND, legend_of_doses(edits), legend_of_p(edits))))),
             ("category", "edit"),
-            lines_of(edits, lambda row: f"{row.name}{' (unread)' * (row.sites in unread)}"),
-            {"What the action does": _WITHOUT_SIDES if context.lacks_sides else _COLUMNS},
+            lines_of(edits, lambda row: f"{row.name}{' (unread)' if row.sites in unread else ''}"),
+            {"What the action does": _columns(context.exchange, not context.lacks_sides)},
             lambda row: row.is_localised and not row.is_by_construction,
+            marks={BY_CONSTRUCTION: "carries the effect by construction and locates nothing"},
+            after=["unread: nothing that acts reads this place", legend_of_doses(edits), legend_of_p(edits)],
         )
 
     @staticmethod
-    def sentence(rows: Sequence[PatchEffect]) -> str:
+    def sentence(rows: Sequence[PatchEffect], context: Measurement) -> str:
         """Return which edits carry half of the swap, or move the action at all."""
         edits, localised, apart = _carriers(rows)
         if all(row.effect is None for row in edits):
@@ -495,27 +498,30 @@ class PatchKind(AlongDirection):
             )
         names = [f"{row.name} {row.effect:.2f}" for row in localised]
         verb = "have" if any(row.is_dose for row in edits) else "carry"
-        by_construction = f"; {apart} more {verb} it by construction and locate nothing (*)" * (apart > 0)
+        by_construction = f"; {apart} more {verb} it by construction and locate nothing (*)" if apart else ""
         count = count_edits(names, len(edits) - apart)
-        return f"edits that {verb} half of the image swap's effect: {count}{by_construction}"
+        return f"edits that {verb} half of the {context.exchange}'s effect: {count}{by_construction}"
 
     @staticmethod
     def finding(rows: Sequence[PatchEffect], context: Measurement) -> str:
         """Return where half of the swap's effect was found, or that no edit has it."""
-        del context
         edits, localised, apart = _carriers(rows)
         tried, steered = len(edits) - apart, any(row.is_dose for row in edits)
         if all(row.effect is None for row in edits):
             moving = _moving(edits)
-            nothing = "not moved: neither the image swap nor any edit moves the action beyond chance"
+            nothing = f"not moved: neither the {context.exchange} nor any edit moves the action beyond chance"
             return f"moved: to the target side by {share_of_edits(moving, tried)}" if moving else nothing
         if localised:
-            what = "steered: half of the image swap's effect by" if steered else "located: half of it passes in"
+            what = (
+                f"steered: half of the {context.exchange}'s effect by"
+                if steered
+                else "located: half of it passes in"
+            )
             return f"{what} {share_of_edits(localised, tried)}"
         if not tried:
             return "not located: all edits carry the effect by construction, which locates nothing"
         verdict = "not steered" if steered else "not located"
-        return f"{verdict}: no edit of {tried} has half of the image swap's effect"
+        return f"{verdict}: no edit of {tried} has half of the {context.exchange}'s effect"
 
     @staticmethod
     def keys_in_use(run: RunReader) -> set[str]:
@@ -584,30 +590,73 @@ class Interchange(PatchKind):
 
 
 KIND = Interchange
-_COLUMNS: Mapping[str, Any] = {
-    "effect": lambda row: (
-        ("n/a" if row.effect is None else number(row.effect)) + "*" * (row.is_localised and row.is_by_construction)
-    ),
-    "net flip rate [95 %]": lambda row: signed_interval(row.net, row.net_ci),
-    "left / right": lambda row: f"{row.net_left:+.2f} / {row.net_right:+.2f}",
-    "displacement cm": lambda row: f"{100 * row.mean_displacement:+.2f}",
-    "controls cm": lambda row: signed(
-        None if row.control_displacement is None else 100 * row.control_displacement
-    ),
-    "p": lambda row: p_of(row.p_fwe, row.is_resolved),
-    "relative change": lambda row: f"{row.relative_change:.2f}",
-}
+BY_CONSTRUCTION = "*"
+"""The mark of an effect that an edit has by construction."""
 
 
-_WITHOUT_SIDES: Mapping[str, Any] = {
-    "effect": _COLUMNS["effect"],
-    "nearer to the source [95 %]": _COLUMNS["net flip rate [95 %]"],
-    "displacement": lambda row: f"{row.mean_displacement:+.2f}",
-    "controls": lambda row: signed(row.control_displacement),
-    "p": _COLUMNS["p"],
-    "relative change": _COLUMNS["relative change"],
-}
-"""Columns of a run without sides; displacements are in spreads of clean actions, toward the source's action."""
+def _share(effect: float | None) -> str:
+    """Return a share of the exchange's effect; n/a where that is not beyond chance."""
+    return "n/a" if effect is None else number(effect)
+
+
+def _columns(exchange: str, has_sides: bool) -> list[EffectColumn[PatchEffect]]:
+    """Return the columns of edits.
+
+    Args:
+        exchange: The change of inputs of which effects are shares.
+        has_sides: Whether displacements are in cm toward a side. Else they are in spreads of clean actions, toward
+            the source's action.
+    """
+    effect = EffectColumn[PatchEffect](
+        "effect",
+        lambda row: TableCell(
+            row.effect, _share, after=BY_CONSTRUCTION if row.is_localised and row.is_by_construction else ""
+        ),
+        f"effect: share of what the whole {exchange} does, n/a where that is not beyond chance",
+    )
+    p = EffectColumn[PatchEffect](
+        "p",
+        lambda row: p_of(row.p_fwe, row.is_resolved),
+        "p: family-wise over all edits of the category, one-sided",
+    )
+    change = EffectColumn[PatchEffect](
+        "relative change",
+        lambda row: TableCell(row.relative_change, number),
+        "relative change: how far tokens were moved, in their own norms",
+    )
+    if not has_sides:
+        return [
+            effect,
+            EffectColumn(
+                "nearer to the source [95 %]",
+                _net,
+                "nearer to the source: share of episodes whose action is nearer to the source's than to the clean "
+                "one",
+            ),
+            EffectColumn("displacement", lambda row: TableCell(row.mean_displacement, signed)),
+            EffectColumn("controls", lambda row: TableCell(row.control_displacement, signed)),
+            p,
+            change,
+        ]
+    return [
+        effect,
+        EffectColumn(
+            "net flip rate [95 %]",
+            _net,
+            "net flip rate: share of episodes that flip to the target side, minus those that flip away from it",
+        ),
+        EffectColumn(
+            "left / right", lambda row: TableCell(row.net_left, signed, after=f" / {signed(row.net_right)}")
+        ),
+        EffectColumn("displacement cm", lambda row: centimetres(row.mean_displacement, signed)),
+        EffectColumn("controls cm", lambda row: centimetres(row.control_displacement, signed)),
+        p,
+        change,
+    ]
+
+
+def _net(row: PatchEffect) -> TableCell:
+    return signed_interval(row.net, row.net_ci)
 
 
 HALF_DIFFERENCE, VECTOR = "half class-mean differences", "lengths of the file's vector"

@@ -9,13 +9,16 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from probe_kit._tables.content import Cell as TableCell
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.sites import KV_STREAM
+from probe_kit.intervene.edited_cells import ALONE, WITHOUT, EditedCell
 from probe_kit.intervene.exchange import CARRIES, NOTHING, SwapShare, carries_nothing, pooled_share, share_fields
 from probe_kit.intervene.kinds.base import (
+    EffectColumn,
     Intervention,
     effect_table,
-    interval_text,
+    interval_cell,
     is_resolved,
     lines_of,
     p_of,
@@ -25,7 +28,7 @@ from probe_kit.intervene.outcomes import CLEAN, ConditionOutcomes, Effect
 from probe_kit.intervene.pairs import Pair
 from probe_kit.intervene.patching.patch import Cell, all_but, sites_of_cells
 from probe_kit.intervene.patching.sweep import KEEP, choosing_half, find_minimal_set
-from probe_kit.intervene.places import SEPARATOR, list_places, resolve_all
+from probe_kit.intervene.places import list_places, resolve_all
 from probe_kit.intervene.replay import CLEAN_RUN, SOURCE_RUN, Condition, patched_run
 from probe_kit.intervene.stored import Measurement, StoredResult, stored_results
 from probe_kit.runs.reader import RunReader
@@ -39,20 +42,13 @@ if TYPE_CHECKING:
 NAME = "joint"
 SITES, ROLES = ("kv.*",), ("image", "language", "state")
 """Default places and roles of a search: all that the acting stream reads."""
-EVERY, ALONE, WITHOUT, MINIMAL, SECOND = "every-cell", "alone", "without", "minimal", "second"
+EVERY, MINIMAL, SECOND = "every-cell", "minimal", "second"
 """Names of conditions: all cells; one of them, all but it; the smallest set, and one found without it."""
 WITHOUT_MINIMAL = f"{WITHOUT}|{MINIMAL}"
 WORTH_SEARCHING = 0.5
 """Effect of all cells together from which on a smallest set is searched: of less, hardly any carries half."""
 MOST_PLACES = 3
 """Number of places that a short sentence names."""
-_LEGEND = (
-    "alone: share of the image swap with only these cells patched; needed: what all cells lose without them; "
-    "read here: both at least 0.5; enough alone: another copy is read as well; needed, not enough: one part of "
-    "several; nothing alone: neither, which leaves a part of a set; opposes it: both below -0.1; smallest set: "
-    "searched in one half of the groups, scored in the other; p: that the action moves toward the target side, of "
-    "cells max-T over all"
-)
 _PARTS = {EVERY: "all cells of", MINIMAL: "smallest set:", SECOND: "without it:"}
 
 
@@ -128,10 +124,10 @@ class JointPlaces(Intervention):
                 pairs.setdefault(pair.category, []).append(pair)
         searched = {name: self._search(session, cells, part) for name, part in pairs.items()}
         session.certificate[NAME] = {name: search.to_json() for name, search in searched.items()}
-        sets: dict[str, dict[str, tuple[Cell, ...]]] = {EVERY: {"": cells}}
+        sets: dict[str | EditedCell, dict[str, tuple[Cell, ...]]] = {EVERY: {"": cells}}
         for cell in cells:
-            at = f"{cell.site_group.name}{SEPARATOR}{cell.role}"
-            sets |= {f"{ALONE}|{at}": {"": (cell,)}, f"{WITHOUT}|{at}": {"": all_but(cells, (cell,))}}
+            alone = EditedCell(cell.site_group.name, cell.role, part=ALONE)
+            sets |= {alone: {"": (cell,)}, replace(alone, part=WITHOUT): {"": all_but(cells, (cell,))}}
         sets[WITHOUT_MINIMAL] = {
             name: all_but(cells, search.cells) if search.cells else () for name, search in searched.items()
         }
@@ -191,16 +187,16 @@ class JointPlaces(Intervention):
         """Return one line per category and set."""
         return effect_table(
             f"Where is it read, alone and jointly? {context.subject}, joint places",
-            context.in_words(_LEGEND),
             ("category", "cells"),
             lines_of(rows, lambda row: f"{_PARTS.get(row.part, '')} {row.cells}".lstrip()),
-            {context.in_words("Share of the image swap"): _COLUMNS},
+            {f"Share of the {context.exchange}": _columns(context.exchange)},
             lambda row: row.finding.startswith("read"),
         )
 
     @staticmethod
-    def sentence(rows: "Sequence[JointEffect]") -> str:
+    def sentence(rows: "Sequence[JointEffect]", context: Measurement) -> str:
         """Return which cells carry the answer, alone or together."""
+        del context
         places = describe_joint_places(rows) or "where the answer is read remains open"
         return "; ".join(filter(None, (places, describe_remainder(rows))))
 
@@ -237,13 +233,38 @@ class JointPlaces(Intervention):
 
 
 KIND = JointPlaces
-_COLUMNS: Mapping[str, Any] = {
-    "alone [95 %]": lambda row: interval_text(row.alone, row.alone_ci),
-    "needed [95 %]": lambda row: interval_text(row.needed, row.needed_ci),
-    "p": lambda row: p_of(row.p if row.p_fwe is None else row.p_fwe, row.alone is None or is_resolved(row.alone)),
-    "groups": lambda row: str(row.n_groups),
-    "finding": lambda row: row.finding,
-}
+
+
+def _columns(exchange: str) -> "tuple[EffectColumn[JointEffect], ...]":
+    """Return the columns of a search; `exchange` is the change of inputs of which effects are shares."""
+    return (
+        EffectColumn(
+            "alone [95 %]",
+            lambda row: interval_cell(row.alone, row.alone_ci),
+            f"alone: share of the {exchange} with only these cells patched",
+        ),
+        EffectColumn(
+            "needed [95 %]",
+            lambda row: interval_cell(row.needed, row.needed_ci),
+            "needed: what all cells lose without them",
+        ),
+        EffectColumn(
+            "p",
+            lambda row: p_of(
+                row.p if row.p_fwe is None else row.p_fwe, row.alone is None or is_resolved(row.alone)
+            ),
+            "p: that the action moves toward the target side, of cells max-T over all",
+        ),
+        EffectColumn("groups", lambda row: TableCell(row.n_groups)),
+        EffectColumn("finding", lambda row: row.finding, _FINDINGS),
+    )
+
+
+_FINDINGS = (
+    "read here: both at least 0.5; enough alone: another copy is read as well; needed, not enough: one part of "
+    "several; nothing alone: neither, which leaves a part of a set; opposes it: both below -0.1; smallest set: "
+    "searched in one half of the groups, scored in the other"
+)
 
 
 # -- effects -------------------------------------------------------------------------------------------------
@@ -383,7 +404,7 @@ def describe_remainder(rows: Sequence[JointEffect]) -> str:
     """Return the part that places leave out: cells that oppose it, and a part that passes outside of all cells."""
     (every,) = (row for row in rows if row.part == EVERY)
     opposing = [row.cells for row in rows if row.part == "cell" and row.finding == "opposes it"]
-    parts = [f"opposed at {list_places(opposing)}"] * bool(opposing)
+    parts = [f"opposed at {list_places(opposing)}"] if opposing else []
     if not joint_places(rows).is_past and every.alone_ci is not None and every.alone_ci[1] < KEEP:
         parts.append(f"all cells of {every.cells} carry {every.alone:z.2f} of it")
     return "; ".join(parts)
@@ -402,23 +423,23 @@ def _rows(
     clean, exchange = outcomes.of(CLEAN), outcomes.exchange()
     assert exchange is not None
     moved = {name: outcomes.of(name) - clean for name in outcomes.conditions}
-    names = [name.partition("|")[2] for name in outcomes.conditions if name.startswith(f"{ALONE}|")]
-    alone = np.array([moved[f"{ALONE}|{name}"] for name in names])
-    lost = np.array([moved[EVERY] - moved[f"{WITHOUT}|{name}"] for name in names])
+    cells = [cell for cell in outcomes.cells if cell.part == ALONE]
+    alone = np.array([moved[str(cell)] for cell in cells])
+    lost = np.array([moved[EVERY] - moved[str(replace(cell, part=WITHOUT))] for cell in cells])
     rows = [
-        _row("cell", name, outcomes, *reading)
-        for name, reading in zip(names, exchange.readings(moved[EVERY], alone, lost), strict=True)
+        _row("cell", f"{cell.site} {cell.role}", outcomes, *reading)
+        for cell, reading in zip(cells, exchange.readings(moved[EVERY], alone, lost), strict=True)
     ]
     every = exchange.share(moved[EVERY])
     exact = paired_greater_p(exchange.leads * moved[EVERY], outcomes.items, outcomes.groups)
-    rows.append(_row(EVERY, _all_cells(names, settings), outcomes, every, None, exact, None, _of_all(every)))
+    rows.append(_row(EVERY, _all_cells(cells, settings), outcomes, every, None, exact, None, _of_all(every)))
     # The smallest sets, on the groups in which they were not searched.
     searched = searches.get(str(outcomes.categories[0]), {})
     scoring = ~np.isin(outcomes.groups, searched.get("choosing", []))
     scored = outcomes.of_episodes(scoring)
     for part, name in ((MINIMAL, "cells"), (SECOND, "second")):
-        cells = " + ".join(searched.get(name, []))
-        if not cells:
+        together = " + ".join(searched.get(name, []))
+        if not together:
             continue
         unit = scored.exchange()
         assert unit is not None
@@ -427,9 +448,9 @@ def _rows(
             needed = unit.share((moved[EVERY] - moved[WITHOUT_MINIMAL])[scoring])
         exact = paired_greater_p((exchange.leads * moved[part])[scoring], scored.items, scored.groups)
         confirmed = share is not None and share.value >= CARRIES and share.low > NOTHING and exact < SIGNIFICANCE
-        word = "read jointly" if "+" in cells else "read here"
+        word = "read jointly" if len(searched[name]) > 1 else "read here"
         finding = word if confirmed else "not confirmed"
-        rows.append(_row(part, cells, scored, share, needed, exact, None, finding))
+        rows.append(_row(part, together, scored, share, needed, exact, None, finding))
     return rows
 
 
@@ -446,18 +467,16 @@ def _row(
     """Return one row; see `JointEffect`."""
     counts = {name: value for name, value in outcomes.counts.items() if name != "n_items"}
     fields: dict[str, Any] = {**share_fields("alone", alone), **share_fields("needed", needed)}
-    return JointEffect(
-        **counts, part=part, cells=cells.replace(SEPARATOR, " "), **fields, p=p, p_fwe=p_fwe, finding=finding
-    )
+    return JointEffect(**counts, part=part, cells=cells, **fields, p=p, p_fwe=p_fwe, finding=finding)
 
 
-def _all_cells(names: Sequence[str], settings: Mapping[str, Any]) -> str:
+def _all_cells(cells: Sequence[EditedCell], settings: Mapping[str, Any]) -> str:
     """Return all cells together: `kv` if nothing of it is missing, else their places and roles."""
     if is_of_all_kv(settings):
         return KV_STREAM
-    places, roles = (list(dict.fromkeys(name.split(SEPARATOR)[at] for name in names)) for at in (0, 1))
+    places, roles = dict.fromkeys(cell.site for cell in cells), dict.fromkeys(cell.role for cell in cells)
     every_block = {*SITES} <= {*settings.get("sites", SITES)}
-    return f"{KV_STREAM if every_block else list_places(places)} {', '.join(roles)}"
+    return f"{KV_STREAM if every_block else list_places(list(places))} {', '.join(roles)}"
 
 
 def _of_all(every: SwapShare | None) -> str:

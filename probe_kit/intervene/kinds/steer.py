@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, get_args
 
 from probe_kit.errors import UsageError
 from probe_kit.hooks.capturing.edits import AddVector, apply_patch
-from probe_kit.intervene.kinds.base import ConditionName
+from probe_kit.intervene.edited_cells import EditedCell
 from probe_kit.intervene.kinds.image_swap import SMALLEST_REACH
 from probe_kit.intervene.kinds.interchange import PatchEffect, PatchKind
 from probe_kit.intervene.patching.patch import Cell
@@ -45,8 +45,7 @@ def steered(cell: Cell, name: str, coefficient: float, target_side: TargetSide, 
         with apply_patch(session.policy, site_group.sites, tokens, AddVector(shift)) as edit_log:
             return ConditionResult(context.act(), edit_log)
 
-    condition = ConditionName(cell.site_group.name, cell.role, name, f"{coefficient:g}")
-    return Condition(str(condition), play, (condition.site,))
+    return Condition.of_cell(EditedCell(cell.site_group.name, cell.role, name, f"{coefficient:g}"), play)
 
 
 @dataclass(frozen=True, kw_only=True)

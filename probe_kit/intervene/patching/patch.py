@@ -21,8 +21,9 @@ from probe_kit.hooks.capturing.edits import (
 from probe_kit.hooks.contract.declared import ALL_EDITS
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.sites import Site, plays
+from probe_kit.intervene.edited_cells import SEPARATOR
 from probe_kit.intervene.pairs import Given, Pair
-from probe_kit.intervene.places import ALL, RESIDUAL, SEPARATOR, TILE_ROLES, SiteGroup, positions_of, resolve_sites
+from probe_kit.intervene.places import ALL, RESIDUAL, TILE_ROLES, SiteGroup, positions_of, resolve_sites
 from probe_kit.intervene.tokens import ANSWERS_NOTHING, PairTokens, roles_of_tokens
 
 if TYPE_CHECKING:

@@ -10,7 +10,8 @@ from dataclasses import dataclass, replace
 from operator import attrgetter
 from typing import Any
 
-from probe_kit._tables.numbers import number, p_text, percent, points, signed, with_limits
+from probe_kit._tables.numbers import number, p_text, percent, points, signed
+from probe_kit._tables.table import Cell, absent
 from probe_kit.retention.behaviour import Regime
 from probe_kit.retention.choices import Section
 from probe_kit.retention.columns.text import (
@@ -24,7 +25,7 @@ from probe_kit.retention.columns.text import (
     published_value,
     regime_value,
     retention_value,
-    site_text,
+    site_cell,
     success_interval,
     verdict_text,
 )
@@ -32,7 +33,7 @@ from probe_kit.retention.compare.compare import Difference
 from probe_kit.retention.rows.row import RetentionRow, StreamPart
 from probe_kit.statistics.significance import SIGNIFICANCE
 
-Text = Callable[[RetentionRow], str]
+Show = Callable[[RetentionRow], Cell]
 Sort = Callable[[RetentionRow], Any]
 
 
@@ -44,29 +45,31 @@ class Column:
         key: The field that it shows, as `part.field`.
         heading: Its heading with the unit, the same in all formats.
         help: Its entry in the glossary.
-        text: The text of a row; "–" or nothing where it has no value.
+        cell: The value of a row with its format, and its interval where it has one.
         sort: The value that the report sorts by, the field itself by default.
-        difference: The text of a difference between runs; None for an empty cell.
+        difference: The same of a difference between runs; None for an empty cell.
         heat: Whether the report and LaTeX colour it by `sort`, from 0 to 1.
         averaged: Whether a category mean averages the field.
         also_averaged: Further fields of the same column that are averaged.
         strong: Whether a row is bold; None for no row.
         note: Text that the report shows on pointing at the cell.
         answers: Heading and help where the rows are of models that were asked, if these differ.
+        both: Heading where the rows are of both, if it is not the one behind the other.
     """
 
     key: str
     heading: str
     help: str
-    text: Text
+    cell: Show
     sort: Sort | None = None
-    difference: Callable[[Difference], str] | None = None
+    difference: Callable[[Difference], Cell] | None = None
     heat: bool = False
     averaged: bool = False
     also_averaged: tuple[str, ...] = ()
     strong: Callable[[RetentionRow], bool] | None = None
-    note: Text | None = None
+    note: Callable[[RetentionRow], str] | None = None
     answers: tuple[str, str] | None = None
+    both: str = ""
 
     def worded(self, modes: Modes) -> "Column":
         """Return the column with the words for rows of policies, of models that were asked, or of both."""
@@ -75,7 +78,7 @@ class Column:
         heading, meaning = self.answers
         if modes == "answers":
             return replace(self, heading=heading, help=meaning)
-        both = self.heading if heading == self.heading else f"{self.heading.removesuffix(' %')} / {heading}"
+        both = self.heading if heading == self.heading else self.both or f"{self.heading} / {heading}"
         return replace(
             self, heading=both, help=f"{self.help} Of a model that was asked: {meaning[:1].lower()}{meaning[1:]}"
         )
@@ -103,7 +106,9 @@ class ColumnGroup:
 def share(key: str, heading: str, meaning: str, **more: Any) -> Column:
     """Return a column of a share in percent, averaged over categories."""
     read = attrgetter(key)
-    column = Column(key=key, heading=heading, help=meaning, text=lambda row: percent(read(row)), averaged=True)
+    column = Column(
+        key=key, heading=heading, help=meaning, cell=lambda row: Cell(read(row), percent), averaged=True
+    )
     return replace(column, **more)
 
 
@@ -111,10 +116,10 @@ def interval(key: str, ci: str, heading: str, meaning: str, **more: Any) -> Colu
     """Return a column of a share in percent with its 95 % interval, averaged over categories."""
     read, limits = attrgetter(key), attrgetter(ci)
 
-    def text(row: RetentionRow) -> str:
-        return with_limits(read(row), limits(row), percent)
+    def cell(row: RetentionRow) -> Cell:
+        return Cell(read(row), percent, limits(row))
 
-    return replace(Column(key=key, heading=heading, help=meaning, text=text, averaged=True), **more)
+    return replace(Column(key=key, heading=heading, help=meaning, cell=cell, averaged=True), **more)
 
 
 def p_value(key: str, heading: str, meaning: str, **more: Any) -> Column:
@@ -125,14 +130,14 @@ def p_value(key: str, heading: str, meaning: str, **more: Any) -> Column:
         value = read(row)
         return value is not None and value < SIGNIFICANCE
 
-    column = Column(key=key, heading=heading, help=meaning, text=lambda row: p_text(read(row)), strong=low)
+    column = Column(key=key, heading=heading, help=meaning, cell=lambda row: Cell(read(row), p_text), strong=low)
     return replace(column, **more)
 
 
 def _judged(column: Column) -> Column:
     """Return the column, empty for a run that keeps no trajectories; `sr_idle` is known wherever they are."""
-    text = column.text
-    return replace(column, text=lambda row: "–" if row.rules.sr_idle is None else text(row))
+    cell = column.cell
+    return replace(column, cell=lambda row: Cell(None) if row.rules.sr_idle is None else cell(row))
 
 
 # -- what the policy did, and what the VLM answered ----------------------------------------------------------
@@ -142,8 +147,8 @@ SR = Column(
     heading="SR % [95 %]",
     help="Success rate: share of episodes in which the cube ended on the correct picture. In brackets the 95 % "
     "interval, groups of questions as the unit. Two pictures: guessing gives 50 %.",
-    text=success_interval,
-    difference=lambda row: with_limits(row.sr, row.sr_ci, points),
+    cell=success_interval,
+    difference=lambda row: Cell(row.sr, points, row.sr_ci),
     heat=True,
     averaged=True,
     strong=lambda row: row.success.regime == Regime.KNOWLEDGE,
@@ -160,7 +165,7 @@ DIFFERENCE_P = Column(
     help="Of a difference between two runs: probability that two equally good ones differ so much on these "
     "questions. Signs of whole groups are flipped. In brackets: corrected by Holm for all categories and pairs. "
     f"{P_DECIDES[:1].upper()}{P_DECIDES[1:]}.",
-    text=lambda _: "",
+    cell=lambda _: absent(""),
     sort=lambda _: None,
     difference=difference_test,
 )
@@ -175,7 +180,7 @@ SR_MODELS = Column(
     key="difference.sr_models",
     heading="p over models (least)",
     help=_MODELS,
-    text=lambda _: "",
+    cell=lambda _: absent(""),
     sort=lambda _: None,
     difference=lambda row: models_test(row.sr_models, points),
 )
@@ -204,7 +209,7 @@ REGIME = Column(
     help="Knowledge: further above 50 % than guessing leads with this many questions. Not reliable: not so far. "
     "Failure: as far below; the policy misses both pictures or prefers the wrong one. In a mean the normalised "
     "score: the success rate on a scale where guessing is 0 and perfection 100.",
-    text=regime_value,
+    cell=lambda row: Cell(regime_value(row)),
     sort=lambda row: row.success.sr,
     answers=(
         "regime",
@@ -233,10 +238,10 @@ FOLLOWS = Column(
     help="With the two pictures swapped, and nothing else: share of episodes whose action turns to the other "
     "side. "
     "After the slash: share in which it does the reverse.",
-    text=lambda row: (
-        "–"
+    cell=lambda row: (
+        Cell(None)
         if row.image_swap.follow_rate is None
-        else f"{percent(row.image_swap.follow_rate)} / {percent(row.image_swap.reversal_rate)}"
+        else Cell(row.image_swap.follow_rate, percent, after=f" / {percent(row.image_swap.reversal_rate)}")
     ),
     sort=lambda row: row.image_swap.net_follow_rate,
     averaged=True,
@@ -249,7 +254,7 @@ USED = Column(
     heading="used",
     help="Whether the action depends on the answer, by the image swap. Not used: it moves the action by less than "
     "a tenth of the policy's reach, while another category's answer is used.",
-    text=lambda row: "–" if row.image_swap.use is None else row.image_swap.use.verdict,
+    cell=lambda row: Cell(None if row.image_swap.use is None else row.image_swap.use.verdict),
     sort=lambda row: row.image_swap.net_follow_rate,
     strong=lambda row: row.image_swap.is_used,
     note=lambda row: row.image_swap.explanation,
@@ -297,12 +302,15 @@ GOES_LEFT = share(
         "answers left %",
         "Among the answers that could be read, the share that named the left one. 50 %: no habit.",
     ),
+    both="goes left / answers left %",
 )
 
 
-def _right_twice(row: RetentionRow) -> str:
+def _right_twice(row: RetentionRow) -> Cell:
     paired = row.success.paired
-    return "–" if paired is None else f"{paired.both} of {paired.both + paired.exactly_one + paired.none}"
+    if paired is None:
+        return Cell(None)
+    return Cell(paired.both, after=f" of {paired.both + paired.exactly_one + paired.none}")
 
 
 RIGHT_TWICE = Column(
@@ -310,7 +318,7 @@ RIGHT_TWICE = Column(
     heading="right twice",
     help="Questions answered correctly in both layouts, of those that ran in both. A habit of going to one side "
     "cannot produce these.",
-    text=_right_twice,
+    cell=_right_twice,
     sort=lambda row: None if row.success.paired is None else row.success.paired.both,
     answers=(
         "right twice",
@@ -324,7 +332,7 @@ RIGHT_TWICE_P = replace(
         "p (twice)",
         "Probability that luck alone gives so many questions right twice rather than wrong twice.",
     ),
-    text=lambda row: "–" if row.success.paired is None else p_text(row.success.paired.p),
+    cell=lambda row: Cell(None if row.success.paired is None else row.success.paired.p, p_text),
     sort=lambda row: None if row.success.paired is None else row.success.paired.p,
     strong=lambda row: row.success.paired is not None and row.success.paired.p < SIGNIFICANCE,
 )
@@ -332,7 +340,7 @@ SIZES = Column(
     key="success.n_episodes",
     heading="n (items)",
     help="Episodes, and in brackets questions; each question is asked in two layouts.",
-    text=lambda row: f"{row.success.n_episodes} ({row.success.n_items})",
+    cell=lambda row: Cell(row.success.n_episodes, after=f" ({row.success.n_items})"),
 )
 
 # -- what the outcome rule makes of it -----------------------------------------------------------------------
@@ -364,7 +372,7 @@ RULES = tuple(
                 "rules.share_both_zones",
                 "in both zones %",
                 "Share of episodes whose cube counts for both pictures, which is called correct.",
-                text=lambda row: percent(row.rules.share_both_zones) if row.rules.share_both_zones else "–",
+                cell=lambda row: Cell(row.rules.share_both_zones or None, percent),
             ),
         ),
     )
@@ -384,7 +392,7 @@ def _radius(radius: str) -> Column:
         key=f"rules.sr_by_epsilon.{radius}",
         heading=f"SR % at {1000 * float(radius):g} mm",
         help="Success rate if the cube had to end this close to the middle of the correct picture.",
-        text=lambda row: percent(value(row)),
+        cell=lambda row: Cell(value(row), percent),
         sort=value,
         heat=True,
     )
@@ -423,13 +431,13 @@ ANSWERS = (
         "answers.option_mass",
         "option mass",
         "Mean probability of the admissible answers together.",
-        text=lambda row: number(row.answers.option_mass),
+        cell=lambda row: Cell(row.answers.option_mass, number),
     ),
     share(
         "answers.letter_bias",
         "letter bias",
         "Mean logit by which the option named first is preferred.",
-        text=lambda row: number(row.answers.letter_bias),
+        cell=lambda row: Cell(row.answers.letter_bias, number),
     ),
 )
 
@@ -447,9 +455,9 @@ RETENTION = Column(
     help="Share of the backbone's signal that can be read where the action is made: the action's score above one "
     "half over the backbone's. In a mean: the ratio of the mean scores. “No limits”: the backbone is not known "
     "well enough to divide by. n/a: its signal is not shown.",
-    text=retention_value,
+    cell=retention_value,
     sort=_where_defined("retention.value"),
-    difference=lambda row: with_limits(row.retention, row.retention_ci, signed),
+    difference=lambda row: Cell(row.retention, signed, row.retention_ci),
     heat=True,
     note=lambda row: row.retention.note,
     answers=(
@@ -463,7 +471,7 @@ PUBLISHED = Column(
     heading="published ratio",
     help="The paper's formula: accuracies of the best sites above one half, action over backbone. Both are "
     "maxima, so that it is biased where signals are weak. In a mean: the mean of these ratios.",
-    text=published_value,
+    cell=published_value,
     sort=_where_defined("retention.published"),
 )
 PROBE_MINUS_SR = share(
@@ -474,6 +482,7 @@ PROBE_MINUS_SR = share(
         "probe − accuracy %",
         "Backbone score minus the accuracy of the answers, in points: what can be read but is not said.",
     ),
+    both="probe − SR / probe − accuracy %",
 )
 _P = (
     "Probability that the best layer of a stream looks this good when the labels are permuted at random. It "
@@ -502,34 +511,34 @@ BACKBONE = interval(
     "backbone.ci",
     "backbone % [95 %]",
     f"In the vision-language backbone. {_SCORE}",
-    difference=lambda row: with_limits(row.backbone, row.backbone_ci, points),
+    difference=lambda row: Cell(row.backbone, points, row.backbone_ci),
     strong=lambda row: row.backbone.has_signal,
 )
 BACKBONE_VERDICT = Column(
     key="backbone.verdict",
     heading="in the backbone",
     help=_VERDICT,
-    text=lambda row: verdict_text(row.backbone),
+    cell=lambda row: Cell(verdict_text(row.backbone)),
     sort=lambda row: row.backbone.at_most,
 )
 BACKBONE_LAYER = Column(
     key="backbone.layer",
     heading="backbone layer",
     help=_LAYER,
-    text=lambda row: site_text(row.backbone.layer, None, row.backbone.ties),
+    cell=lambda row: site_cell(row.backbone.layer, None, row.backbone.ties),
 )
 BACKBONE_P = p_value("backbone.p_fwe", "backbone p", _P)
 BACKBONE_PEAK = share(
     "backbone.peak",
     "backbone peak %",
     _PEAK,
-    text=lambda row: percent(row.backbone.peak if row.is_side else None),
+    cell=lambda row: Cell(row.backbone.peak if row.is_side else None, percent),
 )
 EXCEEDS = Column(
     key="backbone.exceeds",
     heading="backbone exceeds",
     help=_EXCEEDS,
-    text=lambda row: exceeds_text(row.backbone),
+    cell=lambda row: Cell(exceeds_text(row.backbone)),
     sort=lambda row: exceeds_text(row.backbone),
 )
 _IN_ACTION = "Where the action is made: in the action expert, or at the positions that choose action tokens."
@@ -539,14 +548,14 @@ ACTION = interval(
     "action % [95 %]",
     f"{_IN_ACTION} {_SCORE}",
     answers=("answer % [95 %]", f"At the position that chooses the first token of the answer. {_SCORE}"),
-    difference=lambda row: with_limits(row.action, row.action_ci, points),
+    difference=lambda row: Cell(row.action, points, row.action_ci),
     strong=lambda row: row.action.has_signal,
 )
 ACTION_VERDICT = Column(
     key="action.verdict",
     heading="in the action",
     help=_VERDICT,
-    text=lambda row: verdict_text(row.action),
+    cell=lambda row: Cell(verdict_text(row.action)),
     sort=lambda row: row.action.at_most,
     answers=("in the answer", _VERDICT),
 )
@@ -555,7 +564,7 @@ ACTION_LAYER = Column(
     heading="action layer @iteration",
     help=f"{_LAYER} After @: the iteration, a flow-matching step or an action token, of which the first sees no "
     "action yet.",
-    text=lambda row: site_text(row.action.layer, row.action.iteration, row.action.ties),
+    cell=lambda row: site_cell(row.action.layer, row.action.iteration, row.action.ties),
     answers=("answer layer", _LAYER),
 )
 ACTION_P = p_value("action.p_fwe", "action p", _P, answers=("answer p", _P))
@@ -563,8 +572,9 @@ ACTION_PEAK = share(
     "action.peak",
     "action peak %",
     _PEAK,
-    text=lambda row: percent(row.action.peak if row.is_side else None),
+    cell=lambda row: Cell(row.action.peak if row.is_side else None, percent),
     answers=("answer peak %", _PEAK),
+    both="action peak / answer peak %",
 )
 FIRST_ITERATION = share(
     "action.first_peak",
@@ -587,26 +597,26 @@ METRIC = Column(
     key="task",
     heading="metric",
     help="The score of a label: accuracy balanced between its classes, or R² of a quantity.",
-    text=lambda row: "–" if row.is_side else row.metric,
+    cell=lambda row: Cell(None if row.is_side else row.metric),
 )
 
 
-def _of_label(part: str, name: str, meaning: str, text: Callable[[StreamPart], str], **more: Any) -> Column:
+def _of_label(part: str, name: str, meaning: str, show: Callable[[StreamPart], Cell], **more: Any) -> Column:
     """Return a column of one stream's probes of a label; empty for a side, which has columns of its own."""
     stream, read = part.partition(".")[0], attrgetter(part.partition(".")[0])
 
-    def cell(row: RetentionRow) -> str:
-        return "–" if row.is_side else text(read(row))
+    def cell(row: RetentionRow) -> Cell:
+        return Cell(None) if row.is_side else show(read(row))
 
-    return replace(Column(key=part, heading=f"{stream} {name}", help=meaning, text=cell), **more)
+    return replace(Column(key=part, heading=f"{stream} {name}", help=meaning, cell=cell), **more)
 
 
 def _label_columns(part: str) -> tuple[Column, ...]:
     strong = {"strong": lambda row: not row.is_side and attrgetter(part)(row).has_signal}
     return (
-        _of_label(f"{part}.site", "site", _SITE, lambda of: of.site or "–"),
-        _of_label(f"{part}.peak", "score", _LABEL_SCORE, lambda of: number(of.peak), **strong),
-        _of_label(f"{part}.chance", "chance", _CHANCE, lambda of: number(of.chance)),
+        _of_label(f"{part}.site", "site", _SITE, lambda of: Cell(of.site or None)),
+        _of_label(f"{part}.peak", "score", _LABEL_SCORE, lambda of: Cell(of.peak, number), **strong),
+        _of_label(f"{part}.chance", "chance", _CHANCE, lambda of: Cell(of.chance, number)),
         _of_label(f"{part}.above", "above chance", _ABOVE_CHANCE, above_chance, **strong),
     )
 
@@ -615,7 +625,7 @@ GROUPS = Column(
     key="controls.n_groups",
     heading="groups",
     help="Independent groups of questions; questions that share a picture count once.",
-    text=lambda row: "–" if row.controls.n_groups is None else str(row.controls.n_groups),
+    cell=lambda row: Cell(row.controls.n_groups),
 )
 
 # -- controls ------------------------------------------------------------------------------------------------
@@ -624,15 +634,16 @@ GROUPS = Column(
 def _baseline(name: str) -> Column:
     """Return the column of a baseline's accuracy in percent, and whether it is above chance."""
 
-    def text(row: RetentionRow) -> str:
-        mark = f" {ABOVE_CHANCE}" if name in row.controls.leaks else ""
-        return percent(row.controls.baselines.get(name)) + mark
+    def cell(row: RetentionRow) -> Cell:
+        leaks = name in row.controls.leaks
+        mark = f" {ABOVE_CHANCE}" if leaks else ""
+        return Cell(row.controls.baselines.get(name), percent, after=mark, alarm=leaks)
 
     return Column(
         key=f"controls.baselines.{name}",
         heading=f"{name} %",
         help=_BASELINES[name],
-        text=text,
+        cell=cell,
         sort=lambda row: row.controls.baselines.get(name),
     )
 

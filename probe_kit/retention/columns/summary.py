@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from probe_kit._system.escaping import as_argument
-from probe_kit._tables.numbers import Limits, points, signed, whole_percent, with_limits
-from probe_kit._tables.table import Cell, Heading, Row, Table
+from probe_kit._tables.numbers import Limits, points, signed, whole_percent
+from probe_kit._tables.table import Cell, Heading, Row, Table, absent
 from probe_kit.intervene.verdict import UseVerdict, describe_readouts, more_groups, size_of_groups
 from probe_kit.retention.behaviour import Regime
 from probe_kit.retention.columns.text import (
@@ -119,8 +119,9 @@ def _in_action(row: RetentionRow) -> str:
 
 def _head(row: RetentionRow, vlm: RetentionRow | None, used: str) -> str:
     """Return the verdict: whether the VLM knows the answer, the policy encodes it, and the action uses it."""
-    stages = ["known"] * (vlm is not None and knows(vlm)) + ["encoded"] * _is_encoded(row)
-    return ", ".join(filter(None, (" and ".join(stages), used)))
+    stages = {"known": vlm is not None and knows(vlm), "encoded": _is_encoded(row)}
+    reached = " and ".join(stage for stage, is_reached in stages.items() if is_reached)
+    return ", ".join(filter(None, (reached, used)))
 
 
 def _of_use(row: RetentionRow, vlm: RetentionRow | None, use: UseVerdict) -> str:
@@ -249,29 +250,38 @@ def next_step(rows: Sequence[RetentionRow]) -> str:
 
 MARK = "✓"
 """Mark after a share: the stream exceeds chance and a control, or the regime of the behaviour is knowledge."""
-_LEGENDS = {
-    "metric": "Metric: of a label, balanced accuracy of classes, R² of quantities",
-    "backbone above chance": "Above chance: score of sites that other groups chose minus its mean score with "
-    "permuted labels, 95 % intervals over groups",
-    "VLM %": "VLM: share of its answers that are right; its name ends on the prompt and the size of the picture",
-    "backbone %": "Backbone: accuracy of probes in the backbone, at sites that other questions chose",
-    "action %": "Action: the same at the action's sites",
-    "success %": "Success: the cube ends on the correct picture",
-    "retention": "Retention: share of the backbone's signal left in the action; a mean is of the scores, not of "
-    "these shares",
+_TERMS = {
+    "metric": ("Metric", "of a label, balanced accuracy of classes, R² of quantities"),
+    "backbone above chance": (
+        "Above chance",
+        "score of sites that other groups chose minus its mean score with permuted labels, 95 % intervals over "
+        "groups",
+    ),
+    "VLM %": (
+        "VLM",
+        "share of its answers that are right; its name ends on the prompt and the size of the picture",
+    ),
+    "backbone %": ("Backbone", "accuracy of probes in the backbone, at sites that other questions chose"),
+    "action %": ("Action", "the same at the action's sites"),
+    "success %": ("Success", "the cube ends on the correct picture"),
+    "retention": (
+        "Retention",
+        "share of the backbone's signal left in the action; a mean is of the scores, not of these shares",
+    ),
+    "p (Holm)": (
+        "p",
+        f"exact, of a difference in success or answers, (corrected for all categories and pairs); {P_DECIDES}",
+    ),
+    "p over models (least)": (
+        "p over models",
+        "exact, models as the unit (the least that so few models allow)",
+    ),
 }
-"""The meaning of a column."""
-_TESTS = {
-    "p (Holm)": "p: exact, of a difference in success or answers, (corrected for all categories and pairs); "
-    f"{P_DECIDES}",
-    "p over models (least)": "p over models: exact, models as the unit (the least that so few models allow)",
+"""The name and the meaning of a column in the legend; the last two are of differences."""
+_TESTS = ("p (Holm)", "p over models (least)")
+HEADING_HELP = {heading: f"{meaning[:1].upper()}{meaning[1:]}." for heading, (_, meaning) in _TERMS.items()} | {
+    "verdict": "What all numbers of the category say together."
 }
-"""The meaning of a column of differences."""
-HEADING_HELP = {
-    heading: f"{meaning[:1].upper()}{meaning[1:]}."
-    for heading, legend in (_LEGENDS | _TESTS).items()
-    for meaning in [legend.partition(": ")[2]]
-} | {"verdict": "What all numbers of the category say together."}
 """The meanings of the columns as entries of the glossary."""
 
 
@@ -292,21 +302,21 @@ class CategorySummary:
         return name_of(self.row)
 
     @property
-    def cells(self) -> tuple[str, ...]:
-        """The texts under `HEADINGS`."""
+    def cells(self) -> tuple[Cell, ...]:
+        """The cells under `HEADINGS`."""
         row, vlm = self.row, self.row if is_vlm(self.row) else self.vlm
         acts = None if is_vlm(row) else row
         if not row.is_side:
-            label = row.metric, *map(_above, (row.backbone, row.action))
-            return (*label, *["–"] * 4, _retention(row), "")
+            label = Cell(row.metric), *map(_above, (row.backbone, row.action))
+            return (*label, *[Cell(None)] * 4, _retention(row), Cell(""))
         return (
-            *["–"] * 3,
-            "–" if vlm is None else _share(vlm.success.sr, vlm.success.ci, knows(vlm)),
+            *[Cell(None)] * 3,
+            Cell(None) if vlm is None else _share(vlm.success.sr, vlm.success.ci, knows(vlm)),
             _share(row.backbone.score, row.backbone.ci, _is_marked(row.backbone)),
             _share(row.action.score, row.action.ci, _is_marked(row.action)),
-            "–" if acts is None else _share(acts.success.sr, acts.success.ci, knows(acts)),
+            Cell(None) if acts is None else _share(acts.success.sr, acts.success.ci, knows(acts)),
             _retention(row),
-            "" if row.category == MEAN else str(verdict(row)),
+            Cell("" if row.category == MEAN else str(verdict(row))),
         )
 
     @property
@@ -317,7 +327,7 @@ class CategorySummary:
     @property
     def details(self) -> str:
         """The conclusion from all numbers of the row, and what to do next; the numbers are in tables."""
-        return f"{self.name}{':' * self.row.is_side} {conclusion(self.row)}"
+        return f"{self.name}{':' if self.row.is_side else ''} {conclusion(self.row)}"
 
 
 HEADINGS = (
@@ -334,19 +344,18 @@ def _is_marked(part: StreamPart) -> bool:
     return part.has_signal and part.is_controlled
 
 
-def _share(value: float | None, limits: Limits | None, marked: bool) -> str:
-    text = with_limits(value, limits, whole_percent)
-    return f"{text} {MARK}" if marked and value is not None else text
+def _share(value: float | None, limits: Limits | None, marked: bool) -> Cell:
+    return Cell(value, whole_percent, limits, after=f" {MARK}" if marked and value is not None else "")
 
 
-def _above(part: StreamPart) -> str:
+def _above(part: StreamPart) -> Cell:
     """Return the score of a label above chance with its interval, marked where there is signal."""
-    return f"{above_chance(part)} {MARK}" if _is_marked(part) else above_chance(part)
+    return replace(above_chance(part), after=f" {MARK}" if _is_marked(part) else "")
 
 
-def _retention(row: RetentionRow) -> str:
+def _retention(row: RetentionRow) -> Cell:
     if any(part.score is None and part.above is None for part in (row.backbone, row.action)):
-        return "–"
+        return Cell(None)
     return retention_value(row)
 
 
@@ -401,8 +410,8 @@ def summary_table(summaries: Sequence[RunSummary], differences: Sequence[Differe
             lines += [_row(summary, run.run) for summary in of_name]
         for row in differences:
             if title_of(row.category) == name:
-                texts = (name, f"{row.group} − {row.minus}", "", *_difference_cells(row))
-                lines.append(Row(tuple(map(Cell, texts)), row.category == MEAN, is_difference=True))
+                cells = (Cell(name), Cell(f"{row.group} − {row.minus}"), Cell(""), *_difference_cells(row))
+                lines.append(Row(cells, row.category == MEAN, is_difference=True))
     is_of_sides = all(category.row.is_side for category in every)
     headings = ("category" if is_of_sides else "label", "run", "view", *HEADINGS, *_TESTS)
     title = " · ".join(dict.fromkeys(run.title for run in summaries))
@@ -414,10 +423,9 @@ def summary_table(summaries: Sequence[RunSummary], differences: Sequence[Differe
         overflow="fold",
     )
     has_views = not is_of_sides and len({category.row.view for category in every}) > 1
-    left_out = [*[1] * (len(summaries) < 2 and not differences), *[2] * (not has_views)]
-    table = table.only([at for at in range(len(headings)) if at not in left_out]).filled()
-    legends = _LEGENDS | _TESTS
-    legend = [legends[name] for name in table.columns if name in legends]
+    is_needed = {"run": len(summaries) > 1 or bool(differences), "view": has_views}
+    table = table.only([at for at, name in enumerate(headings) if is_needed.get(name, True)]).filled()
+    legend = [": ".join(_TERMS[name]) for name in table.columns if name in _TERMS]
     readouts = describe_readouts(summary.row.image_swap.use for run in summaries for summary in run.categories)
     counts = [(summary.row.success.n_items, summary.row.success.n_groups) for summary in every]
     size = size_of_groups(
@@ -427,29 +435,31 @@ def summary_table(summaries: Sequence[RunSummary], differences: Sequence[Differe
 
 
 def _row(category: CategorySummary, run: str) -> Row:
-    texts = (category.name, run, category.row.view or "", *category.cells, *[""] * len(_TESTS))
-    return Row(tuple(map(Cell, texts)), category.row.category == MEAN)
+    names = map(Cell, (category.name, run, category.row.view or ""))
+    return Row((*names, *category.cells, *[Cell("")] * len(_TESTS)), category.row.category == MEAN)
 
 
 def _marks(summaries: Sequence[RunSummary], table: Table) -> list[str]:
     """Return the meaning of the mark if a cell has it, and a warning where no control allows it."""
-    marked = any(MARK in text for line in table.texts for text in line)
+    notes = []
+    if any(MARK in text for line in table.texts for text in line):
+        notes.append(f"{MARK} above chance, and above every control that was run")
     warning = chance_only(
         [category.row for run in summaries for category in run.categories if category.row.is_side]
     )
-    return [f"{MARK} above chance, and above every control that was run"] * marked + [warning] * bool(warning)
+    return [*notes, warning] if warning else notes
 
 
-def _difference_cells(row: Difference) -> tuple[str, ...]:
+def _difference_cells(row: Difference) -> tuple[Cell, ...]:
     sr, backbone, action = (
-        with_limits(value, limits, points)
+        Cell(value, points, limits)
         for value, limits in ((row.sr, row.sr_ci), (row.backbone, row.backbone_ci), (row.action, row.action_ci))
     )
-    answered, acted = (sr, "") if row.mode == "answers" else ("", sr)
-    ratio = with_limits(row.retention, row.retention_ci, signed)
-    over_models = "" if row.sr_models is None else models_p(row.sr_models)
-    test = "" if over_models else difference_test(row)
-    return "", "", "", answered, backbone, action, acted, ratio, "", test, over_models
+    none = absent("")
+    answered, acted = (sr, none) if row.mode == "answers" else (none, sr)
+    ratio = Cell(row.retention, signed, row.retention_ci)
+    test, over_models = (difference_test(row), none) if row.sr_models is None else (none, models_p(row.sr_models))
+    return none, none, none, answered, backbone, action, acted, ratio, none, test, over_models
 
 
 def summarise_runs(all_rows: Sequence[RetentionRow]) -> list[RunSummary]:

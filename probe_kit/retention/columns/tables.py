@@ -1,18 +1,18 @@
 """The tables of a retention table, of rows and of comparisons."""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import chain, count, groupby
 from pathlib import Path
 
 from probe_kit._system.counting import counted
-from probe_kit._tables.numbers import number, percent, points, span, with_limits
-from probe_kit._tables.table import Cell, Heading, Row, Table
+from probe_kit._tables.numbers import NONE, number, percent, plain, points, span
+from probe_kit._tables.table import Cell, Cells, Heading, Legend, Row, Table, absent
 from probe_kit.retention.behaviour import rule_sentence
 from probe_kit.retention.choices import Section
 from probe_kit.retention.columns.columns import TABLES, Column, ColumnGroup, radius_columns
 from probe_kit.retention.columns.text import (
-    ABOVE_CHANCE,
     P_DECIDES,
     TERMS,
     by_run,
@@ -86,7 +86,7 @@ def retention_tables(
 
 def _groups(title: str, rows: Sequence[RetentionRow]) -> list[ColumnGroup]:
     radii = radius_columns(rows) if title in BEHAVIOUR else ()
-    return [*TABLES[title], *[ColumnGroup("By zone radius", radii, True)] * bool(radii)]
+    return [*TABLES[title], ColumnGroup("By zone radius", radii, True)] if radii else list(TABLES[title])
 
 
 def _differences(
@@ -126,7 +126,7 @@ def _table(
         (column.worded(modes), group)
         for group in groups
         for column in group.columns
-        if any(cell_text(column, line) not in ("–", "") for line in lines)
+        if any(_cell(column, line).text not in (NONE, "") for line in lines)
     ]
     names = _name_columns(title, rows, differences)
     tested = any(column.key == "difference.p" for column, _ in columns)
@@ -180,8 +180,7 @@ def _name_columns(
         return difference_name(line) if isinstance(line, Difference) else model_name(line)
 
     def call(line: TableRow) -> str:
-        number = line.call if isinstance(line, Difference) else line.run.call
-        return "–" if number is None else str(number)
+        return plain(line.call if isinstance(line, Difference) else line.run.call)
 
     names: list[tuple[Heading, Callable[[TableRow], str]]] = [
         (Heading("category", "Kind of question."), name)
@@ -206,28 +205,20 @@ def _title(title: str, rows: Sequence[RetentionRow]) -> str:
     view = f", view {rows[0].view}" if title not in BEHAVIOUR and len(views) == 1 else ""
     model = f"{next(iter(runs))} on " if len(runs) == 1 else ""
     targets = list(dict.fromkeys(row.target for row in rows if not row.is_side))
-    of_label = f" of {targets[0]}" if len(targets) == 1 else " of labels" * bool(targets)
+    of_label = f" of {'labels' if len(targets) > 1 else targets[0]}" if targets else ""
     return f"{title}{of_label}{view}: {model}{', '.join(dict.fromkeys(row.run.suite for row in rows))}"
 
 
-def cell_text(column: Column, line: TableRow) -> str:
-    """Return the text of a column; nothing where differences have no such number."""
-    if isinstance(line, RetentionRow):
-        return column.text(line)
-    return "" if column.difference is None else column.difference(line)
-
-
 def _cell(column: Column, line: TableRow) -> Cell:
-    text = cell_text(column, line)
+    """Return the cell of a column; an empty one where differences have no such number."""
     if isinstance(line, Difference):
-        return Cell(text)
+        return absent("") if column.difference is None else column.difference(line)
     value = column.sort_value(line)
-    return Cell(
-        text,
+    return replace(
+        column.cell(line),
         sort=value,
         heat=value if column.heat and isinstance(value, float) else None,
         strong=column.strong is not None and column.strong(line),
-        alarm=text.endswith(ABOVE_CHANCE),
         note=column.note(line) if column.note else "",
     )
 
@@ -293,17 +284,19 @@ def _difference_legend(differences: Sequence[Difference], has_tests: bool) -> st
     """Return how differences and their intervals are made; empty without any."""
     if not differences:
         return ""
-    parts = [
-        "groups of items as pairs" * any(row.paired for row in differences),
-        "of other items: each side's own groups" * (not all(row.paired for row in differences)),
-    ]
+    parts = []
+    if any(row.paired for row in differences):
+        parts.append("groups of items as pairs")
+    if not all(row.paired for row in differences):
+        parts.append("of other items: each side's own groups")
     if has_tests and any(row.p is not None for row in differences):
         parts.append(
             "p of the share right: exact, signs of groups flipped, in means over all items (Holm: all categories "
             f"and pairs); {P_DECIDES}"
         )
-    parts.append("these models, other items" * any(row.sr_models for row in differences))
-    return "differences: 95 %, " + "; ".join(filter(None, parts))
+    if any(row.sr_models for row in differences):
+        parts.append("these models, other items")
+    return f"differences: 95 %, {'; '.join(parts)}"
 
 
 def _sizes(rows: Sequence[RetentionRow]) -> list[str]:
@@ -311,14 +304,15 @@ def _sizes(rows: Sequence[RetentionRow]) -> list[str]:
     sizes: dict[str, list[str]] = {}
     for of_run in by_run([row for row in rows if row.category != MEAN]):
         sizes.setdefault(_size(of_run), []).append(Path(of_run[0].run.location).name)
-    return [f"run{'s' * (len(names) > 1)} {', '.join(names)}: {size}" for size, names in sizes.items()]
+    return [f"run{'s' if len(names) > 1 else ''} {', '.join(names)}: {size}" for size, names in sizes.items()]
 
 
 def _size(rows: Sequence[RetentionRow]) -> str:
     is_of_sides = all(row.is_side for row in rows)
     samples = [row.success.n_episodes if is_of_sides else row.controls.n_samples or 0 for row in rows]
     parts = [f"{span(samples)} {'episodes' if is_of_sides else 'samples'}"]
-    parts += [f"{span([row.success.n_items for row in rows])} items"] * is_of_sides
+    if is_of_sides:
+        parts.append(f"{span([row.success.n_items for row in rows])} items")
     if groups := [row.controls.n_groups for row in rows if row.controls.n_groups is not None]:
         parts.append(f"{span(groups)} groups")
     return f"per {'category' if is_of_sides else 'label'} {', '.join(parts)}"
@@ -349,9 +343,9 @@ def wording_tables(wordings: Sequence[Difference], names: Mapping[str, str]) -> 
                     row.category,
                     f"{row.group} / {row.minus}",
                     _items(row),
-                    f"{percent(row.sr_group)} / {percent(row.sr_minus)}",
-                    with_limits(row.sr, row.sr_ci, points),
-                    "–" if row.only is None else f"{row.only} / {row.only_minus}",
+                    Cell(row.sr_group, percent, after=f" / {percent(row.sr_minus)}"),
+                    Cell(row.sr, points, row.sr_ci),
+                    Cell(row.only, after="" if row.only is None else f" / {row.only_minus}"),
                     difference_test(row),
                 )
                 for row in rows
@@ -363,11 +357,11 @@ def wording_tables(wordings: Sequence[Difference], names: Mapping[str, str]) -> 
     ]
 
 
-def _items(row: Difference) -> str:
+def _items(row: Difference) -> Cell:
     """Return how many items are compared, and of how many where some are left out."""
     if row.n_items is None:
-        return "other items"
-    return str(row.n_items) if row.of_items in (None, row.n_items) else f"{row.n_items} of {row.of_items}"
+        return Cell("other items")
+    return Cell(row.n_items, after="" if row.of_items in (None, row.n_items) else f" of {row.of_items}")
 
 
 def size_table(means: Sequence[RetentionRow]) -> list[Table]:
@@ -381,7 +375,7 @@ def size_table(means: Sequence[RetentionRow]) -> list[Table]:
     sizes = sorted(
         {str(row.answers.picture_size) for row in of_vlms}, key=lambda size: [int(n) for n in size.split("x")]
     )
-    lines: dict[tuple[str, str], dict[str, str]] = {}
+    lines: dict[tuple[str, str], dict[str, Cell]] = {}
     for row in of_vlms:
         name = full_name(row.run.model, row.run.random_weights)
         extras = [
@@ -393,7 +387,9 @@ def size_table(means: Sequence[RetentionRow]) -> list[Table]:
         names = chain([name], (model_name(row) + " '" * primes for primes in count()))
         free = next(name for name in names if size not in lines.get((name, prompt), {}))
         lines.setdefault((free, prompt), {})[size] = success_interval(row)
-    cells = [(*name, *(rates.get(size, "–") for size in sizes)) for name, rates in lines.items()]
+    cells: list[Cells] = [
+        (*name, *(rates.get(size, Cell(None)) for size in sizes)) for name, rates in lines.items()
+    ]
     title, note = "Accuracy by prompt and size of the picture", "mean over categories in %, with its 95 % interval"
     return [Table.of(title, ("model", "prompt", *sizes), cells, names=2, notes=[note])]
 
@@ -428,11 +424,11 @@ def _vlm_vla_table(vlm: str, policy: str, rows: Sequence[Difference]) -> Table:
     cells = [
         (
             row.category,
-            percent(row.sr_group),
-            percent(row.sr_minus),
-            with_limits(row.sr, row.sr_ci, percent),
-            number(row.p, 4),
-            number(row.p_holm, 4),
+            Cell(row.sr_group, percent),
+            Cell(row.sr_minus, percent),
+            Cell(row.sr, percent, row.sr_ci),
+            Cell(row.p, _p4),
+            Cell(row.p_holm, _p4),
             _items(row),
         )
         for row in rows
@@ -444,11 +440,9 @@ def _vlm_vla_table(vlm: str, policy: str, rows: Sequence[Difference]) -> Table:
 
 # -- answer, probe, success --------------------------------------------------------------------------------------
 
-Columns = Sequence[tuple[str, Callable[[CategoryCounts], str]]]
-_LEGEND = (
-    "answer: the VLM answers right; probe: its held-out decision is right; success: the cube ends right; each in "
-    "both layouts of an item, which a coin manages in 25 %"
-)
+Columns = Sequence[tuple[Heading | str, Callable[[CategoryCounts], Cell]]]
+_p4 = partial(number, digits=4)
+_BOTH_LAYOUTS = "each in both layouts of an item, which a coin manages in 25 %"
 _NAMES = {"answered": "answer", "encoded": "probe", "acted": "success"}
 _CODES = "a capital letter for what is right, a small one for what is not"
 _TESTS = "p: exact McNemar over items or over whole groups, the larger; (Holm) over all categories and pairs shown"
@@ -461,7 +455,9 @@ def known_used_tables(joined: KnownUsedTable) -> list[Table]:
     rows = joined.rows
     which = "Which of them: VLM · probe · success (expected of coins)"
     return [
-        _counts(title, f"{_LEGEND}; {probes}", rows, ("Items", _SHARES), ("Answer right, without success", _LOST)),
+        _counts(
+            title, f"{_BOTH_LAYOUTS}; {probes}", rows, ("Items", _SHARES), ("Answer right, without success", _LOST)
+        ),
         _counts(which, _CODES, rows, ("", _codes(rows))),
         _counts("Equally many?", _TESTS, rows, ("", _TESTED)),
         _counts("Single episodes (nothing is tested)", "", rows, ("", _episodes(rows))),
@@ -469,46 +465,55 @@ def known_used_tables(joined: KnownUsedTable) -> list[Table]:
 
 
 def _counts(title: str, note: str, rows: Sequence[CategoryCounts], *groups: tuple[str, Columns]) -> Table:
-    headings = [Heading(name, group=group) for group, columns in groups for name, _ in columns]
-    cells = [(row.category, *(cell(row) for _, columns in groups for _, cell in columns)) for row in rows]
-    return Table.of(title, ("category", *headings), cells, mean=OVERALL, notes=[note]).filled()
+    headings = [
+        replace(heading if isinstance(heading, Heading) else Heading(heading), group=group)
+        for group, columns in groups
+        for heading, _ in columns
+    ]
+    cells: list[Cells] = [
+        (row.category, *(cell(row) for _, columns in groups for _, cell in columns)) for row in rows
+    ]
+    legend = Legend(after=(note,))
+    return Table.of(title, ("category", *headings), cells, mean=OVERALL, legend=legend).filled()
 
 
-def _share(count: int | None, row: CategoryCounts) -> str:
-    return "–" if count is None else f"{count} ({percent(count / row.n_items, 0)} %)"
+def _share(count: int | None, row: CategoryCounts) -> Cell:
+    return Cell(count, after="" if count is None else f" ({percent(count / row.n_items, 0)} %)")
 
 
 _SHARES: Columns = [
-    ("items (groups)", lambda row: f"{row.n_items} ({row.n_groups})"),
-    ("answer right", lambda row: _share(row.answered_correctly, row)),
-    ("probe right", lambda row: _share(row.encoded, row)),
-    ("success", lambda row: _share(row.acted_correctly, row)),
-    ("shown", lambda row: {True: "yes", False: "no", None: "–"}[row.has_signal]),
+    ("items (groups)", lambda row: Cell(row.n_items, after=f" ({row.n_groups})")),
+    (
+        Heading("answer right", term="answer: the VLM answers right"),
+        lambda row: _share(row.answered_correctly, row),
+    ),
+    (Heading("probe right", term="probe: its held-out decision is right"), lambda row: _share(row.encoded, row)),
+    (Heading("success", term="success: the cube ends right"), lambda row: _share(row.acted_correctly, row)),
+    ("shown", lambda row: Cell({True: "yes", False: "no", None: None}[row.has_signal])),
 ]
 _LOST: Columns = [
-    (
-        "answer and probe right",
-        lambda row: "–" if row.answered_and_encoded is None else str(row.answered_and_encoded),
-    ),
+    ("answer and probe right", lambda row: Cell(row.answered_and_encoded)),
     (
         "of these without success % [95 %]",
-        lambda row: with_limits(row.share_not_acted_on, row.share_not_acted_on_ci, percent),
+        lambda row: Cell(row.share_not_acted_on, percent, row.share_not_acted_on_ci),
     ),
-    ("answer with success, p", lambda row: number(row.p_linked, 4)),
+    ("answer with success, p", lambda row: Cell(row.p_linked, _p4)),
 ]
 
 
 def _codes(rows: Sequence[CategoryCounts]) -> Columns:
-    def cell(code: str, row: CategoryCounts) -> str:
-        return f"{row.counts[code]} ({row.guessed[code]:.1f})" if code in row.counts else "–"
+    def cell(code: str, row: CategoryCounts) -> Cell:
+        if code not in row.counts:
+            return Cell(None)
+        return Cell(row.counts[code], after=f" ({row.guessed[code]:.1f})")
 
     codes = dict.fromkeys(code for row in rows for code in row.counts)
     return [(_spelt(code), partial(cell, code)) for code in codes]
 
 
 def _episodes(rows: Sequence[CategoryCounts]) -> Columns:
-    def cell(code: str, row: CategoryCounts) -> str:
-        return str(row.episodes.get(code, "–"))
+    def cell(code: str, row: CategoryCounts) -> Cell:
+        return Cell(row.episodes.get(code))
 
     codes = dict.fromkeys(code for row in rows for code in row.episodes)
     return [(_spelt(code), partial(cell, code)) for code in codes]
@@ -520,12 +525,12 @@ def _spelt(code: str) -> str:
     return " ".join(letter if mark == "1" else letter.lower() for letter, mark in letters if mark != "-")
 
 
-def _test(first: str, second: str, row: CategoryCounts) -> str:
+def _test(first: str, second: str, row: CategoryCounts) -> Cell:
     for test in row.comparisons:
         if (test.first, test.second) == (first, second):
-            corrected = "" if test.p_holm is None else f" ({number(test.p_holm, 4)})"
-            return f"{test.only_first} against {test.only_second}, {number(test.p, 4)}{corrected}"
-    return "–"
+            corrected = "" if test.p_holm is None else f" ({_p4(test.p_holm)})"
+            return Cell(test.only_first, after=f" against {test.only_second}, {_p4(test.p)}{corrected}")
+    return Cell(None)
 
 
 _TESTED: Columns = [

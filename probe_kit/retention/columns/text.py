@@ -1,11 +1,13 @@
 """The words of a retention table: texts of single values, terms that are no column, verdicts and sentences."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from math import ceil
 from typing import Literal, cast
 
 from probe_kit._system.counting import counted, enumerated
 from probe_kit._tables.numbers import NONE, Write, number, p_text, percent, whole_percent, with_limits
+from probe_kit._tables.table import Cell, absent
 from probe_kit.hooks.contract.sites import label_of
 from probe_kit.intervene.verdict import UNTESTED, UseVerdict
 from probe_kit.retention.behaviour import Regime, SuccessRate
@@ -50,15 +52,15 @@ _REGIMES = {
 }
 
 
-def site_text(layer: int | None, iteration: int | None = None, ties: int | None = None) -> str:
+def site_cell(layer: int | None, iteration: int | None = None, ties: int | None = None) -> Cell:
     """Return where the best site is: its layer, after @ the iteration where the stream has several.
 
     After + follows the number of other sites that are as good.
     """
     if layer is None:
-        return "–"
+        return Cell(None)
     more = f" +{ties}" if ties else ""
-    return f"{layer}{more}" if iteration is None else f"{layer} @{iteration}{more}"
+    return Cell(layer, after=more if iteration is None else f" @{iteration}{more}")
 
 
 # -- rows ----------------------------------------------------------------------------------------------------
@@ -69,11 +71,11 @@ def model_name(row: RetentionRow) -> str:
     return row.run.name if row.group is None else f"{row.group}: {row.run.name}"
 
 
-def success_interval(row: RetentionRow) -> str:
+def success_interval(row: RetentionRow) -> Cell:
     """Return the SR in percent with its interval; n/a for a model that did not act or lacks trajectories."""
     if row.success.sr is None:
-        return NOT_ACTED
-    return with_limits(row.success.sr, row.success.ci, percent)
+        return absent(NOT_ACTED)
+    return Cell(row.success.sr, percent, row.success.ci)
 
 
 def regime_value(row: RetentionRow) -> str:
@@ -85,16 +87,16 @@ def regime_value(row: RetentionRow) -> str:
     return _REGIMES[row.success.regime]
 
 
-def retention_value(row: RetentionRow) -> str:
+def retention_value(row: RetentionRow) -> Cell:
     """Return the retention with its interval; n/a where the backbone's signal is not shown."""
     if not row.retention.defined:
-        return "n/a"
-    return with_limits(row.retention.value, row.retention.ci, number)
+        return absent("n/a")
+    return Cell(row.retention.value, number, row.retention.ci)
 
 
-def published_value(row: RetentionRow) -> str:
+def published_value(row: RetentionRow) -> Cell:
     """Return the published ratio; a dash where retention is not defined."""
-    return number(row.retention.published) if row.retention.defined else "–"
+    return Cell(row.retention.published if row.retention.defined else None, number)
 
 
 def call_words(call: int) -> str:
@@ -115,9 +117,9 @@ def verdict_text(part: StreamPart) -> str:
     return words[part.verdict]
 
 
-def above_chance(part: StreamPart) -> str:
+def above_chance(part: StreamPart) -> Cell:
     """Return the score of a label above chance with its interval; a dash where no chance is known."""
-    return NONE if part.chance is None else with_limits(part.above, part.above_ci, number)
+    return Cell(None if part.chance is None else part.above, number, part.above_ci)
 
 
 def exceeds_text(part: StreamPart) -> str:
@@ -141,12 +143,12 @@ def difference_name(row: Difference) -> str:
     return f"{row.group} − {row.minus}{mark}"
 
 
-def difference_test(row: Difference) -> str:
+def difference_test(row: Difference) -> Cell:
     """Return p of a difference of success rates, and its Holm-corrected value."""
-    return "" if row.p is None else f"{p_text(row.p)} ({p_text(row.p_holm)})"
+    return absent("") if row.p is None else Cell(row.p, p_text, after=f" ({p_text(row.p_holm)})")
 
 
-def models_test(test: ModelTest | None, write: Write) -> str:
+def models_test(test: ModelTest | None, write: Write) -> Cell:
     """Return p over models, the least possible p, and Welch's interval; a dash for none.
 
     Empty without groups of models.
@@ -156,15 +158,16 @@ def models_test(test: ModelTest | None, write: Write) -> str:
         write: Formats a limit of the interval.
     """
     if test is None:
-        return ""
-    low, high = test.ci
-    limits = NONE if low is None or high is None else f"[{write(low)}, {write(high)}]"
-    return f"{models_p(test)} {limits}"
+        return absent("")
+    p = models_p(test)
+    if None in test.ci:
+        return replace(p, after=f"{p.after} {NONE}")
+    return Cell(test.p, lambda _: p.text, test.ci, write_ends=write)
 
 
-def models_p(test: ModelTest) -> str:
+def models_p(test: ModelTest) -> Cell:
     """Return p over models and the least possible p; a dash where spreads allow none."""
-    return p_text(None) if test.p is None else f"{p_text(test.p)} ({p_text(test.smallest_p)})"
+    return Cell(test.p, p_text, after="" if test.p is None else f" ({p_text(test.smallest_p)})")
 
 
 # -- tables --------------------------------------------------------------------------------------------------

@@ -584,7 +584,7 @@ class Words:
 
 def words_of(tables: Sequence[Table]) -> Words:
     """Return the words of all columns of `tables` and of the verdicts in them, and terms that are neither."""
-    cells = {cell.value for table in tables for row in table.rows for cell in row.cells}
+    cells = {cell.value_text for table in tables for row in table.rows for cell in row.cells}
     groups: dict[str, dict[tuple[str, str], None]] = {}
     for table in tables:
         title = re.split("[:,]", table.title)[0]

@@ -103,12 +103,15 @@ class Controls:
     Attributes:
         comparisons: Comparisons of every site with controls.
         left_out: Reasons why a default control was not run, by name.
+        untrained_probes: Key of the untrained network's probes, which names its weights, settings and episodes;
+            empty without one, and in older results, which do not name it.
     """
 
     scores: tuple[ControlScore, ...] = ()
     untrained: tuple[UntrainedScore, ...] = ()
     comparisons: tuple[ControlComparison, ...] = ()
     left_out: Mapping[str, str] = field(default_factory=dict)
+    untrained_probes: str = ""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -184,11 +187,17 @@ class Controls:
             self, scores=tuple(by_place.values()), comparisons=tuple(by_site.values()), left_out=missing
         )
 
-    def with_untrained(self, scores: Sequence[UntrainedScore]) -> "Controls":
-        """Return the same with another untrained network, with which nothing is compared yet."""
+    def with_untrained(self, scores: Sequence[UntrainedScore], probes: str) -> "Controls":
+        """Return the same with another untrained network, with which nothing is compared yet.
+
+        Args:
+            scores: Gains over that network.
+            probes: Key of its probes.
+        """
         return replace(
             self,
             untrained=tuple(scores),
+            untrained_probes=probes,
             scores=tuple(score for score in self.scores if score.name != UNTRAINED),
             comparisons=tuple(test for test in self.comparisons if test.control != UNTRAINED),
         )
@@ -210,4 +219,5 @@ class Controls:
             tuple(UntrainedScore(**read(score)) for score in stored["untrained"]),
             tuple(ControlComparison(**comparison) for comparison in stored["comparisons"]),
             dict(stored["left_out"]),
+            str(stored.get("untrained_probes", "")),
         )

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit._system.bounded_files import UNREADABLE, open_arrays
-from probe_kit._tables.numbers import p_text
-from probe_kit._tables.table import Table
+from probe_kit._tables.numbers import Limits, number, p_text, percent
+from probe_kit._tables.table import Cell, Legend, Table
 from probe_kit.errors import UnknownSiteError
 from probe_kit.hashing import sha256_json
 from probe_kit.hooks.contract.sites import Site, label_of
@@ -355,19 +355,20 @@ def best_sites(scores: "pd.DataFrame", is_side: bool) -> "list[pd.Series]":
     return [row for _, row in best.iterrows()]
 
 
-def site_cells(row: "pd.Series", is_side: bool) -> tuple[str, str, str, str]:
-    """Return a row of `best_sites` as text: the site with its ties, score, chance and p; a dash for none."""
-    site = f"{row['site']} +{row['ties']}" if row["ties"] else str(row["site"])
-    limits = (row["score"], row["ci_low"], row["ci_high"])
-    score, low, high = (score_text(value, is_side) for value in limits)
-    return site, f"{score} [{low}, {high}]", score_text(row["chance"], is_side), p_text(row["p_fwe"])
+def site_cells(row: "pd.Series", is_side: bool) -> tuple[Cell, Cell, Cell, Cell]:
+    """Return a row of `best_sites`: the site with its ties, score, chance and p; a dash for none."""
+    site = Cell(str(row["site"]), after=f" +{row['ties']}" if row["ties"] else "")
+    score = score_cell(row["score"], is_side, (row["ci_low"], row["ci_high"]))
+    return site, score, score_cell(row["chance"], is_side), Cell(row["p_fwe"], p_text)
 
 
-def score_text(value: float | None, is_side: bool) -> str:
+def score_cell(value: float | None, is_side: bool, limits: Limits | None = None) -> Cell:
     """Return the accuracy of a side in percent, other scores as they are; a dash for none."""
-    if value is None or value != value:
-        return "–"
-    return f"{100 * value:.1f}" if is_side else f"{value:.3f}"
+    return Cell(value, percent if is_side else _three_digits, limits)
+
+
+def _three_digits(value: float | None) -> str:
+    return number(value, 3)
 
 
 # -- all results ---------------------------------------------------------------------------------------------
@@ -490,7 +491,7 @@ def episodes_sha256(run: RunReader) -> str:
 
 # -- the table of best sites -------------------------------------------------------------------------------------
 
-_TIES = "+: as many other sites tie with it"
+_TIES = {"+": "as many other sites tie with it"}
 _LEGEND = "the score of a chosen site is too high"
 _OF_SIDE = "; `retention` corrects it"
 _OF_LABEL = ". Chance: mean score of this site with exchanged labels"
@@ -506,25 +507,25 @@ def best_sites_table(fitted: Sequence[ProbeResults], splits: bool = True) -> Tab
     """
     first, several_calls = fitted[0].settings, len(fitted) > 1
     several_views, metric = len(first.views) > 1, "accuracy %" if first.is_side else METRICS[first.task]
-    rows: list[tuple[str, ...]] = []
+    rows: list[tuple[Cell | str, ...]] = []
     for results in fitted:
-        call = [f"call {results.settings.call}"] * several_calls
+        call = f"call {results.settings.call}" if several_calls else ""
         for row in best_sites(results.scores, first.is_side):
-            view = [str(row["view"])] * several_views
-            name = " · ".join([_name(results, row["category"], row["stream"]), *view, *call])
+            view = str(row["view"]) if several_views else ""
+            name = " · ".join(filter(None, (_name(results, row["category"], row["stream"]), view, call)))
             met, missed = exceeded_controls(results, row)
-            parts = [", ".join(met)] * bool(met) + [f"not shown: {', '.join(missed)}"] * bool(missed)
-            begin = score_text(row["first"], first.is_side)
-            rows.append((name, *site_cells(row, first.is_side), "; ".join(parts) or "–", str(row["n"]), begin))
+            not_shown = f"not shown: {', '.join(missed)}" if missed else ""
+            begin = score_cell(row["first"], first.is_side)
+            exceeds = Cell("; ".join(filter(None, (", ".join(met), not_shown))) or None)
+            rows.append((name, *site_cells(row, first.is_side), exceeds, Cell(int(row["n"])), begin))
         for control in results.controls.scores if splits or not first.is_side else ():
-            view = [control.view] * (several_views and bool(control.view))
+            view = control.view if several_views else ""
             where = _name(results, control.category, control.stream)
-            name = " · ".join(filter(None, [f"control {control.name}", where, *view, *call]))
-            score, low, high, chance = (
-                score_text(value, first.is_side) for value in (control.score, *control.ci, control.chance)
-            )
-            p = "–" if control.p is None else f"{p_text(control.p)} (this control alone)"
-            rows.append((name, "", f"{score} [{low}, {high}]", chance, p, "", str(control.n), ""))
+            name = " · ".join(filter(None, [f"control {control.name}", where, view, call]))
+            score = score_cell(control.score, first.is_side, control.ci)
+            chance = score_cell(control.chance, first.is_side)
+            p = Cell(control.p, p_text, after="" if control.p is None else " (this control alone)")
+            rows.append((name, "", score, chance, p, "", Cell(control.n), ""))
     headings = (
         "category" if first.is_side else "stream",
         "best site",
@@ -535,9 +536,16 @@ def best_sites_table(fitted: Sequence[ProbeResults], splits: bool = True) -> Tab
         "n",
         "first iteration",
     )
-    notes = [_TIES, _LEGEND + (_OF_SIDE if first.is_side else _OF_LABEL)]
+    notes = [_LEGEND + (_OF_SIDE if first.is_side else _OF_LABEL)]
     overflow = "split" if splits else "leave out"
-    return Table.of(", ".join(_title(fitted, several_views)), headings, rows, notes=notes, overflow=overflow)
+    return Table.of(
+        ", ".join(_title(fitted, several_views)),
+        headings,
+        rows,
+        legend=Legend(marks=_TIES),
+        notes=notes,
+        overflow=overflow,
+    )
 
 
 def _title(fitted: Sequence[ProbeResults], several_views: bool) -> Iterator[str]:

@@ -3,12 +3,13 @@
 import re
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from probe_kit.intervene import InterventionResult
+from probe_kit.intervene import InterventionResult, kinds
 from probe_kit.intervene.kinds import every_kind
 from probe_kit.intervene.kinds.attribution import AttributionPatching
 from probe_kit.intervene.kinds.base import Intervention
@@ -397,16 +398,31 @@ def test_an_effect_below_the_resolution_of_its_measure_is_significant_of_nothing
     ]
     table = Steering.table(doses, context(None))
     assert [row[table.columns.index("p")] for row in table.texts] == ["–", "–", "–"]
-    assert "lengths of the file's vector" in table.notes[0]
-    assert "significant of nothing" in table.notes[0]
+    assert "lengths of the file's vector" in table.all_notes[0]
+    assert "significant of nothing" in table.all_notes[0]
     found = Steering.table([replace(patch("backbone.02", 0.6, 0.004), coefficient="1")], context(None))
-    assert "significant of nothing" not in found.notes[0]
+    assert "significant of nothing" not in found.all_notes[0]
     assert unit_of_doses("mean-difference:1") == unit_of_doses("probe") == "half class-mean differences"
 
 
 def unsided() -> InterventionResult:
     described = context(None)
     return with_parts(described, replace(described.outcomes, sides=np.array([""])))
+
+
+def test_without_sides_sentences_name_the_input_that_is_exchanged() -> None:
+    varied = replace(unsided(), settings={"kind": Interchange.kind, "vary": "instruction"})
+    for rows in ([patch("backbone.02", 0.9, 0.001)], [patch("backbone.02", 0.1, 0.9)]):
+        said = [*Interchange.sentences(rows, varied), *Interchange.findings(rows, varied)]
+        notes = Interchange.table(rows, varied).all_notes
+        assert "half of the exchange of the instruction's effect" in said[0]
+        assert "effect: share of what the whole exchange of the instruction does" in notes[0]
+        assert "image swap" not in " ".join((*said, *notes))
+
+
+def test_no_noun_of_a_sentence_is_replaced_in_its_text() -> None:
+    for file in Path(kinds.__file__).parents[1].rglob("*.py"):
+        assert '.replace("image' not in file.read_text("utf-8"), file.name
 
 
 @pytest.mark.parametrize("seed", [None, 1.0])

@@ -606,7 +606,7 @@ def test_a_smaller_group_with_a_larger_spread_has_an_interval_and_no_p() -> None
     test = ModelTest.of(few, many)
     assert test is not None
     assert (test.p, test.smallest_p) == (None, None)
-    assert models_test(test, signed).startswith("– ")
+    assert models_test(test, signed).text.startswith("– ")
     other = ModelTest.of(many, [*few[:2], 0.5, 0.55, 0.45, 0.5])
     assert other is not None
     assert other.p is not None, "groups of equal size exchange whatever their spreads"
@@ -632,7 +632,7 @@ def test_an_interval_of_rates_stays_within_a_hundred_points(
 ) -> None:
     test = ModelTest.of(first, second, largest=1.0)
     assert test is not None
-    assert models_test(test, points).endswith(f" {written}")
+    assert models_test(test, points).text.endswith(f" {written}")
     assert all(limit is None or abs(limit) <= 1 for limit in test.ci)
 
 

@@ -286,7 +286,7 @@ def test_the_summary_quotes_the_retention_of_the_mean(table: RetentionTable) -> 
     assert found.value is not None
     assert f"{found.value:.2f}" != f"{found.published:.2f}"
     first = next(run for run in table.summary if run.mean.row.group == "first")
-    assert first.mean.cells[HEADINGS.index("retention")].startswith(f"{found.value:.2f} [")
+    assert first.mean.cells[HEADINGS.index("retention")].text.startswith(f"{found.value:.2f} [")
 
 
 def test_differences_hold_one_retention_and_the_call(table: RetentionTable) -> None:
