@@ -45,7 +45,9 @@ if TYPE_CHECKING:
 Values = NDArray[np.float64]
 CONTROL = "control-"
 """Beginning of the names of random directions, which distinguishes them in stored results."""
-OPTIONS = ("sites", "roles", "direction", "controls", "coefficients", "target_side", "seed")
+OPTIONS = (
+    "sites", "roles", "direction", "controls", "coefficients", "target_side", "seed", "window", "readers", "heads",
+)  # fmt: skip
 """Options of the command that a kind may take."""
 
 
