@@ -96,7 +96,7 @@ class Knockout(Intervention):
     summary: ClassVar[str] = "Attention knockout: from which tokens, up to which layer, does the action read?"
     position: ClassVar[int] = 8
     asks_where: ClassVar[bool] = True
-    needs: ClassVar[tuple[InterventionKind, ...]] = ("edit", "attention")
+    needs: ClassVar[tuple[InterventionKind, ...]] = ("edit", "attention", "knockout")
     options: ClassVar[Mapping[str, str]] = {
         "roles": "whose tokens are cut; default image,language,state",
         "window": "layers that are cut together: both (default), first, last, or a number of neighbours",
@@ -174,18 +174,20 @@ class Knockout(Intervention):
             for first, last in windows(self.window, layers):
                 sites = [site for site in stream.sites(HEADS) if first <= site.layer <= last]
                 for name in (CUT, *(f"{CONTROL}{at + 1}" for at in range(self.controls))):
-                    place = f"{stream.name}.{first:02d}-{last:02d}.{HEADS}"
-                    condition = str(ConditionName(place, role, name))
+                    span = f"{stream.name}.{first:02d}-{last:02d}.{HEADS}"
+                    condition = str(ConditionName(span, role, name))
                     conditions.append(self._cut(condition, backbone, role, name, (first, last), sites))
         return conditions
 
     def _roles(self, policy: "Policy", backbone: str) -> tuple[str, ...]:
         roles = self.roles or ROLES
         present = roles_of(policy, backbone, roles)
-        known = (*policy.role_names[policy.tokens_of(backbone)], *TILES)
+        role_names = (*policy.role_names[policy.tokens_of(backbone)], *TILES)
         for role in (*self.roles, *([self.readers] if self.readers else [])):
             if role not in roles_of(policy, backbone, (role,)):
-                raise UsageError(f"no token of {backbone} has the role {role!r}; there are {', '.join(known)}")
+                raise UsageError(
+                    f"no token of {backbone} has the role {role!r}; there are {', '.join(role_names)}"
+                )
         return tuple(present)
 
     def _cut(
@@ -292,10 +294,10 @@ def random_tokens(keys: NDArray[np.bool_], every: NDArray[np.bool_], seed: int) 
         every: (T,) all tokens but padding.
         seed: Seed of the draw.
     """
-    others = np.flatnonzero(every & ~keys)
-    count = min(int(keys.sum()), others.size)
+    drawable = np.flatnonzero(every & ~keys)
+    count = min(int(keys.sum()), drawable.size)
     drawn = np.zeros_like(keys)
-    drawn[np.random.default_rng(seed).choice(others, count, replace=False)] = True
+    drawn[np.random.default_rng(seed).choice(drawable, count, replace=False)] = True
     return drawn
 
 
@@ -400,9 +402,9 @@ def knockout_effects(outcomes: ConditionOutcomes) -> list[KnockoutEffect]:
     return effects
 
 
-def layers_of(place: str) -> tuple[int, int]:
+def layers_of(site_name: str) -> tuple[int, int]:
     """Return the first and last layer of a place of a cut, such as `expert.00-03.heads`."""
-    first, last = place.split(".")[1].split("-")
+    first, last = site_name.split(".")[1].split("-")
     return int(first), int(last)
 
 
