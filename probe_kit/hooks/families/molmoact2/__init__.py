@@ -13,7 +13,7 @@ LAYERWISE = replace(
     tiles=False,
     instead={
         "tiles": f"{MERGED}Its tower reads overlapping crops. Exchange all of `image`",
-        "knockout": "no hook reaches the heads of its expert. Patch `kv` instead (`--kind interchange --sites kv.*`)",
+        "knockout": "no hook reaches the heads of its expert. Patch `kv` instead",
     },
 )
 """The interventions of an expert whose block n reads the keys and values of block n of the backbone.
