@@ -13,10 +13,12 @@ from probe_kit.hooks.registry import known_families, load_model, load_policy
 
 if TYPE_CHECKING:
     from probe_kit.hooks.capturing.attention import (
+        AttentionCut,
         AttentionMass,
         attended_roles,
         capture_attention,
         capture_patterns,
+        cut_attention,
     )
     from probe_kit.hooks.capturing.capture_context import ActivationCache, capture, edit, gradients_at
     from probe_kit.hooks.capturing.edits import apply_edits
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
 __all__ = [
     "ActivationCache",
     "AnswerModel",
+    "AttentionCut",
     "AttentionMass",
     "Edit",
     "Family",
@@ -51,6 +54,7 @@ __all__ = [
     "capture",
     "capture_attention",
     "capture_patterns",
+    "cut_attention",
     "edit",
     "gradients_at",
     "known_families",
@@ -69,6 +73,8 @@ __getattr__, __dir__ = lazy_names(
     {
         "read_weights": "checkpoints.weights",
         "load_weights": "checkpoints.weights",
+        "AttentionCut": "capturing.attention",
+        "cut_attention": "capturing.attention",
         "capture_attention": "capturing.attention",
         "AttentionMass": "capturing.attention",
         "capture_patterns": "capturing.attention",

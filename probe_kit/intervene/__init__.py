@@ -26,6 +26,7 @@ if TYPE_CHECKING:
         stored_site_effects,
     )
     from probe_kit.intervene.kinds.joint import JointEffect, JointPlaces, stored_joint_places
+    from probe_kit.intervene.kinds.knockout import Knockout, KnockoutEffect
     from probe_kit.intervene.kinds.steer import Steering
     from probe_kit.intervene.outcomes import ConditionOutcomes
     from probe_kit.intervene.patching.attribution import AttributionEffect
@@ -58,6 +59,8 @@ __all__ = [
     "InterventionResult",
     "JointEffect",
     "JointPlaces",
+    "Knockout",
+    "KnockoutEffect",
     "PatchEffect",
     "Places",
     "ReplaySession",
@@ -112,6 +115,8 @@ __getattr__, __dir__ = lazy_names(
         "Behaviour": "verdict",
         "JointEffect": "kinds.joint",
         "JointPlaces": "kinds.joint",
+        "Knockout": "kinds.knockout",
+        "KnockoutEffect": "kinds.knockout",
         "Places": "verdict",
         "stored_joint_places": "kinds.joint",
         "run_intervention": "runner",

@@ -119,6 +119,25 @@ Coefficients = Annotated[
 TargetSide = Annotated[
     str | None, _inside_option("--target-side", help="Side to steer toward: wrong, correct, left or right.")
 ]
+Window = Annotated[
+    str | None,
+    _inside_option(
+        "--window",
+        metavar="<both|first|last|N>",
+        help="Layers that a knockout cuts together. first: from the first layer to each. last: from each to the "
+        "last. both: first and last. N: every N neighbouring layers.",
+    ),
+]
+Readers = Annotated[
+    str | None,
+    _inside_option(
+        "--readers", metavar="ROLE", help="Tokens of the backbone that no longer read. Default: the acting stream."
+    ),
+]
+Heads = Annotated[
+    Names | None,
+    _inside_option("--heads", **LISTED, help="Heads that no longer read, counted from 0. Default: all."),
+]
 _pairs_option = partial(typer.Option, rich_help_panel="Recordings and your own environment")
 Vary = Annotated[
     str | None,
@@ -199,6 +218,9 @@ def intervene(
     controls: Controls = None,
     coefficients: Coefficients = None,
     target_side: TargetSide = None,
+    window: Window = None,
+    readers: Readers = None,
+    heads: Heads = None,
     seed: common.Seed = 0,
     readout: ReadoutName = "first-chunk",
     suite: common.SuiteFolder = None,
@@ -238,6 +260,7 @@ def intervene(
         "sites": sites, "roles": roles, "direction": direction, "controls": controls,
         # Seed 0 is the default of every kind, and no kind without a seed refuses it.
         "coefficients": coefficients, "target_side": target_side, "seed": seed or None,
+        "window": window, "readers": readers, "heads": heads,
     }  # fmt: skip
     kind_options = {name: value for name, value in inside.items() if value is not None}
     check_options(kind, kind_options)

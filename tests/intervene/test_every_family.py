@@ -20,6 +20,7 @@ from probe_kit.intervene import (
     Interchange,
     InterventionResult,
     JointPlaces,
+    Knockout,
     ReplaySource,
     Steering,
     run_intervention,
@@ -80,6 +81,7 @@ def asked_of(run: Run, kind: str) -> Intervention:
             top=1,
             controls=1,
         ),
+        "knockout": lambda: Knockout(**COMMON | {"items": 2}, roles=("image", "language"), window="2", controls=1),
         "attention": lambda: AttentionReadout(**COMMON | {"items": 2}),
         "attention-shadow": lambda: AttentionReadout(**COMMON | {"items": 1}, readout="per-step"),
         "closed-loop": lambda: ClosedLoop(
@@ -102,6 +104,7 @@ def asked_of(run: Run, kind: str) -> Intervention:
         "erase",
         "joint",
         "attribution",
+        "knockout",
         "attention",
         "attention-shadow",
         "closed-loop",

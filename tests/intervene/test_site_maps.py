@@ -12,7 +12,7 @@ import pytest
 
 from probe_kit.errors import EmptyRoleError, RunDamagedError, UnknownSiteError, UsageError
 from probe_kit.hooks import Site
-from probe_kit.hooks.capturing.edits import EditLog, ReplaceInSubspace, ReplaceWith, _ActiveEdits
+from probe_kit.hooks.capturing.edits import ActiveEdits, EditLog, ReplaceInSubspace, ReplaceWith
 from probe_kit.intervene import (
     ClosedLoop,
     ConceptErasure,
@@ -229,7 +229,7 @@ def test_what_fires_moved_is_summed_whatever_their_shapes() -> None:
     """Two fires of one shape, one of another; the second moves nothing. By hand."""
     import torch
 
-    active, sites = _ActiveEdits(), (Site("backbone", 0), Site("backbone", 1), Site("expert", 0))
+    active, sites = ActiveEdits(), (Site("backbone", 0), Site("backbone", 1), Site("expert", 0))
     one, other = torch.tensor([[3.0, 4.0], [0.0, 1.0]]), torch.tensor([[2.0, 0.0, 0.0]])
     tokens = (one, one + torch.tensor([[0.0, 2.0], [0.0, 4.0]])), (other, -other), (one, one)
     active.fired += [
@@ -239,7 +239,7 @@ def test_what_fires_moved_is_summed_whatever_their_shapes() -> None:
     assert [entry.site for entry in edit_log.entries] == [str(site) for site in sites]
     assert edit_log.row().tolist() == [3, 1, (3 + 2 + 3) / 3, (3 + 4 + 0) / 3, 4]
     assert EditLog.sum([edit_log, edit_log]).row().tolist() == [6, 2, 8 / 3, 7 / 3, 4]
-    assert EditLog(_ActiveEdits().measured()) == EditLog()
+    assert EditLog(ActiveEdits().measured()) == EditLog()
 
 
 # -- where ---------------------------------------------------------------------------------------------------

@@ -8,6 +8,9 @@ with capture_patterns(policy, policy.streams["expert"].sites("heads")) as patter
     policy.act([seen], [0])
 patterns["expert.02.heads@9"]  # (B, H, S, T): S positions of the stream attend to T
 
+with cut_attention(policy, {site: AttentionCut(keys) for site in policy.streams["expert"].sites("heads")}) as log:
+    policy.act([seen], [0])  # no head reads the tokens that `keys` marks
+
 Queries, keys, masks and scales are those that reach torch, behind rotation and norms. Every pattern is checked:
 with the values of the same call it must give what the heads read. An attended token need not be used.
 """
@@ -15,6 +18,7 @@ with the values of the same call it must give what the heads read. An attended t
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -25,7 +29,8 @@ from torch.nn import functional
 from torch.overrides import TorchFunctionMode
 
 from probe_kit.errors import CaptureError, RolesMismatchError, UnknownSiteError, UsageError
-from probe_kit.hooks.capturing.capture_context import ActivationCache, capture
+from probe_kit.hooks.capturing.capture_context import ActivationCache, capture, edit
+from probe_kit.hooks.capturing.edits import ActiveEdits, EditLog
 from probe_kit.hooks.contract.model import Model, Policy
 from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import HEADS, Site, Stream, first_of
@@ -151,7 +156,7 @@ def capture_patterns(
 
     def keep(site: Site, read: Tensor) -> Tensor:
         nonlocal used
-        pattern = _pattern_of(model, site, calls, read)
+        pattern, _ = _attention_at(model, site, calls, read)
         used += pattern.numel() * 4
         if used > most_bytes:
             raise UsageError(
@@ -162,6 +167,100 @@ def capture_patterns(
 
     with calls, capture(model, head_sites, reduce=keep) as patterns:
         yield patterns
+
+
+# -- knockout -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class AttentionCut:
+    """Tokens that some heads of a site no longer attend to.
+
+    The weights on these tokens become 0, and the others are renormalised: w_t / Σ w. That equals scores of −∞ in
+    front of the softmax.
+
+    Attributes:
+        keys: (T',) bool, the tokens that are cut, from the first position that the site attends to; positions
+            behind T' stay.
+        queries: (S,) bool, the positions of the site's stream that no longer attend to them; None for all.
+        heads: The heads that no longer attend to them, counted from 0; None for all.
+    """
+
+    keys: NDArray[np.bool_]
+    queries: NDArray[np.bool_] | None = None
+    heads: tuple[int, ...] | None = None
+
+
+@contextmanager
+def cut_attention(model: Model, cuts: Mapping[Site, AttentionCut]) -> Iterator[EditLog]:
+    """Cut the attention of heads to tokens while the model runs once.
+
+    The attention of the site is computed once more from what reaches torch, and compared with what the heads read,
+    as in `capture_patterns`. Only heads and positions that are cut change: a cut of no token changes no bit.
+
+    Args:
+        model: The model that runs inside the context.
+        cuts: By site of the quantity `heads`, the tokens that are cut there.
+
+    Raises:
+        UnknownSiteError: For another quantity.
+        UsageError: For a head that the stream does not have.
+        RolesMismatchError: For more tokens than a site attends to, or another number of positions.
+        CaptureError: For an attention that cannot be computed once more, and where the tokens that are left have
+            no weight that float32 can hold.
+    """
+    for site, cut in cuts.items():
+        if site.quantity != HEADS:
+            raise UnknownSiteError(f"{site} has no attention to cut; expected a site of the quantity heads")
+        count = model.stream_of(site).heads
+        if outside := [head for head in cut.heads or () if not 0 <= head < count]:
+            raise UsageError(f"{site} has {count} heads, counted from 0; there is no head {outside[0]}")
+    calls, active, log = _AttentionCalls(), ActiveEdits(), EditLog()
+
+    def change(site: Site, read: Tensor) -> Tensor:
+        new = _without(model, site, calls, read, cuts[site])
+        active.fired.append((site, read, new))
+        return new
+
+    with calls, edit(model, {site: partial(change, site) for site in cuts}):
+        yield log
+    log.entries += active.measured()
+
+
+def _without(model: Model, site: Site, calls: "_AttentionCalls", read: Tensor, cut: AttentionCut) -> Tensor:
+    """Return what the heads read (B, S, H · E) without the tokens that are cut."""
+    weights, values = _attention_at(model, site, calls, read)
+    if not cut.keys.any():
+        return read
+    if cut.keys.size > weights.shape[3]:
+        raise RolesMismatchError(
+            f"{cut.keys.size} tokens are to be cut or kept; {site} attends to {weights.shape[3]}. Take the roles "
+            "of the observation that is inferred"
+        )
+    calls.is_paused = True
+    left = weights.clone()
+    left[..., : cut.keys.size].masked_fill_(torch.from_numpy(cut.keys).to(left.device), 0.0)
+    total = left.sum(dim=-1, keepdim=True)
+    # A position that attended to nothing before, such as padding, has no weights to renormalise.
+    if bool(((total == 0) & (weights.sum(dim=-1, keepdim=True) > 0)).any()):
+        raise CaptureError(
+            f"{site}: the tokens that are left have no weight that float32 can hold, and cannot be renormalised. "
+            "Cut fewer tokens"
+        )
+    count = weights.shape[1]
+    without = (left / total.clamp_min(torch.finfo(left.dtype).tiny)) @ values
+    new = read.clone().view(*read.shape[:2], count, -1)
+    heads = list(range(count)) if cut.heads is None else list(cut.heads)
+    positions = slice(None)
+    if cut.queries is not None:
+        if cut.queries.size != read.shape[1]:
+            raise RolesMismatchError(f"{site} has {read.shape[1]} positions; {cut.queries.size} are chosen among")
+        positions = torch.from_numpy(np.flatnonzero(cut.queries)).to(read.device)  # type: ignore[assignment]
+    by_token = without.transpose(1, 2).to(read.dtype)
+    for head in heads:
+        new[:, positions, head] = by_token[:, positions, head]
+    calls.is_paused = False
+    return new.flatten(2)
 
 
 def attended_roles(model: Model, roles: Mapping[str, Sequence[Roles]], site: Site, tokens: int) -> list[Roles]:
@@ -295,8 +394,10 @@ def _of_every_head(heads: Tensor, count: int) -> Tensor:
     return heads.repeat_interleave(count // heads.shape[1], dim=1)
 
 
-def _pattern_of(model: Model, site: Site, calls: _AttentionCalls, read: Tensor) -> Tensor:
+def _attention_at(model: Model, site: Site, calls: _AttentionCalls, read: Tensor) -> tuple[Tensor, Tensor]:
     """Return the pattern (B, H, S, T) of the positions of a site, whose heads read `read` (B, S, H · E).
+
+    With it come the values (B, H, T, E) float32 that every head reads.
 
     Raises:
         CaptureError: If torch computed no attention, or one that does not give what the heads read.
@@ -313,7 +414,7 @@ def _pattern_of(model: Model, site: Site, calls: _AttentionCalls, read: Tensor) 
     computed = tap.rows.of((weights @ values.to(weights.device)).transpose(1, 2).flatten(2))[:, tap.tokens]
     calls.is_paused = False
     _check_reading(site, stream, weights.shape[1], computed, read)
-    return tap.rows.of(weights)[:, :, tap.tokens]
+    return tap.rows.of(weights)[:, :, tap.tokens], tap.rows.of(values.to(weights.device))
 
 
 def _check_reading(site: Site, stream: Stream, heads: int, computed: Tensor, read: Tensor) -> None:

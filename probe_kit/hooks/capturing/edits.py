@@ -364,7 +364,7 @@ def apply_patches(
     """Change several sites as `apply_patch` does, each with tokens and changes of its own, in their order."""
     from probe_kit.hooks.capturing.capture_context import edit
 
-    log, active = EditLog(), _ActiveEdits()
+    log, active = EditLog(), ActiveEdits()
     with edit(model, {site: partial(active.apply, site, site_changes) for site, site_changes in changes.items()}):
         yield log
     log.entries += active.measured()
@@ -419,7 +419,7 @@ def _tokens(row: "Roles", roles: tuple[str, ...] | None) -> NDArray[np.bool_]:
 
 
 @dataclass
-class _ActiveEdits:
+class ActiveEdits:
     """Edits of one inference.
 
     They are measured after the inference, all at once. An inference drives everything else out of the processor's

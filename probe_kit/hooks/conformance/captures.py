@@ -20,7 +20,7 @@ from probe_kit.errors import (
     UnknownSiteError,
     UnsupportedInterventionError,
 )
-from probe_kit.hooks.capturing.attention import attended_roles, capture_patterns
+from probe_kit.hooks.capturing.attention import AttentionCut, attended_roles, capture_patterns, cut_attention
 from probe_kit.hooks.capturing.capture_context import ActivationCache, capture, edit, reason_of_change, same_bits
 from probe_kit.hooks.capturing.readouts import logit_lens, project_heads
 from probe_kit.hooks.conformance.check import (
@@ -290,6 +290,20 @@ def attention_patterns_are_the_models_own(subject: Subject) -> None:
         if site.stream in roles:
             keys = attended_roles(subject.model, roles, site, pattern.shape[-1])
             _require_shares_of_valid_tokens(site, pattern, roles[site.stream], keys)
+
+
+@check(
+    "A cut of attention to no token changes no bit.",
+    "Tap `heads` directly behind the attention, which torch computes, so that it can be computed once more.",
+)
+def a_cut_of_attention_to_no_token_changes_nothing(subject: Subject) -> None:
+    subject.require_float32()
+    model, observations = subject.model, subject.batch[:1]
+    sites = [site for stream in _streams_with_heads(subject) for site in stream.sites(HEADS)]
+    plain = subject.run(observations)
+    with cut_attention(model, dict.fromkeys(sites, AttentionCut(np.zeros(1, bool)))) as log:
+        require_bits(subject.run(observations), plain, "outputs with attention cut to no token", "those without")
+    require(log.no_op_fires == log.fires > 0, f"{log.no_op_fires} of {log.fires} cuts changed nothing", "all")
 
 
 def _require_shares_of_valid_tokens(

@@ -259,7 +259,7 @@ def answering(layers: int, width: int, tokens: int, sums: bool = True) -> tuple[
 
 # -- interventions --------------------------------------------------------------------------------------------
 
-InterventionKind = Literal["swap", "edit", "kv", "attention", "tiles", "gradients"]
+InterventionKind = Literal["swap", "edit", "kv", "attention", "knockout", "tiles", "gradients"]
 Readout = Literal["first-chunk", "per-step"]
 """The readout with which interventions of a family are compared.
 
@@ -285,6 +285,7 @@ _UNDECLARED = {
     "kv": "its adapter declares no `kv` stream. Patch residual sites instead, or declare `Model.prompt_kv`",
     "attention": "its adapter gives no attention. Patch `kv` or single roles instead: what a patch "
     "moves is read, whatever attention weighs",
+    "knockout": "its adapter gives no attention to cut. Patch `kv` or single roles instead",
     "gradients": "its adapter has no differentiable inference. Patch exactly: `--kind interchange`, or "
     "`--kind joint`, which halves large sets",
     "tiles": "its adapter does not say which picture token comes of which patch. Patch all of `image`, or "
@@ -337,6 +338,7 @@ class Interventions:
         declared = {
             "kv": self.prompt_kv,
             "attention": self.attention,
+            "knockout": self.attention and "knockout" not in self.instead,
             "tiles": self.tiles,
             "gradients": self.gradients,
         }

@@ -46,7 +46,9 @@ if TYPE_CHECKING:
     from probe_kit.intervene.sessions import ReplaySession
 
 Values = NDArray[np.float64]
-OPTIONS = ("sites", "roles", "direction", "controls", "coefficients", "target_side", "seed")
+OPTIONS = (
+    "sites", "roles", "direction", "controls", "coefficients", "target_side", "seed", "window", "readers", "heads",
+)  # fmt: skip
 """Options of the command that a kind may take."""
 
 

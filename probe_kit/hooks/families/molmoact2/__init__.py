@@ -11,7 +11,10 @@ LAYERWISE = replace(
     FLOW,
     edits={"backbone": QUANTITIES, "expert": EXPERT},
     tiles=False,
-    instead={"tiles": f"{MERGED}Its tower reads overlapping crops. Exchange all of `image`"},
+    instead={
+        "tiles": f"{MERGED}Its tower reads overlapping crops. Exchange all of `image`",
+        "knockout": "no hook reaches the heads of its expert. Patch `kv` instead",
+    },
 )
 """The interventions of an expert whose block n reads the keys and values of block n of the backbone.
 

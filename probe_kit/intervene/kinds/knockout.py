@@ -1,0 +1,489 @@
+"""Attention knockout: from which tokens, and in which layers, does the action read?
+
+The attention of the acting stream to the tokens of a role is cut in a window of layers, on the clean inference:
+the weights become 0 and the others are renormalised. Windows grow from the first layer, from the last one, or
+slide. The control cuts as many random tokens of other roles in the same layers. Source: Geva, Bastings, Filippova,
+Globerson: Dissecting recall of factual associations in auto-regressive language models, EMNLP 2023.
+
+What is cut is the view of the acting stream, not the information: words that the backbone carried into other
+tokens still pass. So *cut and nothing lost* says that nothing is read there directly.
+
+In a scene the loss is a share of the effect of the picture's place. An item is played with its pictures in both
+orders, and what remains of the difference between the two is what the action still knows:
+
+    lost = 2 · Σ s (x_clean − x_cut) / Σ s (x_clean − x_swapped)
+
+over episodes, where x is the displacement and s the side of the correct picture. 1 is an action that no longer
+tells both orders apart, and 2 one that answers as after the swap. Without sides the size of the change, in spreads
+of the clean actions, is compared with that of the controls.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit._tables.content import Cell as TableCell
+from probe_kit._tables.content import absent
+from probe_kit._tables.numbers import number, signed
+from probe_kit.errors import EmptyRoleError, UnsupportedInterventionError, UsageError
+from probe_kit.hashing import derive_seed
+from probe_kit.hooks.contract.declared import InterventionKind
+from probe_kit.hooks.contract.sites import HEADS, Site, first_of
+from probe_kit.intervene.edited_cells import CONTROL, EditedCell
+from probe_kit.intervene.exchange import NOTHING
+from probe_kit.intervene.kinds.attention import backbone_of
+from probe_kit.intervene.kinds.base import (
+    UNRESOLVED,
+    EffectColumn,
+    EffectRow,
+    Intervention,
+    common_columns,
+    compare_with_controls,
+    effect_table,
+    interval_cell,
+    is_resolved,
+    lines_of,
+    mean_of,
+    p_of,
+)
+from probe_kit.intervene.outcomes import CLEAN, UNCHANGED, ConditionOutcomes
+from probe_kit.intervene.places import ALL, TILES, roles_of
+from probe_kit.intervene.replay import CLEAN_RUN, SOURCE_RUN, Condition, ConditionContext, ConditionResult
+from probe_kit.intervene.settings import FIRST_CHUNK, has_sides
+from probe_kit.intervene.stored import Measurement
+from probe_kit.runs.run import Run
+from probe_kit.statistics.significance import SIGNIFICANCE
+
+if TYPE_CHECKING:
+    from probe_kit._tables.table import Table
+    from probe_kit.hooks import Policy
+    from probe_kit.intervene.sessions import ReplaySession
+
+ROLES = ("image", "language", "state")
+"""Roles that are cut by default, as many of them as the backbone's tokens have."""
+CUT = "cut"
+"""Direction of a condition that cuts the role itself, beside those of its controls."""
+Growth = Literal["both", "first", "last"]
+
+
+# -- the kind --------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class Knockout(Intervention):
+    """Cuts of the attention to every role, in windows of layers.
+
+    Attributes:
+        roles: Roles of the backbone's tokens that are cut; empty for `ROLES`, as many as there are.
+        window: `first`: layers 0 to n, for every n. `last`: layers n to the last, for every n. `both`. A number k:
+            every k neighbouring layers.
+        readers: Role of the backbone's tokens that no longer read; empty for the acting stream.
+        heads: Heads that no longer read, counted from 0; empty for all.
+        controls: Number of controls per window and role.
+        seed: Seed of the controls.
+
+    Raises:
+        UsageError: For another window, and for controls that are fewer than one in runs without sides.
+    """
+
+    kind: ClassVar[str] = "knockout"
+    summary: ClassVar[str] = "Attention knockout: from which tokens, up to which layer, does the action read?"
+    position: ClassVar[int] = 8
+    asks_where: ClassVar[bool] = True
+    needs: ClassVar[tuple[InterventionKind, ...]] = ("edit", "attention", "knockout")
+    options: ClassVar[Mapping[str, str]] = {
+        "roles": "whose tokens are cut; default image,language,state",
+        "window": "layers that are cut together: both (default), first, last, or a number of neighbours",
+        "readers": "role of the backbone's tokens that no longer read; default the acting stream",
+        "heads": "heads that no longer read; default all",
+        "controls": "cuts of as many random tokens of other roles; default 2",
+        "seed": "of the controls; default 0",
+    }
+
+    roles: tuple[str, ...] = ()
+    window: str = "both"
+    readers: str = ""
+    heads: tuple[int, ...] = ()
+    controls: int = 2
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        is_number = self.window.isdecimal() and int(self.window) > 0
+        if self.window not in get_args(Growth) and not is_number:
+            raise UsageError(
+                f"--window is {self.window!r}; expected {', '.join(get_args(Growth))} or a number of layers"
+            )
+        if self.readout != FIRST_CHUNK:
+            raise UsageError("--kind knockout measures the first inference; leave --readout out")
+        if ALL in self.roles:
+            raise UsageError(
+                "--roles all leaves no token of another role for a control; name roles, such as image,language"
+            )
+
+    @classmethod
+    def from_options(cls, run: Run, **options: Any) -> Self:
+        """Return the kind with the heads as numbers.
+
+        Raises:
+            UsageError: For a head that is no number.
+        """
+        names = options.pop("heads", ())
+        if wrong := [name for name in names if not str(name).isdecimal()]:
+            raise UsageError(f"--heads has {wrong[0]!r}; expected numbers, counted from 0, such as 0,3")
+        return super().from_options(run, heads=tuple(int(name) for name in names), **options)
+
+    def check_run(self, run: Run) -> None:
+        """Refuse a run without sides where no control is to be compared with; raises as the base does too.
+
+        Raises:
+            UsageError: For no control in a run without sides.
+        """
+        super().check_run(run)
+        if not has_sides(run) and not self.controls:
+            raise UsageError(
+                "--controls 0 leaves nothing to compare with: any cut changes an action. Take 1 or more"
+            )
+
+    def conditions(self, session: "ReplaySession") -> Sequence[Condition]:
+        """Return clean, the pictures swapped where they have sides, and every cut with its controls.
+
+        Raises:
+            UsageError: For a role that the backbone's tokens do not have, and for a window or head that is too
+                large.
+        """
+        policy = session.policy
+        backbone = backbone_of(policy)
+        stream = policy.streams[backbone if self.readers else acting_stream(policy)]
+        if outside := [head for head in self.heads if head >= stream.heads]:
+            raise UsageError(f"{stream.name} has {stream.heads} heads, counted from 0; there is no {outside[0]}")
+        if not stream.heads:
+            raise UnsupportedInterventionError(
+                f"the heads of {stream.name} of {policy.card.family} cannot be reached, so that their attention "
+                "cannot be cut. Patch `kv` instead (--kind interchange --sites kv.*)"
+            )
+        layers = stream.layers - 1
+        conditions = [CLEAN_RUN, *([SOURCE_RUN] if has_sides(session.run) else [])]
+        for role in self._roles(policy, backbone):
+            for first, last in windows(self.window, layers):
+                sites = [site for site in stream.sites(HEADS) if first <= site.layer <= last]
+                for name in (CUT, *(f"{CONTROL}{at + 1}" for at in range(self.controls))):
+                    cell = EditedCell(f"{stream.name}.{first:02d}-{last:02d}.{HEADS}", role, name)
+                    conditions.append(self._cut(cell, backbone, (first, last), sites))
+        return conditions
+
+    def _roles(self, policy: "Policy", backbone: str) -> tuple[str, ...]:
+        roles = self.roles or ROLES
+        present = roles_of(policy, backbone, roles)
+        role_names = (*policy.role_names[policy.tokens_of(backbone)], *TILES)
+        for role in (*self.roles, *([self.readers] if self.readers else [])):
+            if role not in roles_of(policy, backbone, (role,)):
+                raise UsageError(
+                    f"no token of {backbone} has the role {role!r}; there are {', '.join(role_names)}"
+                )
+        return tuple(present)
+
+    def _cut(self, cell: EditedCell, backbone: str, window: tuple[int, int], sites: Sequence[Site]) -> Condition:
+        """Return the clean inference in which nothing at these sites reads the tokens of a role, or a control."""
+
+        def play(context: ConditionContext) -> ConditionResult:
+            from probe_kit.hooks.capturing.attention import AttentionCut, cut_attention
+
+            tokens = context.tokens
+            try:
+                keys = tokens.mask(backbone, cell.role)
+            except EmptyRoleError:  # a tile may be hidden by the arm
+                return ConditionResult(context.act())
+            readers = tokens.mask(backbone, self.readers) if self.readers else None
+            if cell.is_control:
+                seed = derive_seed(
+                    "knockout", self.seed, context.pair.episode, context.pair.step, str(cell), *window
+                )
+                keys = random_tokens(keys, tokens.mask(backbone, ALL), seed)
+            cut = AttentionCut(keys, readers, self.heads or None)
+            with cut_attention(context.session.policy, dict.fromkeys(sites, cut)) as log:
+                return ConditionResult(context.act(), log)
+
+        return Condition(str(cell), play, cell=cell)
+
+    @staticmethod
+    def effects(measurement: Measurement) -> "list[KnockoutEffect]":
+        """Return one row per category, role and window, controls among them."""
+        return measurement.rows(knockout_effects)
+
+    @staticmethod
+    def table(rows: "Sequence[KnockoutEffect]", context: Measurement) -> "Table":
+        """Return one line per category, role and window; controls are columns."""
+        cuts = [row for row in rows if not row.is_control]
+        return effect_table(
+            f"From which tokens does it read? {context.subject}, knockout",
+            ("category", "cut"),
+            lines_of(cuts, lambda row: f"{row.role}, {row.layers}"),
+            {"What the action loses": _columns(not context.lacks_sides)},
+            lambda row: row.matters,
+            before=["layers: those in which the acting part cannot read the tokens"],
+            after=[UNRESOLVED if any(not row.is_resolved for row in cuts) else ""],
+        )
+
+    @staticmethod
+    def sentence(rows: "Sequence[KnockoutEffect]", context: Measurement) -> str:
+        """Return from which tokens the action reads, and in which layers, role by role."""
+        del context
+        return "; ".join(reading_of(part) for part in by_role(rows).values())
+
+    @staticmethod
+    def finding(rows: "Sequence[KnockoutEffect]", context: Measurement) -> str:
+        """Return the roles that the action reads, with their layers."""
+        del context
+        roles = by_role(rows)
+        read = {role: span for role, part in roles.items() if (span := layers_read(part)) is not None}
+        if not read:
+            return f"not read: no cut of {', '.join(roles)} loses more than its controls do"
+        parts = [f"{role} in {span_text(*sorted(span))}" for role, span in read.items()]
+        return f"read: {', '.join(parts)}"
+
+    @staticmethod
+    def notes(rows: "Sequence[KnockoutEffect]") -> list[str]:
+        """Return what a cut that loses nothing does not say."""
+        if all(layers_read(part) is not None for part in by_role(rows).values()):
+            return []
+        return [
+            "A cut that loses nothing says that the action does not read these tokens directly. What they say may "
+            "still reach it through other tokens of the backbone (--kind interchange)."
+        ]
+
+
+KIND = Knockout
+
+
+def acting_stream(policy: "Policy") -> str:
+    """Return the name of the stream whose heads read the backbone for the action."""
+    name = first_of("action", policy.streams.values())
+    assert name is not None, "every policy has a stream that acts"
+    return name
+
+
+def windows(window: str, layers: int) -> list[tuple[int, int]]:
+    """Return the first and last layer of every window, without repetition.
+
+    Raises:
+        UsageError: For a window of more layers than there are.
+    """
+    first = [(0, at) for at in range(layers)]
+    last = [(at, layers - 1) for at in range(layers)]
+    if window in get_args(Growth):
+        return [*dict.fromkeys((*(first if window != "last" else []), *(last if window != "first" else [])))]
+    if (size := int(window)) > layers:
+        raise UsageError(f"--window {size} is more than the {layers} layers that read")
+    return [(at, at + size - 1) for at in range(layers - size + 1)]
+
+
+def random_tokens(keys: NDArray[np.bool_], every: NDArray[np.bool_], seed: int) -> NDArray[np.bool_]:
+    """Return (T,) as many random tokens of others as `keys` marks; all others where there are fewer.
+
+    Args:
+        keys: (T,) the tokens that are not drawn.
+        every: (T,) all tokens but padding.
+        seed: Seed of the draw.
+    """
+    drawable = np.flatnonzero(every & ~keys)
+    count = min(int(keys.sum()), drawable.size)
+    drawn = np.zeros_like(keys)
+    drawn[np.random.default_rng(seed).choice(drawable, count, replace=False)] = True
+    return drawn
+
+
+# -- effects ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class KnockoutEffect(EffectRow):
+    """The loss by one cut in one category; see `EffectRow`.
+
+    Here `net` is the share of episodes whose action no longer goes to the correct picture's side, minus those that
+    do only with the cut; 0 without sides.
+
+    Attributes:
+        first: First layer that is cut.
+        last: Last layer that is cut.
+        readable: Number of layers that could be cut.
+        lost: Share of the picture's effect that is gone; None without sides, or without such an effect.
+        lost_ci: The 95 % interval of `lost`, by groups; None likewise.
+        size: Mean change of the action, in spreads of the clean actions.
+        control_lost: Mean `lost` of the controls; None likewise, or without controls.
+        control_size: Mean `size` of the controls; None without any.
+        p: The p-value of the loss beyond the controls; without sides of the change. None for controls.
+        p_fwe: Family-wise p-value over all cuts of the category; None likewise.
+    """
+
+    first: int
+    last: int
+    readable: int
+    lost: float | None
+    lost_ci: tuple[float, float] | None
+    size: float
+    control_lost: float | None
+    control_size: float | None
+    p: float | None
+    p_fwe: float | None
+
+    @property
+    def layers(self) -> str:
+        """The layers that are cut, as text."""
+        return span_text(self.first, self.last)
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether all layers are cut."""
+        return self.first == 0 and self.last == self.readable - 1
+
+    @property
+    def is_resolved(self) -> bool:
+        """Whether the loss or the change is as large as the resolution of its measure."""
+        return is_resolved(self.size if self.lost is None else self.lost)
+
+    @property
+    def matters(self) -> bool:
+        """Whether it loses more than its controls beyond chance, and a share that would matter."""
+        is_large = self.lost is None or self.lost - (self.control_lost or 0.0) >= NOTHING
+        return self.is_resolved and is_large and self.p_fwe is not None and self.p_fwe < SIGNIFICANCE
+
+
+def span_text(first: int, last: int) -> str:
+    """Return a span of layers as text, such as `layer 2` or `layers 2 to 5`."""
+    return f"layer {first}" if first == last else f"layers {first} to {last}"
+
+
+def knockout_effects(outcomes: ConditionOutcomes) -> list[KnockoutEffect]:
+    """Return one row per cut and control, of one category."""
+    rows = [row for row, name in enumerate(outcomes.conditions) if name not in UNCHANGED]
+    if not rows:
+        return []
+    cells = [outcomes.cells[row] for row in rows]
+    spans = [layers_of(cell.site) for cell in cells]
+    readable = 1 + max(last for _, last in spans)
+    clean, correct = outcomes.of(CLEAN), outcomes.correct_sign
+    moved = outcomes.displacement[rows] - clean
+    size = outcomes.size[rows] if outcomes.size is not None else np.abs(moved)
+    exchange = outcomes.exchange() if outcomes.has_sides else None
+    shares = [None if exchange is None else exchange.share(away) for away in moved]
+    # Where a picture has a side, a loss is a move away from the correct one; else any change counts.
+    tested = -correct * moved if outcomes.has_sides else size
+    tests = compare_with_controls(np.asarray(tested), cells, outcomes)
+    effects = []
+    for at, (row, cell, test) in enumerate(zip(rows, cells, tests, strict=True)):
+        right_before, right = correct * clean > 0, correct * outcomes.displacement[row] > 0
+        gains = right_before.astype(float) - right if outcomes.has_sides else np.zeros(clean.size)
+        share = shares[at]
+        of_controls = [2 * part.value for control in test.controls if (part := shares[control]) is not None]
+        effects.append(
+            KnockoutEffect(
+                **common_columns(outcomes, row, cell, gains),
+                first=spans[at][0],
+                last=spans[at][1],
+                readable=readable,
+                lost=None if share is None else 2 * share.value,
+                lost_ci=None if share is None else (2 * share.low, 2 * share.high),
+                size=float(size[at].mean()),
+                control_lost=float(np.mean(of_controls)) if of_controls else None,
+                control_size=mean_of(size[test.controls]),
+                p=test.p,
+                p_fwe=test.p_fwe,
+            )
+        )
+    return effects
+
+
+def layers_of(site_name: str) -> tuple[int, int]:
+    """Return the first and last layer of a place of a cut, such as `expert.00-03.heads`."""
+    first, last = site_name.split(".")[1].split("-")
+    return int(first), int(last)
+
+
+def by_role(rows: "Sequence[KnockoutEffect]") -> dict[str, list[KnockoutEffect]]:
+    """Return cuts by role, without controls."""
+    parts: dict[str, list[KnockoutEffect]] = {}
+    for row in rows:
+        if not row.is_control:
+            parts.setdefault(row.role, []).append(row)
+    return parts
+
+
+def layers_read(rows: "Sequence[KnockoutEffect]") -> tuple[int, int] | None:
+    """Return the first and last layer in which a role is read, of the cuts of one role; None if it is not.
+
+    With windows that grow from the first layer, reading begins where a loss is first beyond chance. With those
+    that grow from the last, it ends in the last layer from which a cut still loses. One of both alone leaves the
+    other limit at the end of the stack. Of windows that slide these are the outer limits of all that lose.
+    """
+    readable = rows[0].readable
+    losing = [row for row in rows if row.matters]
+    if not losing:
+        return None
+    growing, shrinking = (
+        [row for row in losing if row.first == 0],
+        [row for row in losing if row.last == readable - 1],
+    )
+    slides = [row for row in losing if row.first and row.last != readable - 1]
+    if slides:
+        return min(row.first for row in losing), max(row.last for row in losing)
+    begin = min((row.last for row in growing), default=0)
+    end = max((row.first for row in shrinking), default=readable - 1)
+    return begin, end
+
+
+def reading_of(rows: "Sequence[KnockoutEffect]") -> str:
+    """Return a clause on one role: the layers in which the action reads it, and what a cut loses."""
+    role, read = rows[0].role, layers_read(rows)
+    widest = max(rows, key=lambda row: row.last - row.first)
+    loss = (
+        f"change of {number(widest.size)} spreads"
+        if widest.lost is None
+        else f"loss of {interval_cell(widest.lost, widest.lost_ci).text} of the picture's effect"
+    )
+    if read is None:
+        return f"the action does not read {role} directly: a cut in {widest.layers} is a {loss}"
+    begin, end = read
+    if begin > end:
+        return (
+            f"the action reads {role} in {span_text(end, begin)}, where a part is enough: only cut "
+            f"together they lose it ({loss})"
+        )
+    behind = f"; behind layer {end} nothing is lost" if end < rows[0].readable - 1 else ""
+    return f"the action reads {role} in {span_text(begin, end)} ({loss}){behind}"
+
+
+def _columns(has_sides: bool) -> list[EffectColumn[KnockoutEffect]]:
+    """Return the columns of cuts; `has_sides` is whether a loss is a share of the picture's effect."""
+    p = EffectColumn[KnockoutEffect](
+        "p",
+        lambda row: p_of(row.p_fwe, row.is_resolved),
+        "p: family-wise over all cuts of the category, one-sided, against the controls",
+    )
+    change = EffectColumn[KnockoutEffect](
+        "change",
+        lambda row: TableCell(row.size, number),
+        "change: of the action, in spreads of the clean actions",
+    )
+    controls = "controls: the same for as many random tokens of other roles"
+    if not has_sides:
+        return [change, EffectColumn("controls", lambda row: TableCell(row.control_size, number), controls), p]
+    return [
+        EffectColumn(
+            "lost [95 %]",
+            lambda row: absent("n/a") if row.lost is None else interval_cell(row.lost, row.lost_ci),
+            "lost: share of the picture's effect on the action that is gone, n/a where that effect is not beyond "
+            "chance",
+        ),
+        EffectColumn("controls", lambda row: TableCell(row.control_lost, number), controls),
+        change,
+        EffectColumn(
+            "wrong side",
+            lambda row: TableCell(row.net, signed),
+            "wrong side: share of episodes whose action leaves the correct picture's side, minus those that come there",
+        ),
+        p,
+    ]

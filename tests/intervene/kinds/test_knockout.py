@@ -1,0 +1,145 @@
+"""Attention knockout: windows, controls, losses of policies whose reading is known, and sentences."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from typer.testing import CliRunner
+
+from probe_kit.cli import app
+from probe_kit.errors import UsageError
+from probe_kit.intervene import ConditionOutcomes, Knockout
+from probe_kit.intervene.edited_cells import NO_CELL, EditedCell, columns_of
+from probe_kit.intervene.kinds.knockout import (
+    KnockoutEffect,
+    by_role,
+    knockout_effects,
+    layers_read,
+    random_tokens,
+    reading_of,
+    windows,
+)
+from probe_kit.runs import Run
+from tests.intervene.answers import follower, outcomes_of
+
+LAYERS, EPISODES = 6, 48
+Losses = NDArray[np.float64]
+
+
+def test_windows_grow_from_either_end_and_hold_each_span_once() -> None:
+    assert windows("first", 3) == [(0, 0), (0, 1), (0, 2)]
+    assert windows("last", 3) == [(0, 2), (1, 2), (2, 2)]
+    assert windows("both", 3) == [(0, 0), (0, 1), (0, 2), (1, 2), (2, 2)]
+    assert windows("2", 3) == [(0, 1), (1, 2)]
+    with pytest.raises(UsageError, match="more than the 3 layers"):
+        windows("4", 3)
+
+
+def test_controls_are_as_many_tokens_of_other_roles() -> None:
+    keys, every = np.arange(20) < 6, np.arange(20) < 18
+    drawn = random_tokens(keys, every, 3)
+    assert drawn.sum() == 6
+    assert not (drawn & (keys | ~every)).any()
+    assert (random_tokens(keys, every, 3) == drawn).all()
+    assert random_tokens(~keys, every, 3).sum() == 6  # there are no more
+
+
+def played(reads: dict[str, list[set[int]]], seed: int) -> ConditionOutcomes:
+    """A follower with the loss that its reading implies: a role is lost if all layers of one of its sets are cut.
+
+    Actions of every condition have noise of their own, and a control loses nothing.
+    """
+    plain = outcomes_of({"color": follower(EPISODES)})
+    draw = np.random.default_rng(seed)
+    names, rows = list(plain.conditions), [plain.displacement[0], plain.displacement[1]]
+    cells = [NO_CELL] * 2
+    for role, sets in reads.items():
+        for first, last in windows("both", LAYERS):
+            cut = set(range(first, last + 1))
+            is_lost = bool(sets) and all(needed & cut for needed in sets)
+            for name in ("cut", "control-1", "control-2"):
+                cells.append(EditedCell(f"expert.{first:02d}-{last:02d}.heads", role, name))
+                names.append(str(cells[-1]))
+                remaining = 0.1 if is_lost and name == "cut" else 1.0
+                rows.append(remaining * plain.displacement[0])
+    moved = np.array(rows)
+    moved[2:] += draw.normal(0, 0.03, moved[2:].shape)
+    change = np.abs(moved - moved[0])
+    return replace(
+        plain,
+        conditions=tuple(names),
+        **columns_of(cells),
+        displacement=moved,
+        max_action_change=change,
+        size=change,
+        edit_log=np.ones((*moved.shape, 5)),
+    )
+
+
+def read_by(outcomes: ConditionOutcomes) -> dict[str, list[KnockoutEffect]]:
+    return by_role(knockout_effects(outcomes))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_reading_in_one_layer_is_found_there_and_words_that_are_unread_are_not(seed: int) -> None:
+    roles = read_by(played({"image": [{2}], "language": []}, seed))
+    assert layers_read(roles["image"]) == (2, 2)
+    assert layers_read(roles["language"]) is None
+    assert re.fullmatch(
+        r"the action reads image in layer 2 \(loss of 0\.[89]\d \[.*\] of the picture's effect\); "
+        "behind layer 2 nothing is lost",
+        reading_of(roles["image"]),
+    )
+    assert "does not read language directly" in reading_of(roles["language"])
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_layers_that_are_each_enough_are_named_together(seed: int) -> None:
+    """Reading in layer 1 or in layer 4 is enough: only a cut of both loses."""
+    roles = read_by(played({"image": [{1}, {4}]}, seed))
+    assert layers_read(roles["image"]) == (4, 1)
+    assert "in layers 1 to 4, where a part is enough" in reading_of(roles["image"])
+
+
+def test_what_nothing_reads_is_read_in_one_of_twenty_cases_at_most() -> None:
+    alarms = [
+        any(layers_read(part) is not None for part in read_by(played({"image": [], "state": []}, seed)).values())
+        for seed in range(60)
+    ]
+    assert np.mean(alarms) <= 0.05 + 2 * np.sqrt(0.05 * 0.95 / 60)
+
+
+def test_the_loss_is_twice_the_share_of_the_swap() -> None:
+    """An action that no longer tells both orders apart lies half way between clean and swapped."""
+    roles = read_by(played({"image": [{0}]}, 0))
+    widest = next(row for row in roles["image"] if row.is_whole)
+    assert widest.lost == pytest.approx(0.9, abs=0.05)
+    assert widest.lost_ci is not None
+    assert widest.lost_ci[0] < 0.9 < widest.lost_ci[1]
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"window": "0"}, "expected both, first, last or a number"),
+        ({"window": "half"}, "expected both, first, last or a number"),
+        ({"roles": ("all",)}, "leaves no token of another role"),
+        ({"readout": "per-step"}, "measures the first inference"),
+    ],
+)
+def test_settings_that_mean_nothing_are_refused(settings: dict[str, object], message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        Knockout(**settings)  # type: ignore[arg-type]
+
+
+@pytest.mark.slow
+def test_a_knockout_of_a_run_is_stored_and_read_again(copy: Run) -> None:
+    command = ["intervene", str(copy.path), "--kind", "knockout", "--items", "2", "--window", "3"]
+    answer = CliRunner().invoke(app, [*command, "--controls", "1"])
+    assert answer.exit_code == 0, answer.output
+    assert "layers 0 to 2" in answer.stdout
+    again = CliRunner().invoke(app, [*command, "--controls", "1"])
+    assert "loaded the stored result" in again.stderr
+    assert again.stdout == answer.stdout
