@@ -483,7 +483,7 @@ def _columns(has_sides: bool) -> list[EffectColumn[KnockoutEffect]]:
         EffectColumn(
             "wrong side",
             lambda row: TableCell(row.net, signed),
-            "wrong side: share of episodes whose action leaves the correct picture's side, minus those that come there",
+            "wrong side: share of episodes whose action leaves the correct picture's side, minus those that come",
         ),
         p,
     ]
