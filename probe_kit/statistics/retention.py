@@ -5,17 +5,20 @@ from dataclasses import dataclass
 from math import nan, sqrt
 
 import numpy as np
+from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
-from probe_kit.statistics.crossfit import CHANCE, CrossFit, Matrix
+from probe_kit.statistics.crossfit import CrossFit, Matrix
 from probe_kit.statistics.intervals import (
     NO_LIMITS,
-    TAIL,
     Interval,
     difference_interval,
     fieller_interval,
-    wilson_interval,
 )
+from probe_kit.statistics.share_limits import TAIL, wilson_limits
+
+_DIGITS = 9
+"""Digits to which sums of groups are equal: those of tied sites differ by the rounding of means."""
 
 # -- scores above chance -------------------------------------------------------------------------------------
 
@@ -62,11 +65,22 @@ class Scores:
 
 
 def accuracy_interval(fit: CrossFit, row: int) -> Interval:
-    """The 95 % interval of the held-out accuracy ½ + c of one category's chosen site, by `wilson_interval`."""
-    low, high = wilson_interval(
-        CHANCE + fit.above[row], fit.covariance[row, row], fit.n_groups, fit.n_episodes, fit.df
-    )
-    return Interval(float(low), float(high))
+    """The 95 % interval of the held-out accuracy ½ + c of one category's chosen site.
+
+    Every resample chooses sites, whose accuracy has limits by `wilson_limits`. The lower limit is the mean of the
+    lower half of these, the upper one that of the upper half. So the interval also holds what the choice adds, and
+    no limit rises with an added error.
+    """
+    choices, times = np.unique(fit.chosen[row].round(_DIGITS), axis=0, return_counts=True)
+    lows, highs = wilson_limits(choices, fit.sizes[row])
+    return Interval(_mean_of_lower_half(lows, times), -_mean_of_lower_half(-highs, times))
+
+
+def _mean_of_lower_half(values: Matrix, times: NDArray[np.intp]) -> float:
+    """Return the mean of the lower half of (U,) values that occur so many `times` each."""
+    order = np.argsort(values)
+    weights = np.diff(np.minimum(times[order].cumsum(), times.sum() / 2), prepend=0.0)
+    return float(values[order] @ weights / weights.sum())
 
 
 def t_quantile(df: float, tail: float = TAIL) -> float:
