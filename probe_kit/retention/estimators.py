@@ -25,7 +25,7 @@ from probe_kit.statistics.intervals import (
 )
 from probe_kit.statistics.retention import Ratio, Scores, accuracy_interval, retention, t_quantile
 from probe_kit.statistics.sufficiency import ABSENT_BELOW, at_most, findable, is_absent, permuted_threshold
-from probe_kit.train.results.control_scores import RANDOM_FEATURES, UNTRAINED, Controls, Exceeds, has_signal
+from probe_kit.train.results.control_scores import Controls, Exceeds, has_signal
 from probe_kit.train.results.probe_curve import ProbeCurve
 
 ACTION, BACKBONE = "action", "backbone"
@@ -431,7 +431,7 @@ def _missing_signal(exceeds: Exceeds, streams: StreamScores, absent_below: float
             if absent
             else f"n/a (backbone not shown, could be up to {most})"
         )
-    equals = [name for name in (RANDOM_FEATURES, UNTRAINED) if exceeds[name] is False]
+    equals = [name for name, better in exceeds.items() if better is False]
     return f"n/a (backbone not shown to beat {' and '.join(equals)})" if equals else ""
 
 

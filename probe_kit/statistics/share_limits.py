@@ -106,7 +106,8 @@ def korn_graubard_limits(sums: Matrix, sizes: Matrix, tail: float = TAIL) -> tup
         alike = exchangeable_variances(errors, sizes)
         few = np.minimum(_effective(share, alike, total), counting[:, -1])
         counting = np.column_stack([counting, few])
-        return np.minimum(_lowest_beta(np.column_stack([shares, share]), lost * counting, tail), perfect)
+        low: Matrix = np.minimum(_lowest_beta(np.column_stack([shares, share]), lost * counting, tail), perfect)
+        return low
 
     return _both(sums, sizes, lowest)
 
@@ -134,7 +135,8 @@ def wilson_limits(sums: Matrix, sizes: Matrix, tail: float = TAIL) -> tuple[Matr
 
     def lowest(errors: Matrix) -> Matrix:
         shares, counting = _of_fewer_errors(errors, sizes)
-        return np.minimum(wilson_low(shares, np.maximum(counting, count), square).min(axis=1), perfect)
+        low: Matrix = np.minimum(wilson_low(shares, np.maximum(counting, count), square).min(axis=1), perfect)
+        return low
 
     return _both(sums, sizes, lowest)
 
