@@ -28,6 +28,8 @@ NEGLIGIBLE_VARIANCE = 1e-12
 """A variance below this is the rounding of 0."""
 _NEGLIGIBLE_SHARE = 1e-9
 """A share of errors below this is the rounding of none."""
+_ALL = 1 - _NEGLIGIBLE_SHARE
+"""A share of hits above this is 1 but for rounding."""
 _MOST_STEPS = 512
 """Number of episodes up to which every smaller number of errors is tried; beyond, so many numbers."""
 
@@ -106,8 +108,7 @@ def korn_graubard_limits(sums: Matrix, sizes: Matrix, tail: float = TAIL) -> tup
         alike = exchangeable_variances(errors, sizes)
         few = np.minimum(_effective(share, alike, total), counting[:, -1])
         counting = np.column_stack([counting, few])
-        low: Matrix = np.minimum(_lowest_beta(np.column_stack([shares, share]), lost * counting, tail), perfect)
-        return low
+        return _below(perfect, share, total, _lowest_beta(np.column_stack([shares, share]), lost * counting, tail))
 
     return _both(sums, sizes, lowest)
 
@@ -135,8 +136,9 @@ def wilson_limits(sums: Matrix, sizes: Matrix, tail: float = TAIL) -> tuple[Matr
 
     def lowest(errors: Matrix) -> Matrix:
         shares, counting = _of_fewer_errors(errors, sizes)
-        low: Matrix = np.minimum(wilson_low(shares, np.maximum(counting, count), square).min(axis=1), perfect)
-        return low
+        low = wilson_low(shares, np.maximum(counting, count), square)
+        share = 1 - errors.sum(axis=1) / sizes.sum()
+        return _below(perfect, share, sizes.sum(), np.where(shares < _ALL, low, 1.0).min(axis=1))
 
     return _both(sums, sizes, lowest)
 
@@ -148,11 +150,21 @@ def wilson_low(shares: Matrix, counting: Matrix, square: float) -> Matrix:
     return low.clip(0)
 
 
+def _below(perfect: float, shares: Matrix, n_episodes: float, low: Matrix) -> Matrix:
+    """Return lower limits of (S,) shares that are below `perfect`, that of a share of 1, the more so by each error.
+
+    The bound falls by a part in E² with every error, so that no share with an error is known as well as without.
+    """
+    bounded: Matrix = np.minimum(low, perfect * (1 - (1 - shares) / n_episodes))
+    return np.where(shares < _ALL, bounded, perfect)
+
+
 def _lowest_beta(shares: Matrix, counting: Matrix, tail: float) -> Matrix:
     """Return the lowest (S,) of Clopper and Pearson's lower limits for (S, K) shares of `counting` episodes."""
     from scipy.special import betainc, betaincinv
 
     hits, others = np.maximum(shares * counting, _NEGLIGIBLE_SHARE), (1 - shares) * counting + 1
+    hits = np.where(shares < _ALL, hits, np.inf)
     low: Matrix = np.where(shares[:, -1] > _NEGLIGIBLE_SHARE, betaincinv(hits[:, -1], others[:, -1], tail), 0.0)
     # A limit is lower if more than `tail` lies below the one so far. That is faster to ask than all limits.
     rows, columns = np.nonzero(betainc(hits, others, low[:, None]) > tail * (1 + 1e-9))

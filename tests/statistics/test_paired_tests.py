@@ -208,7 +208,7 @@ def right(share: float, sites: int, seed: int) -> np.ndarray:
 
 
 def test_a_site_that_is_much_better_than_the_reference_gets_the_smallest_p() -> None:
-    sites = np.concatenate([right(0.9, 1, 0), right(0.6, 3, 1)])
+    sites = np.concatenate([right(0.95, 1, 0), right(0.6, 3, 1)])
     p = better_than_reference(sites, right(0.6, 1, 2)[0].astype(float), GROUPS, seed=0)
     assert p[0] == 1 / (1 + EXCHANGES)
     assert (p[1:] > 0.05).all()
