@@ -97,12 +97,14 @@ LEAST_KNOWN = 0.25
 
 A score that may be a quarter of its estimate makes the upper limit of a ratio four times as large.
 """
+WELL_KNOWN = 0.5
+"""The same share, from which on the limits are Fieller's; below, they are wider, see `retention`."""
 OTHER_TRAINING = 1.1
 """Factor of the standard errors of both scores, for what other training questions would change.
 
 A group also influences a score through the probes of the other folds, which no variance over tested groups
 includes. Without the factor, intervals cover 90.8 % at least in seven simulated settings of 480 draws, with it
-94.2 %. In a weak one, 88.7 % of those with limits cover (`benchmarks/retention_coverage.py`).
+94.2 % (`benchmarks/retention_coverage.py`).
 """
 
 
@@ -118,16 +120,25 @@ def retention(scores: Scores) -> Ratio:
     """Return the first score over the second one, (expert, backbone), with Fieller's limits (Fieller 1954).
 
     Of a mean over categories it is the ratio of the mean scores. The limits allow for other training questions,
-    see OTHER_TRAINING. There are none where the backbone is not known well enough to divide by, see LEAST_KNOWN.
-    NaN where its score is exactly 0.
+    see OTHER_TRAINING. NaN where the backbone's score is exactly 0.
+
+    A backbone that is not known well has limits only where its score is too high by chance, and then Fieller's
+    cover too rarely. Let the lower end of its interval be a share k of its score. From WELL_KNOWN down to
+    LEAST_KNOWN the distances of the limits grow by (WELL_KNOWN − LEAST_KNOWN) / (k − LEAST_KNOWN), without a jump,
+    until there are none.
     """
     expert, backbone = float(scores.above[0]), float(scores.above[1])
     value = expert / backbone if backbone else nan
     quantile = t_quantile(scores.df)
     low = backbone - quantile * sqrt(scores.covariance[1, 1])
-    if backbone <= 0 or low < LEAST_KNOWN * backbone:
+    known = low / backbone if backbone > 0 else 0.0
+    if known <= LEAST_KNOWN:
         return Ratio(value, NO_LIMITS)
-    return Ratio(value, fieller_interval(expert, backbone, scores.covariance[:2, :2], quantile * OTHER_TRAINING))
+    interval = fieller_interval(expert, backbone, scores.covariance[:2, :2], quantile * OTHER_TRAINING)
+    if not interval.bounded or known >= WELL_KNOWN:
+        return Ratio(value, interval)
+    times = (WELL_KNOWN - LEAST_KNOWN) / (known - LEAST_KNOWN)
+    return Ratio(value, Interval(value - times * (value - interval.low), value + times * (interval.high - value)))
 
 
 def retention_difference(first: Scores, second: Scores, between: Matrix | None = None) -> Ratio:

@@ -151,7 +151,7 @@ def wilson_low(shares: Matrix, counting: Matrix, square: float) -> Matrix:
 
 
 def _below(perfect: float, shares: Matrix, n_episodes: float, low: Matrix) -> Matrix:
-    """Return lower limits of (S,) shares that are below `perfect`, that of a share of 1, the more so by each error.
+    """Return lower limits of (S,) shares that are below `perfect`, that of a share of 1.
 
     The bound falls by a part in E² with every error, so that no share with an error is known as well as without.
     """

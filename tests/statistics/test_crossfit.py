@@ -406,6 +406,18 @@ def test_the_limits_solve_fiellers_equation_with_errors_a_tenth_larger() -> None
     assert interval.low < 0.4 < interval.high
 
 
+def test_limits_of_a_ratio_grow_without_a_jump_until_there_are_none() -> None:
+    """The lower end of the backbone's interval falls from nine tenths of its score to none of it."""
+    intervals = [retention(scores(0.1, 0.2, error)).interval for error in np.linspace(0.01, 0.095, 400)]
+    bounded = [one.bounded for one in intervals]
+    assert bounded == sorted(bounded, reverse=True)
+    widths = 1 / np.array([one.high - one.low for one in intervals if one.bounded])
+    assert not all(bounded)
+    assert (np.diff(widths) < 0).all()
+    assert widths[-1] < 0.02
+    assert np.abs(np.diff(widths)).max() < 0.12 * widths.max()
+
+
 def test_identical_streams_retain_exactly_all() -> None:
     one = stream(0, 0.75)
     found = retention(Scores.of(fitted(one, one)))
