@@ -107,7 +107,7 @@ def welch_interval(first: Sequence[float], second: Sequence[float], largest: flo
         largest: The difference that no two means can exceed, 1 for rates. Limits beyond it are cut there; where
             both are, there are none.
     """
-    from scipy.special import stdtrit  # type: ignore[import-untyped]
+    from scipy.special import stdtrit
 
     _values(first, second)
     sizes = np.array([len(first), len(second)])

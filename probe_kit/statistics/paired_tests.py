@@ -5,8 +5,7 @@ Groups of items are the unit: items that share pictures are not independent.
 
 from collections.abc import Callable, Hashable, Sequence
 from itertools import product
-from math import comb, sqrt
-from statistics import NormalDist
+from math import comb, pi, sqrt
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,37 +20,25 @@ Matrix = NDArray[np.float64]
 
 EXCHANGES = 999
 """Number of drawn exchanges: with the observed one 1,000, so that no p is below 0.001."""
-SHARED_PROBE = 1.25
-"""Factor of the drawn differences of squared errors, as `shared_probe_factor` is that of correct decisions.
+SHARED_DECISIONS = sqrt(1 + 2 / pi)
+"""Factor, 1.28, by which cross-validation widens the spread of an accuracy beyond that of its groups.
 
-Without the factor, one of two networks that know a quantity equally well exceeds the other in 6 to 14 % of
-experiments, with it in 2 to 6 % (`benchmarks/label_coverage.py`).
+Exchanges of groups take groups to be independent, and they are not. Any two groups of different folds train the
+probe of each other, and how similar their features are is a part of the decision values of both. Let G groups
+train a probe. The similarity to one of them then is 1 / G of the variance of a decision value, and two groups are
+correlated by ρ = 1 / G. So the sum over groups has twice the variance of independent groups.
+
+Decisions are right where a decision value exceeds a limit, in a share a of the episodes. They are correlated by
+ρ φ(z)² / (a (1 − a)) with z = Φ⁻¹(a), the first term of Pearson's series (Philosophical Transactions A 195, 1900).
+That is 2 ρ / π at a = ½, and less elsewhere: the factor would be 1.24 at 0.75 and 1.16 at 0.9. It is the most that
+there can be, of decision values in which the training groups decide all but the signal.
 """
+SHARED_PROBE = 1.25
+"""The same factor of differences of squared errors, by simulation.
 
-
-def shared_probe_factor(accuracy: float) -> float:
-    """Return the factor by which cross-validation widens the spread of an accuracy beyond that of its groups.
-
-    Exchanges of groups take groups to be independent, and they are not. Any two groups of different folds train
-    the probe of each other, and how similar their features are is a part of the decision values of both. Let G
-    groups train a probe. The similarity to one of them then is 1 / G of the variance of a decision value, and two
-    groups are correlated by ρ = 1 / G. So the sum over groups has twice the variance of independent groups.
-
-    Decisions are right where a decision value exceeds a limit, in a share a of the episodes. They are correlated
-    by ρ φ(z)² / (a (1 − a)) with z = Φ⁻¹(a), the first term of Pearson's series (Philosophical Transactions A 195,
-    1900). So the factor is √(1 + φ(z)² / (a (1 − a))): 1.28 at one half, 1.24 at 0.75, 1.16 at 0.9. It is the most
-    that there can be, of decision values in which the training groups decide all but the signal.
-
-    Args:
-        accuracy: Accuracy a that two networks have alike, that of the control; below one half taken as one half.
-    """
-    share = min(max(accuracy, 0.5), 1.0)
-    if share == 1:
-        return 1.0
-    normal = NormalDist()
-    return sqrt(1 + normal.pdf(normal.inv_cdf(share)) ** 2 / (share * (1 - share)))
-
-
+Without it, one of two networks that know a quantity equally well exceeds the other in 6 to 14 % of experiments,
+with it in 2 to 6 % (`benchmarks/label_coverage.py`).
+"""
 KNOWING = 0.05
 """Accuracy above chance from which on a control is taken to know something, see `_widening`."""
 
@@ -121,19 +108,19 @@ def better_than_best(
 def _widening(reference: float, chance: float) -> float:
     """Return the factor of the drawn differences of decisions from a control of this score.
 
-    Two networks that both guess differ by chance, which needs no factor: a site must be better than chance too,
-    and that is tested with the factor. Of a control that knows something the factor is `shared_probe_factor`.
-    Between, its square grows with the control's score above chance, up to KNOWING. In trained worlds of every
-    accuracy, both tests together find a difference in at most 5 % where there is none
-    (`benchmarks/score_coverage.py`).
+    Of two networks that both guess none exceeds the other, because a site must be better than chance too, and
+    that is tested with the factor. Of a control that knows something the factor is SHARED_DECISIONS. Between, its
+    square grows with the control's score above chance, up to KNOWING. So a control that knows nothing hides
+    little of what a site knows. `benchmarks/score_coverage.py` counts how often both tests together find a
+    difference where there is none.
     """
     knows = min(max((reference - chance) / KNOWING, 0.0), 1.0)
-    return sqrt(1 + knows * (shared_probe_factor(reference) ** 2 - 1))
+    return sqrt(1 + knows * (SHARED_DECISIONS**2 - 1))
 
 
 def _above_chance_p(correct: NDArray[np.bool_] | Matrix, groups: ArrayLike, seed: int, chance: float) -> Matrix:
     """Return the family-wise p (S,) that decisions are better than chance."""
-    return _flipped_p(_group_sums(correct - np.float64(chance), groups), seed, shared_probe_factor(chance))
+    return _flipped_p(_group_sums(correct - np.float64(chance), groups), seed, SHARED_DECISIONS)
 
 
 def _flipped_p(gains: Matrix, seed: int, factor: float) -> Matrix:
