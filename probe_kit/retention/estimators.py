@@ -235,7 +235,7 @@ class PooledScores:
         return Rate(mine.value - theirs.value, gap)
 
 
-_OF_STREAMS = ("above", "peaks", "influence", "chosen", "sizes")
+_OF_STREAMS = ("above", "peaks", "influence", "choice_sums", "sizes")
 """Members of `CrossFit` that have a row per stream."""
 
 

@@ -211,7 +211,7 @@ class CrossFit:
         peaks: (K,) accuracy of the site that is best on all groups, scored on them too.
         influence: (K, G) how much a group increases a score, through its own score and through the choice of
             sites.
-        chosen: (K, R, G) sums of the sites that each of R resamples chooses, as in `GroupSums`; R is
+        choice_sums: (K, R, G) sums of the sites that each of R resamples chooses, as in `GroupSums`; R is
             LIMITED_RESAMPLES.
         sizes: (K, G) sizes of the groups, as in `GroupSums`.
         groups: Names of the G groups.
@@ -221,7 +221,7 @@ class CrossFit:
     above: Matrix
     peaks: Matrix
     influence: Matrix
-    chosen: Matrix
+    choice_sums: Matrix
     sizes: Matrix
     groups: tuple[str, ...]
     suite: str
@@ -283,7 +283,7 @@ def crossfit(
         np.array([score for score, *_ in scored]) - chance,
         np.array([stream.peak for stream in streams]),
         np.array([influence for _, influence, _ in scored]),
-        np.array([chosen for *_, chosen in scored]),
+        np.array([choices for *_, choices in scored]),
         np.array([stream.scores.sizes for stream in streams]),
         tuple(map(str, groups)),
         suite,
@@ -297,7 +297,7 @@ def _scored(stream: StreamScores) -> tuple[float, Matrix, Matrix]:
     times = draw_groups(sizes.size, 0, RESAMPLES).T.astype(np.float64)
     of_group = np.empty(sizes.size)
     of_resample = np.zeros(RESAMPLES)
-    chosen = np.empty((LIMITED_RESAMPLES, sizes.size))
+    choice_sums = np.empty((LIMITED_RESAMPLES, sizes.size))
     for fold in range(stream.guide.shape[1]):
         tested = stream.fold_of == fold
         # Sites of the largest quality share the choice of every resample, (S, R).
@@ -305,10 +305,10 @@ def _scored(stream: StreamScores) -> tuple[float, Matrix, Matrix]:
         shares: Matrix = best / best.sum(axis=0)
         of_group[tested] = shares.mean(axis=1) @ sums[:, tested]
         of_resample += sums[:, tested].sum(axis=1) @ shares
-        chosen[:, tested] = shares[:, :LIMITED_RESAMPLES].T @ sums[:, tested]
+        choice_sums[:, tested] = shares[:, :LIMITED_RESAMPLES].T @ sums[:, tested]
     score = float(of_group.sum() / sizes.sum())
     by_choice = _influence_on_choice(times, of_resample / sizes.sum())
-    return score, (of_group - score * sizes) / sizes.sum() + by_choice, chosen
+    return score, (of_group - score * sizes) / sizes.sum() + by_choice, choice_sums
 
 
 def _are_best(quality: Matrix) -> NDArray[np.bool_]:

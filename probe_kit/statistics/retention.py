@@ -71,7 +71,7 @@ def accuracy_interval(fit: CrossFit, row: int) -> Interval:
     lower half of these, the upper one that of the upper half. So the interval also holds what the choice adds, and
     no limit rises with an added error.
     """
-    choices, times = np.unique(fit.chosen[row].round(_DIGITS), axis=0, return_counts=True)
+    choices, times = np.unique(fit.choice_sums[row].round(_DIGITS), axis=0, return_counts=True)
     lows, highs = wilson_limits(choices, fit.sizes[row])
     return Interval(_mean_of_lower_half(lows, times), -_mean_of_lower_half(-highs, times))
 
@@ -131,13 +131,13 @@ def retention(scores: Scores) -> Ratio:
     value = expert / backbone if backbone else nan
     quantile = t_quantile(scores.df)
     low = backbone - quantile * sqrt(scores.covariance[1, 1])
-    known = low / backbone if backbone > 0 else 0.0
-    if known <= LEAST_KNOWN:
+    least_share = low / backbone if backbone > 0 else 0.0
+    if least_share <= LEAST_KNOWN:
         return Ratio(value, NO_LIMITS)
     interval = fieller_interval(expert, backbone, scores.covariance[:2, :2], quantile * OTHER_TRAINING)
-    if not interval.bounded or known >= WELL_KNOWN:
+    if not interval.bounded or least_share >= WELL_KNOWN:
         return Ratio(value, interval)
-    times = (WELL_KNOWN - LEAST_KNOWN) / (known - LEAST_KNOWN)
+    times = (WELL_KNOWN - LEAST_KNOWN) / (least_share - LEAST_KNOWN)
     return Ratio(value, Interval(value - times * (value - interval.low), value + times * (interval.high - value)))
 
 

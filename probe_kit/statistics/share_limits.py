@@ -163,12 +163,12 @@ def _lowest_beta(shares: Matrix, counting: Matrix, tail: float) -> Matrix:
     """Return the lowest (S,) of Clopper and Pearson's lower limits for (S, K) shares of `counting` episodes."""
     from scipy.special import betainc, betaincinv
 
-    hits, others = np.maximum(shares * counting, _NEGLIGIBLE_SHARE), (1 - shares) * counting + 1
+    hits, misses = np.maximum(shares * counting, _NEGLIGIBLE_SHARE), (1 - shares) * counting + 1
     hits = np.where(shares < _ALL, hits, np.inf)
-    low: Matrix = np.where(shares[:, -1] > _NEGLIGIBLE_SHARE, betaincinv(hits[:, -1], others[:, -1], tail), 0.0)
+    low: Matrix = np.where(shares[:, -1] > _NEGLIGIBLE_SHARE, betaincinv(hits[:, -1], misses[:, -1], tail), 0.0)
     # A limit is lower if more than `tail` lies below the one so far. That is faster to ask than all limits.
-    rows, columns = np.nonzero(betainc(hits, others, low[:, None]) > tail * (1 + 1e-9))
-    np.minimum.at(low, rows, betaincinv(hits[rows, columns], others[rows, columns], tail))
+    rows, columns = np.nonzero(betainc(hits, misses, low[:, None]) > tail * (1 + 1e-9))
+    np.minimum.at(low, rows, betaincinv(hits[rows, columns], misses[rows, columns], tail))
     return low
 
 
@@ -216,16 +216,16 @@ def _of_fewer_errors(errors: Matrix, sizes: Matrix) -> tuple[Matrix, Matrix]:
         ordered = -np.sort(-errors, axis=1)
         zero = np.zeros((len(errors), 1))
         at, squares = (np.hstack([zero, part.cumsum(axis=1)]) for part in (ordered, ordered**2))
-        taken = np.array([np.interp(*row) for row in zip(numbers, at, squares, strict=True)])
-        taken = taken.reshape(numbers.shape) - 2 * q * numbers * sizes[0]
+        sums = np.array([np.interp(*row) for row in zip(numbers, at, squares, strict=True)])
+        sums = sums.reshape(numbers.shape) - 2 * q * numbers * sizes[0]
     else:
-        taken = np.array([_taken(*row, sizes) for row in zip(errors, numbers, q, strict=True)])
-        taken = taken.reshape(numbers.shape)
-    variances = np.maximum(q**2 * (sizes @ sizes) + taken, 0) * count / (count - 1) / total**2
+        sums = np.array([_largest_sums(*row, sizes) for row in zip(errors, numbers, q, strict=True)])
+        sums = sums.reshape(numbers.shape)
+    variances = np.maximum(q**2 * (sizes @ sizes) + sums, 0) * count / (count - 1) / total**2
     return 1 - q, _effective(q, variances, total)
 
 
-def _taken(errors: Matrix, numbers: Matrix, q: Matrix, sizes: Matrix) -> Matrix:
+def _largest_sums(errors: Matrix, numbers: Matrix, q: Matrix, sizes: Matrix) -> Matrix:
     """Return (K,) the largest sums over groups of y (x − 2 q size) with Σ y = t; see `_of_fewer_errors`."""
     worth = errors - 2 * q[:, None] * sizes
     order = np.argsort(-worth, axis=1)

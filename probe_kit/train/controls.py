@@ -166,11 +166,11 @@ def add_controls(
                 references, scored = dict.fromkeys(widths, reference), {"": reference}
             scores = [control_score(name, category, curve, stream) for stream, curve in scored.items()]
             compared: list[ControlComparison] = []
-            asked = name == RANDOM_FEATURES or not problem.is_side
-            if not asked and references:
+            is_compared = name == RANDOM_FEATURES or not problem.is_side
+            if not is_compared and references:
                 reference = next(iter(references.values()))  # the same for all streams
-                asked = is_informative(reference.inner[0], reference.labels, reference.groups)
-            if asked:
+                is_compared = is_informative(reference.inner[0], reference.labels, reference.groups)
+            if is_compared:
                 compared = [
                     comparison
                     for (curve_category, view), curve in results.curves.items()
