@@ -8,14 +8,16 @@ is a matter of label permutations and folds, so a linear discriminant with the c
 larger class where it sees nothing, stands for the logistic probe; `--probe nested` fits that, at a hundred times
 the cost. *Shared*: features of a group and of an item that hold no answer. *Mirrored*: features that hold the
 answer in a direction of the group's own. *Missing*: that share of the episodes whose correct side is right. The
-rival flips items. Controls: correctness of 75 groups of four episodes at 19 sites, neighbours correlated 0.9,
-against a random-features control and an untrained network that are as accurate. `--keep` keeps the draws of
+rival flips items. Controls: correctness of 75 groups of four episodes at 19 sites, neighbours correlated 0.9, and
+at six unlike ones, against a random-features control and an untrained network that are as accurate. Groups are
+independent here; `score_coverage.py` trains the probes of such worlds. `--keep` keeps the draws of
 worlds, so that the same command resumes.
 """
 
 import argparse
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -122,24 +124,26 @@ def p_values(world: World, seed: int, by_item: bool = False, nested: bool = Fals
     return float(p_value(accuracy, null)[0]), float(max_statistic_p(accuracy, null).min())
 
 
-def correlated(generator: np.random.Generator, sites: int, accuracy: float) -> NDArray[np.bool_]:
-    """(sites, 300) correctness; episodes of a group correlated 0.3, neighbouring sites 0.9."""
+def correlated(
+    generator: np.random.Generator, sites: int, accuracy: float, neighbours: float = 0.9
+) -> NDArray[np.bool_]:
+    """(sites, 300) correctness; episodes of a group are correlated 0.3."""
     from scipy.special import ndtri
 
     of_group = np.repeat(generator.standard_normal((sites, 75)), 4, axis=1)
     values = np.sqrt(0.3) * of_group + np.sqrt(0.7) * generator.standard_normal((sites, 300))
     for site in range(1, sites):
-        values[site] = 0.9 * values[site - 1] + np.sqrt(1 - 0.81) * values[site]
+        values[site] = neighbours * values[site - 1] + np.sqrt(1 - neighbours**2) * values[site]
     right: NDArray[np.bool_] = values < ndtri(accuracy)
     return right
 
 
-def control_alarms(accuracy: float, draws: int) -> tuple[float, float]:
-    """How often any of 19 sites exceeds an equally accurate random-features control, and untrained network."""
+def control_alarms(accuracy: float, draws: int, sites: int, neighbours: float) -> tuple[float, float]:
+    """How often any of the sites exceeds an equally accurate random-features control, and untrained network."""
     groups, found = np.repeat(np.arange(75), 4), []
     for seed in range(draws):
         generator = np.random.default_rng(seed)
-        here, there = correlated(generator, 19, accuracy), correlated(generator, 19, accuracy)
+        here, there = (correlated(generator, sites, accuracy, neighbours) for _ in range(2))
         layers = [correlated(generator, 1, accuracy)[0] for _ in range(LAYERS)]
         reference = np.mean(layers, axis=0)
         found.append(
@@ -166,11 +170,15 @@ def main() -> None:
     with threadpool_limits(1):
         accuracies = (0.5, 0.6, 0.8) if arguments.control_draws else ()
         controls = Table(
-            "accuracy", "random-features", "untrained", title=f"false alarms, {arguments.control_draws} draws"
+            "sites",
+            "accuracy",
+            "random-features",
+            "untrained",
+            title=f"false alarms, {arguments.control_draws} draws",
         )
-        for accuracy in accuracies:
-            random_features, untrained = control_alarms(accuracy, arguments.control_draws)
-            controls.add_row(f"{accuracy:.1f}", f"{random_features:.1%}", f"{untrained:.1%}")
+        for accuracy, (sites, neighbours) in product(accuracies, ((19, 0.9), (6, 0.0))):
+            random_features, untrained = control_alarms(accuracy, arguments.control_draws, sites, neighbours)
+            controls.add_row(str(sites), f"{accuracy:.1f}", f"{random_features:.1%}", f"{untrained:.1%}")
         if accuracies:
             console.print(controls)
         names = tuple(arguments.worlds.split(";"))

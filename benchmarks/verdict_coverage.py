@@ -208,7 +208,7 @@ def models(draws: int, seed: int) -> Table:
     return table
 
 
-SPREADS = ((3, 9, 1), (3, 9, 3), (4, 8, 3), (3, 6, 5), (2, 8, 3))
+SPREADS = ((3, 9, 1), (3, 9, 3), (4, 8, 3), (3, 6, 5), (2, 8, 3), (2, 12, 5), (4, 4, 5), (6, 6, 3), (6, 6, 5))
 
 
 def spreads(draws: int, seed: int) -> Table:

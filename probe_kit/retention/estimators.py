@@ -25,7 +25,7 @@ from probe_kit.statistics.intervals import (
 )
 from probe_kit.statistics.retention import Ratio, Scores, accuracy_interval, retention, t_quantile
 from probe_kit.statistics.sufficiency import ABSENT_BELOW, at_most, findable, is_absent, permuted_threshold
-from probe_kit.train.results.control_scores import RANDOM_FEATURES, UNTRAINED, Controls, Exceeds, has_signal
+from probe_kit.train.results.control_scores import Controls, Exceeds, has_signal
 from probe_kit.train.results.probe_curve import ProbeCurve
 
 ACTION, BACKBONE = "action", "backbone"
@@ -194,12 +194,10 @@ class PooledScores:
             return None
         fits = [_only(run, names) for run in runs]
         if not all(fit.shares_groups_with(fits[0]) for fit in fits):
-            means = tuple(map(Rate.mean, zip(*map(_rates, fits), strict=True)))
-            return cls(names, Scores.mean([Scores.of(fit) for fit in fits]), means, None)
-        above, peaks, influence = (
-            np.mean([getattr(fit, part) for fit in fits], axis=0) for part in ("above", "peaks", "influence")
-        )
-        fit = replace(fits[0], above=above, peaks=peaks, influence=influence)
+            rates = tuple(map(Rate.mean, zip(*map(_rates, fits), strict=True)))
+            return cls(names, Scores.mean([Scores.of(fit) for fit in fits]), rates, None)
+        means = {name: np.mean([getattr(fit, name) for fit in fits], axis=0) for name in _OF_STREAMS}
+        fit = replace(fits[0], **means)
         return cls(names, Scores.of(fit), _rates(fit), fit)
 
     def accuracy(self, name: str) -> Rate:
@@ -237,6 +235,10 @@ class PooledScores:
         return Rate(mine.value - theirs.value, gap)
 
 
+_OF_STREAMS = ("above", "peaks", "influence", "choice_sums", "sizes")
+"""Members of `CrossFit` that have a row per stream."""
+
+
 def _rates(fit: CrossFit) -> tuple[Rate, ...]:
     """Return the accuracies of all streams."""
     return tuple(Rate(CHANCE + float(above), accuracy_interval(fit, row)) for row, above in enumerate(fit.above))
@@ -244,8 +246,7 @@ def _rates(fit: CrossFit) -> tuple[Rate, ...]:
 
 def _only(run: StreamScores, names: Sequence[str]) -> CrossFit:
     rows = [run.names.index(name) for name in names]
-    fit = run.fit
-    return replace(fit, above=fit.above[rows], peaks=fit.peaks[rows], influence=fit.influence[rows])
+    return replace(run.fit, **{name: getattr(run.fit, name)[rows] for name in _OF_STREAMS})
 
 
 # -- retention -----------------------------------------------------------------------------------------------
@@ -430,7 +431,7 @@ def _missing_signal(exceeds: Exceeds, streams: StreamScores, absent_below: float
             if absent
             else f"n/a (backbone not shown, could be up to {most})"
         )
-    equals = [name for name in (RANDOM_FEATURES, UNTRAINED) if exceeds[name] is False]
+    equals = [name for name, better in exceeds.items() if better is False]
     return f"n/a (backbone not shown to beat {' and '.join(equals)})" if equals else ""
 
 

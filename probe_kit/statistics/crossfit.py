@@ -129,6 +129,8 @@ def remove_fold_priors(decisions: Matrix, labels: NDArray[np.bool_], fold_of: Ar
 
 RESAMPLES = 1000
 """Number of resamples of the groups; in each, the sites are chosen anew."""
+LIMITED_RESAMPLES = 250
+"""Number of these whose choice of sites has limits of its own."""
 FEWEST_GROUPS = OUTER_FOLDS
 """The fewest groups of a cross-fit: every outer fold tests at least one group."""
 _EQUAL = 1e-9
@@ -209,7 +211,9 @@ class CrossFit:
         peaks: (K,) accuracy of the site that is best on all groups, scored on them too.
         influence: (K, G) how much a group increases a score, through its own score and through the choice of
             sites.
-        n_episodes: E, the least of all streams.
+        choice_sums: (K, R, G) sums of the sites that each of R resamples chooses, as in `GroupSums`; R is
+            LIMITED_RESAMPLES.
+        sizes: (K, G) sizes of the groups, as in `GroupSums`.
         groups: Names of the G groups.
         suite: Name of the suite that the groups are from.
     """
@@ -217,7 +221,8 @@ class CrossFit:
     above: Matrix
     peaks: Matrix
     influence: Matrix
-    n_episodes: float
+    choice_sums: Matrix
+    sizes: Matrix
     groups: tuple[str, ...]
     suite: str
 
@@ -275,22 +280,24 @@ def crossfit(
     _check(streams, groups)
     scored = [_scored(stream) for stream in streams]
     return CrossFit(
-        np.array([score for score, _ in scored]) - chance,
+        np.array([score for score, *_ in scored]) - chance,
         np.array([stream.peak for stream in streams]),
-        np.array([influence for _, influence in scored]),
-        min(stream.scores.n_episodes for stream in streams),
+        np.array([influence for _, influence, _ in scored]),
+        np.array([choices for *_, choices in scored]),
+        np.array([stream.scores.sizes for stream in streams]),
         tuple(map(str, groups)),
         suite,
     )
 
 
-def _scored(stream: StreamScores) -> tuple[float, Matrix]:
-    """Return the score of a stream, and (G,) the influence of every group on it."""
+def _scored(stream: StreamScores) -> tuple[float, Matrix, Matrix]:
+    """Return the score of a stream, (G,) the influence of every group on it, and (R, G) the sums of choices."""
     sums, sizes = stream.scores.sums, stream.scores.sizes
     # One seed for all streams and runs: on equal groups their choices are made in the same resamples.
     times = draw_groups(sizes.size, 0, RESAMPLES).T.astype(np.float64)
     of_group = np.empty(sizes.size)
     of_resample = np.zeros(RESAMPLES)
+    choice_sums = np.empty((LIMITED_RESAMPLES, sizes.size))
     for fold in range(stream.guide.shape[1]):
         tested = stream.fold_of == fold
         # Sites of the largest quality share the choice of every resample, (S, R).
@@ -298,9 +305,10 @@ def _scored(stream: StreamScores) -> tuple[float, Matrix]:
         shares: Matrix = best / best.sum(axis=0)
         of_group[tested] = shares.mean(axis=1) @ sums[:, tested]
         of_resample += sums[:, tested].sum(axis=1) @ shares
+        choice_sums[:, tested] = shares[:, :LIMITED_RESAMPLES].T @ sums[:, tested]
     score = float(of_group.sum() / sizes.sum())
     by_choice = _influence_on_choice(times, of_resample / sizes.sum())
-    return score, (of_group - score * sizes) / sizes.sum() + by_choice
+    return score, (of_group - score * sizes) / sizes.sum() + by_choice, choice_sums
 
 
 def _are_best(quality: Matrix) -> NDArray[np.bool_]:

@@ -1,13 +1,7 @@
 """Intervals of shares, ratios (Fieller), differences and means (MOVER), with groups of items as the unit.
 
 Success rates and other outcomes have Korn and Graubard's interval. Accuracies of probes have Wilson's. See `Share`
-and `Accuracy`.
-
-Korn and Graubard, “Confidence intervals for proportions with small expected number of positive counts estimated
-from survey data”, Survey Methodology 24 (1998).
-
-Wilson, “Probable inference, the law of succession, and statistical inference”, Journal of the American Statistical
-Association 22 (1927). Kish, “Survey sampling” (1965), for the design effect.
+and `Accuracy`, and `share_limits` for the formulas.
 
 Zou and Donner, “Construction of confidence limits about effect measures”, Statistics in Medicine 27 (2008).
 """
@@ -16,13 +10,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from math import inf, isfinite, isinf, sqrt
-from statistics import NormalDist, fmean
+from statistics import fmean
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from probe_kit.errors import UsageError
-from probe_kit.statistics.significance import SIGNIFICANCE
+from probe_kit.statistics.share_limits import (
+    NEGLIGIBLE_VARIANCE,
+    effective_groups,
+    korn_graubard_limits,
+    wilson_limits,
+)
 
 
 @dataclass(frozen=True)
@@ -66,8 +65,6 @@ def fieller_interval(
 
 
 NO_LIMITS = Interval(-inf, inf)
-NEGLIGIBLE_VARIANCE = 1e-12
-"""A variance below this is the rounding of 0."""
 
 
 def difference_interval(
@@ -144,9 +141,6 @@ def _combined(first: float, second: float, correlation: float) -> float:
 # -- shares --------------------------------------------------------------------------------------------------
 
 Matrix = NDArray[np.float64]
-
-TAIL = SIGNIFICANCE / 2
-"""Chance of either side of a two-sided 95 % interval."""
 
 
 @dataclass(frozen=True)
@@ -244,11 +238,11 @@ class Share:
         return difference_interval(self.value, self.interval(), other.value, other.interval(), related)
 
     def interval(self) -> Interval:
-        """The 95 % interval by `share_interval`; 0 to 1 with a single group."""
+        """The 95 % interval by `korn_graubard_limits`; 0 to 1 with a single group."""
         if self.groups.size == 1:
             return Interval(0.0, 1.0)
-        low, high = share_interval(self.value, self.variance, self.groups.size, self.sizes.sum(), self.df)
-        return Interval(float(low), float(high))
+        low, high = korn_graubard_limits(self.sums[None], self.sizes)
+        return Interval(float(low[0]), float(high[0]))
 
 
 class Accuracy(Share):
@@ -260,108 +254,8 @@ class Accuracy(Share):
     """
 
     def interval(self) -> Interval:
-        """The 95 % interval by `wilson_interval`; 0 to 1 with a single group."""
+        """The 95 % interval by `wilson_limits`; 0 to 1 with a single group."""
         if self.groups.size == 1:
             return Interval(0.0, 1.0)
-        low, high = wilson_interval(self.value, self.variance, self.n_groups, self.sizes.sum(), self.df)
-        return Interval(float(low), float(high))
-
-
-def effective_groups(sizes: Matrix) -> float:
-    """Return G* of (G,) sizes: so many groups of equal size vary as little, E² / Σ size²."""
-    return float(sizes.sum() ** 2 / (sizes @ sizes))
-
-
-def effective_episodes(
-    shares: ArrayLike, variances: ArrayLike, n_episodes: float
-) -> tuple[Matrix, Matrix, NDArray[np.bool_]]:
-    """Return shares s within [0, 1], min(s (1 − s) / v, E), and whether all groups agree; arrays of one shape.
-
-    The second is E over the design effect (Kish 1965). It has no meaning where all groups agree.
-    """
-    s, v = np.broadcast_arrays(np.asarray(shares, np.float64).clip(0, 1), variances)
-    agree = (v <= NEGLIGIBLE_VARIANCE) | (s <= 0) | (s >= 1)
-    return s, np.minimum(s * (1 - s) / np.where(agree, 1.0, v), n_episodes), agree
-
-
-def group_shares(sums: Matrix, sizes: Matrix) -> tuple[Matrix, Matrix]:
-    """Return shares and their variances, groups as the unit; (S,) each from (S, G) sums and (G,) sizes.
-
-    variance = Σ (sum − share · size)² · G / (G − 1) / E², with E = Σ size. Two groups or more are needed.
-    """
-    total, count = sizes.sum(), sizes.size
-    shares: Matrix = sums.sum(axis=1) / total
-    residuals = sums - shares[:, None] * sizes
-    variances: Matrix = (residuals**2).sum(axis=1) * count / (count - 1) / total**2
-    return shares, variances
-
-
-def share_interval(
-    share: ArrayLike,
-    variance: ArrayLike,
-    n_groups: float,
-    n_episodes: float,
-    df: float,
-    tail: float = TAIL,
-) -> tuple[Matrix, Matrix]:
-    """Return Clopper and Pearson's limits for arrays of shares, with the effective number of episodes.
-
-    The method is that of Korn and Graubard (1998). The effective number is n = min(s (1 − s) / v, E) · (t(1 −
-    tail, E − 1) / t(1 − tail, df))². The limits are Beta⁻¹(tail; s n, n − s n + 1) and Beta⁻¹(1 − tail; s n + 1, n
-    − s n).
-
-    Where nothing varies, n is `n_groups`, whatever their sizes: G groups that are alike with chance p all agree
-    with chance p^G. No share is better known than there. Without this rule, a share near 1 of unequal groups with
-    few errors is covered in 88 %.
-
-    Args:
-        share: The estimates s.
-        variance: Their variances v, with groups as the unit.
-        n_groups: Number of groups, G.
-        n_episodes: Number of episodes, E.
-        df: Degrees of freedom of the variance.
-        tail: Chance of either side.
-    """
-    from scipy.special import betaincinv, stdtrit  # type: ignore[import-untyped]
-
-    s, counting, agree = effective_episodes(share, variance, n_episodes)
-    lost = stdtrit(max(n_episodes - 1, 1), 1 - tail) / stdtrit(df, 1 - tail)
-    n = np.where(agree, n_groups, counting * lost**2)
-    right, wrong = s * n, n - s * n
-    none, all_ = right <= 1e-9, wrong <= 1e-9
-    low = betaincinv(np.where(none, 1.0, right), wrong + 1, tail)
-    high = betaincinv(right + 1, np.where(all_, 1.0, wrong), 1 - tail)
-    perfect = tail ** (1 / n_groups)
-    return np.where(none, 0.0, np.minimum(low, perfect)), np.where(all_, 1.0, np.maximum(high, 1 - perfect))
-
-
-def wilson_interval(
-    share: ArrayLike, variance: ArrayLike, n_groups: float, n_episodes: float, df: float, tail: float = TAIL
-) -> tuple[Matrix, Matrix]:
-    """Return Wilson's limits (1927) with the effective number of episodes, for arrays of accuracies.
-
-    n is the number of `effective_episodes`, at least G. With t the quantile of Student's distribution, the limits
-    are (s + t²/2n ± t √(s (1 − s)/n + t²/4n²)) / (1 + t²/n).
-
-    Where all groups agree, the variance knows nothing of other groups: n is G, and t is the normal quantile. No
-    accuracy is better known than there.
-
-    Args:
-        share: The estimates s.
-        variance: Their variances v, with groups as the unit.
-        n_groups: Number of groups G; of unequal groups G* (`effective_groups`).
-        n_episodes: Number of episodes, E.
-        df: Degrees of freedom of the variance.
-        tail: Chance of either side.
-    """
-    from scipy.special import stdtrit
-
-    s, counting, agree = effective_episodes(share, variance, n_episodes)
-    n = np.where(agree, n_groups, np.maximum(counting, n_groups))
-    normal = NormalDist().inv_cdf(1 - tail) ** 2
-    square = np.where(agree, normal, stdtrit(df, 1 - tail) ** 2)
-    reach = np.sqrt(square * s * (1 - s) / n + (square / (2 * n)) ** 2)
-    low, high = ((s + square / (2 * n) + sign * reach) / (1 + square / n) for sign in (-1, 1))
-    # Else one group with an error would make an accuracy better known than none does.
-    perfect = n_groups / (n_groups + normal)
-    return np.minimum(low, perfect).clip(0), np.maximum(high, 1 - perfect).clip(max=1)
+        low, high = wilson_limits(self.sums[None], self.sizes)
+        return Interval(float(low[0]), float(high[0]))

@@ -5,11 +5,12 @@ Groups of items are the unit: items that share pictures are not independent.
 
 from collections.abc import Callable, Hashable, Sequence
 from itertools import product
-from math import comb
+from math import comb, pi, sqrt
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from probe_kit.statistics.crossfit import CHANCE
 from probe_kit.statistics.label_permutations import p_value
 from probe_kit.statistics.significance import SIGNIFICANCE
 
@@ -19,34 +20,55 @@ Matrix = NDArray[np.float64]
 
 EXCHANGES = 999
 """Number of drawn exchanges: with the observed one 1,000, so that no p is below 0.001."""
-SHARED_PROBE = 1.25
-"""Factor of the drawn differences of squared errors.
+SHARED_DECISIONS = sqrt(1 + 2 / pi)
+"""Factor, 1.28, by which cross-validation widens the spread of an accuracy beyond that of its groups.
 
-Groups share a probe, so two networks that know a quantity equally well differ by more than exchanges of groups
-allow. Without the factor, one exceeds the other in 6 to 14 % of experiments, with it in 2 to 6 %
-(`benchmarks/label_coverage.py`).
+Exchanges of groups take groups to be independent, and they are not. Any two groups of different folds train the
+probe of each other, and how similar their features are is a part of the decision values of both. Let G groups
+train a probe. The similarity to one of them then is 1 / G of the variance of a decision value, and two groups are
+correlated by ρ = 1 / G. So the sum over groups has twice the variance of independent groups.
+
+Decisions are right where a decision value exceeds a limit, in a share a of the episodes. They are correlated by
+ρ φ(z)² / (a (1 − a)) with z = Φ⁻¹(a), the first term of Pearson's series (Philosophical Transactions A 195, 1900).
+That is 2 ρ / π at a = ½, and less elsewhere: the factor would be 1.24 at 0.75 and 1.16 at 0.9. It is the most that
+there can be, of decision values in which the training groups decide all but the signal.
 """
+SHARED_PROBE = 1.25
+"""The same factor of differences of squared errors, by simulation.
+
+Without it, one of two networks that know a quantity equally well exceeds the other in 6 to 14 % of experiments,
+with it in 2 to 6 % (`benchmarks/label_coverage.py`).
+"""
+KNOWING = 0.05
+"""Accuracy above chance from which on a control is taken to know something, see `_widening`."""
 
 
 def better_than_reference(
-    correct: NDArray[np.bool_] | Matrix, reference: Matrix, groups: ArrayLike, seed: int, widening: float = 1.0
+    correct: NDArray[np.bool_] | Matrix,
+    reference: Matrix,
+    groups: ArrayLike,
+    seed: int,
+    widening: float | None = None,
+    chance: float = CHANCE,
 ) -> Matrix:
     """Return the family-wise p (S,) that a site's mean score is higher than one control's.
 
     If a site is no better, a group is as likely to favour it as to oppose it. So the signs of the groups'
-    differences are drawn anew, the same for all sites, and the largest of them counts.
+    differences are drawn anew, the same for all sites, and the largest of them counts. Decisions must also be
+    better than chance by the same test: see `_widening`.
 
     Args:
-        correct: (S, E) scores, such as whether a decision is right.
+        correct: (S, E) scores, such as whether a held-out decision is right.
         reference: (E,) score of the control in each episode.
         groups: (E,) group of items of every episode.
         seed: Seed of the signs.
-        widening: Factor of the drawn differences; SHARED_PROBE for R², whose groups share a probe and so are not
-            independent.
+        widening: Factor of the drawn differences; SHARED_PROBE of R². None for decisions.
+        chance: Mean score of guessing, for decisions.
     """
     gain = _group_sums(correct - reference, groups)
-    signs = np.where(np.random.default_rng(seed).random((gain.shape[1], EXCHANGES)) < 0.5, -1.0, 1.0)
-    return p_value(gain.sum(axis=1), widening * (gain @ signs).max(axis=0, keepdims=True))
+    factor = _widening(float(reference.mean()), chance) if widening is None else widening
+    p = _flipped_p(gain, seed, factor)
+    return p if widening is not None else np.maximum(p, _above_chance_p(correct, groups, seed, chance))
 
 
 def better_than_best(
@@ -54,7 +76,8 @@ def better_than_best(
     references: NDArray[np.bool_] | Matrix,
     groups: ArrayLike,
     seed: int,
-    widening: float = 1.0,
+    widening: float | None = None,
+    chance: float = CHANCE,
 ) -> Matrix:
     """Return the family-wise p (S,) that a site's mean score is higher than that of another model's best site.
 
@@ -62,11 +85,12 @@ def better_than_best(
     and both best sites are chosen anew.
 
     Args:
-        correct: (S, E) scores, such as whether a decision is right.
+        correct: (S, E) scores, such as whether a held-out decision is right.
         references: (S', E) scores of the other model's sites on the same episodes.
         groups: (E,) group of items of every episode.
         seed: Seed of the exchanges.
         widening: Factor of the drawn differences, as in `better_than_reference`.
+        chance: Mean score of guessing, for decisions.
     """
     sums, reference_sums = _group_sums(correct, groups), _group_sums(references, groups)
     stays = (np.random.default_rng(seed).random((sums.shape[1], EXCHANGES)) < 0.5).astype(float)
@@ -75,7 +99,34 @@ def better_than_best(
     mixed_here = _mixed(sums, reference_sums[_matching(len(sums), shared)], stays)
     mixed_there = _mixed(reference_sums, sums[_matching(len(reference_sums), shared)], stays)
     null = mixed_here.max(axis=0) - mixed_there.max(axis=0)
-    return p_value(sums.sum(axis=1) - reference_sums.sum(axis=1).max(), widening * null[None, :])
+    best = float(np.asarray(references, np.float64).mean(axis=1).max())
+    factor = _widening(best, chance) if widening is None else widening
+    p = p_value(sums.sum(axis=1) - reference_sums.sum(axis=1).max(), factor * null[None, :])
+    return p if widening is not None else np.maximum(p, _above_chance_p(correct, groups, seed, chance))
+
+
+def _widening(reference: float, chance: float) -> float:
+    """Return the factor of the drawn differences of decisions from a control of this score.
+
+    Of two networks that both guess none exceeds the other, because a site must be better than chance too, and
+    that is tested with the factor. Of a control that knows something the factor is SHARED_DECISIONS. Between, its
+    square grows with the control's score above chance, up to KNOWING. So a control that knows nothing hides
+    little of what a site knows. `benchmarks/score_coverage.py` counts how often both tests together find a
+    difference where there is none.
+    """
+    knows = min(max((reference - chance) / KNOWING, 0.0), 1.0)
+    return sqrt(1 + knows * (SHARED_DECISIONS**2 - 1))
+
+
+def _above_chance_p(correct: NDArray[np.bool_] | Matrix, groups: ArrayLike, seed: int, chance: float) -> Matrix:
+    """Return the family-wise p (S,) that decisions are better than chance."""
+    return _flipped_p(_group_sums(correct - np.float64(chance), groups), seed, SHARED_DECISIONS)
+
+
+def _flipped_p(gains: Matrix, seed: int, factor: float) -> Matrix:
+    """Return the family-wise p (S,) that the sums of (S, G) gains are positive, by drawn signs of the groups."""
+    signs = np.where(np.random.default_rng(seed).random((gains.shape[1], EXCHANGES)) < 0.5, -1.0, 1.0)
+    return p_value(gains.sum(axis=1), factor * (gains @ signs).max(axis=0, keepdims=True))
 
 
 def _mixed(sums: Matrix, other: Matrix, stays: Matrix) -> Matrix:

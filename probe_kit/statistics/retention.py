@@ -5,17 +5,20 @@ from dataclasses import dataclass
 from math import nan, sqrt
 
 import numpy as np
+from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
-from probe_kit.statistics.crossfit import CHANCE, CrossFit, Matrix
+from probe_kit.statistics.crossfit import CrossFit, Matrix
 from probe_kit.statistics.intervals import (
     NO_LIMITS,
-    TAIL,
     Interval,
     difference_interval,
     fieller_interval,
-    wilson_interval,
 )
+from probe_kit.statistics.share_limits import TAIL, wilson_limits
+
+_DIGITS = 9
+"""Digits to which sums of groups are equal: those of tied sites differ by the rounding of means."""
 
 # -- scores above chance -------------------------------------------------------------------------------------
 
@@ -62,11 +65,22 @@ class Scores:
 
 
 def accuracy_interval(fit: CrossFit, row: int) -> Interval:
-    """The 95 % interval of the held-out accuracy ½ + c of one category's chosen site, by `wilson_interval`."""
-    low, high = wilson_interval(
-        CHANCE + fit.above[row], fit.covariance[row, row], fit.n_groups, fit.n_episodes, fit.df
-    )
-    return Interval(float(low), float(high))
+    """The 95 % interval of the held-out accuracy ½ + c of one category's chosen site.
+
+    Every resample chooses sites, whose accuracy has limits by `wilson_limits`. The lower limit is the mean of the
+    lower half of these, the upper one that of the upper half. So the interval also holds what the choice adds, and
+    no limit rises with an added error.
+    """
+    choices, times = np.unique(fit.choice_sums[row].round(_DIGITS), axis=0, return_counts=True)
+    lows, highs = wilson_limits(choices, fit.sizes[row])
+    return Interval(_mean_of_lower_half(lows, times), -_mean_of_lower_half(-highs, times))
+
+
+def _mean_of_lower_half(values: Matrix, times: NDArray[np.intp]) -> float:
+    """Return the mean of the lower half of (U,) values that occur so many `times` each."""
+    order = np.argsort(values)
+    weights = np.diff(np.minimum(times[order].cumsum(), times.sum() / 2), prepend=0.0)
+    return float(values[order] @ weights / weights.sum())
 
 
 def t_quantile(df: float, tail: float = TAIL) -> float:
@@ -83,12 +97,14 @@ LEAST_KNOWN = 0.25
 
 A score that may be a quarter of its estimate makes the upper limit of a ratio four times as large.
 """
+WELL_KNOWN = 0.5
+"""The same share, from which on the limits are Fieller's; below, they are wider, see `retention`."""
 OTHER_TRAINING = 1.1
 """Factor of the standard errors of both scores, for what other training questions would change.
 
 A group also influences a score through the probes of the other folds, which no variance over tested groups
 includes. Without the factor, intervals cover 90.8 % at least in seven simulated settings of 480 draws, with it
-94.2 %. In a weak one, 88.7 % of those with limits cover (`benchmarks/retention_coverage.py`).
+94.2 % (`benchmarks/retention_coverage.py`).
 """
 
 
@@ -104,16 +120,25 @@ def retention(scores: Scores) -> Ratio:
     """Return the first score over the second one, (expert, backbone), with Fieller's limits (Fieller 1954).
 
     Of a mean over categories it is the ratio of the mean scores. The limits allow for other training questions,
-    see OTHER_TRAINING. There are none where the backbone is not known well enough to divide by, see LEAST_KNOWN.
-    NaN where its score is exactly 0.
+    see OTHER_TRAINING. NaN where the backbone's score is exactly 0.
+
+    A backbone that is not known well has limits only where its score is too high by chance, and then Fieller's
+    cover too rarely. Let the lower end of its interval be a share k of its score. From WELL_KNOWN down to
+    LEAST_KNOWN the distances of the limits grow by (WELL_KNOWN − LEAST_KNOWN) / (k − LEAST_KNOWN), without a jump,
+    until there are none.
     """
     expert, backbone = float(scores.above[0]), float(scores.above[1])
     value = expert / backbone if backbone else nan
     quantile = t_quantile(scores.df)
     low = backbone - quantile * sqrt(scores.covariance[1, 1])
-    if backbone <= 0 or low < LEAST_KNOWN * backbone:
+    least_share = low / backbone if backbone > 0 else 0.0
+    if least_share <= LEAST_KNOWN:
         return Ratio(value, NO_LIMITS)
-    return Ratio(value, fieller_interval(expert, backbone, scores.covariance[:2, :2], quantile * OTHER_TRAINING))
+    interval = fieller_interval(expert, backbone, scores.covariance[:2, :2], quantile * OTHER_TRAINING)
+    if not interval.bounded or least_share >= WELL_KNOWN:
+        return Ratio(value, interval)
+    times = (WELL_KNOWN - LEAST_KNOWN) / (least_share - LEAST_KNOWN)
+    return Ratio(value, Interval(value - times * (value - interval.low), value + times * (interval.high - value)))
 
 
 def retention_difference(first: Scores, second: Scores, between: Matrix | None = None) -> Ratio:

@@ -15,9 +15,9 @@ from probe_kit.errors import TooFewGroupsError
 from probe_kit.statistics.bootstrap import GAINS, group_bootstrap
 from probe_kit.statistics.crossfit import CHANCE, FEWEST_GROUPS, GroupSums, Matrix
 from probe_kit.statistics.folds import OUTER_FOLDS
-from probe_kit.statistics.intervals import effective_episodes, group_shares, share_interval
 from probe_kit.statistics.label_permutations import possible_flips, smallest_p
 from probe_kit.statistics.paired_tests import smallest_flip_p
+from probe_kit.statistics.share_limits import effective_episodes, group_shares, korn_graubard_limits
 from probe_kit.statistics.significance import SIGNIFICANCE
 
 # -- verdicts on a stream ------------------------------------------------------------------------------------
@@ -45,11 +45,7 @@ def at_most(sites: GroupSums) -> float:
         raise TooFewGroupsError(
             f"{counted(sites.n_groups, 'independent group')} of items set no limit; expected two or more"
         )
-    shares, variances = group_shares(sites.sums, sites.sizes)
-    _, high = share_interval(
-        shares, variances, sites.n_groups, sites.n_episodes, sites.n_groups - 1, tail=SIGNIFICANCE
-    )
-    return float(high.max())
+    return float(korn_graubard_limits(sites.sums, sites.sizes, SIGNIFICANCE)[1].max())
 
 
 def findable(sites: GroupSums, threshold: float) -> float:
@@ -64,7 +60,7 @@ def findable(sites: GroupSums, threshold: float) -> float:
     """
     if not threshold < 1:
         return inf
-    _, counting, agree = effective_episodes(*group_shares(sites.sums, sites.sizes), sites.n_episodes)
+    counting, agree = effective_episodes(*group_shares(sites.sums, sites.sizes), sites.n_episodes)
     counting = counting[~agree]
     k = NormalDist().inv_cdf(POWER) ** 2 / float(np.median(counting) if counting.size else sites.n_episodes)
     half = (2 * threshold + k) / 2

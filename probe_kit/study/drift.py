@@ -5,6 +5,8 @@ Stored probes are used on the activations of another run of the same episodes. N
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from math import sqrt
+from statistics import NormalDist
 from typing import Any, Literal
 
 import numpy as np
@@ -24,9 +26,12 @@ from probe_kit.runs.layout import FIRST_FRAME
 from probe_kit.runs.reader import RunReader
 from probe_kit.statistics.cka import unbiased_cka
 from probe_kit.statistics.label_permutations import flip_groups, max_statistic_p
+from probe_kit.statistics.share_limits import effective_episodes, group_shares
 from probe_kit.statistics.significance import SIGNIFICANCE
+from probe_kit.statistics.sufficiency import permuted_threshold
 from probe_kit.suite.categories import category_of
 from probe_kit.train.crossval.task_scores import correctness
+from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_results import Direction, ProbeResults
 from probe_kit.train.results.store import load_results
 
@@ -53,13 +58,13 @@ def _features(side: Side, site: Site, view: str, episodes: NDArray[np.str_]) -> 
 
 def _transfer(
     probed: Side, other: Side, category: str, view: str, sites: Sequence[Site], common: NDArray[np.str_]
-) -> Features:
+) -> tuple[Features, float]:
     """Return accuracies of the probes of one run on the activations of another, as shares, and p: (3, S).
 
     The first accuracies are of decisions as they are. For the second ones features are centred and scaled as in
     the other run's own training folds, without labels. p is of these, against the best site under label
     permutations of whole groups. Each of the `common` episodes is judged by the probe that was trained without its
-    fold.
+    fold. The second value is the accuracy that the best site exceeds in 5 % of the permutations.
 
     Args:
         probed: The run whose probes are used.
@@ -85,7 +90,7 @@ def _transfer(
     null = flip_groups(labels, curve.groups[rows], PERMUTATIONS, derive_seed("transfer", category, view))
     right = np.array([correctness(run[:, None], null).mean(axis=0) for run in recentred])
     accuracy, aligned = (correctness(run, labels[None, :]).mean(axis=1) for run in (raw, recentred))
-    return np.stack([accuracy, aligned, max_statistic_p(aligned, right)])
+    return np.stack([accuracy, aligned, max_statistic_p(aligned, right)]), permuted_threshold(right)
 
 
 def _decisions(
@@ -146,7 +151,9 @@ def _cosines(first: Direction, second: Direction, features: Features) -> tuple[f
 Verdict = Literal["kept", "transfer not shown", "forgotten", "learned", "not shown in either", "not clear"]
 VERDICTS: Mapping[Verdict, str] = {
     "kept": "signal in both, and probes transfer after recentring",
-    "transfer not shown": "signal in both, and the items are too few to tell whether probes transfer",
+    "transfer not shown": "signal in both, and the test does not find that probes transfer. This is no proof that "
+    "the direction moved. In brackets the power: how often the test finds probes that decode the other run as "
+    "well as its own do",
     "forgotten": "signal in the first alone, and the 95 % interval of the drop excludes 0",
     "learned": "signal in the second alone, and the 95 % interval of the gain excludes 0",
     "not shown in either": "signal in neither",
@@ -192,6 +199,8 @@ class CategoryDrift:
         best: The position of the site at which the first run's own probes are best.
         episodes: Number of episodes that both runs have.
         why_alone: Reason why nothing is transferred, empty if it is.
+        power: How often the test of the transfer forth finds probes that decode the other run as well as own ones
+            do; None where nothing is transferred.
     """
 
     category: str
@@ -202,6 +211,7 @@ class CategoryDrift:
     best: int
     episodes: int
     why_alone: str = ""
+    power: float | None = None
 
     @property
     def verdict(self) -> Verdict:
@@ -335,7 +345,7 @@ def _category(
     if why:
         return CategoryDrift(name, *rows, difference, (), 0, episodes.size, why)
     sites = _common_sites(sides, name, view)
-    forth, back = (
+    (forth, threshold), (back, _) = (
         _transfer(probed, other, name, view, sites, episodes) for probed, other in (sides, (sides[1], sides[0]))
     )
     lenses = [lens_accuracy(run, episodes) for run, _ in sides]
@@ -351,7 +361,20 @@ def _category(
         likeness = (unbiased_cka(before, after), *cosines, _at_layer(lenses, site.layer))
         drifts.append(SiteDrift(site, raw, recentred, p_fwe, raw_back, recentred_back, p_fwe_back, *likeness))
     accuracies = [curves[0].correct[curves[0].sites.index(site)].mean() for site in sites]
-    return CategoryDrift(name, *rows, difference, tuple(drifts), int(np.argmax(accuracies)), episodes.size)
+    best = int(np.argmax(accuracies))
+    power = min(_power(curve, sites[best], threshold) for curve in curves)
+    return CategoryDrift(name, *rows, difference, tuple(drifts), best, episodes.size, power=power)
+
+
+def _power(curve: ProbeCurve, site: Site, threshold: float) -> float:
+    """Return how often decisions as accurate as the probes of a site are more accurate than `threshold`."""
+    sums = curve.sums.only([curve.sites.index(site)])
+    shares, variances = group_shares(sums.sums, sums.sizes)
+    counting, agree = effective_episodes(shares, variances, sums.n_episodes)
+    share = float(shares[0])
+    count = sums.n_episodes if agree[0] else float(counting[0])
+    error = sqrt(max(0.0, share * (1 - share)) / count)
+    return NormalDist(share, error).cdf(2 * share - threshold) if error else float(share > threshold)
 
 
 def lens_accuracy(run: RunReader, episodes: NDArray[np.str_]) -> NDArray[np.float64] | None:
@@ -436,7 +459,7 @@ def drift_table(pairs: Mapping[tuple[str, str], Sequence[CategoryDrift]], title:
     drifts = [(names, drift) for names, of_pair in pairs.items() for drift in of_pair]
     has_lens = any(site.lens for _, drift in drifts for site in drift.sites)
     cells: tuple[Cells, ...] = tuple(
-        (f"{names[0]} → {names[1]}", category_of(drift.category).title, drift.verdict, *_cells(drift, has_lens))
+        (f"{names[0]} → {names[1]}", category_of(drift.category).title, _verdict(drift), *_cells(drift, has_lens))
         for names, drift in drifts
     )
     verdicts = dict.fromkeys(drift.verdict for _, drift in drifts)
@@ -447,6 +470,13 @@ def drift_table(pairs: Mapping[tuple[str, str], Sequence[CategoryDrift]], title:
     numbers = tuple(number for names, drift in drifts for number in _numbers(names, drift, view))
     groups = (*_COLUMNS, *[_LENS][:has_lens])
     return Table.of(heading, grouped(*groups), cells, names=2, notes=note, numbers=numbers)
+
+
+def _verdict(drift: CategoryDrift) -> str:
+    """Return the verdict; of a transfer that is not shown, how often it would be."""
+    if drift.verdict != "transfer not shown" or drift.power is None:
+        return drift.verdict
+    return f"{drift.verdict} (power {percent(drift.power)} %)"
 
 
 def _cells(drift: CategoryDrift, has_lens: bool) -> tuple[Cell, ...]:
@@ -489,6 +519,7 @@ def _numbers(names: tuple[str, str], drift: CategoryDrift, view: str) -> list[Nu
         "difference": None if gap is None else gap.backbone,
         "difference_ci": None if gap is None else gap.backbone_ci,
         "p": drift.p_transfer if drift.sites else None,
+        "power": drift.power,
     }
     of_sites: list[Number] = [
         {

@@ -3,19 +3,25 @@
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from math import log, sqrt
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from probe_kit.errors import SuiteNotFoundError, UsageError
 from probe_kit.hashing import derive_seed
 from probe_kit.runs.layout import DATASET
 from probe_kit.runs.reader import RunReader, full_name
 from probe_kit.runs.run_suite import suite_of
+from probe_kit.statistics.crossfit import CHANCE
+from probe_kit.statistics.folds import sums_by_group
 from probe_kit.statistics.intervals import Accuracy
 from probe_kit.statistics.label_permutations import p_value
 from probe_kit.statistics.paired_tests import better_than_best, better_than_reference
+from probe_kit.statistics.retention import t_quantile
+from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.choices import CONTROLS, EVERYWHERE
 from probe_kit.train.control_features import LAYERS, PICTURED, ControlInputs, why_impossible
 from probe_kit.train.crossval.site_probe import SiteProbe
@@ -44,7 +50,7 @@ A policy's own action is no leak: whether a site exceeds it is another question.
 `position` gives a label away is a fact of the table, for which no site can be blamed.
 """
 _SIDE_SEEDS = {RANDOM_FEATURES: "binding", UNTRAINED: "twin"}
-"""Words in the seeds of the controls that sites of a side are compared with.
+"""Words in the seeds of the controls that sites of a side are compared with; of others their name.
 
 Numbers depend on them: another word would draw other exchanges.
 """
@@ -130,7 +136,7 @@ def add_controls(
     """Return `results` with these controls for every category.
 
     Every site is compared with `random-features`. Sites of a target other than a side are compared with every
-    control.
+    control, those of a side with every one that `is_informative`.
 
     Args:
         results: Results without these controls.
@@ -160,7 +166,11 @@ def add_controls(
                 references, scored = dict.fromkeys(widths, reference), {"": reference}
             scores = [control_score(name, category, curve, stream) for stream, curve in scored.items()]
             compared: list[ControlComparison] = []
-            if name == RANDOM_FEATURES or not problem.is_side:
+            is_compared = name == RANDOM_FEATURES or not problem.is_side
+            if not is_compared and references:
+                reference = next(iter(references.values()))  # the same for all streams
+                is_compared = is_informative(reference.inner[0], reference.labels, reference.groups)
+            if is_compared:
                 compared = [
                     comparison
                     for (curve_category, view), curve in results.curves.items()
@@ -169,6 +179,27 @@ def add_controls(
                 ]
             controls = controls.with_scores(scores, compared)
     return replace(results, controls=controls)
+
+
+def is_informative(inner: NDArray[np.floating], labels: NDArray[np.bool_], groups: ArrayLike) -> bool:
+    """Return whether the inner folds of a control's probe of a side know more than the shares of the sides.
+
+    They do if their log-likelihood is above that of the shares, by Student's one-sided test with groups as the
+    unit. The outer folds, on which sites are compared, do not take part: a control that happens to score well is
+    not chosen for that.
+
+    Args:
+        inner: (F, G) log-likelihood of every group in the inner folds of each outer fold, 0 for the groups that
+            the outer fold tests.
+        labels: (E,) side of every episode.
+        groups: (E,) group of items of every episode.
+    """
+    share = float(labels.mean())
+    entropy = -sum(part * log(part) for part in (share, 1 - share) if part > 0)
+    # Every group is in the inner folds of all outer folds but its own.
+    gains = inner.sum(axis=0) / (len(inner) - 1) + entropy * sums_by_group(np.ones(labels.size), groups)
+    quantile = t_quantile(gains.size - 1, SIGNIFICANCE)
+    return bool(gains.mean() > quantile * gains.std(ddof=1) / sqrt(gains.size))
 
 
 def _layer_probes(inputs: ControlInputs, problem: Problem, width: int, seed: int) -> list[SiteProbe]:
@@ -216,17 +247,18 @@ def _compared(
     curve, settings = results.curves[key], results.settings
     rows = curve.stream(stream)
     if settings.is_side:
-        seed = derive_seed(_SIDE_SEEDS[name], settings.seed, *key, stream)
+        seed = derive_seed(_SIDE_SEEDS.get(name, name), settings.seed, *key, stream)
     else:
         scope = key[1:] if settings.categories == (EVERYWHERE,) else key
         seed = derive_seed("label control", settings.seed, name, *scope, stream)
+    chance = 1 / len(curve.classes) if curve.classes else CHANCE
     if name == UNTRAINED:
         level = float(references.mean(axis=1).max())
-        p = better_than_best(curve.scores[rows], references, curve.groups, seed, curve.widening)
+        p = better_than_best(curve.scores[rows], references, curve.groups, seed, curve.widening, chance)
     else:
         reference = references.mean(axis=0)
         level = float(reference.mean())
-        p = better_than_reference(curve.scores[rows], reference, curve.groups, seed, curve.widening)
+        p = better_than_reference(curve.scores[rows], reference, curve.groups, seed, curve.widening, chance)
     for row, of_site in zip(rows, p, strict=True):
         yield ControlComparison(name, *key, str(curve.sites[row]), level, float(of_site))
 

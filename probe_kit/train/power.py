@@ -27,6 +27,12 @@ SEEDS = 5
 """Parts of a simulation, each with a limit of chance of its own; their spread is the error of the whole."""
 NULL_DRAWS, POOL = 4000, 40_000
 """Experiments without signal per seed, and the groups that they are made of."""
+NO_PROBES = 1.0
+"""Factor of differences from controls: simulated groups train no probes of each other.
+
+Those of trained probes spread more, and are tested with a factor. Both together detect about as much as the
+simulation (`benchmarks/power_trained.py`).
+"""
 _NUMBERS_IN_MEMORY = 200_000
 """The most random numbers that are held at once."""
 
@@ -168,8 +174,8 @@ def _part(items: int, signal: NDArray[np.float64], draws: int, seed: int) -> tup
         detected.append(
             (
                 right.mean(axis=1).max() > limit,
-                better_than_reference(right, reference, groups, draw).min() < SIGNIFICANCE,
-                better_than_best(right, untrained, groups, draw).min() < SIGNIFICANCE,
+                better_than_reference(right, reference, groups, draw, NO_PROBES).min() < SIGNIFICANCE,
+                better_than_best(right, untrained, groups, draw, NO_PROBES).min() < SIGNIFICANCE,
                 is_absent(at_most(_group_sums(untrained)), findable(_group_sums(untrained), limit)),
             )
         )

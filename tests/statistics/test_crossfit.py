@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.stats import t
+from scipy.stats import beta, t
 
 from probe_kit.errors import TooFewGroupsError, UnbalancedEpisodesError, UsageError
 from probe_kit.statistics.crossfit import (
@@ -15,7 +15,7 @@ from probe_kit.statistics.crossfit import (
     remove_fold_priors,
     smoothing,
 )
-from probe_kit.statistics.intervals import NO_LIMITS, difference_interval, share_interval
+from probe_kit.statistics.intervals import NO_LIMITS, difference_interval
 from probe_kit.statistics.retention import (
     Ratio,
     Scores,
@@ -286,7 +286,6 @@ def test_groups_of_unequal_weight_count_by_their_episodes() -> None:
     sums = GroupSums(np.array([0.8 * sizes, 0.5 * sizes]), sizes)
     fit = fitted(stream_of(sums, [0, 1]))
     assert fit.above[0] == pytest.approx(0.3)
-    assert fit.n_episodes == sizes.sum()
 
 
 def test_fewer_groups_than_outer_folds_are_refused() -> None:
@@ -356,6 +355,21 @@ def test_a_perfect_site_is_known_as_well_as_its_groups_allow() -> None:
     assert (interval.low, interval.high) == pytest.approx((0.7575, 1.0), abs=5e-4)
 
 
+@pytest.mark.parametrize("sites", [1, 3, 6, 7, 12, 13])
+@pytest.mark.parametrize("seed", range(3))
+def test_limits_of_a_stream_never_rise_with_an_added_error(sites: int, seed: int) -> None:
+    """All sites have the same errors; means of tied sites differ by rounding."""
+    generator, groups = np.random.default_rng(seed), 12
+    right, limits = np.full(groups * 4, 1.0), []
+    for at in [None, *generator.permutation(right.size)[:30]]:
+        right[at if at is not None else []] = 0.0
+        sums = np.repeat(right.reshape(groups, 4).sum(axis=1)[None], sites, axis=0)
+        interval = accuracy_interval(fitted(stream_of(GroupSums(sums, np.full(groups, 4.0)), np.arange(sites))), 0)
+        limits.append((interval.low, interval.high))
+    assert limits[0] == pytest.approx((0.7575, 1.0), abs=5e-4)
+    assert np.diff(limits, axis=0).max() <= 1e-9
+
+
 def test_the_interval_of_an_accuracy_holds_what_choosing_adds() -> None:
     fit = fitted(site_stream(0.7, 40))
     interval = accuracy_interval(fit, 0)
@@ -390,6 +404,18 @@ def test_the_limits_solve_fiellers_equation_with_errors_a_tenth_larger() -> None
         by = np.array([1, -ratio])
         assert (by @ found.above) ** 2 == pytest.approx((1.1 * t.ppf(0.975, 30)) ** 2 * by @ found.covariance @ by)
     assert interval.low < 0.4 < interval.high
+
+
+def test_limits_of_a_ratio_grow_without_a_jump_until_there_are_none() -> None:
+    """The lower end of the backbone's interval falls from nine tenths of its score to none of it."""
+    intervals = [retention(scores(0.1, 0.2, error)).interval for error in np.linspace(0.01, 0.095, 400)]
+    bounded = [one.bounded for one in intervals]
+    assert bounded == sorted(bounded, reverse=True)
+    widths = 1 / np.array([one.high - one.low for one in intervals if one.bounded])
+    assert not all(bounded)
+    assert (np.diff(widths) < 0).all()
+    assert widths[-1] < 0.02
+    assert np.abs(np.diff(widths)).max() < 0.12 * widths.max()
 
 
 def test_identical_streams_retain_exactly_all() -> None:
@@ -487,8 +513,10 @@ def test_the_limit_is_the_highest_of_the_sites_own_limits() -> None:
     each = [at_most(sites.only([row])) for row in range(3)]
     assert at_most(sites) == max(each)
     rest = sites.sums[0] - sites.accuracies[0] * 4
-    variance = rest @ rest * 20 / 19 / 80**2
-    assert each[0] == pytest.approx(float(share_interval(sites.accuracies[0], variance, 20, 80, 19, tail=0.05)[1]))
+    right = sites.accuracies[0]
+    count = right * (1 - right) * 80**2 / (rest @ rest * 20 / 19)
+    count *= (t.ppf(0.95, 79) / t.ppf(0.95, 19)) ** 2
+    assert each[0] == pytest.approx(beta.ppf(0.95, right * count + 1, (1 - right) * count))
 
 
 @pytest.mark.parametrize("sites", [1, 4, 60])

@@ -34,16 +34,21 @@ from probe_kit.statistics.intervals import (
     Interval,
     Share,
     difference_interval,
-    effective_groups,
     fieller_interval,
-    group_shares,
     mean_interval,
-    share_interval,
-    wilson_interval,
 )
 from probe_kit.statistics.paired_tests import clopper_pearson
+from probe_kit.statistics.share_limits import (
+    effective_groups,
+    exchangeable_variances,
+    group_shares,
+    korn_graubard_limits,
+    wilson_limits,
+    wilson_low,
+)
 
 Values = NDArray[np.float64]
+Limited = Callable[[Values, Values, float], tuple[Values, Values]]
 COUNTS = (2, 5, 16)
 QUARTERS = np.linspace(0, 1, 5)
 
@@ -308,24 +313,74 @@ GROUPS = np.repeat(list("abcdefgh"), 4)
 
 
 @pytest.mark.parametrize(("hits", "trials"), [(0, 10), (3, 10), (17, 20), (40, 40), (1, 200)])
-def test_independent_trials_have_clopper_and_pearsons_interval(hits: int, trials: int) -> None:
-    share = hits / trials
-    found = share_interval(share, share * (1 - share) / trials, trials, trials, trials - 1)
-    exact = binomtest(hits, trials).proportion_ci(0.95, "exact")
-    np.testing.assert_allclose(found, (exact.low, exact.high), atol=1e-9)
+def test_groups_of_one_episode_have_clopper_and_pearsons_interval_of_one_fewer(hits: int, trials: int) -> None:
+    found = korn_graubard_limits((np.arange(trials) < hits)[None].astype(float), np.ones(trials))
+    if hits in (0, trials):
+        exact = binomtest(hits, trials).proportion_ci(0.95, "exact")
+        np.testing.assert_allclose(np.ravel(found), (exact.low, exact.high), atol=1e-9)
+        return
+    right, count = hits / trials * (trials - 1), trials - 1  # s (1 − s) / v with v = s (1 − s) / (G − 1)
+    low = min(stats.beta.ppf(0.025, right, count - right + 1), 0.025 ** (1 / trials))
+    high = max(stats.beta.ppf(0.975, right + 1, count - right), 1 - 0.025 ** (1 / trials))
+    np.testing.assert_allclose(np.ravel(found), (low, high), atol=1e-9)
 
 
 def test_twelve_of_twelve_groups_right_leave_a_quarter_open() -> None:
-    low, high = share_interval(1.0, 0.0, 12, 48, 11)
-    assert (float(low), float(high)) == pytest.approx((0.025 ** (1 / 12), 1.0))
-    assert float(low) == pytest.approx(0.735, abs=5e-4)
+    low, high = korn_graubard_limits(np.full((1, 12), 4.0), np.full(12, 4.0))
+    assert (float(low[0]), float(high[0])) == pytest.approx((0.025 ** (1 / 12), 1.0))
+    assert float(low[0]) == pytest.approx(0.735, abs=5e-4)
 
 
-def test_limits_of_many_shares_are_those_of_each() -> None:
-    shares, variances = np.array([0.0, 0.3, 0.5, 0.99, 1.0]), np.array([0.0, 0.004, 0.0, 0.001, 0.0])
-    together = share_interval(shares, variances, 20, 80, 19, tail=0.05)
-    each = [share_interval(shares[row], variances[row], 20, 80, 19, tail=0.05) for row in range(5)]
-    np.testing.assert_allclose(together, np.array(each).T)
+@pytest.mark.parametrize("limits_of", [korn_graubard_limits, wilson_limits])
+@pytest.mark.parametrize("sizes", [np.full(20, 4.0), 1.0 + np.arange(20) % 5], ids=["equal", "unequal"])
+def test_limits_of_many_shares_are_those_of_each(limits_of: Limited, sizes: Values) -> None:
+    sums = (
+        np.random.default_rng(0).binomial(sizes.astype(int), np.array([[0.0], [0.3], [0.9], [1.0]])).astype(float)
+    )
+    together = limits_of(sums, sizes, 0.05)
+    each = [limits_of(sums[[row]], sizes, 0.05) for row in range(len(sums))]
+    np.testing.assert_allclose(together, np.array(each)[:, :, 0].T)
+
+
+# An error more may make groups more alike, so that a variance falls.
+PATTERNS = st.sampled_from(["spread", "drawn", "group by group", "the largest first"])
+
+
+def errors_one_by_one(sizes: Values, pattern: str, seed: int) -> Values:
+    """(E + 1, G) errors, from none to all of sum(sizes)."""
+    generator, steps = np.random.default_rng(seed), [np.zeros(sizes.size)]
+    while steps[-1].sum() < sizes.sum():
+        last = steps[-1]
+        room = np.flatnonzero(last < sizes)
+        at = {
+            "spread": room[np.argmin(last[room])],
+            "drawn": generator.choice(room),
+            "group by group": room[0],
+            "the largest first": room[np.argmax(sizes[room])],
+        }[pattern]
+        steps.append(last + (np.arange(sizes.size) == at))
+    return np.array(steps)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.integers(1, 8), min_size=2, max_size=24), st.booleans(), PATTERNS, st.integers(0, 99))
+def test_limits_never_rise_with_an_added_error(counts: list[int], equal: bool, pattern: str, seed: int) -> None:
+    """A share of unequal groups also has the variance of groups that are all equally alike, which may fall."""
+    sizes = np.full(len(counts), float(counts[0])) if equal else np.array(counts, float)
+    right = sizes - errors_one_by_one(sizes, pattern, seed)
+    for limits_of in (wilson_limits, korn_graubard_limits) if equal else (wilson_limits,):
+        assert np.diff(limits_of(right, sizes), axis=1).max() <= 1e-12
+    low, high = wilson_limits(right, sizes)
+    shares = right.sum(axis=1) / sizes.sum()
+    assert (low <= shares + 1e-12).all()
+    assert (shares <= high + 1e-12).all()
+
+
+def test_an_error_beside_all_right_has_nearly_the_limit_of_all_right() -> None:
+    """A mean of twelve sites that are all right is 1 − 1e-16."""
+    sizes = np.full(12, 4.0)
+    for missing in (0.0, 1e-15, 1e-12, 1e-6):
+        assert wilson_limits(sizes[None] - missing, sizes)[0] == pytest.approx(0.7575, abs=5e-4)
 
 
 def test_episodes_that_agree_within_groups_widen_the_interval() -> None:
@@ -347,6 +402,18 @@ def test_the_variance_is_that_of_a_ratio_estimator_over_groups() -> None:
     both, variances = group_shares(np.array([sums, sizes - sums]), sizes.astype(float))
     assert both.sum() == pytest.approx(1.0)
     np.testing.assert_allclose(variances, share.variance)
+
+
+def test_equally_alike_episodes_vary_as_their_correlation_says() -> None:
+    """Kish: E² v = s (1 − s) Σ size (1 + (size − 1) ρ), with ρ of all pairs of a group."""
+    sizes = np.array([2.0, 2, 4, 4, 6, 12])
+    sums = np.array([[2.0, 0, 3, 1, 6, 5]])
+    share = sums.sum() / sizes.sum()
+    alike = 1 - (sums * (sizes - sums)).sum() / (sizes * (sizes - 1)).sum() / (share * (1 - share))
+    expected = share * (1 - share) * (sizes * (1 + (sizes - 1) * alike)).sum() / sizes.sum() ** 2
+    assert exchangeable_variances(sums, sizes) == pytest.approx(expected * 6 / 5)
+    equal = np.full(6, 6.0)
+    np.testing.assert_allclose(exchangeable_variances(sums / 2, equal), group_shares(sums / 2, equal)[1])
 
 
 def test_unequal_groups_are_worth_fewer_equal_ones() -> None:
@@ -408,24 +475,16 @@ def test_values_that_are_no_shares_are_refused() -> None:
 @pytest.mark.parametrize(("hits", "trials"), [(3, 10), (50, 100), (170, 200), (199, 200)])
 def test_an_accuracy_of_many_independent_groups_has_wilsons_interval(hits: int, trials: int) -> None:
     share = hits / trials
-    found = wilson_interval(share, share * (1 - share) / trials, trials, trials, 1e9)
+    low, high_of_errors = wilson_low(
+        np.array([share, 1 - share]), np.full(2, float(trials)), stats.chi2.ppf(0.95, 1)
+    )
     wilson = binomtest(hits, trials).proportion_ci(0.95, "wilson")
-    np.testing.assert_allclose(found, (wilson.low, wilson.high), atol=1e-6)
+    np.testing.assert_allclose((low, 1 - high_of_errors), (wilson.low, wilson.high), atol=1e-6)
 
 
 def test_where_all_groups_agree_an_accuracy_counts_groups() -> None:
     wilson = binomtest(12, 12).proportion_ci(0.95, "wilson")
-    assert np.ravel(wilson_interval(1.0, 0.0, 12, 96, 11)) == pytest.approx((wilson.low, 1.0))
-
-
-@pytest.mark.parametrize("groups", [6, 12, 24, 150])
-def test_limits_of_an_accuracy_never_rise_with_one_more_wrong_decision(groups: int) -> None:
-    sizes = np.full(groups, 8.0)
-    limits = []
-    for wrong in range(groups // 2 + 1):
-        accuracy = Accuracy(np.arange(groups).astype(str), sizes - (np.arange(groups) < wrong), sizes)
-        limits.append((accuracy.interval().low, accuracy.interval().high))
-    assert np.diff(limits, axis=0).max() <= 1e-12
+    assert np.ravel(wilson_limits(np.full((1, 12), 8.0), np.full(12, 8.0))) == pytest.approx((wilson.low, 1.0))
 
 
 def test_one_wrong_decision_of_96_hardly_widens_the_interval() -> None:
@@ -449,17 +508,14 @@ def test_intervals_of_accuracies_cover_their_share(truth: float, sizes: NDArray[
     assert np.mean(covered) > 0.92
 
 
-@pytest.mark.parametrize("rate", [0.9, 0.97])
-def test_success_rates_of_very_unequal_groups_are_covered(rate: float) -> None:
+@pytest.mark.parametrize(("groups", "rate", "alike"), [(24, 0.97, 0.5), (40, 0.9, 1.0), (150, 0.03, 1.0)])
+def test_success_rates_of_very_unequal_groups_are_covered(groups: int, rate: float, alike: float) -> None:
     generator = np.random.default_rng(0)
-    sizes = 2 * np.ceil(20 * np.exp(-3 * np.linspace(0, 1, 24))).astype(int)
-    groups = np.repeat(np.arange(24), sizes)
-    covered = []
-    for _ in range(400):
-        chance = generator.beta(rate, 1 - rate, 24)  # correlation 1/2
-        interval = Share.of(generator.random(groups.size) < chance[groups], groups).interval()
-        covered.append(interval.low <= rate <= interval.high)
-    assert np.mean(covered) > 0.92
+    sizes = np.minimum(30, np.ceil(2 / generator.random(groups)))
+    odds = (1 / alike - 1) or 1e-9
+    chance = generator.beta(rate * odds, (1 - rate) * odds, (400, groups))
+    low, high = korn_graubard_limits(generator.binomial(sizes.astype(int), chance).astype(float), sizes)
+    assert np.mean((low <= rate) & (rate <= high)) > 0.92
 
 
 def test_one_group_that_fails_makes_a_success_rate_no_better_known() -> None:

@@ -128,10 +128,10 @@ def test_empty_groups_and_missing_values_are_refused() -> None:
             compare([0.1, float("nan")], [0.2])
 
 
-@pytest.mark.parametrize(("few", "many"), [(3, 6), (4, 8), (3, 9)])
+@pytest.mark.parametrize(("few", "many"), [(2, 8), (3, 6), (4, 8), (3, 9), (5, 5), (6, 6)])
 def test_p_that_is_shown_holds_its_level_whatever_the_spreads(few: int, many: int) -> None:
     generator = np.random.default_rng(0)
-    for spread in (1, 3):
+    for spread in (1, 3, 5):
         alarms = []
         for _ in range(400):
             pair = generator.normal(0, spread, few), generator.normal(0, 1, many)
@@ -139,8 +139,12 @@ def test_p_that_is_shown_holds_its_level_whatever_the_spreads(few: int, many: in
         assert np.mean(alarms) < 0.08
 
 
-def test_groups_of_equal_size_or_of_one_model_are_exchangeable() -> None:
+def test_groups_of_like_spread_or_of_one_model_are_exchangeable() -> None:
     assert is_exchangeable([0.1, 0.9], [0.5, 0.5])
     assert is_exchangeable([0.1], [0.5, 0.5, 0.6])
     assert not is_exchangeable([0.1, 0.9], [0.5, 0.5, 0.6])
     assert is_exchangeable([0.5, 0.5], [0.5, 0.1, 0.9])
+    assert not is_exchangeable([0.3, 0.7], [0.5, 0.2, 0.8])
+    assert is_exchangeable([0.1, 0.3, 0.5, 0.7], [0.4, 0.5, 0.6, 0.7])
+    assert not is_exchangeable([0.1, 0.3, 0.5, 0.7], [0.49, 0.5, 0.51, 0.52])
+    assert is_exchangeable([0.5] * 4, [0.6] * 4)

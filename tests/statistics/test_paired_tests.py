@@ -8,13 +8,14 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from scipy.stats import binomtest
+from scipy.stats import binomtest, norm
 
 from probe_kit.retention import retention_table
 from probe_kit.retention.compare.known_used import OVERALL, join_runs
 from probe_kit.retention.rows.row import MEAN
 from probe_kit.statistics.paired_tests import (
     EXCHANGES,
+    SHARED_DECISIONS,
     better_than_best,
     better_than_reference,
     clopper_pearson,
@@ -208,7 +209,7 @@ def right(share: float, sites: int, seed: int) -> np.ndarray:
 
 
 def test_a_site_that_is_much_better_than_the_reference_gets_the_smallest_p() -> None:
-    sites = np.concatenate([right(0.9, 1, 0), right(0.6, 3, 1)])
+    sites = np.concatenate([right(0.95, 1, 0), right(0.6, 3, 1)])
     p = better_than_reference(sites, right(0.6, 1, 2)[0].astype(float), GROUPS, seed=0)
     assert p[0] == 1 / (1 + EXCHANGES)
     assert (p[1:] > 0.05).all()
@@ -228,6 +229,40 @@ def test_the_best_of_many_sites_is_rarely_better_than_the_best_of_as_many_others
         for seed in range(100)
     ]
     assert np.mean(alarms) <= 0.05 + 3 * np.sqrt(0.05 * 0.95 / 100)
+
+
+def similarity_decisions(above: float, groups: int, draws: int, seed: int) -> np.ndarray:
+    """(draws, G) whether each group is right that is decided by its similarity to all others: no fit is needed.
+
+    The similarity of two groups is one number, which takes part in the decisions of both.
+    """
+    generator = np.random.default_rng(seed)
+    similarity = np.triu(generator.standard_normal((draws, groups, groups)), 1)
+    values = (similarity + similarity.transpose(0, 2, 1)).sum(axis=2) / np.sqrt(groups - 1)
+    right: np.ndarray = values + norm.ppf(0.5 + above) > 0
+    return right
+
+
+@pytest.mark.parametrize("above", [0.0, 0.1, 0.25, 0.4])
+def test_groups_that_train_each_others_probes_widen_the_spread_of_an_accuracy(above: float) -> None:
+    accuracy, share = similarity_decisions(above, 40, 3000, 0).mean(axis=1), 0.5 + above
+    independent = np.sqrt(share * (1 - share) / 40)
+    excess = norm.pdf(norm.ppf(share)) ** 2 / (share * (1 - share))
+    assert accuracy.std() / independent == pytest.approx(np.sqrt(1 + excess), rel=0.04)
+    assert np.sqrt(1 + excess) <= SHARED_DECISIONS + 1e-12
+
+
+@pytest.mark.parametrize("above", [0.0, 0.05, 0.2])
+@pytest.mark.parametrize("sites", [1, 4])
+def test_sites_of_shared_probes_rarely_exceed_a_control_that_is_as_good(above: float, sites: int) -> None:
+    """Sites and layers are trained on the same groups, by features of their own."""
+    decisions = similarity_decisions(above, 30, 200 * (sites + 5), sites).reshape(200, sites + 5, 30)
+    groups = np.arange(30)
+    alarms = [
+        better_than_reference(each[:sites], each[sites:].mean(axis=0), groups, seed).min() < 0.05
+        for seed, each in enumerate(decisions)
+    ]
+    assert np.mean(alarms) <= 0.05 + 2 * np.sqrt(0.05 * 0.95 / 200)
 
 
 def test_a_signal_in_one_site_is_better_than_the_best_of_the_twin() -> None:

@@ -19,6 +19,7 @@ from probe_kit.runs import Run, open_run
 from probe_kit.suite import Suite, build_suite, load_picture
 from probe_kit.train import ArrayRun, ProbeResults, Target, load_results, train_probes
 from probe_kit.train.control_features import ControlInputs, random_layer
+from probe_kit.train.controls import is_informative
 from probe_kit.train.results.inventory import inventory
 from probe_kit.train.samples import Samples
 from probe_kit.train.target_samples import TargetSamples
@@ -110,9 +111,27 @@ def test_baselines_of_a_fair_suite_are_at_chance_and_stored(planted_run: Planted
 def test_a_suite_that_keeps_the_answer_on_one_side_is_found_out(planted_run: PlantedRun) -> None:
     run = planted_run()
     run.episodes["side_correct"] = run.episodes["layout"].map({"original": "left", "swapped": "right"})
-    score = train_probes(run, permutations=40, controls=("position",)).controls.of_category("color")["position"]
+    controls = train_probes(run, permutations=40, controls=("position",)).controls
+    score = controls.of_category("color")["position"]
     assert score.score == 1.0
     assert score.above_chance
+    assert controls.exceeded("color", "mean", PLANTED) == {"position": False}, "a control that knows is asked"
+
+
+@pytest.mark.parametrize(("gain", "asked"), [(0.0, False), (0.02, False), (0.3, True)])
+@pytest.mark.parametrize("missing", [0, 20])
+def test_a_control_is_asked_if_its_inner_folds_know_more_than_the_shares_of_the_sides(
+    gain: float, asked: bool, missing: int
+) -> None:
+    labels, groups = np.tile([True, False], 40)[missing:], np.repeat(np.arange(20), 4)[missing:]
+    labels[: missing // 2] = True
+    share, names = labels.mean(), np.unique(groups)
+    chance = share * np.log(share) + (1 - share) * np.log(1 - share)
+    noise = np.random.default_rng(0).normal(0, 0.1, names.size)
+    noise -= noise.mean()
+    inner = np.tile((chance + gain + noise) * 4, (5, 1))
+    inner[names % 5, np.arange(names.size)] = 0  # the outer fold's own groups
+    assert is_informative(inner, labels, groups) == asked
 
 
 @pytest.mark.slow

@@ -173,7 +173,7 @@ _MODELS = (
     "Of a difference between groups of models: exact p of exchanging the models' labels, the model as the unit. "
     "It tests that both groups have equal distributions. In brackets the least p that so few models allow, and "
     "Welch's 95 % interval over models, which is no inversion of this test: where the two disagree, p decides. A "
-    "dash stands for p where the smaller group has the larger spread: then only the interval holds. Other numbers "
+    "dash stands for p where the groups' spreads are too unlike: then only the interval holds. Other numbers "
     "of the row are of these models on other items."
 )
 SR_MODELS = Column(

@@ -74,8 +74,8 @@ class ControlComparison:
     """A test of a site's probe against a control: paired by group, family-wise over its stream.
 
     Attributes:
-        control: For a side `random-features`, or `untrained` for the best site of that stream in the untrained
-            network; for other targets every control that was run.
+        control: For a side `random-features`, a control that `is_informative`, or `untrained` for the best site of
+            that stream in the untrained network; for other targets every control that was run.
         reference: The control's score.
     """
 

@@ -147,9 +147,9 @@ class ProbeCurve:
         return float(scores.mean()), score_interval(scores, self.labels, self.groups, self.task, deviations)
 
     @property
-    def widening(self) -> float:
-        """The factor of score differences under exchange: R² of groups that share a probe is not independent."""
-        return SHARED_PROBE if self.task == "continuous" else 1.0
+    def widening(self) -> float | None:
+        """The factor of drawn differences of R² from a control's; None for decisions, which have their own."""
+        return SHARED_PROBE if self.task == "continuous" else None
 
     def p_fwe(self) -> Matrix:
         """Return the family-wise p of every site, (S,): each stream's sites are one family.

@@ -21,8 +21,8 @@ from probe_kit.runs.direction_files import about_direction, write_directions
 from probe_kit.runs.reader import RunReader
 from probe_kit.runs.results import Bundle, axes_problem, fields_problem
 from probe_kit.statistics.folds import FoldUnit
-from probe_kit.statistics.intervals import effective_groups, group_shares, wilson_interval
 from probe_kit.statistics.label_permutations import p_value, permutations_for, shortage
+from probe_kit.statistics.share_limits import wilson_limits
 from probe_kit.train.choices import EVERYWHERE, SIDES, Incomplete, Task
 from probe_kit.train.crossval.task_scores import METRICS, fold_auc, fold_spearman, log_loss
 from probe_kit.train.results.control_scores import Controls, has_signal
@@ -306,10 +306,7 @@ def _estimates(curve: ProbeCurve) -> tuple[Matrix, Matrix, Matrix]:
     """Return the scores (S,) with the lower and upper ends of their intervals."""
     if curve.is_side:
         sums = curve.sums
-        shares, variances = group_shares(sums.sums, sums.sizes)
-        count = effective_groups(sums.sizes)
-        low, high = wilson_interval(shares, variances, count, sums.n_episodes, max(count - 1, 1.0))
-        return shares, low, high
+        return sums.accuracies, *wilson_limits(sums.sums, sums.sizes)
     limits = np.array([curve.estimate(np.array([row]))[1] for row in range(len(curve.sites))])
     return curve.metric, limits[:, 0], limits[:, 1]
 
