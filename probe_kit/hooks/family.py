@@ -235,18 +235,6 @@ class Family:
         )
         return model
 
-    def ancestor(self, checkpoint: str) -> str:
-        """Return the first checkpoint of the family that one grew from, as far as its rows say; else itself.
-
-        Args:
-            checkpoint: Hub id, at any revision, or a folder.
-        """
-        grew_from = {row.checkpoint: row.grew_from for first in self.protocols.values() for row in first.rows}
-        earlier = without_revision(checkpoint) or ""
-        while grew_from.get(earlier):
-            earlier = grew_from[earlier]
-        return earlier
-
     def _source_of(self, card: ModelCard, location: str | None) -> dict[str, Any]:
         """The source fields of the card: an untrained network has none, a foreign checkpoint an unknown one."""
         if card.random_weights:

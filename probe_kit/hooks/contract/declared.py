@@ -149,7 +149,6 @@ class ProtocolRow:
         unmatched: The parts of the protocol that cannot be done here.
         variant: The name of this checkpoint among several, as in labels.
         alternatives: Rows of the others; without a checkpoint, the row that holds them is used.
-        grew_from: Hub id of the checkpoint of this family that training began with; empty where that is unknown.
     """
 
     checkpoint: str
@@ -161,7 +160,6 @@ class ProtocolRow:
     unmatched: tuple[str, ...] = ()
     variant: str = ""
     alternatives: "tuple[ProtocolRow, ...]" = ()
-    grew_from: str = ""
 
     @property
     def rows(self) -> "tuple[ProtocolRow, ...]":

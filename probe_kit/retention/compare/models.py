@@ -9,8 +9,6 @@ from typing import Any, Literal
 import numpy as np
 
 from probe_kit.errors import UsageError
-from probe_kit.hooks.checkpoints.checkpoint import without_revision
-from probe_kit.hooks.registry import get_family
 from probe_kit.retention.estimators import ACTION, BACKBONE, Limits, PooledScores, limits
 from probe_kit.retention.rows.build import RowWithEstimates
 from probe_kit.runs.reader import RunReader
@@ -74,8 +72,7 @@ def origins_of(runs: Sequence[RunReader], declared: Mapping[str, str] | None = N
     """Return the origin of every run's model, by location; runs of equal origin are of one model.
 
     A run without a declared origin has the folder of its training where its checkpoint is one of several steps.
-    A released checkpoint that grew from another one of its family has that one, as the family declares. Otherwise
-    a run has its weights, or else its own location.
+    Otherwise it has its weights, or else its own location.
 
     Args:
         runs: The runs that are compared.
@@ -87,13 +84,7 @@ def origins_of(runs: Sequence[RunReader], declared: Mapping[str, str] | None = N
     places = {str(run.location): run for run in runs}
     if strange := [location for location in declared or {} if location not in places]:
         raise UsageError(f"an origin is declared of {strange[0]}; expected one of the runs {', '.join(places)}")
-    ancestors = {location: _ancestor(run) for location, run in places.items()}
-    grown = {ancestor for location, ancestor in ancestors.items() if ancestor != _released(places[location])}
-    return {
-        location: (declared or {}).get(location)
-        or (ancestors[location] if ancestors[location] in grown else _origin(run))
-        for location, run in places.items()
-    }
+    return {location: (declared or {}).get(location) or _origin(run) for location, run in places.items()}
 
 
 def _origin(run: RunReader) -> str:
@@ -101,17 +92,6 @@ def _origin(run: RunReader) -> str:
     if training is not None and training[0]:
         return training[0]
     return run.weights_sha256 or str(run.location)
-
-
-def _released(run: RunReader) -> str:
-    return "" if card_of(run).get("random_weights") else without_revision(checkpoint_of(run)) or ""
-
-
-def _ancestor(run: RunReader) -> str:
-    """Return the checkpoint that a run's checkpoint grew from, as its family declares; else its own."""
-    checkpoint, name = _released(run), card_of(run).get("family")
-    family = get_family(str(name)) if checkpoint and name else None
-    return checkpoint if family is None else family.ancestor(checkpoint)
 
 
 # -- two groups of models ------------------------------------------------------------------------------------

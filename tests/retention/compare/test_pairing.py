@@ -20,7 +20,6 @@ from probe_kit.retention import RetentionTable, retention_table
 from probe_kit.retention.behaviour import TableRun, distinct_labels
 from probe_kit.retention.columns.text import models_test
 from probe_kit.retention.compare.compare import Difference, ModelTest
-from probe_kit.retention.compare.models import origins_of
 from probe_kit.train import ArrayRun, load_results, save_results
 from tests.retention.asked_runs import SUITE, SaidRun, asked, episodes
 from tests.retention.paired_limits import mover
@@ -594,21 +593,6 @@ def test_checkpoints_of_one_training_are_one_model(probed_run: ProbedRun) -> Non
     row = retention_table({"first": runs[:3], "second": runs[3:]}).differences[0]
     assert row.sr_models is not None
     assert (row.sr_models.n, row.sr_models.n_minus) == (3, 2)
-
-
-def test_a_checkpoint_and_what_grew_from_it_are_one_model_as_their_family_knows(probed_run: ProbedRun) -> None:
-    runs = sisters(probed_run)
-    names = ("openvla/openvla-7b@abc", "gen-robot/openvla-7b-rlvla-sft_16k", "gen-robot/openvla-7b-rlvla-rl@def")
-    others = ("me/openvla-7b-of-my-own", "", "lerobot/pi0")
-    for run, checkpoint in zip(runs, (*names, *others), strict=True):
-        object.__setattr__(run, "certificate", {"policy": {"family": "openvla", "checkpoint": checkpoint}})
-    assert list(origins_of(runs).values()) == ["openvla/openvla-7b"] * 3 + ["d", "e", "f"]
-    assert list(origins_of(runs[1:3]).values()) == ["openvla/openvla-7b"] * 2
-    assert list(origins_of(runs[:1]).values()) == ["a"], "nothing that grew from it is compared"
-    assert origins_of(runs[:2], {str(runs[1].location): "own"}) == {
-        str(runs[0].location): "openvla/openvla-7b",
-        str(runs[1].location): "own",
-    }
 
 
 def test_an_origin_of_no_run_is_refused(probed_run: ProbedRun) -> None:

@@ -5,7 +5,6 @@ from probe_kit.hooks.families.prismatic import BITS, TOKENIZER
 from probe_kit.hooks.families.shared.kinds import TOKENS
 from probe_kit.hooks.family import Family
 
-BASE = "openvla/openvla-7b"
 BRIDGE = "bridge_orig"
 """The data set of the WidowX arm that Act2Answer imitates."""
 
@@ -21,7 +20,6 @@ def _row(variant: str, checkpoint: str, unnorm_key: str, *alternatives: Protocol
         unmatched=(OWN_SEEDS, "another filter than the checkpoint's own would not be noticed"),
         variant=variant,
         alternatives=alternatives,
-        grew_from="" if checkpoint == BASE else BASE,
     )
 
 
@@ -29,7 +27,7 @@ FAMILIES = (
     Family(
         "openvla",
         "OpenVLA (DINOv2 + SigLIP, Llama 2 7B, actions as tokens), native; fine-tunes and LoRA as --checkpoint",
-        BASE,
+        "openvla/openvla-7b",
         "probe_kit.hooks.families.openvla.adapter:load_openvla",
         embodiment="as the data set of -M unnorm_key; bridge_orig: WidowX end-effector delta at 5 Hz",
         packages=(("timm", "openvla"),),
@@ -75,7 +73,7 @@ FAMILIES = (
                 "gen-robot/openvla-7b-rlvla-sft_16k",
                 "sft",
                 _row("RL", "gen-robot/openvla-7b-rlvla-rl", BRIDGE),
-                _row("base", BASE, BRIDGE),
+                _row("base", "openvla/openvla-7b", BRIDGE),
             )
         },
         interventions=TOKENS,
