@@ -19,7 +19,6 @@ from probe_kit.errors import (
 from probe_kit.hooks import ActivationCache, Observation, Site, capture, edit, load_policy
 from probe_kit.hooks.capturing.capture_context import Reduce, compiled_parts
 from probe_kit.hooks.capturing.edits import Edit, apply_edits, vector_hash
-from probe_kit.hooks.capturing.passes import _overwritten
 from probe_kit.hooks.families.pi0.adapter import Pi0
 
 
@@ -152,7 +151,6 @@ def test_a_network_that_writes_its_stream_in_place_is_captured_as_it_passed(
     finally:
         for handle in handles:
             handle.remove()
-        _overwritten.pop(pi0_tiny)
     if most_bytes is None:
         assert not torch.equal(fired["backbone.01.residual"] + 1, fired["backbone.02.residual"])
 

@@ -250,6 +250,8 @@ of the call, the tensor is only read.
 """
 _captured_now: "WeakKeyDictionary[Model, PassCapture | None]" = WeakKeyDictionary()
 """The models that are being captured, each with the passes that wait; None where a function reduces at once."""
+_attached_now: set[int] = set()
+"""The ids of the hooks of all captures and edits."""
 
 
 @contextmanager
@@ -350,7 +352,7 @@ def _capture(
         stack.callback(_captured_now.pop, model, None)
         hooks = _attach(model, sites, keep, stack)
         if passes is not None:
-            passes.arrange((hook.tap, hook.at_fire) for hook in hooks)
+            passes.arrange(((hook.tap, hook.at_fire) for hook in hooks), _attached_now)
         yield
     for hook in hooks:
         hook.check_count()
@@ -402,7 +404,10 @@ def _attach(model: Model, sites: Iterable[Site], handle: Handle, stack: ExitStac
     compiled = partial(compiled_parts, model)
     hooks = [_CountingHook(model.tap(group[0]), group, handle, compiled) for group in groups.values()]
     for hook in hooks:
-        stack.callback(hook.attach().remove)
+        attached = hook.attach()
+        _attached_now.add(attached.id)
+        stack.callback(_attached_now.discard, attached.id)
+        stack.callback(attached.remove)
     return hooks
 
 

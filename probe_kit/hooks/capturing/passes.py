@@ -1,15 +1,15 @@
-"""Activations of whole passes: references while a stack runs, then one copy or one product for all its layers.
+"""Activations of whole passes: references while a stack runs, then one copy or product for all its layers.
 
-On a GPU the number of operations costs, not their size. Therefore a firing keeps what passes, without an operation.
+On a GPU the number of operations costs, not their size. Therefore a firing keeps what passes, and does nothing else.
 When the last site of a pass has fired, all tensors become one: (n * R, T, D) of n sites and R rows, of which one
 product makes all views.
 
-A network may write into a tensor after it passed. The first pass of each kind therefore copies at once as well, and
-compares. Sites whose tensor was written are copied at once from then on. Kinds differ in sites and rows.
+A network may write into a tensor after it passed. The first pass of each kind therefore copies at once too, and
+compares. Sites whose tensor was written are copied at once from then on. Kinds differ in sites, rows and hooks.
 """
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -18,14 +18,20 @@ from typing import Any
 from weakref import WeakKeyDictionary
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from probe_kit.errors import RolesMismatchError
 from probe_kit.hooks.contract.model import ALL_ROWS, EVERY, Model, Rows, Tap
 from probe_kit.hooks.contract.sites import Site
 
+_MOST_KINDS = 10_000
+"""The most kinds that are remembered of one model; who registers other hooks at every inference makes new ones."""
+
 _overwritten: "WeakKeyDictionary[Model, dict[Any, frozenset[Site]]]" = WeakKeyDictionary()
 """By model and kind of pass, the sites whose tensor was written after it had passed. A new kind is missing."""
+
+_hook_tables: "WeakKeyDictionary[Model, list[Any]]" = WeakKeyDictionary()
+"""By model, the tables of hooks of all its modules."""
 
 
 @contextmanager
@@ -202,9 +208,19 @@ class PassCapture:
         self._hooks: dict[tuple[int, str], int] = {}
         self._repeated: dict[Any, Tensor] = {}
         self._copies_at_once = False
+        self._tables = _tables_of(model)
+        self._registered: Any = None
 
-    def arrange(self, tapped: Iterable[tuple[Tap, Mapping[int, Site]]]) -> None:
-        """Take the taps, each with its sites by iteration; their hooks are attached already."""
+    def arrange(self, tapped: Iterable[tuple[Tap, Mapping[int, Site]]], attached: Set[int]) -> None:
+        """Take the taps, each with its sites by iteration; their hooks are attached already.
+
+        Args:
+            tapped: The taps with their sites.
+            attached: The ids of hooks of captures and edits. Those of others belong to the kind of a pass, because
+                they may write into what passed.
+        """
+        registered = [number for table in self._tables if table for number in table]
+        self._registered = len(attached), frozenset(registered) - attached
         calls: dict[tuple[str, str, int | None], list[Any]] = defaultdict(list)
         members: dict[tuple[str, str, int | None], list[Site]] = defaultdict(list)
         taps: dict[tuple[str, str, int | None], Tap] = {}
@@ -259,6 +275,8 @@ class PassCapture:
             if whole.overwritten is None and whole.is_proof and whole.kind is not None:
                 flags = torch.stack(list(whole.compared.values())).tolist() if whole.compared else []
                 written = (site for site, is_written in zip(whole.compared, flags, strict=True) if is_written)
+                if len(self._known) == _MOST_KINDS:
+                    self._known.clear()
                 self._known[whole.kind] = frozenset(written)
 
     def _passes(self) -> list[_Pass]:
@@ -266,7 +284,7 @@ class PassCapture:
 
     def _begin(self, whole: _Pass, passing: Tensor) -> None:
         sites = tuple(site for reading in whole.readings for site in reading.sites)
-        whole.kind = (sites, passing.shape[0], self._most_bytes)
+        whole.kind = (sites, passing.shape[0], self._most_bytes, self._registered)
         whole.overwritten = self._known.get(whole.kind)
 
     def _make_room(self, whole: _Pass, tensor: Tensor) -> None:
@@ -383,6 +401,15 @@ def _product(weights: Tensor, tokens: Tensor) -> Tensor:
 def _copy(tensor: Tensor) -> Tensor:
     with outside_inference_mode():
         return tensor.clone()
+
+
+def _tables_of(model: Model) -> list[Any]:
+    if model not in _hook_tables:
+        networks = [part for part in vars(model).values() if isinstance(part, nn.Module)]
+        modules = {id(module): module for network in networks for module in network.modules()}.values()
+        tables = [table for module in modules for table in (module._forward_hooks, module._forward_pre_hooks)]
+        _hook_tables[model] = tables
+    return _hook_tables[model]
 
 
 def _hooks_of(tap: Tap) -> Any:

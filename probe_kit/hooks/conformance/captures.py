@@ -170,7 +170,7 @@ def capturing_changes_no_output_bit_for_bit(subject: Subject) -> None:
 
 @check(
     "What is kept of a whole pass equals what is copied as each site fires, bit for bit.",
-    "Write a tensor that entered a block at every inference or at none: the first capture learns which are written.",
+    "Write a tensor that entered a block at every inference or at none: the first capture learns which they are.",
 )
 def passes_keep_what_fires(subject: Subject) -> None:
     model, observations = subject.model, subject.batch
