@@ -1,6 +1,6 @@
 """Activations of whole passes: references while a stack runs, then one copy or product for all its layers.
 
-On a GPU the number of operations costs, not their size. Therefore a firing keeps what passes, and does nothing else.
+On a GPU the number of operations costs, not their size. Therefore a firing keeps what passes, and does no more.
 When the last site of a pass has fired, all tensors become one: (n * R, T, D) of n sites and R rows, of which one
 product makes all views.
 
@@ -367,12 +367,12 @@ class PassCapture:
         """Return the weights (n * R, V, T) of n sites; rows that no reading has weigh nothing."""
         key = tuple(id(reading.weights) for reading in readings), blocks, count
         if key not in self._repeated:
-            by_block = {reading.tap.rows.index: reading.weights for reading in readings}
+            of_readings = [(reading.tap.rows.index, reading.weights) for reading in readings]
+            by_block = {index: of_stream for index, of_stream in of_readings if of_stream is not None}
             weights = next(iter(by_block.values()))
-            assert weights is not None
             if blocks > 1:
                 absent = torch.zeros_like(weights)
-                weights = torch.cat([by_block.get(number) or absent for number in range(blocks)])
+                weights = torch.cat([by_block.get(number, absent) for number in range(blocks)])
             if count > 1:
                 weights = weights.expand(count, -1, -1) if len(weights) == 1 else weights.repeat(count, 1, 1)
             self._repeated[key] = weights
