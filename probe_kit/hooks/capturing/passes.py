@@ -66,10 +66,10 @@ class Block:
 
     def whole(self) -> Tensor:
         """Return what is kept of all sites, (n, B, …), as a view."""
-        blocks, rest = self.rows.blocks, self.flat.shape[1:]
-        if blocks == 1:
+        rest = self.flat.shape[1:]
+        if self.rows == ALL_ROWS:
             return self.flat.view(self.sites, -1, *rest)
-        return self.flat.view(self.sites, blocks, -1, *rest)[:, self.rows.index]
+        return self.flat.view(self.sites, self.rows.blocks, -1, *rest)[:, self.rows.index]
 
 
 @dataclass
@@ -105,23 +105,27 @@ class BlockPart:
 def block_of(parts: Sequence[Tensor | BlockPart]) -> Tensor:
     """Return what is kept of these sites as one tensor (n, B, …), from as few operations as their blocks allow."""
     with outside_inference_mode():
-        pieces: list[Tensor] = []
+        pieces: list[Block] = []
         at = 0
         while at < len(parts):
             part = parts[at]
             if isinstance(part, Tensor):
-                pieces.append(part[None])
+                pieces.append(Block(part, 1))
                 at += 1
                 continue
             block = part.settled()
             others = parts[at : at + block.sites]
             if [_place(other) for other in others] == [(id(block), number) for number in range(block.sites)]:
-                pieces.append(block.whole())
+                pieces.append(block)
                 at += block.sites
             else:
-                pieces.append(block.of(part.position)[None])
+                pieces.append(Block(block.of(part.position), 1))
                 at += 1
-        return pieces[0] if len(pieces) == 1 else torch.cat(pieces)
+        if len({piece.rows for piece in pieces}) > 1:
+            return torch.cat([piece.whole() for piece in pieces])
+        flats = [piece.flat for piece in pieces]
+        flat = flats[0] if len(flats) == 1 else torch.cat(flats)
+        return Block(flat, len(parts), pieces[0].rows).whole()
 
 
 def _place(part: Tensor | BlockPart) -> tuple[int, int] | None:

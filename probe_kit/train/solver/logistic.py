@@ -76,18 +76,24 @@ def newton_steps(
                 step, change = solved, changed
             return step * size, change * size, live[keep]
         if not keep.all():
-            solved[:, live[~keep]], changed[:, live[~keep]] = step[:, ~keep], change[:, ~keep]
-            live, slope, precision = live[keep], slope[keep], precision[keep]
+            done, left = ((~keep).nonzero()[0], keep.nonzero()[0]) if xp is np else (~keep, keep)  # faster
+            solved[:, live[done]], changed[:, live[done]] = step[:, done], change[:, done]
+            live, slope, precision = live[left], slope[left], precision[left]
             residual, direction, diagonal, curvature, step, change = (
-                part[:, keep] for part in (residual, direction, diagonal, curvature, step, change)
+                _columns(part, left) for part in (residual, direction, diagonal, curvature, step, change)
             )
-            bent, scaled = xp.empty_like(curvature), xp.empty_like(residual)
+            bent, scaled, design = xp.empty_like(curvature), xp.empty_like(residual), design.of(keep)
         xp.divide(residual, diagonal, out=scaled)
         previous, slope = slope, _dots(residual, scaled)
         direction *= slope / previous
         direction += scaled
     solved[:, live], changed[:, live] = 0.0, 0.0
     return solved * size, changed * size, live
+
+
+def _columns(part: Array, chosen: Array) -> Array:
+    """Return a copy of columns, by their numbers or a mask."""
+    return part.take(chosen, axis=1) if isinstance(part, np.ndarray) else part[:, chosen]
 
 
 def _dots(first: Array, second: Array) -> Array:
@@ -305,11 +311,13 @@ class LogisticSolver:
             return step, todo.samples @ step
         # More than the point has, or is asked, is wasted work.
         precision = self.xp.maximum(relative, (goal / relative).clip(min=FINEST)).clip(max=COARSEST)
-        step, change, unsettled = newton_steps(self._narrow, self.penalty, gradient, curvature, precision)
+        design = todo.samples if self._narrow is self.samples else self._narrow
+        step, change, unsettled = newton_steps(design, self.penalty, gradient, curvature, precision)
         for column in unsettled:  # one after another: all Hessians may be more than the memory holds
             problem = gradient[:, column, None], curvature[:, column, None]
-            step[:, column] = self._exact_newton_steps(self.samples, *problem)[:, 0]
-            change[:, column] = self.samples @ step[:, column]
+            samples = todo.samples.of(column[None])
+            step[:, column, None] = self._exact_newton_steps(samples, *problem)
+            change[:, column, None] = samples @ step[:, column, None]
         return step, change
 
     @cached_property
