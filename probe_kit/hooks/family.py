@@ -11,7 +11,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
-from probe_kit._system.imports import install_command
+from probe_kit._system.imports import install_command, one_scan_of_packages
 from probe_kit._system.machine import AUTO, check_device_name, device_here, what_is_here
 from probe_kit.errors import (
     CheckpointError,
@@ -491,7 +491,7 @@ class Family:
         return self._imported(getattr(self, purpose))
 
     def _imported(self, path: str) -> Callable[..., Any]:
-        with while_loading(self.name, path):
+        with while_loading(self.name, path), one_scan_of_packages():
             function: Callable[..., Any] = imported(path)
         return function
 

@@ -28,8 +28,8 @@ Categories = Annotated[
     typer.Option(
         "--categories",
         **NAMED,
-        help="Categories, each by itself, comma-separated. all: pool every episode. Default: each category "
-        "of the run for a side, all for other targets.",
+        help="Categories to probe, each on its own, comma-separated. all: pool all episodes. Default: each "
+        "category of the run for a side, all for other targets.",
     ),
 ]
 Views = Annotated[
@@ -37,7 +37,8 @@ Views = Annotated[
     typer.Option(
         "--views",
         **LISTED,
-        help="Views of the tokens, comma-separated: mean, last, mean:ROLE, tokens, tokens:ROLE.",
+        help="How tokens are pooled, comma-separated: mean, last, mean:ROLE. tokens and tokens:ROLE pool "
+        "nothing: every token is a sample.",
     ),
 ]
 ProbeTarget = Annotated[
@@ -67,8 +68,8 @@ LabelFile = Annotated[
     _label_option(
         "--labels",
         metavar="FILE",
-        help="CSV or Parquet file with a column to decode, by episode_id and, where wanted, inference. Start from "
-        "`probe-kit labels RUN`.",
+        help="CSV or Parquet file with a column to decode, and the key episode_id. A label per inference also "
+        "has the key inference. Start from `probe-kit labels RUN`.",
     ),
 ]
 LabelTask = Annotated[
@@ -76,7 +77,7 @@ LabelTask = Annotated[
     _label_option(
         "--task",
         help="binary: one of two values. classes: one of several. continuous: a quantity, scored by R². Default: "
-        "what the values allow; few integers need it.",
+        "decided by the values. A column of few different integers needs this option.",
     ),
 ]
 GroupBy = Annotated[
@@ -84,8 +85,8 @@ GroupBy = Annotated[
     _label_option(
         "--group-by",
         metavar="COLUMN",
-        help="Column of what depends on each other: folds, intervals and p-values keep it together. Default: "
-        "items that share a picture.",
+        help="Column that names which rows belong together, such as the scene. Rows of one group are never split "
+        "between training and test. Default: items that share a picture.",
     ),
 ]
 ExchangeWithin = Annotated[
@@ -93,14 +94,16 @@ ExchangeWithin = Annotated[
     _label_option(
         "--exchange-within",
         metavar="COLUMN",
-        help="Column within which p-values exchange the labels of groups, such as category. Default: everywhere.",
+        help="For p-values, exchange labels only between groups with one value in this column, such as category. "
+        "Default: between all groups.",
     ),
 ]
 Window = Annotated[
     int | None,
     _label_option(
         "--window",
-        help="With a label per inference: inferences per episode. Default: what 90 % of the episodes reach.",
+        help="With a label per inference: number of inferences per episode. Default: the number that 90 % of the "
+        "episodes reach.",
     ),
 ]
 
@@ -126,9 +129,13 @@ TestOn = Annotated[
 ]
 TestLabels = Annotated[
     Path | None,
-    _transfer_option("--test-labels", metavar="FILE", help="Labels of that run. Default: the file of --labels."),
+    _transfer_option(
+        "--test-labels", metavar="FILE", help="Labels of the run of --test-on. Default: the file of --labels."
+    ),
 ]
-AcrossWeights = Annotated[bool, _transfer_option("--across-weights", help="Accept a run of another network.")]
+AcrossWeights = Annotated[
+    bool, _transfer_option("--across-weights", help="Accept a run of other weights in --test-on.")
+]
 
 # -- controls -----------------------------------------------------------------------------------------------
 
@@ -138,9 +145,9 @@ Controls = Annotated[
         "--controls",
         parser=some_of(CONTROLS, none="none"),
         metavar=f"{choices(CONTROLS)},…",
-        help="Features that never see the model, comma-separated, or none. Default of a side: random-features and "
-        "pixels, if the pictures of the suite are available; of other targets all but action and position. pixels "
-        "takes as long as one or two sites.",
+        help="Control features that do not come from the model, comma-separated, or none. Default for a side: "
+        "random-features and pixels, if the pictures of the suite are available. Default for other targets: "
+        "all but action and position. pixels takes as long as one or two sites.",
     ),
 ]
 Untrained = Annotated[
@@ -178,14 +185,16 @@ Folds = Annotated[
     FoldUnit,
     _statistics_option(
         "--folds",
-        help="Items kept in one fold. groups: items that share a picture. concepts: also items about the same two "
-        "concepts.",
+        help="What a fold must keep together. groups: items that share a picture. concepts: also items about the "
+        "same two concepts.",
     ),
 ]
 IncompleteItems = Annotated[
     Incomplete,
     _statistics_option(
-        "--incomplete", help="Items with one missing episode. keep: use the other episode. drop: leave it out."
+        "--incomplete",
+        help="What to do with items that lack one of their two episodes. keep: use the other episode. drop: "
+        "leave the item out.",
     ),
 ]
 

@@ -122,7 +122,7 @@ def _of_parquet(path: Path, requested: Sequence[str], names: Sequence[str]) -> L
             headings = file.schema_arrow.names
             position_of = _places(headings, requested, str(path))
             read = read_parquet(file, list(position_of))
-    except (UsageError, LfsPointerError):
+    except (UsageError, LfsPointerError, MemoryError):
         raise
     except OSError as error:
         reason = str(error.strerror or error).rstrip(".")

@@ -69,7 +69,7 @@ def targets(
 
 def _command(run: str, options: Sequence[str]) -> str:
     """Return the command that trains probes, as it is typed."""
-    return shlex.join(["probe-kit", "train", run, *options])
+    return " ".join(["probe-kit train", as_argument(run), *map(shlex.quote, options)])
 
 
 DOUBTFUL = "classes or continuous"

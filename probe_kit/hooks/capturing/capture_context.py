@@ -197,8 +197,8 @@ class ActivationCache(Mapping[Site, Tensor]):
 
     def _part(self, site: Site) -> Tensor:
         """Return what is kept of a site, which may share memory with what is kept of others."""
-        kept = self._kept[site]
-        return kept.settled().of(kept.position) if isinstance(kept, BlockPart) else kept
+        part = self._kept[site]
+        return part.settled().of(part.position) if isinstance(part, BlockPart) else part
 
     def _form(self, site: Site) -> tuple[tuple[int, ...], torch.dtype, torch.device]:
         part = self._part(site)

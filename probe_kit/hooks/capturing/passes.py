@@ -47,7 +47,7 @@ def outside_inference_mode() -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Block:
-    """What is kept of n sites that fired one after another.
+    """A tensor of what is kept of n sites that fired one after another.
 
     Attributes:
         flat: (n * R, …), site by site; R rows are those of the pass.
@@ -64,17 +64,17 @@ class Block:
         count = self.flat.shape[0] // self.sites
         return self.rows.of(self.flat[position * count : (position + 1) * count])
 
-    def whole(self) -> Tensor:
+    def tensor(self) -> Tensor:
         """Return what is kept of all sites, (n, B, …), as a view."""
-        rest = self.flat.shape[1:]
+        shape = self.flat.shape[1:]
         if self.rows == ALL_ROWS:
-            return self.flat.view(self.sites, -1, *rest)
-        return self.flat.view(self.sites, self.rows.blocks, -1, *rest)[:, self.rows.index]
+            return self.flat.view(self.sites, -1, *shape)
+        return self.flat.view(self.sites, self.rows.blocks, -1, *shape)[:, self.rows.index]
 
 
 @dataclass
 class BlockPart:
-    """What is kept of one site as a part of a block, which may not be there yet.
+    """A part of a block: what is kept of one site. The block may not be there yet.
 
     Attributes:
         settle: Makes the block now, while the pass still runs; None once it is there.
@@ -114,21 +114,23 @@ def block_of(parts: Sequence[Tensor | BlockPart]) -> Tensor:
                 at += 1
                 continue
             block = part.settled()
-            others = parts[at : at + block.sites]
-            if [_place(other) for other in others] == [(id(block), number) for number in range(block.sites)]:
+            neighbours = parts[at : at + block.sites]
+            if [_position_of(part) for part in neighbours] == [
+                (id(block), number) for number in range(block.sites)
+            ]:
                 pieces.append(block)
                 at += block.sites
             else:
                 pieces.append(Block(block.of(part.position), 1))
                 at += 1
         if len({piece.rows for piece in pieces}) > 1:
-            return torch.cat([piece.whole() for piece in pieces])
+            return torch.cat([piece.tensor() for piece in pieces])
         flats = [piece.flat for piece in pieces]
         flat = flats[0] if len(flats) == 1 else torch.cat(flats)
-        return Block(flat, len(parts), pieces[0].rows).whole()
+        return Block(flat, len(parts), pieces[0].rows).tensor()
 
 
-def _place(part: Tensor | BlockPart) -> tuple[int, int] | None:
+def _position_of(part: Tensor | BlockPart) -> tuple[int, int] | None:
     return None if isinstance(part, Tensor) else (id(part.block), part.position)
 
 
@@ -208,7 +210,7 @@ class PassCapture:
         self._known = _overwritten.setdefault(model, {})
         self._weights, self._views, self._tokens, self._most_bytes = weights, views, tokens, most_bytes
         self._size = 0
-        self._places: dict[Site, tuple[_Pass, _Reading]] = {}
+        self._reading_of: dict[Site, tuple[_Pass, _Reading]] = {}
         self._hooks: dict[tuple[int, str], int] = {}
         self._repeated: dict[Any, Tensor] = {}
         self._copies_at_once = False
@@ -240,58 +242,58 @@ class PassCapture:
             weights = None if self._weights is None else self._weights[stack[0]]
             shared[tuple(calls[stack])].append(_Reading(taps[stack], sites, weights))
         for readings in shared.values():
-            whole = _Pass(readings)
-            self._places |= {site: (whole, reading) for reading in readings for site in reading.sites}
+            stack_pass = _Pass(readings)
+            self._reading_of |= {site: (stack_pass, reading) for reading in readings for site in reading.sites}
 
     def copy_at_once(self) -> None:
-        """From now on let every firing copy: somebody edits what passes, behind the hooks of this capture."""
+        """Let every further firing copy: an edit writes what passes, behind the hooks of this capture."""
         self._copies_at_once = True
 
     def fire(self, site: Site, tap: Tap, passing: Tensor) -> None:
         """Keep what passes at a site; where it is the last of its pass, make the blocks."""
-        whole, reading = self._places[site]
-        if whole.kind is None:
-            self._begin(whole, passing)
+        stack_pass, reading = self._reading_of[site]
+        if stack_pass.kind is None:
+            self._begin(stack_pass, passing)
         if reading.is_selected is None:
-            reading.is_selected = reading.decide(passing, len(whole.readings) > 1)
+            reading.is_selected = reading.decide(passing, len(stack_pass.readings) > 1)
         tensor = passing
         if reading.is_selected:
             with outside_inference_mode():
                 tensor = tap.select(passing)
         if self._most_bytes is not None:
-            self._make_room(whole, tensor)
+            self._make_room(stack_pass, tensor)
         # Another hook behind ours may write into the tensor, in this inference alone.
         if self._copies_at_once or len(_hooks_of(tap)) != self._hooks[id(tap.module), tap.end]:
-            whole.is_proof, tensor = False, _copy(tensor)
-        elif whole.overwritten is None:
-            if whole.left > 1:
+            stack_pass.is_proof, tensor = False, _copy(tensor)
+        elif stack_pass.overwritten is None:
+            if stack_pass.left > 1:
                 reading.copies.append(_copy(tensor))
-        elif site in whole.overwritten:
+        elif site in stack_pass.overwritten:
             tensor = _copy(tensor)
-        self._hold(whole, reading, site, tensor)
-        whole.left -= 1
-        if not whole.left:
-            self._settle(whole)
+        self._hold(stack_pass, reading, site, tensor)
+        stack_pass.left -= 1
+        if not stack_pass.left:
+            self._settle(stack_pass)
 
     def learn(self) -> None:
         """Learn from passes of new kinds, after the inference: the answer waits for the device."""
-        for whole in self._passes():
-            if whole.overwritten is None and whole.is_proof and whole.kind is not None:
-                flags = torch.stack(list(whole.compared.values())).tolist() if whole.compared else []
-                written = (site for site, is_written in zip(whole.compared, flags, strict=True) if is_written)
+        for stack_pass in self._passes():
+            if stack_pass.overwritten is None and stack_pass.is_proof and stack_pass.kind is not None:
+                flags = torch.stack(list(stack_pass.compared.values())).tolist() if stack_pass.compared else []
+                written = (site for site, is_written in zip(stack_pass.compared, flags, strict=True) if is_written)
                 if len(self._known) == _MOST_KINDS:
                     self._known.clear()
-                self._known[whole.kind] = frozenset(written)
+                self._known[stack_pass.kind] = frozenset(written)
 
     def _passes(self) -> list[_Pass]:
-        return list({id(whole): whole for whole, _ in self._places.values()}.values())
+        return list({id(stack_pass): stack_pass for stack_pass, _ in self._reading_of.values()}.values())
 
-    def _begin(self, whole: _Pass, passing: Tensor) -> None:
-        sites = tuple(site for reading in whole.readings for site in reading.sites)
-        whole.kind = (sites, passing.shape[0], self._most_bytes, self._registered)
-        whole.overwritten = self._known.get(whole.kind)
+    def _begin(self, stack_pass: _Pass, passing: Tensor) -> None:
+        sites = tuple(site for reading in stack_pass.readings for site in reading.sites)
+        stack_pass.kind = (sites, passing.shape[0], self._most_bytes, self._registered)
+        stack_pass.overwritten = self._known.get(stack_pass.kind)
 
-    def _make_room(self, whole: _Pass, tensor: Tensor) -> None:
+    def _make_room(self, stack_pass: _Pass, tensor: Tensor) -> None:
         """Count a tensor that is to wait; before it would exceed the bytes, make blocks of what waits."""
         size = 2 * tensor.numel() * tensor.element_size()
         if self._weights is not None and tensor.dtype != torch.float32:
@@ -299,11 +301,11 @@ class PassCapture:
         if self._size and self._size + size > (self._most_bytes or 0):
             for waiting in self._passes():
                 self._settle(waiting)
-        whole.size += size
+        stack_pass.size += size
         self._size += size
 
-    def _hold(self, whole: _Pass, reading: _Reading, site: Site, tensor: Tensor) -> None:
-        settle = partial(self._settle, whole)
+    def _hold(self, stack_pass: _Pass, reading: _Reading, site: Site, tensor: Tensor) -> None:
+        settle = partial(self._settle, stack_pass)
         view = None if self._weights is None else BlockPart(settle)
         token = None if self._tokens is None else BlockPart(settle)
         if view is not None:
@@ -314,20 +316,20 @@ class PassCapture:
         reading.tensors.append(tensor)
         reading.parts.append((view, token))
 
-    def _settle(self, whole: _Pass) -> None:
+    def _settle(self, stack_pass: _Pass) -> None:
         """Make blocks of what waits in a pass."""
         with outside_inference_mode():
             joined: dict[Any, Tensor] = {}
             products: dict[Any, list[tuple[_Reading, slice]]] = defaultdict(list)
-            for reading in whole.readings:
+            for reading in stack_pass.readings:
                 if reading.copies:
-                    self._compare(whole, reading)
+                    self._compare(stack_pass, reading)
                 for same in _runs(reading.tensors):
                     key = tuple(map(id, reading.tensors[same])), str(self._tokens_of(reading))
                     if key not in joined:
                         joined[key] = self._join(reading, reading.tensors[same])
                     rows = ALL_ROWS if reading.is_selected else reading.tap.rows
-                    self._place(reading, same, 1, Block(joined[key], same.stop - same.start, rows))
+                    self._assign(reading, same, 1, Block(joined[key], same.stop - same.start, rows))
                     if reading.weights is not None:
                         alone = id(reading) if rows.blocks == 1 else 0
                         products[key, rows.blocks, reading.weights.shape[1], alone].append((reading, same))
@@ -338,15 +340,17 @@ class PassCapture:
                 flat = _product(weights, joined[key])
                 for reading, of_reading in members:
                     rows = ALL_ROWS if reading.is_selected else reading.tap.rows
-                    self._place(reading, of_reading, 0, Block(flat, count, rows))
-        for reading in whole.readings:
+                    self._assign(reading, of_reading, 0, Block(flat, count, rows))
+        for reading in stack_pass.readings:
             reading.clear()
-        self._size, whole.size = self._size - whole.size, 0
+        self._size, stack_pass.size = self._size - stack_pass.size, 0
 
-    def _compare(self, whole: _Pass, reading: _Reading) -> None:
-        """Ask which tensors were written since they passed, and go on with the copies."""
+    def _compare(self, stack_pass: _Pass, reading: _Reading) -> None:
+        """Ask which tensors were written since they passed, and take the copies for them."""
         for number, copied in enumerate(reading.copies):
-            whole.compared[reading.fired[number]] = (copied != reading.tensors[number]).any()  # NaN: to be sure
+            stack_pass.compared[reading.fired[number]] = (
+                copied != reading.tensors[number]
+            ).any()  # NaN: to be sure
             reading.tensors[number] = copied
 
     def _tokens_of(self, reading: _Reading) -> slice:
@@ -361,7 +365,7 @@ class PassCapture:
         part = flat[:, tokens]
         return part if self._tokens is None or 2 * part.shape[1] > flat.shape[1] else part.clone()
 
-    def _place(self, reading: _Reading, same: slice, which: int, block: Block) -> None:
+    def _assign(self, reading: _Reading, same: slice, which: int, block: Block) -> None:
         for position, parts in enumerate(reading.parts[same]):
             part = parts[which]
             if part is not None:

@@ -182,11 +182,11 @@ def passes_keep_what_fires(subject: Subject) -> None:
     with capture(model, sites, reduce=lambda _, activation: activation.clone()) as fired:
         subject.run(observations)
     for _ in range(2):  # the first capture of a kind learns what is written in place
-        with capture(model, sites) as kept:
+        with capture(model, sites) as passed:
             subject.run(observations)
         with capture_views(model, model.sites(), weights) as pooled:
             subject.run(observations)
-    written = [str(site) for site in sites if not torch.equal(kept[site], fired[site])]
+    written = [str(site) for site in sites if not torch.equal(passed[site], fired[site])]
     require(not written, f"other activations at {', '.join(written[:5])}", "those that passed, bit for bit")
     for site in model.sites():
         rows = zip(fired[site], roles[site.stream], strict=True)

@@ -104,19 +104,14 @@ STACKED_COLUMNS, SMALL_HESSIAN = 32, 2**20
 """Label columns, and multiplications of each (N · R²), up to which whole Hessians cost less than the many small
 products of conjugate gradients."""
 
-COLUMNS_AT_ONCE, NUMBERS_AT_ONCE = 128, 2**14
-"""Label columns of all folds together whose Hessians fit into a processor's cache; samples times label columns of
-all folds together, whose vectors do."""
+COLUMNS_AT_ONCE = 128
+"""Label columns of all folds together: more of them do not fit into a processor's cache."""
 
 
 def is_small(samples: Samples, labels: NDArray[np.bool_]) -> bool:
-    """Whether the problems of (E, K) labels are small enough for the folds to be solved together.
-
-    On a device, many label columns of one fold fill it already.
-    """
+    """Whether the problems of (E, K) labels are few and small enough to be solved together."""
     count, width = samples.features.shape
-    few = labels.shape[1] <= STACKED_COLUMNS or isinstance(samples.means, np.ndarray)
-    return samples.pools and few and count * min(count, width) ** 2 <= SMALL_HESSIAN
+    return samples.pools and labels.shape[1] <= STACKED_COLUMNS and count * min(count, width) ** 2 <= SMALL_HESSIAN
 
 
 def cross_validate_together(
@@ -148,9 +143,7 @@ def cross_validate_together(
 
 def _at_once[T](folds: Iterable[T], labels: NDArray[np.bool_]) -> Iterator[tuple[T, ...]]:
     """Yield parts of `folds`, or of their data, whose problems fit into a processor's cache."""
-    count, columns = labels.shape
-    at_once = COLUMNS_AT_ONCE if columns <= STACKED_COLUMNS else NUMBERS_AT_ONCE // count
-    return batched(folds, max(1, at_once // columns))
+    return batched(folds, max(1, COLUMNS_AT_ONCE // labels.shape[1]))
 
 
 @dataclass(frozen=True)
@@ -179,15 +172,13 @@ class _Together:
         held_out = [
             projection(samples.of(fold.test).means) for projection, fold in zip(coordinates, folds, strict=True)
         ]
-        columns = labels.shape[1]
-        trained = [projection.train for projection in coordinates]
-        design = StackedDesign.of_folds(trained, columns, columns <= STACKED_COLUMNS)
+        design = StackedDesign.of_folds([projection.train for projection in coordinates], labels.shape[1])
         signs = np.zeros((design.shape[0], len(folds), labels.shape[1]))
         for number, fold in enumerate(folds):
             check_single_class(labels[fold.train])
             signs[: fold.train.size, number] = 2.0 * labels[fold.train] - 1.0
-        of_columns = to_device_of(design.samples, signs.reshape(len(signs), -1))
-        return cls(folds, labels, coordinates, held_out, LogisticSolver(design), of_columns)
+        columns = to_device_of(design.samples, signs.reshape(len(signs), -1))
+        return cls(folds, labels, coordinates, held_out, LogisticSolver(design), columns)
 
     def losses(self) -> tuple[Matrix, Matrix]:
         """Return the log-losses along the grid of C: of all label columns, and of the first one by episode.

@@ -1,8 +1,9 @@
 """The probes of one category in one view, with all data that later statistics need."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,6 +67,13 @@ class ProbeCurve:
     inferences: NDArray[np.int64] | None = None
     aligned: NDArray[np.int64] | None = None
     smallest_p: float | None = None
+
+    AXES: ClassVar[Mapping[str, str]] = {
+        "sites": "U S", "labels": "biuf E", "episodes": "U E", "items": "U E", "groups": "U E", "fold_of": "iu E",
+        "decisions": "iuf SE", "strengths": "iuf SF", "null": "iuf SP", "inner": "iuf SFG", "parts": "U S",
+        "sample_scores": "biuf SE", "inferences": "iu E", "aligned": "iu E",
+    }  # fmt: skip
+    """The types and axes of the stored arrays, see `axes_problem`."""
 
     def __post_init__(self) -> None:
         if not self.parts:

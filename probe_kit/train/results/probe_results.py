@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
@@ -19,7 +19,7 @@ from probe_kit.hashing import sha256_json
 from probe_kit.hooks.contract.sites import Site, label_of
 from probe_kit.runs.direction_files import about_direction, write_directions
 from probe_kit.runs.reader import RunReader
-from probe_kit.runs.results import Bundle
+from probe_kit.runs.results import Bundle, axes_problem, fields_problem
 from probe_kit.statistics.folds import FoldUnit
 from probe_kit.statistics.intervals import effective_groups, group_shares, wilson_interval
 from probe_kit.statistics.label_permutations import p_value, permutations_for, shortage
@@ -97,6 +97,10 @@ class ProbeSettings:
 
 Place = tuple[str, str, Site]
 """A category, a view and a site."""
+
+
+_AXES = {"weights": "f FD", "intercepts": "f F", "spreads": "f F"}
+"""The types and axes of the arrays of a direction, see `axes_problem`."""
 
 
 @dataclass(frozen=True)
@@ -186,9 +190,14 @@ class StoredDirections(Mapping[Place, Direction]):
                 name = "/".join(map(str, key))
                 if f"{name}/weights" not in arrays:
                     raise KeyError(key)
-                directions[key] = Direction(
-                    **{part: arrays[f"{name}/{part}"] for part in Direction.__annotations__}
-                )
+                parts = {
+                    part.name: arrays[f"{name}/{part.name}"]
+                    for part in fields(Direction)
+                    if f"{name}/{part.name}" in arrays
+                }
+                if problem := fields_problem(Direction, parts) or axes_problem(_AXES, parts):
+                    raise self._bundle.damaged(self._name, f"{problem} ({name})")
+                directions[key] = Direction(**parts)
         return directions
 
     def __iter__(self) -> Iterator[Place]:

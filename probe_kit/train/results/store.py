@@ -16,7 +16,7 @@ import numpy as np
 
 from probe_kit._system.bounded_files import UNREADABLE, open_arrays
 from probe_kit._system.escaping import as_argument, csv_of_frame
-from probe_kit.errors import NoProbesError, RunDamagedError, UsageError
+from probe_kit.errors import NoProbesError, RunDamagedError, UnknownSiteError, UsageError
 from probe_kit.hashing import sha256_json
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.runs.layout import PROBE_DIRECTIONS, PROBES
@@ -24,6 +24,7 @@ from probe_kit.runs.reader import RunReader
 from probe_kit.runs.results import (
     Bundle,
     Pieces,
+    axes_problem,
     bundle_keys,
     complete_key,
     is_complete,
@@ -185,12 +186,9 @@ def load_results(run: RunReader, key: str | None = None, target: str | None = No
         if not run.streams:
             raise NoProbesError(f"{location} has no activations to probe: of {run.model!r} no stream was stored.")
         hint = f" (of {len(stored)} stored, none: other episodes or another target)" if stored else ""
-        advice = (
-            how_to_probe(run)
-            if target in SIDES
-            else f"Run `probe-kit train {as_argument(location)} --target {as_argument(target)}`."
+        raise NoProbesError(
+            f"{location} has no probes for target {target!r} on its episodes{hint}. {how_to_probe(run, target)}"
         )
-        raise NoProbesError(f"{location} has no probes for target {target!r} on its episodes{hint}. {advice}")
     return _read(run, newest)
 
 
@@ -254,14 +252,26 @@ def is_current(settings: ProbeSettings, run: RunReader) -> bool:
     return (settings.run_settings, settings.episodes) == (run.settings_sha256, episodes_sha256(run))
 
 
-def how_to_probe(run: RunReader) -> str:
-    """Return a sentence that says how a run gets probes: the command, or that it has too few groups of items."""
+def how_to_probe(run: RunReader, target: str = CORRECT) -> str:
+    """Return a sentence that says how a run gets probes of a target: the command, or what it has too few of."""
+    from probe_kit.train.builtin_columns import BuiltinColumns
+
+    location = as_argument(run.location)
+    if target not in SIDES and target in BuiltinColumns(run).names:
+        return f"Run `probe-kit train {location} --target {as_argument(target)}`."
+    if target not in SIDES:
+        return (
+            f"It is no built-in column of this run: `probe-kit targets {location}` lists these. If it is a column "
+            f"of your table, run `probe-kit train {location} --labels FILE --target {as_argument(target)}`."
+        )
     if run.recorded or run.in_own_environment:
-        return f"`probe-kit targets {as_argument(run.location)}` lists what can be probed."
+        return f"`probe-kit targets {location}` lists what can be probed."
+    of_target = "" if target == CORRECT else f" --target {target}"
     if not {"category", "group_id"} <= set(run.episodes):
-        return f"Run `probe-kit train {as_argument(run.location)}`."
+        return f"Run `probe-kit train {location}{of_target}`."
     counts = run.episodes.groupby("category", sort=False)["group_id"].nunique().to_dict()
     command = probe_command(run.location, counts)
+    command += of_target if command else ""
     few = [f"{name} has {count}" for name, count in counts.items() if count < GROUPS_FOR_PROBES]
     if not few:
         return f"Run `{command}`."
@@ -304,7 +314,9 @@ def _unpack(arrays: Mapping[str, Any]) -> dict[tuple[str, str], ProbeCurve]:
     for name, value in arrays.items():
         category, view, member = name.rsplit("/", 2)  # from the right: a category of one's own may hold a slash
         curves.setdefault((category, view), {})[member] = value
-    for members in curves.values():
+    for (category, view), members in curves.items():
+        if problem := axes_problem(ProbeCurve.AXES, members):
+            raise ValueError(f"{category}/{view} {problem}")
         members["sites"] = tuple(Site.parse(str(name)) for name in members["sites"])
         members |= {name: tuple(map(str, members[name])) for name in _TEXTS}
         members |= {name: members[name].item() for name in _FACTS if name in members}
@@ -368,7 +380,7 @@ def _read(run: RunReader, bundle: Bundle) -> ProbeResults:
     try:
         with open_arrays(bundle.read(DECISIONS)) as arrays:
             curves = _unpack(arrays)
-    except (*UNREADABLE, TypeError) as error:
+    except (*UNREADABLE, TypeError, UnknownSiteError) as error:
         raise RunDamagedError(
             f"{run.location}/{bundle.folder}/{DECISIONS} cannot be read: {error}. Remove {bundle.folder} and run "
             "the same `probe-kit train` again"

@@ -182,18 +182,16 @@ class StackedDesign:
     """The samples of several folds in memory, (F, N, R) float64, filled up with zeros before the last column.
 
     Attributes:
-        fold_of: (K,) the fold that each label column belongs to, ascending.
-        small: Whether the moments of all label columns cost less than the many small calls of an iteration.
+        fold_of: (K,) the fold that each label column belongs to.
     """
 
     samples: Array
     fold_of: Array
-    small: bool = True
+
+    small = True
 
     @classmethod
-    def of_folds(
-        cls, folds: "Sequence[DenseDesign | StreamedDesign]", columns: int, small: bool = True
-    ) -> "StackedDesign":
+    def of_folds(cls, folds: "Sequence[DenseDesign | StreamedDesign]", columns: int) -> "StackedDesign":
         """Return the stack of dense designs, each with so many label columns of its own."""
         dense = [fold.samples for fold in folds if isinstance(fold, DenseDesign)]
         xp, like = array_namespace(dense[0]), dense[0]
@@ -203,7 +201,7 @@ class StackedDesign:
             fold[: len(samples), : samples.shape[1] - 1] = samples[:, :-1]
             fold[: len(samples), -1] = samples[:, -1]
         numbers = xp.arange(len(folds) * columns, device=like.device)
-        return cls(filled, numbers // columns, small)
+        return cls(filled, numbers // columns)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -213,36 +211,15 @@ class StackedDesign:
     @property
     def spectrum(self) -> Array:
         """The squared length of every column of a label column's samples, (R, K)."""
-        return self._squares[self.fold_of].T
+        return array_namespace(self.samples).square(self.samples).sum(axis=1)[self.fold_of].T
 
     def of(self, columns: Array) -> "StackedDesign":
         """Return the same samples for the label columns of a mask (K,)."""
-        return StackedDesign(self.samples, self.fold_of[columns], self.small)
+        return StackedDesign(self.samples, self.fold_of[columns])
 
     def narrow(self) -> Self:
         """Return itself."""
         return self
-
-    @cached_property
-    def _squares(self) -> Array:
-        """The squared length of every column of every fold, (F, R)."""
-        return array_namespace(self.samples).square(self.samples).sum(axis=1)
-
-    @cached_property
-    def _ends(self) -> NDArray[np.intp]:
-        """The number of label columns up to the end of every fold, (F,)."""
-        return np.searchsorted(to_numpy(self.fold_of), np.arange(len(self.samples)), "right")
-
-    def _by_fold(self, matrices: Array, columns: Array) -> Array:
-        """Return (M, K): the products of every fold's matrix, of (F, M, N), with its part of (N, K) columns."""
-        xp = array_namespace(columns)
-        products = xp.empty((matrices.shape[1], columns.shape[1]), dtype=columns.dtype, device=columns.device)
-        begin = 0
-        for matrix, end in zip(matrices, self._ends, strict=True):
-            if end > begin:
-                xp.matmul(matrix, columns[:, begin:end], out=products[:, begin:end])
-            begin = end
-        return products
 
     @cached_property
     def _samples_by_label(self) -> Array:
@@ -250,14 +227,10 @@ class StackedDesign:
         return self.samples[self.fold_of]
 
     def __matmul__(self, weights: Array) -> Array:
-        if not self.small:
-            return self._by_fold(self.samples, weights)
         return (self._samples_by_label @ weights.T[..., None])[..., 0].T
 
     def gather(self, values: Array) -> Array:
         """Return Zᵀ · values, (R, K) for (N, K)."""
-        if not self.small:
-            return self._by_fold(self.samples.swapaxes(1, 2), values)
         return (values.T[:, None] @ self._samples_by_label)[:, 0].T
 
     def moments(self, weights: Array) -> Array:
