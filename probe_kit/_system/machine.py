@@ -33,7 +33,7 @@ def check_device_name(device: str, present: bool = True) -> None:
     match = _DEVICE.fullmatch(device)
     if match is None or match["kind"] not in _KINDS:
         raise UsageError(
-            f"device {device!r} cannot be used: it is none of auto, {', '.join(_KINDS)}, with an index such as "
+            f"device {device!r} cannot be used: it is none of {', '.join((*_KINDS, AUTO))}, with an index such as "
             f"cuda:1. "
             f"{what_is_here()}"
         )
