@@ -4,6 +4,7 @@
     python benchmarks/capture.py --families pi0 --checkpoint DIR --device cuda [--dtype bfloat16] [--batch 8]
         [--trace FILE]
     python benchmarks/capture.py --full --device cuda
+    python benchmarks/capture.py --count [--families pi0,openvla]
 
 Each family at 110 to 160 million random parameters, with `--full` three at the released size, or one at the size
 of a checkpoint, whose weights need not be there: the same model, observation and process for all ways, in turns. A
@@ -19,6 +20,10 @@ checked bit for bit first.
   references, copies nothing, and its last entry is normed.
 * raw hooks: forward hooks on every layer, `.detach().cpu().clone()` of each output.
 
+`--count` counts operations instead, which any machine can: those that torch dispatches in one inference, plain and
+captured, of the acting families at the depths and steps that were released, with tiny widths. The first capture of
+a process is not counted; it also finds out what the network writes in place.
+
 `--trace` saves a profiler trace of one inference with `tokens to host` and counts what waited for the device.
 `--keep` keeps a family's line in DIR, so that the same command resumes.
 """
@@ -29,18 +34,22 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
-from capture_subjects import FULL, LARGER, Subject, hidden_states, subject
+from capture_subjects import DEEP, FULL, LARGER, Subject, hidden_states, subject
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from probe_kit.extract.rollout.capturing import Capturer, EpisodeBuffers, stored_streams
-from probe_kit.hooks import capture, pool
-from probe_kit.hooks.contract.sites import Site, view_names
+from probe_kit.hooks import capture
+from probe_kit.hooks.capturing.capture_context import capture_views
+from probe_kit.hooks.contract.roles import pool_weights
 
 WAITS = ("cudaStreamSynchronize", "cudaDeviceSynchronize", "cudaEventSynchronize", "aten::item")
+COUNTED = ("plain", "pooled", "tokens", "pooled to host", "tokens to host")
 Output = NDArray[np.float32]
 
 
@@ -69,7 +78,13 @@ class Benchmark:
 
     def pooled(self) -> Output:
         """Every site reduced to its views on the device."""
-        with capture(self.model, self.model.sites(), reduce=self._reduce):
+        views = {stored.name: stored.views for stored in self.streams}
+        weights = {
+            name: pool_weights(roles, views[name], self.model.card.device)
+            for name, roles in self.subject.roles.items()
+            if name in views
+        }
+        with capture_views(self.model, self.model.sites(), weights):
             return self.plain()
 
     def tokens(self) -> Output:
@@ -117,10 +132,42 @@ class Benchmark:
             own.roles = []
         return capturer.run(self.plain, lambda numbers: numbers, self.subject.roles, sets[0])
 
-    def _reduce(self, site: Site, activation: Tensor) -> Tensor:
-        views = view_names(self.model.role_names[site.stream])
-        own = self.subject.roles[site.stream]
-        return torch.stack([pool(row, roles, views) for row, roles in zip(activation, own, strict=True)])
+
+class OperationCount(TorchDispatchMode):  # type: ignore[no-untyped-call]
+    """A mode that counts what torch dispatches."""
+
+    def __init__(self) -> None:
+        super().__init__()  # type: ignore[no-untyped-call]
+        self.count: int = 0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        del types
+        self.count += 1
+        return func(*args, **(kwargs or {}))
+
+
+def count_operations(run: Callable[[], Output]) -> int:
+    """The operations of one call."""
+    with OperationCount() as operations:
+        run()
+    return int(operations.count)
+
+
+def counted(family: str, options: argparse.Namespace, folder: Path) -> str:
+    """The operations of one family at released depth, as a row."""
+    dtype = options.dtype or "float32"
+    made = subject(family, folder, options.device, dtype, options.batch, sizes=DEEP)
+    benchmark = Benchmark(made, options.device)
+    ways = {name: way for name, way in benchmark.ways(host=True).items() if name in COUNTED}
+    for way in ways.values():
+        way()
+    counts = {name: count_operations(way) for name, way in ways.items()}
+    captured = "  ".join(
+        f"{name} +{count - counts['plain']} ({count / counts['plain']:.4f})"
+        for name, count in counts.items()
+        if name != "plain"
+    )
+    return f"{family}: plain {counts['plain']} operations, {len(made.model.sites())} sites: {captured}"
 
 
 def _first(output: Tensor | tuple[Tensor, ...]) -> Tensor:
@@ -197,14 +244,16 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--host", action="store_true", help="also as a run stores them")
+    parser.add_argument("--count", action="store_true", help="count operations at released depth")
     parser.add_argument("--trace")
     parser.add_argument("--keep", type=Path, help="a folder for the lines of finished families")
     options = parser.parse_args()
-    for family in options.families.split(",") if options.families else FULL if options.full else LARGER:
+    make, sizes = (counted, DEEP) if options.count else (line, FULL if options.full else LARGER)
+    for family in options.families.split(",") if options.families else sizes:
         kept = options.keep / f"{family}.txt" if options.keep else None
         if kept is None or not kept.exists():
             with tempfile.TemporaryDirectory() as folder:
-                found = line(family, options, Path(folder))
+                found = make(family, options, Path(folder))
             if kept is not None:
                 kept.parent.mkdir(parents=True, exist_ok=True)
                 kept.write_text(found, encoding="utf-8")

@@ -44,6 +44,7 @@ _TOWER: Values = {
     "num_attention_heads": TOWER_HEADS,
 }  # fmt: skip
 _ROPE: Values = {"rope_scaling": {"mrope_section": [16, 8, 8]}}
+_SMALL: Values = {"embed_dim": 16, "num_heads": 2}
 _TIMM: Values = {"depth": TOWER_DEPTH, "embed_dim": TOWER, "num_heads": TOWER_HEADS}
 _GEMMA: Values = {"depth": DEPTH, "num_heads": HEADS, "num_kv_heads": 1, "head_dim": HEAD}
 _GEMMA_2B: Values = {"depth": 18, "num_heads": 8, "num_kv_heads": 1, "head_dim": 256}
@@ -192,6 +193,86 @@ FULL: dict[str, Values] = {
     },
 }  # fmt: skip
 """The released sizes of pi0, OpenVLA and Qwen3-VL-4B, without their vocabularies, by family and file."""
+
+_FLOW_GEMMA: Values = {"dims.json": {"vlm": {"depth": 18}, "expert": {"depth": 18}, "vision": {"layers": 27}}}
+_TWO_TOWERS: Values = {
+    "config.json": {
+        "text_config": {"num_hidden_layers": 32},
+        "timm_model_overrides": [{**_SMALL, "depth": 24}, {**_SMALL, "depth": 27}],
+    }
+}  # fmt: skip
+
+DEEP: dict[str, Values] = {
+    "pi0": {**_FLOW_GEMMA, "config.json": {"num_steps": 10}},
+    "pi05": {**_FLOW_GEMMA, "config.json": {"num_inference_steps": 10}},
+    "pi0-fast": {"dims.json": {"vlm": {"depth": 18}, "vision": {"layers": 27}}},
+    "molmoact2": {
+        "config.json": {"num_inference_steps": 10},
+        "vlm/config.json": {
+            "text_config": {"num_hidden_layers": 36}, "vit_config": {"num_hidden_layers": 27},
+            "action_expert_config": {"num_layers": 36},
+        },
+    },
+    "groot": {
+        "config.json": {"num_inference_timesteps": 4},
+        "base/config.json": {
+            "select_layer": 16, "num_inference_timesteps": 4, "diffusion_model_cfg": {"num_layers": 32},
+            "vl_self_attention_cfg": {"num_layers": 4},
+        },
+        "base/vlm/config.json": {"text_config": {"num_hidden_layers": 28}, "vision_config": {"depth": 24}},
+    },
+    "xvla": {
+        "config.json": {
+            "depth": 24, "num_denoising_steps": 10,
+            "florence_config": {"text_config": {"encoder_layers": 12}, "vision_config": {"depths": [1, 1, 9, 1]}},
+        }
+    },
+    "eo1": {
+        "config.json": {
+            "num_denoise_steps": 10,
+            "vlm_config": {
+                "text_config": {"num_hidden_layers": 36, "layer_types": ["full_attention"] * 36},
+                "vision_config": {"depth": 32},
+            },
+        }
+    },
+    "smolvla": {
+        "config.json": {"num_steps": 10, "num_vlm_layers": 16},
+        "vlm/config.json": {"text_config": {"num_hidden_layers": 32}, "vision_config": {"num_hidden_layers": 12}},
+    },
+    "openvla": _TWO_TOWERS,
+    "prismatic": _TWO_TOWERS,
+    "spatialvla": {
+        "config.json": {
+            "text_config": {"num_hidden_layers": 26}, "vision_config": {"num_hidden_layers": 27},
+            "vision_zoe_config": {
+                "backbone_config": {
+                    "num_hidden_layers": 24, "out_features": ["stage6", "stage12", "stage18", "stage24"],
+                }
+            },
+        }
+    },
+    "magma": {
+        "config.json": {
+            "text_config": {"num_hidden_layers": 32},
+            "vision_config": {"timm_overrides": {"depths": [3, 4, 30, 3]}},
+        }
+    },
+    "xiaomi-r0": {
+        "config.json": {
+            "vlm_config": {"text_config": {"num_hidden_layers": 36}, "vision_config": {"depth": 24}},
+            "dit_config": {"num_hidden_layers": 16},
+        }
+    },
+    "internvla-m1": {
+        "../vlm/config.json": {"text_config": {"num_hidden_layers": 36}, "vision_config": {"depth": 32}},
+        "config.yaml": {
+            "framework": {"layer_qformer": {"qformer_start_layer": 36, "qformer_end_layer": 37}}
+        },
+        "dims.json": {"dino": {"depth": 12}, "dit": {"depth": 12}},
+    },
+}  # fmt: skip
+"""The depths and steps of the released acting families, at the widths of the tests, by family and file."""
 
 
 @dataclass(frozen=True)

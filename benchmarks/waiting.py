@@ -9,7 +9,9 @@ simulating processes are what calibration chooses.
 Time is the clock's, from the end of the first inference to the end of the last, without those seconds at the start
 in which the first pictures are drawn; the model works while it is asked for actions (its capture included), and
 waits the rest, for observations, buffers and this process's own affairs. Also printed: the
-prediction of calibration, and the wall time without simulators.
+prediction of calibration, and the wall time without simulators. The share of each stage follows: the model, the
+wait for scenes that begin, the wait for actions that are executed, and all else, such as buffers and commits.
+Without simulators this process does that work itself.
 
 Wall time means little on a busy machine: the share of its core that the model's process
 got is printed too. `--spread` gives the model's process the first core and its simulators the others.
@@ -19,16 +21,20 @@ import argparse
 import os
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import psutil
 from capture_subjects import FULL, LARGER, written
 
 from probe_kit.env import SceneSpec
 from probe_kit.extract import Extraction, ExtractSettings, prepare
+from probe_kit.extract.sources.player import Ending, LocalPlayer, ProcessPlayer
 from probe_kit.suite import build_suite
 
 
@@ -39,6 +45,8 @@ class Clock:
     spread: bool
     calls: list[tuple[float, float, float]] = field(default_factory=list)
     """Begin and end of every call of the model, and the processor time of this process at its end."""
+    answers: list[tuple[str, float, float]] = field(default_factory=list)
+    """Begin and end of every wait for a player, and what it was asked for."""
 
     def around(self, infer: Callable[[Any], Any]) -> Callable[[Any], Any]:
         """`infer`, timed."""
@@ -54,6 +62,47 @@ class Clock:
 
         return timed
 
+    @contextmanager
+    def around_players(self) -> Iterator[None]:
+        """Time the answers of all players."""
+        asked: dict[int, list[str]] = defaultdict(list)
+
+        def asking(ask: Callable[..., None]) -> Callable[..., None]:
+            def noted(player: Any, method: str, *arguments: Any, then: Any = None) -> None:
+                asked[id(player)] = [method] if then is None else [method, then[0]]
+                ask(player, method, *arguments, then=then)
+
+            return noted
+
+        def answering(answer: Callable[[Any], Any]) -> Callable[[Any], Any]:
+            def timed(player: Any) -> Any:
+                began = time.perf_counter()
+                answered = answer(player)
+                methods = asked[id(player)]
+                self.answers.append((methods[0], began, time.perf_counter()))
+                if isinstance(answered, Ending) and len(methods) > 1:
+                    del methods[0]
+                return answered
+
+            return timed
+
+        with (
+            patch.multiple(LocalPlayer, ask=asking(LocalPlayer.ask), answer=answering(LocalPlayer.answer)),
+            patch.multiple(ProcessPlayer, ask=asking(ProcessPlayer.ask), answer=answering(ProcessPlayer.answer)),
+        ):
+            yield
+
+    @property
+    def stages(self) -> str:
+        """The share of every stage in the time after the first call."""
+        (_, start, _), (_, end, _) = self.calls[0], self.calls[-1]
+        seconds = {"model": sum(done - began for began, done, _ in self.calls[1:])}
+        for name, method in (("scenes begin", "begin"), ("actions are executed", "advance")):
+            waits = [(max(began, start), min(done, end)) for of, began, done in self.answers if of == method]
+            seconds[name] = sum(max(0.0, done - began) for began, done in waits)
+        seconds["all else"] = end - start - sum(seconds.values())
+        return ", ".join(f"{name} {share / (end - start):.1%}" for name, share in seconds.items())
+
     @property
     def words(self) -> str:
         """Share of the time after the first call in which the model waited, and what a call took."""
@@ -63,7 +112,7 @@ class Clock:
         return (
             f"waited {1 - works / (end - start):6.1%} of {end - start:5.1f} s, {count} calls of "
             f"{1e3 * works / count:6.1f} ms; its process had "
-            f"{(processor_end - processor) / (end - start):.2f} cores"
+            f"{(processor_end - processor) / (end - start):.2f} cores\n    stages: {self.stages}"
         )
 
 
@@ -86,7 +135,8 @@ def measure(extraction: Extraction, out: Path, spread: bool) -> str:
     infer = controller.infer
     controller.infer = clock.around(infer)
     try:
-        extraction.run(out)
+        with clock.around_players():
+            extraction.run(out)
     finally:
         controller.infer = infer
         os.sched_setaffinity(0, cores)

@@ -3,8 +3,9 @@
 import shlex
 import shutil
 import sys
-from collections.abc import Callable, Mapping
-from functools import lru_cache
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import cache, lru_cache
 from importlib import import_module, metadata
 from importlib.util import find_spec
 from pathlib import Path
@@ -49,6 +50,22 @@ def entry_points(group: str) -> tuple[metadata.EntryPoint, ...]:
 def _read(_path: tuple[tuple[str, int], ...]) -> metadata.EntryPoints:
     # Reads the metadata of every installed package, which takes 40 ms; a study asks a thousand times.
     return metadata.entry_points()
+
+
+@contextmanager
+def one_scan_of_packages() -> Iterator[None]:
+    """Let all imports of the body share one scan of the installed packages.
+
+    transformers and diffusers each map every module to its package when they are imported. That reads the list of
+    files of every installed package, nearly a second each time.
+    """
+    scan = metadata.packages_distributions
+    shared = cache(scan)
+    metadata.packages_distributions = lambda: dict(shared())
+    try:
+        yield
+    finally:
+        metadata.packages_distributions = scan
 
 
 def _modified(folder: str) -> int:

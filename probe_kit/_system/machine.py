@@ -16,6 +16,8 @@ CORES = "PROBE_KIT_CORES"
 _DEVICE = re.compile(r"(?P<kind>[a-z]+)(:(?P<index>\d+))?")
 _KINDS = ("cpu", "cuda", "hpu", "mps", "mtia", "xpu")
 """The kinds of devices of torch that compute."""
+AUTO = "auto"
+"""The device that a machine chooses, see `device_here`."""
 _GPU_NODES = ("nvidia[0-9]*", "nvidiactl", "nvhost-*", "nvgpu*", "nvmap", "dxg", "kfd")
 """Device files of Linux without any of which neither CUDA nor ROCm has a GPU."""
 _OUT_OF_MEMORY = ("can't allocate memory", "MPS backend out of memory")
@@ -29,10 +31,13 @@ def check_device_name(device: str, present: bool = True) -> None:
     The message names the devices that the machine has. With `present=False` a device of another machine is
     accepted.
     """
+    if device == AUTO:
+        return
     match = _DEVICE.fullmatch(device)
     if match is None or match["kind"] not in _KINDS:
         raise UsageError(
-            f"device {device!r} cannot be used: it is none of {', '.join(_KINDS)}, with an index such as cuda:1. "
+            f"device {device!r} cannot be used: it is none of {', '.join((*_KINDS, AUTO))}, with an index such as "
+            f"cuda:1. "
             f"{what_is_here()}"
         )
     if not present:
@@ -41,6 +46,21 @@ def check_device_name(device: str, present: bool = True) -> None:
         match["kind"] == "mps" and sys.platform != "darwin"
     ):
         raise UsageError(f"device {device!r} cannot be used: this machine has no such device. {what_is_here()}")
+
+
+def device_here(device: str) -> str:
+    """Return the device that a text means on this machine, for `auto` a GPU where torch finds one.
+
+    `auto` is `cuda` or `cpu`: no family is tested on another kind. It imports torch only where the system shows a
+    GPU.
+    """
+    if device != AUTO:
+        return device
+    if sys.platform == "darwin" or _surely_without_gpu():
+        return "cpu"
+    import torch
+
+    return "cuda" if torch.cuda.is_available() else "cpu"
 
 
 def what_is_here() -> str:

@@ -1,6 +1,6 @@
 """Options that several commands share, each declared once as an annotated type.
 
-`def command(partial: Partial = False, device: Device = "cpu")` gives a command the option with its help. Closed
+`def command(partial: Partial = False, device: Device = "auto")` gives a command the option with its help. Closed
 vocabularies are `Literal` types of the library, whose values help lists and parsing checks. `some_of` and `one_of`
 do the same for comma-separated values and for the names of a registry.
 """
@@ -148,7 +148,12 @@ ModelOptions = Annotated[
 ]
 RandomWeights = Annotated[bool, _weights_option("--random-weights", help="Use untrained weights, as a control.")]
 WeightsSeed = Annotated[int, _weights_option("--weights-seed", help="Seed of the untrained weights.")]
-Device = Annotated[str, typer.Option("--device", help="Device of the model: cpu, cuda, cuda:1, …")]
+Device = Annotated[
+    str,
+    typer.Option(
+        "--device", help="Device of the model: cpu, cuda, cuda:1, … auto: a GPU where torch finds one, else cpu."
+    ),
+]
 
 # -- speed ------------------------------------------------------------------------------------------------------
 

@@ -30,7 +30,7 @@ def check_adapter(
     checkpoint: common.Checkpoint = None,
     options: common.ModelOptions = None,
     instructions: Instructions = None,
-    device: common.Device = "cpu",
+    device: common.Device = "auto",
     dtype: WeightsDtype = None,
     as_json: common.AsJson = False,
 ) -> None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 from rich.text import Text
 
+from probe_kit._system.machine import AUTO
 from probe_kit._tables.printing import Format, print_table
 from probe_kit._terminal import options as common
 from probe_kit._terminal.console import counter, err, marked, print_json, progress, say, say_note, spoken
@@ -237,7 +238,7 @@ def _replay_source(run: "Run", typed: Mapping[str, Any]) -> "ReplaySource":
     from probe_kit.intervene import ReplaySource
 
     options = read_pairs(typed.get("model_option", ()))
-    device, seed = typed.get("device", "cpu"), typed.get("weights_seed")
+    device, seed = typed.get("device", AUTO), typed.get("weights_seed")
     return ReplaySource(typed.get("suite"), typed.get("checkpoint"), options, seed, device, moved_of(run, typed))
 
 

@@ -169,6 +169,7 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
     rows = {
         "model": f"{identity['model']}  weights {weights}" + ("  RANDOM" if identity["random_weights"] else ""),
         "weights": _weights(extraction),
+        "device": extraction.settings.machine.device if plan.streams or extraction.controller else "",
         "units": _units(extraction.settings),
         "protocol": _protocol(identity),
         **extraction.source.describe(plan.episodes),

@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import typer
-from pydantic import BeforeValidator, Field, PlainSerializer, TypeAdapter
+from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer, TypeAdapter
 
+from probe_kit._system.machine import AUTO, device_here
 from probe_kit._terminal import options as common
 from probe_kit._terminal.console import whole_number
 from probe_kit._terminal.field_options import Part
@@ -319,6 +320,7 @@ class Machine(Part):
     """Settings that change no stored number: the speed of a run, and the pictures that are stored for people.
 
     Attributes:
+        device: The device of the model. `auto` becomes one of this machine, see `device_here`; with `ray` too.
         frames: `ends` stores small copies of the first and last frame of every episode, `all` of every frame,
             `none` none.
         env_workers: The number of processes that simulate and draw; None for two per observation of a batch, 0 for
@@ -328,12 +330,14 @@ class Machine(Part):
         ray: The address of a Ray cluster, or `auto`; the workers then run there. None for this machine.
         inference_limit: The seconds that one call of the model may take in a worker. A worker that takes longer is
             ended; its episodes are tried once more, and given up by name. None for no limit.
+        capture_memory: The most memory of the device, in megabytes, for activations that wait to be pooled: those
+            of all layers of one iteration of a stream, and their copy. None waits for all layers.
         allow_mixed: Continue a run whose episodes were made on another kind of device or with other versions. The
             run is then marked as mixed wherever tables name it.
         accept_ignored_inputs: Accept a model that neither another picture nor another instruction changes.
     """
 
-    device: common.Device = "cpu"
+    device: Annotated[common.Device, AfterValidator(device_here), Field(validate_default=True)] = AUTO
     frames: Annotated[
         FrameChoice,
         stored_option(
@@ -348,6 +352,15 @@ class Machine(Part):
     ray: common.RayAddress = None
     inference_limit: Annotated[
         Annotated[float, Field(gt=0, le=LARGEST)] | None, option_of(common.InferenceLimit)
+    ] = None
+    capture_memory: Annotated[
+        Annotated[float, Field(gt=0, le=LARGEST)] | None,
+        further_option(
+            "--capture-memory",
+            metavar="MB",
+            help="Most megabytes of the device for activations that wait to be pooled; fewer layers are then "
+            "pooled at once. Default: all layers of one iteration of a stream.",
+        ),
     ] = None
     allow_mixed: common.AllowMixed = False
     accept_ignored_inputs: Annotated[
@@ -373,6 +386,11 @@ class Machine(Part):
         if not isinstance(batch, int):
             raise UsageError(f"batch is {batch!r}, which has no number before it is measured")
         return batch
+
+    @property
+    def capture_bytes(self) -> int | None:
+        """`capture_memory` in bytes."""
+        return None if self.capture_memory is None else int(1e6 * self.capture_memory)
 
     @property
     def elsewhere(self) -> bool:

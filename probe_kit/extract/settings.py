@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NoReturn, Self
 import typer
 from pydantic import AfterValidator, BeforeValidator, SerializeAsAny
 
+from probe_kit._system.machine import AUTO, device_here
 from probe_kit._terminal import options as common
 from probe_kit._terminal.field_options import Part, options_of
 from probe_kit.errors import UsageError
@@ -163,6 +164,8 @@ class Settings(Part):
         if "family" not in parts["model"]:
             raise UsageError("no model is named; give --model NAME, which `probe-kit models` lists")
         parts["source"] = _with_scene(parts, scene)
+        if (device := parts["machine"].get("device", AUTO)) == AUTO:
+            parts["machine"]["device"] = device_here(device) if has_network(parts["model"]["family"]) else "cpu"
         return parts
 
     @classmethod
@@ -358,7 +361,7 @@ class ExtractSettings(Settings):
         parts = super()._by_part(model, values)
         machine = parts["machine"]
         if machine.get("batch") is None:
-            on_gpu = str(machine.get("device", "cpu")).startswith("cuda") and machine.get("env_workers") is None
+            on_gpu = str(machine["device"]).startswith("cuda") and machine.get("env_workers") is None
             # A source whose player is measured does not refuse to be.
             calibrates = "batch=auto" not in parts["source"].refuses
             measures = on_gpu and calibrates and has_network(parts["model"]["family"])

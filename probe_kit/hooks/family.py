@@ -11,8 +11,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
-from probe_kit._system.imports import install_command
-from probe_kit._system.machine import check_device_name, what_is_here
+from probe_kit._system.imports import install_command, one_scan_of_packages
+from probe_kit._system.machine import AUTO, check_device_name, device_here, what_is_here
 from probe_kit.errors import (
     CheckpointError,
     InstructionError,
@@ -184,7 +184,7 @@ class Family:
     def load(
         self,
         checkpoint: str | None,
-        device: str = "cpu",
+        device: str = AUTO,
         dtype: str | None = None,
         random_weights: bool = False,
         options: Mapping[str, Any] = MappingProxyType({}),
@@ -196,7 +196,7 @@ class Family:
 
         Args:
             checkpoint: Folder or hub id; None loads the default one.
-            device: Device in torch's spelling, such as `cuda:0`.
+            device: Device in torch's spelling, such as `cuda:0`. `auto` takes a GPU where torch finds one.
             dtype: One of `DTYPES`; None leaves the choice to the loader.
             random_weights: Whether the network stays untrained.
             options: By name, as text or values.
@@ -206,6 +206,7 @@ class Family:
             UsageError: For an option it lacks, and for a device, dtype or seed that cannot be used.
             CheckpointError: For a checkpoint that is not there or cannot be loaded.
         """
+        device = device_here(device)
         loader_options = self.check(checkpoint, device, dtype, random_weights, options, weights_seed)
         location = self.location(checkpoint, loader_options.pop(SIZE, None))
         _check_device(device)
@@ -248,7 +249,7 @@ class Family:
     def check(
         self,
         checkpoint: str | None = None,
-        device: str = "cpu",
+        device: str = AUTO,
         dtype: str | None = None,
         random_weights: bool = False,
         options: Mapping[str, Any] = MappingProxyType({}),
@@ -490,7 +491,7 @@ class Family:
         return self._imported(getattr(self, purpose))
 
     def _imported(self, path: str) -> Callable[..., Any]:
-        with while_loading(self.name, path):
+        with while_loading(self.name, path), one_scan_of_packages():
             function: Callable[..., Any] = imported(path)
         return function
 

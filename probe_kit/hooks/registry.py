@@ -13,6 +13,7 @@ from importlib.metadata import EntryPoint
 from typing import TYPE_CHECKING, Any
 
 from probe_kit._system.imports import entry_points
+from probe_kit._system.machine import AUTO
 from probe_kit.errors import UnknownModelError, UsageError
 from probe_kit.hooks.family import Family
 
@@ -153,7 +154,7 @@ def _third_party(entry: EntryPoint) -> Family:
 def load_model(
     name: str,
     checkpoint: str | None = None,
-    device: str = "cpu",
+    device: str = AUTO,
     dtype: str | None = None,
     random_weights: bool = False,
     weights_seed: int = 0,
@@ -164,7 +165,7 @@ def load_model(
     Args:
         name: Name of the family, as `probe-kit models` lists it.
         checkpoint: Folder or hub id; None loads the family's default.
-        device: Device in torch's spelling, such as `cuda:0`.
+        device: Device in torch's spelling, such as `cuda:0`. `auto` takes a GPU where torch finds one.
         dtype: `float32` or `bfloat16`; None leaves the choice to the loader.
         random_weights: Whether the network stays untrained.
         weights_seed: Seed of an untrained network's weights.
@@ -182,7 +183,7 @@ def load_model(
 def load_policy(
     name: str,
     checkpoint: str | None = None,
-    device: str = "cpu",
+    device: str = AUTO,
     dtype: str | None = None,
     random_weights: bool = False,
     weights_seed: int = 0,

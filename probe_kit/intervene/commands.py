@@ -232,7 +232,7 @@ def intervene(
     pairs: PairTable = None,
     instructions: Instructions = None,
     wording: common.Wording = None,
-    device: common.Device = "cpu",
+    device: common.Device = "auto",
     style: Format = "table",
     partial: common.Partial = False,
     details: common.WholeTable = False,

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Protocol, Self
 
 import numpy as np
 
+from probe_kit._system.machine import AUTO
 from probe_kit.errors import (
     CaptureChangedActionError,
 )
@@ -64,7 +65,7 @@ class ReplaySource:
     checkpoint: str | None = None
     options: Mapping[str, Any] = field(default_factory=dict)
     weights_seed: int | None = None
-    device: str = "cpu"
+    device: str = AUTO
     moved: Mapping[str, Any] = field(default_factory=dict)
 
 

@@ -459,3 +459,21 @@ def test_who_plans_for_gpus_elsewhere_needs_none(monkeypatch: pytest.MonkeyPatch
 def test_allowing_a_mix_is_no_part_of_the_identity(suite: Suite) -> None:
     plain, allowed = prepare(expert(suite)), prepare(expert(suite).changed(allow_mixed=True))
     assert plain.identity() == allowed.identity()
+
+
+def test_the_device_is_a_gpu_where_torch_finds_one_and_the_model_has_a_network(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def devices() -> list[str]:
+        return [ExtractSettings(name).machine.device for name in ("pi0-tiny", "expert")]
+
+    monkeypatch.setattr("probe_kit._system.machine._surely_without_gpu", lambda: True)
+    assert devices() == ["cpu", "cpu"]
+    monkeypatch.setattr("probe_kit._system.machine._surely_without_gpu", lambda: False)
+    monkeypatch.setattr("sys.platform", "linux")
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    assert devices() == ["cpu", "cpu"]
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    assert devices() == ["cuda", "cpu"]
+    assert ExtractSettings("pi0-tiny").machine.batch == "auto"
+    assert ExtractSettings("pi0-tiny", device="cpu").machine.device == "cpu"

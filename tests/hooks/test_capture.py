@@ -121,6 +121,68 @@ def test_copies_do_not_alias_what_the_model_works_on(pi0_tiny: Pi0, observation:
     assert torch.equal(activations[site], seen[0])
 
 
+@pytest.mark.parametrize("most_bytes", [None, 1, 100_000])
+def test_a_network_that_writes_its_stream_in_place_is_captured_as_it_passed(
+    pi0_tiny: Pi0, observation: Observation, most_bytes: int | None
+) -> None:
+    """The blocks' inputs change behind the hooks, at every inference; the last one is the output of all."""
+    sites = pi0_tiny.sites()
+    layers = pi0_tiny.tap(Site("backbone", 1)).module, pi0_tiny.tap(Site("expert", 2, iteration=0)).module
+    entered: list[torch.Tensor] = []
+
+    def write(_module: object, inputs: tuple[torch.Tensor, ...], _output: object) -> None:
+        entered.append(inputs[0])
+
+    def write_later(_module: object, _inputs: object, _output: object) -> None:
+        for tensor in entered:
+            tensor.add_(1)
+        entered.clear()
+
+    parts = [pi0_tiny.tap(Site("backbone", 1, "mlp")), pi0_tiny.tap(Site("expert", 2, "mlp", 0))]
+    handles = [module.register_forward_hook(write) for module in layers]
+    handles += [tap.module.register_forward_hook(write_later) for tap in parts]
+    try:
+        with capture(pi0_tiny, sites, reduce=lambda _, activation: activation.clone()) as fired:
+            pi0_tiny.act([observation, observation], [0, 1])
+        for _ in range(2):
+            with capture(pi0_tiny, sites, most_bytes=most_bytes) as kept:
+                pi0_tiny.act([observation, observation], [0, 1])
+            assert [site for site in sites if not torch.equal(kept[site], fired[site])] == []
+    finally:
+        for handle in handles:
+            handle.remove()
+    if most_bytes is None:
+        assert not torch.equal(fired["backbone.01.residual"] + 1, fired["backbone.02.residual"])
+
+
+def test_what_passed_can_be_read_while_the_model_runs_and_shares_no_memory(
+    pi0_tiny: Pi0, observation: Observation
+) -> None:
+    first, seen = Site("backbone", 0), list[torch.Tensor]()
+    with capture(pi0_tiny, pi0_tiny.sites()) as activations:
+        module = pi0_tiny.tap(Site("backbone", 1)).module
+        handle = module.register_forward_hook(lambda *_: seen.append(activations[first].clone()))
+        pi0_tiny.act([observation], [0])
+    handle.remove()
+    kept = activations[first]
+    assert torch.equal(kept, seen[0])
+    assert kept.untyped_storage().nbytes() == kept.numel() * kept.element_size()
+    assert not kept.is_inference()
+
+
+def test_an_edit_that_is_entered_inside_a_capture_does_not_reach_what_passed_before_it(
+    pi0_tiny: Pi0, observation: Observation
+) -> None:
+    sites, zeroed = pi0_tiny.sites(), Site("backbone", 2)
+    for _ in range(2):
+        with capture(pi0_tiny, sites) as clean:
+            pi0_tiny.act([observation], [0])
+    with capture(pi0_tiny, sites) as activations, edit(pi0_tiny, {zeroed: torch.zeros_like}):
+        pi0_tiny.act([observation], [0])
+    assert torch.equal(activations[zeroed], clean[zeroed])
+    assert not torch.equal(activations["backbone.03.residual"], clean["backbone.03.residual"])
+
+
 def test_hooks_are_gone_after_the_context_and_after_an_exception(pi0_tiny: Pi0, observation: Observation) -> None:
     with capture(pi0_tiny, pi0_tiny.sites()):
         assert hooks_on(pi0_tiny) == 8

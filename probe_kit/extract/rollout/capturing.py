@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     import torch
     from torch import Tensor
 
-    from probe_kit.hooks import ActivationCache, Model, Roles, Site
+    from probe_kit.hooks import Model, Roles
+    from probe_kit.hooks.capturing.capture_context import CapturedViews
 
 
 class EpisodeBuffers:
@@ -193,10 +194,19 @@ class Capturer:
         streams: The storage of the streams.
         with_tokens: Whether every token is stored.
         outputs: The name of what an inference returns, in a word.
+        most_bytes: The largest size of what waits on the device to be pooled, see `capture_views`.
     """
 
-    def __init__(self, model: "Model", streams: Sequence[StoredStream], with_tokens: bool, outputs: str) -> None:
+    def __init__(
+        self,
+        model: "Model",
+        streams: Sequence[StoredStream],
+        with_tokens: bool,
+        outputs: str,
+        most_bytes: int | None = None,
+    ) -> None:
         self._model, self._streams, self._with_tokens, self._outputs = model, streams, with_tokens, outputs
+        self._most_bytes = most_bytes
         self.fires: dict[str, int] = {}
         self.check: dict[str, Any] = {}
 
@@ -221,27 +231,25 @@ class Capturer:
             CaptureChangedActionError: If the first capture of this process changes a number of the output.
             CaptureError: If a capture cannot be started.
         """
-        from probe_kit.hooks import capture
-        from probe_kit.hooks.contract.roles import prepare_pool
+        from probe_kit.hooks.capturing.capture_context import capture_views
+        from probe_kit.hooks.contract.roles import pool_weights
 
-        views = {stream.name: stream.views for stream in self._streams}
         # Before the model runs: a copy to a GPU inside a hook would stall it.
-        for name, own_views in views.items():
-            prepare_pool(roles[name], own_views, self._model.card.device)
-
-        def pool_rows(site: "Site", activation: "Tensor") -> "Tensor":
-            return _pool_rows(activation, roles[site.stream], views[site.stream])
-
-        # Pooled at once, so that the device never holds all tokens of all sites; with --tokens all it has to.
-        reduce = None if self._with_tokens else pool_rows
+        weights = {
+            stream.name: pool_weights(roles[stream.name], stream.views, self._model.card.device)
+            for stream in self._streams
+        }
         # The capture is entered last, so that it reads what edits left.
-        with around(), capture(self._model, self._model.sites(), reduce) as activations:
+        capturing = capture_views(self._model, self._model.sites(), weights, self._with_tokens, self._most_bytes)
+        with around(), capturing as captured:
             result = infer()
         if not self.fires:
             self._prove_harmless(infer, output_of, output_of(result), around)
-        self.fires = activations.fires
+        self.fires = captured.views.fires
         for row, episode_buffers in buffers.items():
-            self._keep(activations, row, {name: rows[row] for name, rows in roles.items()}, episode_buffers)
+            episode_buffers.keep_roles({name: rows[row] for name, rows in roles.items()})
+        for stored in self._streams:
+            self._keep(captured, stored, roles[stored.name], buffers)
         return result
 
     def _prove_harmless[Result](
@@ -280,22 +288,25 @@ class Capturer:
             )
 
     def _keep(
-        self, activations: "ActivationCache", row: int, roles: "dict[str, Roles]", buffers: "EpisodeBuffers"
+        self,
+        captured: "CapturedViews",
+        stored: StoredStream,
+        roles: "Sequence[Roles]",
+        buffers: "Mapping[int, EpisodeBuffers]",
     ) -> None:
-        """Hand one episode's share of a capture to its buffers."""
+        """Hand one stream's share of a capture to the buffers of the episodes."""
         import torch
 
-        buffers.keep_roles(roles)
-        for stored in self._streams:
-            stream_roles = roles[stored.name]
-            values = torch.stack([activations[site][row] for site in stored.stream.sites()])
-            if self._with_tokens:
-                valid = torch.from_numpy(stream_roles.valid).to(values.device)
+        sites = stored.stream.sites()
+        views = captured.views.block(sites)
+        tokens = captured.tokens.block(sites) if self._with_tokens else None
+        for row, episode_buffers in buffers.items():
+            if tokens is not None:
+                valid = torch.from_numpy(roles[row].valid).to(tokens.device)
                 # Padding means nothing, and zeros compress well. NaN stays NaN there; readers go by the mask.
-                bits = (values * valid[:, None]).to(torch.bfloat16).view(torch.int16)
-                buffers.keep_tokens(stored.name, bits.reshape(*stored.lead, *bits.shape[1:]))
-                values = torch.stack([_pool_rows(site[None], [stream_roles], stored.views)[0] for site in values])
-            buffers.keep_pooled(stored.name, values)
+                bits = (tokens[:, row] * valid[:, None]).to(torch.bfloat16).view(torch.int16)
+                episode_buffers.keep_tokens(stored.name, bits.view(*stored.lead, *bits.shape[1:]))
+            episode_buffers.keep_pooled(stored.name, views[:, row])
 
 
 def stored_streams(
@@ -320,14 +331,3 @@ def _sha256(outputs: NDArray[np.float32]) -> str:
     return sha256(
         f"{outputs.dtype} {outputs.shape}".encode() + np.ascontiguousarray(outputs).tobytes()
     ).hexdigest()
-
-
-def _pool_rows(activation: "Tensor", roles: "Sequence[Roles]", views: Sequence[str]) -> "Tensor":
-    """Return the views (B, V, D) float32 of activations (B, T, D), on their device."""
-    import torch
-
-    from probe_kit.hooks import pool
-
-    return torch.stack(
-        [pool(tokens, row_roles, views) for tokens, row_roles in zip(activation, roles, strict=True)]
-    )

@@ -353,7 +353,8 @@ class ModelController[Loaded: "Model", Question](Controller):
         self.model, self.streams, self._machine = model, streams, settings.machine
         self.threads = 1 if card.parameters < FEWEST_FOR_THREADS else None
         self.on_gpu = card.device.startswith("cuda")
-        self._capturer = Capturer(model, streams, settings.capture.tokens == "all", self.outputs)
+        tokens, most_bytes = settings.capture.tokens == "all", settings.machine.capture_bytes
+        self._capturer = Capturer(model, streams, tokens, self.outputs, most_bytes)
         self._input_check: dict[str, Reach] | None = None
         self._instruction_ids: dict[str, tuple[int, ...] | None] = {}
         self.identity = {

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from itertools import groupby
 from typing import Any
-from weakref import WeakSet
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -32,6 +32,13 @@ from probe_kit.errors import (
     SiteFiredTooOftenError,
     SiteNeverFiredError,
     UnknownSiteError,
+)
+from probe_kit.hooks.capturing.passes import (
+    BlockPart,
+    PassCapture,
+    block_of,
+    outside_inference_mode,
+    sums_of,
 )
 from probe_kit.hooks.contract.model import Model, Policy, Tap
 from probe_kit.hooks.contract.observation import Observation
@@ -111,7 +118,7 @@ class ActivationCache(Mapping[Site, Tensor]):
     """
 
     def __init__(self) -> None:
-        self._kept: dict[Site, Tensor] = {}
+        self._kept: dict[Site, Tensor | BlockPart] = {}
         self.fires: dict[str, int] = {}
 
     def __getitem__(self, site: Site | str) -> Tensor:
@@ -120,10 +127,21 @@ class ActivationCache(Mapping[Site, Tensor]):
         Raises:
             UnknownSiteError: For a site that was not captured or a name that is none.
         """
-        activation = self._kept.get(Site.parse(site) if isinstance(site, str) else site)
+        captured = Site.parse(site) if isinstance(site, str) else site
+        activation = self._kept.get(captured)
         if activation is None:
             raise UnknownSiteError(f"{site} was not captured; the cache holds {self._contents() or 'nothing yet'}")
+        if isinstance(activation, BlockPart):
+            activation = self._kept[captured] = activation.tensor()
         return activation
+
+    def block(self, sites: Sequence[Site]) -> Tensor:
+        """Return what is kept of sites of one shape as one tensor (n, …), in their order.
+
+        Raises:
+            UnknownSiteError: For a site that was not captured.
+        """
+        return block_of([self._kept[site] if site in self._kept else self[site] for site in sites])
 
     def __iter__(self) -> Iterator[Site]:
         return iter(self._kept)
@@ -171,11 +189,20 @@ class ActivationCache(Mapping[Site, Tensor]):
                 f"layers {incomplete} of {stream} lack iterations that others have; capture all of "
                 f"{len(iterations)} iterations in every layer, or take single sites"
             )
-        if len({self._kept[site].shape for site in sites}) > 1:
+        if len({self._form(site)[0] for site in sites}) > 1:
             raise UnknownSiteError(f"the sites of {stream} have different shapes; take them one by one")
-        rows = [torch.stack([self._kept[site] for site in of_layer]) for of_layer in layers]
+        rows = [torch.stack([self._part(site) for site in of_layer]) for of_layer in layers]
         stacked = torch.stack(rows)
         return stacked[:, 0] if iterations == {None} else stacked
+
+    def _part(self, site: Site) -> Tensor:
+        """Return what is kept of a site, which may share memory with what is kept of others."""
+        part = self._kept[site]
+        return part.settled().of(part.position) if isinstance(part, BlockPart) else part
+
+    def _form(self, site: Site) -> tuple[tuple[int, ...], torch.dtype, torch.device]:
+        part = self._part(site)
+        return tuple(part.shape), part.dtype, part.device
 
     def _streams(self) -> list[tuple[str, str, int, int, tuple[int, ...], str]]:
         """Return per stream and quantity: layers, iterations (0: none), shape of a site, dtype and device."""
@@ -185,10 +212,11 @@ class ActivationCache(Mapping[Site, Tensor]):
         return [
             (
                 stream, quantity, len({site.layer for site in sites}),
-                len({site.iteration for site in sites} - {None}), tuple(self._kept[sites[0]].shape),
-                f"{str(self._kept[sites[0]].dtype).removeprefix('torch.')} on {self._kept[sites[0]].device}",
+                len({site.iteration for site in sites} - {None}), shape,
+                f"{str(dtype).removeprefix('torch.')} on {device}",
             )
             for (stream, quantity), sites in by_stream.items()
+            for shape, dtype, device in [self._form(sites[0])]
         ]  # fmt: skip
 
     def _contents(self) -> str:
@@ -220,11 +248,16 @@ Handle = Callable[[Site, Tap, Tensor], Tensor | None]
 A tensor that it returns passes on in place of the input, and None leaves the input. Where the tap reads a keyword
 of the call, the tensor is only read.
 """
-_captured_now: WeakSet[Model] = WeakSet()
+_captured_now: "WeakKeyDictionary[Model, PassCapture | None]" = WeakKeyDictionary()
+"""The models that are being captured, each with the passes that wait; None where a function reduces at once."""
+_attached_now: set[int] = set()
+"""The ids of the hooks of all captures and edits."""
 
 
 @contextmanager
-def capture(model: Model, sites: Iterable[Site], reduce: Reduce | None = None) -> Iterator[ActivationCache]:
+def capture(
+    model: Model, sites: Iterable[Site], reduce: Reduce | None = None, most_bytes: int | None = None
+) -> Iterator[ActivationCache]:
     """Capture `sites` while the model runs once.
 
     Args:
@@ -232,6 +265,8 @@ def capture(model: Model, sites: Iterable[Site], reduce: Reduce | None = None) -
         sites: The sites to capture; each is captured once, however often it is named.
         reduce: Gives what to keep of a site, such as a pooled view. It is called with (site, (B, T, D)) on the
             device at the moment the site fires, and must return a new tensor. None keeps a copy.
+        most_bytes: Without `reduce`, the largest size of the tensors that wait until their pass is copied as a
+            whole. None waits for all layers of one iteration of a stream.
 
     What is kept can be trained on: although policies infer in `torch.inference_mode`, it is no inference tensor,
     which torch refuses to train on, and carries no gradient. `reduce` runs outside that mode too.
@@ -242,10 +277,13 @@ def capture(model: Model, sites: Iterable[Site], reduce: Reduce | None = None) -
         NonFiniteActivationError: If a copy holds NaN or infinity.
         CaptureError: If this model is being captured already or a tapped module is compiled.
     """
-    if model in _captured_now:
-        raise CaptureError("this model is being captured already; leave the first capture before the next")
     cache = ActivationCache()
-    kept_of = reduce or (lambda _, activation: activation.clone())
+    if reduce is None:
+        passes = PassCapture(model, None, {}, cache._kept, most_bytes)
+        with _capture(model, sites, cache, passes.fire, passes):
+            yield cache
+        return
+    kept_of = reduce
 
     def keep(site: Site, tap: Tap, passing: Tensor) -> None:
         activation = tap.select(passing).detach()
@@ -255,15 +293,73 @@ def capture(model: Model, sites: Iterable[Site], reduce: Reduce | None = None) -
         else:
             cache._kept[site] = kept_of(site, activation)
 
-    with ExitStack() as stack:
-        _captured_now.add(model)
-        stack.callback(_captured_now.discard, model)
-        hooks = _attach(model, sites, keep, stack)
+    with _capture(model, sites, cache, keep, None):
         yield cache
+
+
+@dataclass(frozen=True)
+class CapturedViews:
+    """The pooled views of one inference, and its tokens where they are kept.
+
+    Attributes:
+        views: (B, V, D) float32 per site.
+        tokens: (B, T, D) per site; empty if only views are kept.
+    """
+
+    views: ActivationCache
+    tokens: ActivationCache
+
+
+@contextmanager
+def capture_views(
+    model: Model,
+    sites: Iterable[Site],
+    weights: Mapping[str, Tensor],
+    with_tokens: bool = False,
+    most_bytes: int | None = None,
+) -> Iterator[CapturedViews]:
+    """Capture pooled views of sites while the model runs once, by one product for all layers of a pass.
+
+    Args:
+        model: The model that runs inside the context.
+        sites: The sites to capture.
+        weights: By stream the weights (B, V, T) float32 of `pool_weights`, on the model's device.
+        with_tokens: Whether every token is kept as well.
+        most_bytes: The largest size of the tensors that wait until their pass is pooled, with their copies. None
+            waits for all layers of one iteration of a stream.
+
+    Raises:
+        RolesMismatchError: For weights of another number of rows or tokens, and what `capture` raises.
+    """
+    captured = CapturedViews(ActivationCache(), ActivationCache())
+    tokens = captured.tokens._kept if with_tokens else None
+    passes = PassCapture(model, weights, captured.views._kept, tokens, most_bytes)
+    with _capture(model, sites, captured.views, passes.fire, passes):
+        yield captured
+    captured.tokens.fires = captured.views.fires
+    _check_non_finite(captured.tokens)
+
+
+@contextmanager
+def _capture(
+    model: Model, sites: Iterable[Site], cache: ActivationCache, keep: Handle, passes: PassCapture | None
+) -> Iterator[None]:
+    """Capture with one handle; afterwards check the counts and, in `cache`, that every number is finite."""
+    if model in _captured_now:
+        raise CaptureError("this model is being captured already; leave the first capture before the next")
+    with ExitStack() as stack:
+        _captured_now[model] = passes
+        stack.callback(_captured_now.pop, model, None)
+        hooks = _attach(model, sites, keep, stack)
+        if passes is not None:
+            passes.arrange(((hook.tap, hook.at_fire) for hook in hooks), _attached_now)
+        yield
     for hook in hooks:
         hook.check_count()
         cache.fires[hook.name] = hook.promised
     _check_non_finite(cache)
+    if passes is not None:
+        passes.learn()
 
 
 @contextmanager
@@ -279,6 +375,8 @@ def edit(model: Model, edits: Mapping[Site, EditFunction]) -> Iterator[None]:
     Raises:
         CaptureError: If a replacement has another shape or dtype, and for fires as `capture` does.
     """
+    if (passes := _captured_now.get(model)) is not None:
+        passes.copy_at_once()
 
     def write(site: Site, tap: Tap, passing: Tensor) -> None:
         activation = tap.select(passing)
@@ -306,7 +404,10 @@ def _attach(model: Model, sites: Iterable[Site], handle: Handle, stack: ExitStac
     compiled = partial(compiled_parts, model)
     hooks = [_CountingHook(model.tap(group[0]), group, handle, compiled) for group in groups.values()]
     for hook in hooks:
-        stack.callback(hook.attach().remove)
+        attached = hook.attach()
+        _attached_now.add(attached.id)
+        stack.callback(_attached_now.discard, attached.id)
+        stack.callback(attached.remove)
     return hooks
 
 
@@ -410,14 +511,18 @@ def _check_non_finite(cache: ActivationCache) -> None:
     Raises:
         NonFiniteActivationError: For the first site that holds NaN or infinity.
     """
-    finite = [torch.isfinite(activation).all() for activation in cache._kept.values()]
-    if not finite or bool(torch.stack([flag.to(finite[0].device) for flag in finite]).all()):
+    if not cache._kept:
         return
-    for site, good in zip(cache._kept, finite, strict=True):
-        if not good:
-            raise NonFiniteActivationError(
-                f"{site} holds NaN or infinity; look for overflow (try --dtype float32) or damaged weights"
-            )
+    with outside_inference_mode():
+        sums = sums_of(cache._kept.values())
+        on_one = [number if number.device == sums[0].device else number.to(sums[0].device) for number in sums]
+        if np.isfinite(torch.stack(on_one).tolist()).all():
+            return
+        for site in cache._kept:
+            if not bool(torch.isfinite(cache._part(site)).all()):
+                raise NonFiniteActivationError(
+                    f"{site} holds NaN or infinity; look for overflow (try --dtype float32) or damaged weights"
+                )
 
 
 # -- gradients ------------------------------------------------------------------------------------------------

@@ -21,7 +21,14 @@ from probe_kit.errors import (
     UnsupportedInterventionError,
 )
 from probe_kit.hooks.capturing.attention import AttentionCut, attended_roles, capture_patterns, cut_attention
-from probe_kit.hooks.capturing.capture_context import ActivationCache, capture, edit, reason_of_change, same_bits
+from probe_kit.hooks.capturing.capture_context import (
+    ActivationCache,
+    capture,
+    capture_views,
+    edit,
+    reason_of_change,
+    same_bits,
+)
 from probe_kit.hooks.capturing.readouts import logit_lens, project_heads
 from probe_kit.hooks.conformance.check import (
     CheckFailedError,
@@ -34,7 +41,7 @@ from probe_kit.hooks.conformance.check import (
 )
 from probe_kit.hooks.conformance.subject import Subject
 from probe_kit.hooks.contract.observation import Observation
-from probe_kit.hooks.contract.roles import Roles, pool
+from probe_kit.hooks.contract.roles import Roles, pool, pool_weights
 from probe_kit.hooks.contract.sites import HEADS, PADDING, PARTS, Site, Stream, plays, view_names
 from probe_kit.hooks.outputs import outputs_of
 
@@ -159,6 +166,34 @@ def capturing_changes_no_output_bit_for_bit(subject: Subject) -> None:
             "no difference, bit for bit",
             reason_of_change(lambda: subject.run(observations), plain, captured),
         )
+
+
+@check(
+    "What is kept of a whole pass equals what is copied as each site fires, bit for bit.",
+    "Write a tensor that entered a block at every inference or at none: the first capture learns which they are.",
+)
+def passes_keep_what_fires(subject: Subject) -> None:
+    model, observations = subject.model, subject.batch
+    streams = model.every_stream().values()
+    sites = [site for stream in streams for quantity in stream.captured for site in stream.sites(quantity)]
+    roles = subject.roles_of(observations)
+    names = {name: view_names(model.role_names[name]) for name in model.streams}
+    weights = {name: pool_weights(roles[name], names[name], model.card.device) for name in names}
+    with capture(model, sites, reduce=lambda _, activation: activation.clone()) as fired:
+        subject.run(observations)
+    for _ in range(2):  # the first capture of a kind learns what is written in place
+        with capture(model, sites) as passed:
+            subject.run(observations)
+        with capture_views(model, model.sites(), weights) as pooled:
+            subject.run(observations)
+    written = [str(site) for site in sites if not torch.equal(passed[site], fired[site])]
+    require(not written, f"other activations at {', '.join(written[:5])}", "those that passed, bit for bit")
+    for site in model.sites():
+        rows = zip(fired[site], roles[site.stream], strict=True)
+        alone = torch.stack([pool(tokens, row, names[site.stream]) for tokens, row in rows])
+        # The order of a sum may be another one in a product of few numbers.
+        apart = float((pooled.views[site] - alone).abs().max())
+        require(apart <= 1e-6 * (1 + float(alone.abs().max())), f"views of {site} off by {apart:.3g}", "≤ 1e-6")
 
 
 @check(

@@ -1,6 +1,6 @@
 """Token roles: the kind of each position of a stream, and the pooled views made from them."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
@@ -100,18 +100,34 @@ def pool(tokens: Tensor, roles: Roles, views: Sequence[str]) -> Tensor:
     return _matrix(roles, tuple(views), tokens.device) @ tokens.float()
 
 
-def prepare_pool(roles: Iterable[Roles], views: Sequence[str], device: torch.device | str) -> None:
-    """Bring to `device` what `pool` needs for these roles, which otherwise happens while the model runs.
+def pool_weights(roles: Sequence[Roles], views: Sequence[str], device: torch.device | str) -> Tensor:
+    """Return what makes pooled views of the tokens of several rows, as (B, V, T) float32 on `device`.
+
+    Their product with tokens (B, T, D) gives the views of `pool`. It belongs before the inference: a copy to a GPU
+    would stall the model.
+
+    Args:
+        roles: The roles of the T positions, row by row.
+        views: Names as in `view_names`.
+        device: The device of the tokens.
 
     Raises:
-        EmptyRoleError: For a view without a token, as in `pool`.
-        UnknownSiteError: For an unknown view, as in `pool`.
+        EmptyRoleError: For a view without a token.
+        RolesMismatchError: For rows of different lengths.
+        UnknownSiteError: For an unknown view.
     """
-    indexed_device = torch.device(device)
-    if indexed_device.type == "cuda" and indexed_device.index is None:
-        indexed_device = torch.device("cuda", torch.cuda.current_device())  # as its tensors say
-    for row_roles in roles:
-        _matrix(row_roles, tuple(views), indexed_device)
+    if len({len(row) for row in roles}) > 1:
+        raise RolesMismatchError(
+            f"the rows of a batch have {', '.join(str(len(row)) for row in roles)} positions; pad the shorter ones"
+        )
+    return _matrices(tuple(roles), tuple(views), torch.device(device))
+
+
+@lru_cache(maxsize=64)
+def _matrices(roles: tuple[Roles, ...], views: tuple[str, ...], device: torch.device) -> Tensor:
+    """Return (B, V, T) float32 weights."""
+    with torch.inference_mode(False):
+        return torch.stack([_matrix(row, views, device) for row in roles])
 
 
 # The weights depend on the packing alone, and a run has few packings.
