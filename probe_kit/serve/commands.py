@@ -28,6 +28,8 @@ _NOT_SERVED = frozenset(
 )  # fmt: skip
 """The options of `extract` that a server has no use for."""
 LOOPBACK = "127.0.0.1"
+CALLS = 8
+"""The captured inferences of an episode by default: clients infer many times, and sealing takes as long as they are."""
 
 Host = Annotated[
     str,
@@ -91,11 +93,6 @@ def serve(
 
     settings = settings_of(typed)
     extra_entries = _metadata(metadata or ())
-    if host != LOOPBACK and dict(settings.source)["wire"] == "vla-eval":
-        raise UsageError(
-            f"--host {host} with --wire vla-eval, whose server has no token; leave --host out, and reach it "
-            "through a tunnel"
-        )
     if dry_run:
         _print_plan(plan_server(settings, out_folder), f"ws://{host}:{port}")
         return
@@ -202,7 +199,7 @@ def settings_of(typed: Mapping[str, Any]) -> ExtractSettings:
     fields = {option.parameter: option.field for part in parts for option in options_of(part)}
     source = ServedSettings(**{served[name]: value for name, value in typed.items() if name in served})
     values = {fields[name]: value for name, value in typed.items() if name in fields and name not in served}
-    settings = ExtractSettings(values.pop("family", None), source=source, **values)
+    settings = ExtractSettings(values.pop("family", None), source=source, **{"captured_calls": CALLS, **values})
     return settings.with_every_call(1)
 
 

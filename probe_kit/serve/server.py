@@ -80,6 +80,10 @@ class Server:
     token_file: Path | None = None
     metadata: Mapping[str, Any] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        self.stop = asyncio.Event()
+        """Set to end the server, on the thread of its loop."""
+
     @property
     def address(self) -> str:
         """The address that clients connect to."""
@@ -93,7 +97,7 @@ class Server:
     async def _serve(self, stop_after: int | None, ready: Callable[[], None], note: Callable[[str], None]) -> None:
         from probe_kit.serve.openpi import OpenpiServer
 
-        loop, stop = asyncio.get_running_loop(), asyncio.Event()
+        loop, stop = asyncio.get_running_loop(), self.stop
         before = {number: signal.getsignal(number) for number in _ENDING}
 
         def end() -> None:
@@ -170,8 +174,19 @@ def open_server(
     token_file: Path | None,
     metadata: Mapping[str, Any],
     report: Callable[[Line], None],
+    policy: "Policy | None" = None,
 ) -> Server:
     """Load the model and bind the socket. All that needs no model is checked first.
+
+    Args:
+        settings: The settings of the run, whose source is a `ServedSettings`.
+        out: The folder or URL of the run.
+        host: The address to listen at; another one than this machine's own needs a token.
+        port: The port; 0 for any free one.
+        token_file: The file with the token; None for none, or one that is drawn.
+        metadata: Entries of the first message to a client.
+        report: Called with a line per episode.
+        policy: The policy of these settings, if it is loaded already.
 
     Raises:
         MissingExtraError: Without the packages of the wire.
@@ -188,12 +203,12 @@ def open_server(
     token, drawn = _token(host, token_file)
     listener = _bound(host, port)
     try:
-        opened, source = open_checked(settings, location)
+        opened, source = open_checked(settings, location, policy is not None)
         assert isinstance(opened, ExtractSettings)
         assert isinstance(source, ServedSource)
         _check_stored(opened, source, root, location)
         stored = None if root is None or not root.plan else read_run(location)
-        policy = Act().load(opened)
+        policy = policy or Act().load(opened)
         assert policy is not None, "scripts are refused before"
         source, policy = source.check(policy, opened.machine.accept_units)
         versions = {package: version(package) for package in packages}

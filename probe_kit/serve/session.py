@@ -296,6 +296,10 @@ class Session:
         self._finish_check()
         self._end(client, "connection")
 
+    def wait(self) -> None:
+        """Wait until all episodes that ended are written."""
+        self._thread.submit(lambda: None).result()
+
     def close(self) -> Run | None:
         """End all open episodes, write what waits, seal the run and return it; None without any episode.
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from functools import partial
-from typing import Annotated, Any, ClassVar, Literal, get_args
+from typing import Annotated, Any, ClassVar, Literal
 
 import typer
 from pydantic import BeforeValidator, Field
@@ -13,8 +13,7 @@ from probe_kit.errors import UsageError
 from probe_kit.extract.sources.recording import Pairs, read_pairs_of, read_turns
 from probe_kit.extract.sources.source import SourceSettings
 
-Wire = Literal["openpi", "vla-eval"]
-WIRES: tuple[Wire, ...] = get_args(Wire)
+Wire = Literal["openpi"]
 EpisodeRule = Literal["guessed", "words", "connection", "said"]
 Keep = Literal["full", "small"]
 MOST_CALLS = 64
@@ -54,9 +53,7 @@ class ServedSettings(SourceSettings):
     """
 
     kind: Literal["served"] = "served"
-    wire: Annotated[
-        Wire, typer.Option("--wire", help="Protocol of the clients: openpi's websocket, or that of vla-eval.")
-    ] = "openpi"
+    wire: Wire = "openpi"
     cameras: Annotated[
         Pairs,
         BeforeValidator(partial(read_pairs_of, "--camera", "base=observation/image")),
