@@ -29,7 +29,7 @@ _NOT_SERVED = frozenset(
 """The options of `extract` that a server has no use for."""
 LOOPBACK = "127.0.0.1"
 CALLS = 8
-"""The captured inferences of an episode by default: clients infer many times, and sealing takes as long as they are."""
+"""The captured inferences of an episode by default; the time of sealing grows with them."""
 
 Host = Annotated[
     str,
