@@ -69,7 +69,7 @@ def requests(folder: Path, family: str, checkpoint: str | None, count: int) -> N
     source = ServedSettings(
         cameras={} if checkpoint else {"base": "observation/image"},
         state="observation/state",
-        named="bench",
+        source_name="bench",
         every=2,
     )
     settings = ExtractSettings(family, checkpoint, source=source, captured_calls=8)

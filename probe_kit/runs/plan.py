@@ -307,7 +307,7 @@ def read_plans(location: Location, run: str, columns: Iterable[str]) -> StoredPl
         return StoredPlan()
     selection = next((record.selection for record in reversed(records) if record.selection is not None), None)
     if selection is None:
-        raise RunDamagedError(f"{location}/{plan_key(0)} says nothing of what was selected. {RESTORE}")
+        raise RunDamagedError(f"{location}/{plan_key(0)} lacks the selection. {RESTORE}")
     return StoredPlan(
         rows,
         selection,

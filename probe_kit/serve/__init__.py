@@ -1,1 +1,1 @@
-"""A policy server whose clients play: activations behind the sockets that benchmarks and robots speak."""
+"""A policy server whose clients play: activations behind the sockets of benchmarks and robots."""

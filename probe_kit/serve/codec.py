@@ -136,6 +136,6 @@ def pack(message: Mapping[str, Any]) -> bytes:
 
 def _packed(value: Any) -> Any:
     if isinstance(value, np.ndarray) and value.dtype.kind in _KINDS:
-        array = np.ascontiguousarray(value)
+        array = np.asarray(value, order="C")
         return {_ARRAY: True, _DATA: array.tobytes(), _DTYPE: array.dtype.str, _SHAPE: list(array.shape)}
     raise TypeError(f"a message holds a {type(value).__name__}")

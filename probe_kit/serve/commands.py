@@ -35,7 +35,7 @@ Host = Annotated[
     str,
     typer.Option(
         "--host",
-        help="Address to listen at. Another one than 127.0.0.1 needs a token.",
+        help="Address of the server. Another one than 127.0.0.1 needs a token.",
         rich_help_panel="Network",
     ),
 ]

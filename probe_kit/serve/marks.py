@@ -25,7 +25,7 @@ Facts = Mapping[str, float | bool]
 
 @dataclass(frozen=True)
 class Mark:
-    """What a client says of the episode of an observation, or of its end.
+    """The statement of a client on the episode of an observation, or on its end.
 
     Attributes:
         id: The name of the episode; empty for an end without one.

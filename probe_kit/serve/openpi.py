@@ -62,7 +62,7 @@ class OpenpiServer:
         self._open = 0
 
     async def start(self) -> Server:
-        """Listen, and return the server."""
+        """Open the socket for clients, and return the server."""
         quiet = logging.getLogger("probe_kit.serve")
         quiet.propagate, quiet.disabled = False, True  # its tracebacks are of clients that vanish
         return await serve(
@@ -81,7 +81,7 @@ class OpenpiServer:
         await asyncio.get_running_loop().run_in_executor(None, partial(self._thread.shutdown, wait=True))
 
     def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Return a refusal, or the answer to a question about health; None for a client that may speak."""
+        """Return a refusal, or the answer to a question about health; None for a client that is admitted."""
         if request.path == HEALTH:
             return connection.respond(HTTPStatus.OK, "OK\n")
         if "Origin" in request.headers:
@@ -106,7 +106,7 @@ class OpenpiServer:
         self._open += 1
         assert connection.request is not None, "it was admitted by its request"
         name = connection.request.path.removeprefix("/")
-        client = await self._run(self.session.connect, name)
+        client = self.session.connect(name)  # here: a client is greeted while the model infers for another
         try:
             await connection.send(pack({**self.metadata, "probe_kit": {"version": __version__, "mark": KEY}}))
             await self._converse(connection, client)

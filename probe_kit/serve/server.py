@@ -149,7 +149,7 @@ def plan_server(settings: ExtractSettings, out: str) -> ServerPlan:
     """
     location = locate(out)
     root = find_continuable(location)
-    settings = _named(settings, root, location)
+    settings = _with_source_name(settings, root, location)
     opened, source = open_checked(settings, location, fetch=False)
     assert isinstance(opened, ExtractSettings)
     assert isinstance(source, ServedSource)
@@ -181,7 +181,7 @@ def open_server(
     Args:
         settings: The settings of the run, whose source is a `ServedSettings`.
         out: The folder or URL of the run.
-        host: The address to listen at; another one than this machine's own needs a token.
+        host: The address of the server; another one than this machine's own needs a token.
         port: The port; 0 for any free one.
         token_file: The file with the token; None for none, or one that is drawn.
         metadata: Entries of the first message to a client.
@@ -199,7 +199,7 @@ def open_server(
         require(package, EXTRA)
     location = locate(out)
     root = find_continuable(location)
-    settings = _named(settings, root, location)
+    settings = _with_source_name(settings, root, location)
     token, drawn = _token(host, token_file)
     listener = _bound(host, port)
     try:
@@ -235,7 +235,7 @@ def _answer_shape(policy: "Policy", source: ServedSource) -> tuple[int | None, i
     return rows, width
 
 
-def _named(settings: ExtractSettings, root: Root | None, location: Location) -> ExtractSettings:
+def _with_source_name(settings: ExtractSettings, root: Root | None, location: Location) -> ExtractSettings:
     """Return the settings with the name of what is served: typed, that of the run, or one that is drawn.
 
     Raises:
@@ -244,18 +244,18 @@ def _named(settings: ExtractSettings, root: Root | None, location: Location) -> 
     source = settings.source
     if root is not None and root.own_settings.get(DATASET, {}).get("kind") != "served":
         raise SettingsMismatchError(f"{location} holds a run that was not served; choose another --out")
-    if dict(source)["named"] is not None:
+    if dict(source)["source_name"] is not None:
         return settings
     drawn = f"session-{secrets.token_hex(4)}" if root is None else str(root.own_settings[DATASET]["source"])
-    return settings.changed(source=source.changed(named=drawn))
+    return settings.changed(source=source.changed(source_name=drawn))
 
 
 def _check_stored(settings: ExtractSettings, source: ServedSource, root: Root | None, location: Location) -> None:
     """Raise SettingsMismatchError for a run whose settings differ in what is known before the model is loaded."""
     if root is None:
         return
-    known = {name: value for name, value in settings.identity().items() if name not in _NOT_YET}
-    requested = json.loads(canonical_json({**known, DATASET: source.early_identity()}))
+    decided = {name: value for name, value in settings.identity().items() if name not in _NOT_YET}
+    requested = json.loads(canonical_json({**decided, DATASET: source.early_identity()}))
     stored = {name: root.own_settings.get(name) for name in requested}
     stored[DATASET] = {name: root.own_settings[DATASET].get(name) for name in requested[DATASET]}
     if settings.model.dtype is not None:
@@ -264,7 +264,7 @@ def _check_stored(settings: ExtractSettings, source: ServedSource, root: Root | 
 
 
 def _bound(host: str, port: int) -> socket.socket:
-    """Return a bound socket that does not listen yet: a client is refused until the model is loaded."""
+    """Return a bound socket that accepts no client yet: each is refused until the model is loaded."""
     try:
         family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         listener = socket.socket(family, kind, protocol)

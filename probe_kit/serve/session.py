@@ -1,6 +1,7 @@
 """A session of a policy server: episodes of its clients, one inference at a time, and the run that they make.
 
-A session knows no wire. Its methods are called one at a time, on the thread that infers; another thread writes.
+A session knows no wire. Its methods are called one at a time, on the thread that infers, but for `connect`; another
+thread writes.
 """
 
 import itertools
@@ -62,7 +63,7 @@ LONGEST_INTERVALS, LEAST_PAUSE = 10.0, 5.0
 MOST_WAITING = 8
 """The most episodes that wait to be written: a model cannot outrun the disk."""
 _OF_A_REQUEST = (ObservationError, InstructionError, UnitsError)
-"""Errors of an observation: the client gets their text, and the episode goes on."""
+"""Errors of an observation: the client gets their text, and the episode stays open."""
 UNFINISHED = "the server ended before its commit"
 
 
@@ -77,7 +78,7 @@ class OpenEpisode:
         client: The name of the client.
         instruction: The words of all its inferences.
         playing: What is captured and counted.
-        kept: What is shown again later.
+        record: The inputs that are shown again later.
         inferences: The number of inferences so far, captured or not.
         steps: The number of actions executed before each captured inference, as far as it is said.
         failure: Why it is given up, with the traceback; None while nothing failed.
@@ -91,7 +92,7 @@ class OpenEpisode:
     client: str
     instruction: str
     playing: Playing
-    kept: ServedEpisode
+    record: ServedEpisode
     is_marked: bool
     inferences: int = 0
     steps: list[int | None] = field(default_factory=list)
@@ -128,7 +129,7 @@ class Client:
 
 @dataclass(frozen=True)
 class Line:
-    """What is said of an episode that ended.
+    """The end of an episode, as the terminal shows it.
 
     Attributes:
         number: Its number in the run; None for one that was given up before it had any.
@@ -342,7 +343,7 @@ class Session:
             words: The instruction, where the wire has it beside the observation.
 
         Raises:
-            ObservationError: For what cannot be shown; the episode goes on.
+            ObservationError: For what cannot be shown; the episode stays open.
             ProbeKitError: For a policy that failed, whose episode is given up, and for an error that ends the
                 server.
         """
@@ -551,7 +552,7 @@ class Session:
             if first:
                 self._check, self._proved = (episode, turn, received, actions), True
             else:
-                episode.kept.keep(received, actions, self._source.settings)
+                episode.record.keep(received, actions, self._source.settings)
         if mark is not None and mark.step is not None:
             episode.last_step = mark.step
         if self._source.prediction == (0, 0):
@@ -602,7 +603,7 @@ class Session:
             episode.failure = f"{type(error).__name__}: {error}", traceback_of(error)
             self.fatal = error
             raise
-        episode.kept.keep(received, sent, self._source.settings)
+        episode.record.keep(received, sent, self._source.settings)
 
     # -- the end of an episode -----------------------------------------------------------------------
 
@@ -637,7 +638,7 @@ class Session:
             "frames": captured,
             "recorded_frames": episode.inferences,
             "policy_seed": episode.playing.planned.policy_seed,
-            "content_blake2b": episode.kept.content_blake2b,
+            "content_blake2b": episode.record.content_blake2b,
         }
         return Row(-1, columns)
 
@@ -661,12 +662,12 @@ class Session:
             playing.control_steps = _control_steps(episode, self._source.settings.every)
             playing.instruction_ids = self._instruction_ids(episode.instruction)
             playing.lost_words = self._lost_words[episode.instruction]
-            ending = episode.kept.ending({**outcome, "inferences": episode.inferences})
+            ending = episode.record.ending({**outcome, "inferences": episode.inferences})
             assert self._controller is not None, "it inferred"
             write_episode(self._writer, self._controller, self._settings, playing, ending, self.certified())
             self.committed += 1
             self._say(episode, number, outcome["outcome"])
-        except Exception as error:  # noqa: BLE001 - whatever it is, the clients go on
+        except Exception as error:  # noqa: BLE001 - whatever it is, the clients play on
             reason = f"{type(error).__name__}: {error}"
             self.failed += 1
             failed = row if number is None else replace(row, index=number)
@@ -737,8 +738,8 @@ def _outcome(facts: Mapping[str, Any]) -> dict[str, Any]:
 
 def _control_steps(episode: OpenEpisode, every: int) -> list[int]:
     """Return the steps of the captured inferences as they are said, else their numbers."""
-    said = [step for step in episode.steps if step is not None]
-    return said if len(said) == len(episode.steps) else [number * every for number in range(len(episode.steps))]
+    steps = [step for step in episode.steps if step is not None]
+    return steps if len(steps) == len(episode.steps) else [number * every for number in range(len(episode.steps))]
 
 
 def _check_finite(actions: NDArray[np.float32]) -> None:

@@ -104,7 +104,7 @@ def test_pictures_are_rotated_for_the_model_and_kept_as_they_arrived() -> None:
         {"cameras": ["base=a", "wrist=a"]},
         {"state": "a,a,b", "cameras": ["base"]},
         {"instruction": " "},
-        {"named": ""},
+        {"source_name": ""},
         {"pause": 0},
         {"every": 0},
         {"rule": "always"},

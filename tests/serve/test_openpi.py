@@ -3,6 +3,7 @@
 import asyncio
 import http.client
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -13,6 +14,7 @@ import pytest
 from websockets.exceptions import ConnectionClosedError, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
+from probe_kit.hooks import Policy
 from probe_kit.serve.codec import pack, unpack
 from probe_kit.serve.server import Server
 from tests.support.served_sessions import WORDS, Opens, observation
@@ -49,7 +51,7 @@ def ask(connection: ClientConnection, message: dict[str, Any]) -> Any:
 
 
 def test_a_client_plays_an_episode_and_an_error_leaves_its_connection_open(opened: Opens) -> None:
-    server = opened(captured_calls=2)
+    server = opened(captured_calls=1)
     with serving(server, stop_after=1) as address, connect(f"{address}/arm-1", compression=None) as client:
         assert unpack(client.recv(20))["probe_kit"]["mark"] == MARK
         first = ask(client, {**observation(0), MARK: {"id": "a"}})
@@ -69,6 +71,34 @@ def test_a_client_plays_an_episode_and_an_error_leaves_its_connection_open(opene
     assert run.episodes[["episode_id", "client", "outcome"]].to_numpy().tolist() == [["a", "arm-1", "success"]]
 
 
+@pytest.mark.slow
+def test_a_client_is_greeted_while_the_model_infers_for_one_that_vanishes(
+    opened: Opens, policy: Policy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    server, whole, begun = opened(captured_calls=1), type(policy).predict, threading.Event()
+
+    def slow(self: Policy, observations: Any, seeds: Any) -> Any:
+        begun.set()
+        time.sleep(1.5)
+        return whole(self, observations, seeds)
+
+    monkeypatch.setattr(type(policy), "predict", slow)
+    with serving(server) as address:
+        first = connect(address)
+        first.recv(20)
+        first.send(pack({**observation(0), MARK: {"id": "a"}}))
+        assert begun.wait(20)
+        began = time.monotonic()
+        with connect(address) as second:
+            second.recv(20)
+            assert time.monotonic() - began < 1
+            first.close_socket()
+            assert "actions" in ask(second, {**observation(1), MARK: {"id": "b"}})
+    run = server.close()
+    assert run is not None
+    assert sorted(run.episodes["episode_id"]) == ["a", "b"]
+
+
 def oversized(client: ClientConnection) -> None:
     client.send(bytes((16 << 20) + 1))
 
@@ -81,7 +111,14 @@ def text(client: ClientConnection) -> None:
     client.send("hello")
 
 
-@pytest.mark.parametrize(("send", "code"), [(oversized, 1009), (unreadable, 1007), (text, 1007)])
+@pytest.mark.parametrize(
+    ("send", "code"),
+    [
+        (unreadable, 1007),
+        pytest.param(oversized, 1009, marks=pytest.mark.slow),
+        pytest.param(text, 1007, marks=pytest.mark.slow),
+    ],
+)
 def test_a_message_that_cannot_be_read_closes_its_own_connection(
     opened: Opens, send: Callable[[ClientConnection], None], code: int
 ) -> None:

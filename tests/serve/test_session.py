@@ -6,14 +6,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from probe_kit.errors import ObservationError, PolicyFailedError, SettingsMismatchError, UnitsError
+from probe_kit.errors import ObservationError, PolicyFailedError, SettingsMismatchError, UnitsError, UsageError
 from probe_kit.extract.rollout.worker import torch_threads
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks import Policy
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.intervene.frame_session import Frames
 from probe_kit.intervene.sessions import ReplaySource
-from probe_kit.runs import open_run
+from probe_kit.runs import Run, open_run
 from probe_kit.runs.verify import verify_run
 from probe_kit.serve import session as sessions
 from probe_kit.serve.marks import Mark
@@ -23,6 +23,12 @@ from probe_kit.train.target import Target
 from tests.support.served_sessions import WORDS, Opens, observation
 
 OTHER = "put the cube on the blue shape"
+
+
+def written(server: Server) -> Run:
+    """The run of what was played so far; sealing it would cost more than playing."""
+    server.session.wait()
+    return open_run(server.plan.location, allow_partial=True)
 
 
 def play(server: Server, client: Client, name: str, numbers: list[int], **facts: Any) -> list[np.ndarray]:
@@ -126,7 +132,7 @@ def test_an_id_that_comes_again_is_another_trial_and_a_connection_ends_its_episo
 
 
 def test_what_cannot_be_shown_is_refused_by_name_and_the_episode_goes_on(opened: Opens) -> None:
-    server = opened(captured_calls=4)
+    server = opened(captured_calls=1)
     client = server.session.connect()
     small = observation(0, side=8)
     server.session.answer(client, observation(0), Mark("a"))
@@ -149,9 +155,9 @@ def test_what_cannot_be_shown_is_refused_by_name_and_the_episode_goes_on(opened:
     server.session.answer(client, observation(1), Mark("a", step=3))
     with pytest.raises(ObservationError, match="step 3 of 'a' comes after step 3"):
         server.session.answer(client, observation(1), Mark("a", step=3))
-    run = server.close()
+    server.session.leave(client)
+    run = written(server)
     assert server.session.refused == len(wrong) + 1
-    assert run is not None
     assert run.episodes[["episode_id", "inferences"]].to_numpy().tolist() == [["a", 2]]
 
 
@@ -192,6 +198,7 @@ def test_a_policy_that_predicts_no_number_costs_its_own_episode(
     assert server.session.failed == 1
 
 
+@pytest.mark.slow
 def test_a_fault_of_storing_changes_no_action_and_refuses_new_episodes_until_it_is_over(
     opened: Opens, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -206,11 +213,12 @@ def test_a_fault_of_storing_changes_no_action_and_refuses_new_episodes_until_it_
     with monkeypatch.context() as patched:
         patched.setattr(sessions.RunWriter, "add", full)
         assert play(server, client, "b", [1])[0].size
+        server.session.wait()
         with pytest.raises(sessions.StoreError, match="no further episode begins"):
             server.session.answer(client, observation(2), Mark("c"))
     play(server, client, "c", [2])
-    run = server.close()
-    assert run is not None
+    server.session.leave(client)
+    run = written(server)
     assert run.episodes["episode_id"].tolist() == ["a", "c"]
     assert "full" in run.failed["b"]
 
@@ -223,8 +231,8 @@ def test_the_same_command_continues_a_run_and_another_one_is_refused(opened: Ope
     with pytest.raises(SettingsMismatchError, match="captured_calls"):
         opened(captured_calls=2)
     with pytest.raises(SettingsMismatchError, match=r"dataset\.source"):
-        opened(captured_calls=1, named="other@1")
-    server = opened(captured_calls=1, named=None)
+        opened(captured_calls=1, source_name="other@1")
+    server = opened(captured_calls=1, source_name=None)
     client = server.session.connect()
     with pytest.raises(ObservationError, match="the run stores pictures"):
         server.session.answer(client, observation(1, side=8), Mark("b"))
@@ -260,8 +268,8 @@ def test_rows_of_a_client_without_marks_are_split_and_its_group_is_not(
     send(1.2)
     send(2.2, OTHER)
     send(3.2, OTHER, wait=31)
-    run = server.close()
-    assert run is not None
+    server.session.leave(client)
+    run = written(server)
     assert run.episodes[["episode_id", "began", "ended", "inferences"]].to_numpy().tolist() == [
         ["arm-1/000001", "connection", "state", 4],
         ["arm-1/000002", "state", "words", 2],
@@ -271,6 +279,7 @@ def test_rows_of_a_client_without_marks_are_split_and_its_group_is_not(
     assert set(run.episodes["group_id"]) == {"arm-1"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("rule", "rows", "groups"), [("words", 2, {WORDS, OTHER}), ("connection", 2, {"client-001"})]
 )
@@ -285,9 +294,26 @@ def test_the_user_says_what_bounds_episodes(opened: Opens, rule: str, rows: int,
     assert set(run.episodes["group_id"]) == groups
 
 
+@pytest.mark.slow
 def test_with_said_episodes_others_are_refused_and_nothing_is_stored(opened: Opens) -> None:
     server = opened(rule="said")
     client = server.session.connect()
     with pytest.raises(ObservationError, match="says no episode"):
         server.session.answer(client, observation(0), None)
     assert server.close() is None
+
+
+@pytest.mark.slow
+def test_every_third_inference_is_captured_and_small_pictures_are_not_shown_again(opened: Opens) -> None:
+    server = opened(captured_calls=2, every=3, keep="small")
+    client = server.session.connect()
+    for number in range(8):
+        server.session.answer(client, observation(number), Mark("a"))
+    run = server.close()
+    assert run is not None
+    assert run.control_steps.tolist() == [[0, 3]]
+    assert run.episodes[["frames", "inferences"]].to_numpy().tolist() == [[2, 8]]
+    assert run.inputs is not None
+    assert run.inputs.kinds == ("pixels", "prediction", "state")
+    with pytest.raises(UsageError, match="--keep small"):
+        Frames(run, ReplaySource())

@@ -16,7 +16,7 @@ Opens = Callable[..., Server]
 def settings(**choices: Any) -> ExtractSettings:
     served = ServedSettings.model_fields.keys()
     source: dict[str, Any] = {
-        "cameras": {"base": "observation/image"}, "state": "observation/state", "named": "noise@1",
+        "cameras": {"base": "observation/image"}, "state": "observation/state", "source_name": "noise@1",
         **{name: value for name, value in choices.items() if name in served},
     }  # fmt: skip
     others = {name: value for name, value in choices.items() if name not in served}

@@ -40,8 +40,8 @@ class ServedSettings(SourceSettings):
         instruction: The words that the model reads in place of those that clients send; None for theirs.
         every: The step between captured inferences of an episode.
         keep: `full` stores pictures as they arrive; `small` at 32 × 32 alone, which cannot be shown again.
-        named: The name of what is served; runs of one name count as runs of one data set. None for one that is
-            drawn when the run begins.
+        source_name: The name of what is served; runs of one name count as runs of one data set. None for one
+            that is drawn when the run begins.
         rule: What bounds the episodes of clients that do not say so themselves.
         pause: The seconds between two observations after which a new episode begins; None for ten times the
             longest interval so far, at least 5.
@@ -98,7 +98,7 @@ class ServedSettings(SourceSettings):
             "then not possible.",
         ),
     ] = "full"
-    named: Annotated[
+    source_name: Annotated[
         str | None,
         typer.Option(
             "--source",
@@ -153,17 +153,19 @@ class ServedSettings(SourceSettings):
         for part, names in lists.items():
             if twice := [name for name in names if names.count(name) > 1]:
                 raise UsageError(f"the {part} {twice[0]!r} is given twice; give each once")
-        if self.named is not None and not (
-            self.named.isprintable() and 0 < len(self.named.strip()) <= LONGEST_NAME
+        if self.source_name is not None and not (
+            self.source_name.isprintable() and 0 < len(self.source_name.strip()) <= LONGEST_NAME
         ):
-            raise UsageError(f"--source is {self.named[:80]!r}; expected 1 to {LONGEST_NAME} printable characters")
+            raise UsageError(
+                f"--source is {self.source_name[:80]!r}; expected 1 to {LONGEST_NAME} printable characters"
+            )
         if self.instruction is not None and not self.instruction.strip():
             raise UsageError("--instruction is empty; give the words, or leave it out")
 
     @property
     def name(self) -> str:
         """The name in tables."""
-        return self.named or "a session"
+        return self.source_name or "a session"
 
     def steps(self) -> int:
         """Count the inferences that `--captured-calls all` stands for."""

@@ -426,7 +426,7 @@ class ServedSource(Source[ServedSettings]):
 
 @dataclass
 class ServedEpisode(ShownInputs):
-    """What is kept of the captured inferences of an episode that a client plays."""
+    """The inputs of the captured inferences of an episode that a client plays, and the answers."""
 
     _contents: list[bytes] = field(default_factory=list)
 
@@ -439,8 +439,8 @@ class ServedEpisode(ShownInputs):
         if settings.state:
             self._keep("state", received.observation.state)
         self._keep_pictures(list(received.pictures.values()), False)
-        shown = [received.observation.image, *received.observation.cameras.values()]
-        self._keep("pixels", np.stack(list(map(small_picture, shown))))
+        pictures = [received.observation.image, *received.observation.cameras.values()]
+        self._keep("pixels", np.stack(list(map(small_picture, pictures))))
         if settings.keep == "full":
             for camera, picture in received.pictures.items():
                 self._keep(f"{PICTURE_OF}{camera}", picture)
@@ -497,8 +497,8 @@ class ServedPlayer(InputsPlayer):
 def _observation(
     pictures: Mapping[str, NDArray[np.uint8]], state: NDArray[np.float32], instruction: str
 ) -> Observation:
-    first, *others = pictures
-    return Observation(pictures[first], state, instruction, None, {name: pictures[name] for name in others})
+    first, *later = pictures
+    return Observation(pictures[first], state, instruction, None, {name: pictures[name] for name in later})
 
 
 def _find(sent: Mapping[str, Any], key: str) -> Any:
@@ -539,19 +539,19 @@ def _described(value: Any) -> str:
     return f"a {type(value).__name__}"
 
 
-def _words(sent: Mapping[str, Any], beside: str | None) -> str:
+def _words(sent: Mapping[str, Any], words: str | None) -> str:
     """Return the instruction. Raises ObservationError for none, and for what is no plain text."""
-    words: Any = _find(sent, PROMPT) if beside is None else beside
-    if isinstance(words, bytes):
-        words = words.decode(errors="replace")
-    if not isinstance(words, str) or not words.strip():
-        seen = "none" if words is None else f"{words!r:.80}"
+    text: Any = _find(sent, PROMPT) if words is None else words
+    if isinstance(text, bytes):
+        text = text.decode(errors="replace")
+    if not isinstance(text, str) or not text.strip():
+        described = "none" if text is None else f"{text!r:.80}"
         raise ObservationError(
-            f"the observation has no words: {PROMPT} is {seen}; expected a text. Send it, or start the server "
-            "with --instruction TEXT"
+            f"the observation has no words: {PROMPT} is {described}; expected a text. Send it, or start the "
+            "server with --instruction TEXT"
         )
-    if UNSAFE.search(words) or len(words) > LONGEST_WORDS:
+    if UNSAFE.search(text) or len(text) > LONGEST_WORDS:
         raise ObservationError(
             f"the instruction holds control characters or more than {LONGEST_WORDS} characters; send plain text"
         )
-    return words
+    return text
