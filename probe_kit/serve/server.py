@@ -18,6 +18,7 @@ from probe_kit._system.bounded_files import read_regular
 from probe_kit._system.imports import require
 from probe_kit.errors import EpisodesFailedError, ProbeKitError, SettingsMismatchError, UsageError
 from probe_kit.extract.extraction import open_checked
+from probe_kit.extract.rollout.capturing import stored_streams
 from probe_kit.extract.rollout.tasks import Act
 from probe_kit.extract.settings import ExtractSettings
 from probe_kit.extract.sizes import planned_sizes
@@ -141,7 +142,9 @@ class Server:
 
 
 def plan_server(settings: ExtractSettings, out: str) -> ServerPlan:
-    """Check all that needs no model, and return the plan of a server; reads no weights.
+    """Check all that needs no model, and return the plan of a server.
+
+    Reads no weights, unless the family declares no streams, as embedded ones.
 
     Raises:
         SettingsMismatchError: If the place holds a run with other settings.
@@ -156,7 +159,13 @@ def plan_server(settings: ExtractSettings, out: str) -> ServerPlan:
     _check_stored(opened, source, root, location)
     sizes = planned_sizes(opened, source.instructions)
     plan = ServerPlan(opened, source, location, stored=root)
-    if sizes is not None:
+    if sizes is None:
+        policy = Act().load(opened)
+        assert policy is not None, "scripts are refused before"
+        source, policy = source.check(policy, accept_units=True)
+        plan.cameras, plan.chunk = policy.card.cameras, _answer_shape(policy, source)
+        plan.streams = tuple(stored_streams(policy, policy.roles([source.example(EXAMPLE)])))
+    else:
         model = None if sizes.outline is None else sizes.outline.model
         plan.streams, plan.origin = sizes.streams, sizes.source
         if model is not None:

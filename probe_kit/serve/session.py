@@ -1,7 +1,7 @@
 """A session of a policy server: episodes of its clients, one inference at a time, and the run that they make.
 
-A session knows no wire. Its methods are called one at a time, on the thread that infers, but for `connect`; another
-thread writes.
+A session knows no wire. Its methods are called one at a time, on the thread that infers, but for `connect`.
+Another thread writes.
 """
 
 import itertools
