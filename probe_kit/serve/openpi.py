@@ -59,7 +59,8 @@ class OpenpiServer:
 
     def __post_init__(self) -> None:
         self._thread = ThreadPoolExecutor(1, "probe-kit-model")
-        self._open = 0
+        self._open = self._busy = 0
+        self._ends = False
 
     async def start(self) -> Server:
         """Open the socket for clients, and return the server."""
@@ -75,6 +76,12 @@ class OpenpiServer:
             logger=quiet,
             server_header=None,
         )
+
+    async def drain(self) -> None:
+        """Let every open request be answered, and no further one."""
+        self._ends = True
+        while self._busy:
+            await asyncio.sleep(0.02)
 
     async def close(self) -> None:
         """Wait until the thread of the model has nothing left to do."""
@@ -117,13 +124,16 @@ class OpenpiServer:
             self._open -= 1
             try:
                 await self._run(self.session.leave, client)
-            except ProbeKitError:
+            except Exception:  # noqa: BLE001 - the session has it as `fatal`
                 self.stop()
 
     async def _converse(self, connection: ServerConnection, client: Client) -> None:
         took = 0.0
         async for message in connection:
+            if self._ends:
+                return
             began = perf_counter()
+            self._busy += 1
             try:
                 answer = await self._answer(client, message)
             except MessageError as error:
@@ -135,9 +145,12 @@ class OpenpiServer:
                 if self.session.fatal is not None:
                     self.stop()
                 continue
-            if took:
-                answer["server_timing"]["prev_total_ms"] = took
-            await connection.send(pack(answer))
+            else:
+                if took:
+                    answer["server_timing"]["prev_total_ms"] = took
+                await connection.send(pack(answer))
+            finally:
+                self._busy -= 1
             took = 1000 * (perf_counter() - began)
             # What the first answer leaves to be proved; a later request waits for it.
             await self._run(self.session.finish_check)

@@ -89,7 +89,7 @@ class Server:
     def address(self) -> str:
         """The address that clients connect to."""
         host, port = self.listener.getsockname()[:2]
-        return f"ws://{host}:{port}"
+        return f"ws://[{host}]:{port}" if ":" in host else f"ws://{host}:{port}"
 
     def serve(self, stop_after: int | None, ready: Callable[[], None], note: Callable[[str], None]) -> None:
         """Answer until Ctrl-C, SIGTERM, an error that ends the server, or so many stored episodes."""
@@ -116,6 +116,7 @@ class Server:
         while not stop.is_set() and (stop_after is None or self.session.committed < stop_after):
             with suppress(TimeoutError):
                 await asyncio.wait_for(stop.wait(), 0.1 if stop_after else 3600)
+        await wire.drain()
         server.close()
         await server.wait_closed()
         await wire.close()

@@ -194,6 +194,7 @@ class Session:
         self._lost_words: dict[str, int] = {}
         self._faults: list[tuple[OpenEpisode, Row, str, str]] = []
         self._clients: dict[int, Client] = {}
+        self._connected = self._begun = 0
         self._keys: dict[str, str] = {}
         self._latency = 0.0
         self.refused = self.committed = self.failed = 0
@@ -274,7 +275,7 @@ class Session:
                 "keys": dict(self._keys),
                 "never_read": sorted(self._keys.keys() - self._source.read_keys()),
                 "episodes": settings.rule,
-                "clients": len(self._clients),
+                "clients": self._connected,
                 "largest_latency_s": round(self._latency, 3),
             }
         }
@@ -290,12 +291,16 @@ class Session:
         connection = self._connections[name]
         client = Client(name, connection, name if connection == 1 else f"{name} connection {connection}")
         self._clients[id(client)] = client
+        self._connected += 1
         return client
 
     def leave(self, client: Client) -> None:
         """End the episode of a connection that is over."""
-        self._finish_check()
-        self._end(client, "connection")
+        self._clients.pop(id(client), None)
+        try:
+            self._finish_check()
+        finally:
+            self._end(client, "connection")
 
     def wait(self) -> None:
         """Wait until all episodes that ended are written."""
@@ -308,7 +313,7 @@ class Session:
             ProbeKitError: The error that ended the server, once all else is written.
         """
         try:
-            with suppress(ProbeKitError):
+            with suppress(Exception):  # it is `fatal` from then on
                 self._finish_check()
             for client in list(self._clients.values()):
                 self._end(client, "connection")
@@ -462,9 +467,10 @@ class Session:
     def _check_units(self, received: Received, group: str) -> None:
         """Compare the first states of the first groups, and of each 50th episode. Raises UnitsError."""
         states = [*self._first_states, received.observation.state]
-        new = group not in self._begun_groups
-        if (new and len(self._begun_groups) < FIRST_GROUPS) or len(states) % EVERY_GROUPS == 0:
+        is_first = group not in self._begun_groups and len(self._begun_groups) < FIRST_GROUPS
+        if is_first or (self._begun + 1) % EVERY_GROUPS == 0:
             self._source.check_units(self._policy, states, self._settings.machine.accept_units)
+        self._begun += 1
         self._first_states = states[-MOST_STATES:]
         self._begun_groups.add(group)
 
@@ -580,7 +586,7 @@ class Session:
 
     def finish_check(self) -> None:
         """Prove on the first answer, once it is sent, that capture changes nothing; its error ends the server."""
-        with suppress(ProbeKitError):
+        with suppress(Exception):  # it is `fatal` from then on
             self._finish_check()
 
     def _finish_check(self) -> None:
@@ -599,7 +605,7 @@ class Session:
                     f"the first answer and its captured repetition differ by up to "
                     f"{np.abs(actions - sent).max():.3g}; they must be equal bit for bit"
                 )
-        except ProbeKitError as error:
+        except Exception as error:
             episode.failure = f"{type(error).__name__}: {error}", traceback_of(error)
             self.fatal = error
             raise
