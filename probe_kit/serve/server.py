@@ -111,7 +111,12 @@ class Server:
             with suppress(RuntimeError, ValueError):  # another thread, as in a notebook
                 loop.add_signal_handler(number, end)
         wire = OpenpiServer(self.session, self.listener, self.token, self.metadata, stop.set, note)
-        server = await wire.start()
+        try:
+            server = await wire.start()
+        except OSError as error:  # another server was bound to the port while both loaded their models
+            raise UsageError(
+                f"{self.address} cannot be used: {error.strerror or error}. Give another --port (0 draws one)"
+            ) from error
         ready()
         while not stop.is_set() and (stop_after is None or self.session.committed < stop_after):
             with suppress(TimeoutError):
