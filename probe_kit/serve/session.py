@@ -325,7 +325,7 @@ class Session:
         with self._held, self._location.explained_errors():
             if self.committed:
                 self._writer.write_certificate({**self._certificate(), **self.certified()}, again=True)
-                seal(self._location)
+            seal(self._location)
         return Run(self._location)
 
     def _certificate(self) -> dict[str, Any]:
