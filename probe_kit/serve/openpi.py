@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
 from http import HTTPStatus
-from time import perf_counter
+from time import monotonic, perf_counter
 from typing import Any
 
 import numpy as np
@@ -169,7 +169,7 @@ class OpenpiServer:
             await self._run(self.session.end, client, mark)
             actions = np.zeros((0, *self.session.width), np.float32)
         else:
-            actions = await self._run(self.session.answer, client, sent, mark)
+            actions = await self._run(self.session.answer, client, sent, mark, monotonic())
         return {"actions": actions, "server_timing": {"infer_ms": 1000 * (perf_counter() - began)}}
 
 

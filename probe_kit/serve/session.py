@@ -335,7 +335,12 @@ class Session:
     # -- one observation -----------------------------------------------------------------------------
 
     def answer(
-        self, client: Client, sent: Mapping[str, Any], mark: Mark | None, words: str | None = None
+        self,
+        client: Client,
+        sent: Mapping[str, Any],
+        mark: Mark | None,
+        arrived: float | None = None,
+        words: str | None = None,
     ) -> NDArray[np.float32]:
         """Return the actions (chunk, D) for an observation, captured if it is one of those.
 
@@ -345,6 +350,7 @@ class Session:
             client: The connection.
             sent: The observation by key.
             mark: What the client says of the episode; None for nothing.
+            arrived: When it arrived, by the monotonic clock; other clients may be answered first. None for now.
             words: The instruction, where the wire has it beside the observation.
 
         Raises:
@@ -353,7 +359,7 @@ class Session:
                 server.
         """
         self._finish_check()
-        arrived = monotonic()
+        arrived = monotonic() if arrived is None else arrived
         try:
             if mark is None and self._source.settings.rule == "said":
                 raise ObservationError(
