@@ -114,7 +114,7 @@ def text(client: ClientConnection) -> None:
 @pytest.mark.parametrize(
     ("send", "code"),
     [
-        (unreadable, 1007),
+        pytest.param(unreadable, 1007, marks=pytest.mark.slow),
         pytest.param(oversized, 1009, marks=pytest.mark.slow),
         pytest.param(text, 1007, marks=pytest.mark.slow),
     ],
