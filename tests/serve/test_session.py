@@ -146,6 +146,7 @@ def test_what_cannot_be_shown_is_refused_by_name_and_the_episode_goes_on(opened:
         "state": ({**observation(1), "observation/state": np.zeros(7)}, "has 7 numbers; expected 8"),
         "lost": ({key: value for key, value in observation(1).items() if "state" not in key}, "no state"),
         "finite": ({**observation(1), "observation/state": np.full(8, np.nan)}, "NaN or infinity"),
+        "large": ({**observation(1), "observation/state": np.full(8, 1e300)}, "NaN or infinity"),
         "words": (observation(1, words=None), "no words"),
         "control": (observation(1, words="put\x07 it"), "control characters"),
     }

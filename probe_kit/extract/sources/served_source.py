@@ -313,7 +313,8 @@ class ServedSource(Source[ServedSettings]):
             numbers = np.asarray(value) if isinstance(value, np.ndarray | int | float) else None
             if numbers is None or numbers.dtype.kind not in _KINDS or numbers.ndim > 1:
                 raise ObservationError(f"{key} is {_described(value)}; expected numbers of one axis")
-            parts.append(np.atleast_1d(numbers).astype(np.float32))
+            with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, and is refused below
+                parts.append(np.atleast_1d(numbers).astype(np.float32))
         state = np.concatenate(parts)
         joined = ", ".join(self.settings.state)
         if not 0 < state.size <= MOST_NUMBERS or not np.isfinite(state).all():
