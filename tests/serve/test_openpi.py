@@ -83,8 +83,7 @@ def test_a_client_is_greeted_while_the_model_infers_for_one_that_vanishes(
         return whole(self, observations, seeds)
 
     monkeypatch.setattr(type(policy), "predict", slow)
-    with serving(server) as address:
-        first = connect(address)
+    with serving(server) as address, connect(address) as first:
         first.recv(20)
         first.send(pack({**observation(0), MARK: {"id": "a"}}))
         assert begun.wait(20)
