@@ -29,6 +29,7 @@ from probe_kit.hooks.commands import new_adapter, verify
 from probe_kit.intervene.commands import KindHelp, intervene, list_runs, show
 from probe_kit.intervene.words_command import words
 from probe_kit.retention.commands import retention
+from probe_kit.serve.commands import serve
 from probe_kit.study.commands import app as study_app
 from probe_kit.suite.commands import app as suite_app
 from probe_kit.train.commands import train
@@ -41,7 +42,7 @@ if TYPE_CHECKING:
 
 PANELS = {
     "Start": ("demo", "doctor", "models"),
-    "Make runs": ("suite", "extract", "ask", "dataset", "run"),
+    "Make runs": ("suite", "extract", "ask", "serve", "dataset", "run"),
     "Probe": ("power", "targets", "train", "labels"),
     "Is it used?": ("diagnose", "intervene", "words"),
     "Read results": ("retention", "view"),
@@ -168,7 +169,7 @@ for name, commands in (("suite", suite_app), ("run", run_app), ("study", study_a
 run_app.command()(show)
 run_app.command("list")(list_runs)
 for command in (
-    *(demo, doctor, models, extract, ask, power, targets, train, labels, diagnose, words, retention, view),
+    *(demo, doctor, models, extract, ask, serve, power, targets, train, labels, diagnose, words, retention, view),
     *(new_adapter, check_adapter, check_environment, verify),
 ):
     app.command(rich_help_panel=_PANEL_OF[command.__name__.replace("_", "-")])(command)

@@ -34,6 +34,7 @@ SMALLEST: dict[str, list[str]] = {
     "reports": ["OUT", "--episodes", "264", "--permutations", "1"],
     "retention_coverage": ["--draws", "12", "--only", "6 groups, silent", "--workers", "1"],
     "score_coverage": ["--draws", "2"],
+    "serve": ["--requests", "1", "--episodes", "4"],
     "suite_random_features": ["--items", "12", "--width", "8", "--categories", "color"],
     "throughput": ["--subjects", "tiny", "--batches", "1,2", "--repeats", "1"],
     "units": ["--worlds", "1"],

@@ -132,6 +132,7 @@ def test_a_command_is_accepted_as_it_is_typed(
         return
     monkeypatch.setattr("probe_kit.runs.store._QUICK", timedelta(0))  # without keys a store never answers
     monkeypatch.setattr("probe_kit.extract.prepare", _stop_with, raising=False)
+    monkeypatch.setattr("probe_kit.serve.server.open_server", _stop_with)
     monkeypatch.setattr("probe_kit.extract.extraction.prepare_asks", lambda wanted, _, **__: _stop_with(*wanted))
     with contextlib.chdir(tmp_path):
         answer = CliRunner().invoke(app, command.words[1:])
@@ -150,6 +151,7 @@ LOOKED_FOR = {
     "show": "kitchen is no LeRobotDataset|Make one with",
     "check-environment": "there is no module kitchen",
     "ask": "accepted so far",
+    "serve": "accepted so far|DIR",
     "view": "Make one with",
     "labels": "Make one with",
     "targets": "Make one with",
@@ -172,7 +174,7 @@ def _stop_with(*asked: Any, **_: Any) -> Any:
     from probe_kit.hooks.contract.declared import check_options
     from probe_kit.hooks.registry import find_family
 
-    for settings in (one for one in asked if not isinstance(one, str | None)):
+    for settings in (one for one in asked if isinstance(one, ExtractSettings | AskSettings)):
         check_meaningless(settings)
         followed = settings.followed() if isinstance(settings, ExtractSettings) else settings
         if followed.model.family not in SCRIPTED:
@@ -264,6 +266,7 @@ STAND_INS = {
 
 NOT_TYPED = {
     r"--vary|mine\.csv": "a run on recordings",
+    r"runs/served": "a run of a client; tests/serve has one",
     r"^cd probe_kit": "this is that checkout",
     r"^\. \.venv": "this runs in that environment",
     r"^\./with-uv --extra": "the extras are installed here",

@@ -21,6 +21,7 @@ FOLDERS = {
     "hooks": BASE | {"models"},
     "runs": BASE | {"suite", "env", "hooks"},
     "extract": BASE | {"suite", "env", "hooks", "runs"},
+    "serve": BASE | {"suite", "env", "hooks", "runs", "extract"},
     "train": BASE | {"suite", "hooks", "runs", "statistics"},
     "intervene": BASE | {"suite", "env", "hooks", "runs", "extract", "train", "statistics"},
     "retention": BASE | {"suite", "env", "hooks", "runs", "extract", "train", "intervene", "statistics"},

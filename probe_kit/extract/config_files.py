@@ -81,6 +81,8 @@ def _of_run(folder: Path, typed: Mapping[str, Any], asks: bool) -> Mapping[str, 
     if asks != ("prompt" in config["task"]):
         words, command = ("was not asked", "extract") if asks else ("was asked", "ask")
         raise UsageError(f"{folder} {words}; repeat it with `probe-kit {command} --config {as_argument(folder)}`")
+    if (kind := kind_of(config["source"])) not in SOURCES:
+        raise UsageError(f"{folder}: {run.source.words}. Continue it with `{kind.command}` and the same options")
     if any(edit.get("vector") for edit in config["task"].get("edits", ())):
         raise UsageError(
             f"{folder} was edited by vectors, which no run stores; repeat it in Python with `vectors`"
@@ -203,4 +205,5 @@ def source_again(run: "Run", moved: Mapping[str, Any]) -> "SourceSettings":
     flags = {} if kind is None else {field: option.flag for field, option in _options(kind).items()}
     values = source_of_run(run, moved, flags)
     kind = kind_of(values)
-    return kind(**kind.with_moved(values, moved))
+    values = kind.with_moved(values, moved)
+    return kind(**values, **({"run": run.location.address} if kind.of_run else {}))

@@ -148,7 +148,7 @@ class Frames:
                 yield Frame(
                     name=f"{record['episode_id']}@{number}",
                     group=str(record["group_id"]),
-                    seed=derive_seed(int(record["policy_seed"]), "inference", number),
+                    seed=derive_seed(int(record["policy_seed"]), "inference", planned.noise_of(call)),
                     instruction=str(record["instruction"]),
                     state=np.zeros(0) if states is None else states[row, call],
                     observe=self._cached,

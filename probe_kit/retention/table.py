@@ -42,7 +42,7 @@ from probe_kit.retention.rows.build import (
     with_holm_of_targets,
 )
 from probe_kit.retention.rows.row import RetentionRow
-from probe_kit.runs.environment_success import EnvironmentSuccess
+from probe_kit.runs.environment_success import EnvironmentSuccess, why_no_rates
 from probe_kit.runs.reader import RunReader, check_sides
 from probe_kit.runs.store import Location
 from probe_kit.statistics.sufficiency import ABSENT_BELOW
@@ -623,6 +623,8 @@ def _success_notes(runs: Sequence[TableRun]) -> Iterator[str]:
     for table_run in runs:
         if (success := EnvironmentSuccess.of(table_run.run.episodes)) is not None:
             yield f"{table_run.name}: {success.sentence}."
+        if (reason := why_no_rates(table_run.run.episodes)) is not None:
+            yield f"{table_run.name}: {reason}."
 
 
 def _in_words(tried: Mapping[str, int]) -> str:

@@ -8,8 +8,9 @@ Inputs of recorded frames lie beside the streams, one chunk per row of the plan:
     data.zarr/inputs/prediction   float32 (episode, call, step, number), in the checkpoint's own units
     data.zarr/inputs/columns      float64 (episode, call, column): timestamp, reward … as the data set has them
     data.zarr/inputs/pixels       uint8 (episode, call, camera, y, x, colour): 32 × 32
+    data.zarr/inputs/picture.NAME uint8 (episode, call, y, x, colour): whole pictures of a camera, as received
 
-Rows behind the last frame of a stretch are not numbers; of pixels they are zero.
+Rows behind the last frame of a stretch are not numbers; of pixels and pictures they are zero.
 """
 
 import math
@@ -341,13 +342,20 @@ Columns hold timestamps and indices, for which float32 has too few digits.
 """
 _DIMENSIONS = {"columns": ("column",), "pixels": ("camera", "y", "x", "colour")}
 """The names of the axes of the inputs that are no vectors of numbers."""
+PICTURE_OF = "picture."
+"""The prefix of the kind of input that holds the whole pictures of a camera, before its name."""
+
+
+def type_of_input(name: str) -> np.dtype[Any]:
+    """Return the type in which a kind of input is stored."""
+    return np.dtype("uint8" if name.startswith(PICTURE_OF) else _TYPES.get(name, "float32"))
 
 
 def create_inputs(store: Store, calls: int, shapes: Mapping[str, list[int]], codec: str) -> None:
     """Create the arrays of inputs, from the shapes of one inference by kind."""
     group = zarr.open_group(store, mode="a", zarr_format=3).create_group(INPUTS)
     for name, shape in shapes.items():
-        dtype = np.dtype(_TYPES.get(name, "float32"))
+        dtype = type_of_input(name)
         fill_value = 0 if dtype.kind == "u" else np.nan
         dimensions = ("episode", "call", *_dimensions_of(name, len(shape)))
         create_array(group, name, (ROOM, calls, *shape), (1, calls, *shape), dtype, fill_value, codec, dimensions)
@@ -355,6 +363,8 @@ def create_inputs(store: Store, calls: int, shapes: Mapping[str, list[int]], cod
 
 def _dimensions_of(name: str, axes: int) -> Sequence[str]:
     """Return names of the axes of one inference, which no other input shares: their lengths differ."""
+    if name.startswith(PICTURE_OF):
+        return f"{name}_y", f"{name}_x", "colour"
     names = _DIMENSIONS.get(name, (f"{name}_step", f"{name}_number")[-axes:])
     return names if len(names) == axes else [f"{name}_{axis}" for axis in range(axes)]
 

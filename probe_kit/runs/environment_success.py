@@ -1,4 +1,4 @@
-"""Success rates of runs in environments of the user's own, and what may have lowered them."""
+"""Success rates of runs in environments of the user's own or of clients, and what may have lowered them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,7 +17,8 @@ class EnvironmentSuccess:
 
     Attributes:
         sr: The share of episodes with success after the last action.
-        success_once: The share of episodes with success after any action, the rate that lerobot-eval prints.
+        success_once: The share of episodes with success after any action, the rate that lerobot-eval prints. None
+            where clients of a policy server said how episodes ended, and no more.
         stopped: The number of episodes that `--max-steps` ended before the environment's own limit.
         steps: The actions after which they ended.
         limits: The environment's own limits of these episodes, in actions.
@@ -25,24 +26,24 @@ class EnvironmentSuccess:
 
     n_episodes: int
     sr: float
-    success_once: float
+    success_once: float | None
     stopped: int = 0
     steps: tuple[int, ...] = ()
     limits: tuple[int, ...] = ()
 
     @classmethod
     def of(cls, episodes: "pd.DataFrame") -> Self | None:
-        """Return the rates of a run's episodes; None of episodes without the fact `success`."""
-        if not {ONCE, AT_END} <= set(episodes) or episodes.empty:
+        """Return the rates of a run's episodes; None without the fact `success`, and of guessed episodes."""
+        if AT_END not in episodes or episodes.empty or why_no_rates(episodes) is not None:
             return None
-        rated = episodes.dropna(subset=[ONCE, AT_END])
+        rated = episodes.dropna(subset=[name for name in (ONCE, AT_END) if name in episodes])
         stopped = rated.iloc[:0]
         if {LIMIT, "steps", "done"} <= set(rated):
             stopped = rated[~rated["done"].astype(bool) & (rated["steps"] < rated[LIMIT])]
         return cls(
             len(rated),
             float(rated[AT_END].astype(bool).mean()),
-            float(rated[ONCE].astype(bool).mean()),
+            float(rated[ONCE].astype(bool).mean()) if ONCE in rated else None,
             len(stopped),
             tuple(sorted({int(steps) for steps in stopped["steps"]})) if len(stopped) else (),
             tuple(sorted({int(limit) for limit in stopped[LIMIT]})) if len(stopped) else (),
@@ -61,8 +62,11 @@ class EnvironmentSuccess:
     @property
     def sentence(self) -> str:
         """Both rates, and that `--max-steps` lowered them where it may have."""
+        episodes = counted(self.n_episodes, "episode")
+        if self.success_once is None:
+            return f"success rate {self.sr:.0%} of {episodes}, as their clients said at the end"
         rates = (
-            f"success rate {self.sr:.0%} of {counted(self.n_episodes, 'episode')}, by their last action; "
+            f"success rate {self.sr:.0%} of {episodes}, by their last action; "
             f"{ONCE} {self.success_once:.0%}, by any action, as lerobot-eval counts"
         )
         if not self.stopped:
@@ -72,6 +76,32 @@ class EnvironmentSuccess:
             f"{rates}. --max-steps ended {self.stopped} of them after {counted_steps(self.steps)}, and the "
             f"environment's own {limit}: both rates may be too low"
         )
+
+
+MARKED = "marked"
+"""The column of episodes that says whether the client of a policy server said where they begin."""
+
+
+def why_no_rates(episodes: "pd.DataFrame") -> str | None:
+    """Return why there is no rate over some episodes: a policy server guessed where they begin; None without."""
+    if MARKED not in episodes or episodes[MARKED].all():
+        return None
+    guessed = int((~episodes[MARKED].astype(bool)).sum())
+    return (
+        f"the server guessed where {guessed} of {len(episodes)} episodes begin, "
+        "so that there is no rate over episodes; let clients say it (probe_kit/episode)"
+    )
+
+
+def bounds_of(episodes: "pd.DataFrame") -> str:
+    """Return how served episodes were bounded, with counts in words; empty for other runs."""
+    if MARKED not in episodes:
+        return ""
+    counts = {name: episodes[name].value_counts().to_dict() for name in ("began", "ended")}
+    listed = {
+        name: ", ".join(f"{word} {count}" for word, count in words.items()) for name, words in counts.items()
+    }
+    return "; ".join(f"{name}: {words}" for name, words in listed.items())
 
 
 def counted_steps(steps: tuple[int, ...]) -> str:

@@ -4,7 +4,8 @@
     plan/<n>.json         the n-th growth: the rows it adds, and the order of all of them
 
 A run grows by a further record; none is ever changed. Commits name the hash of the record that planned their
-episode. An episode keeps its number for ever; `order` is that of the same selection planned at once.
+episode. An episode keeps its number for ever; `order` is that of the same selection planned at once. Of rows that
+arrive one by one, as in a served run, a record holds the row alone: they follow those before it.
 """
 
 import re
@@ -42,12 +43,14 @@ class Row:
         content: The content that the source's player plays.
         frames: Recorded frames that the inferences see. None: every inference sees the result of the actions
             before it.
+        noise: The numbers from which the seeds of the inferences derive; None for those of `frames`.
     """
 
     index: int
     columns: RowColumns
     content: Any = None
     frames: Sequence[int] | None = None
+    noise: Sequence[int] | None = None
 
     @property
     def episode_id(self) -> str:
@@ -75,7 +78,8 @@ class Row:
 
     def noise_of(self, call: int) -> int:
         """Return the number from which the seed of inference `call` derives, whatever other frames were chosen."""
-        return call if self.frames is None else self.frames[call]
+        numbers = self.frames if self.noise is None else self.noise
+        return call if numbers is None else numbers[call]
 
     def to_json(self) -> dict[str, Any]:
         """Return the row as flat columns, with its number."""
@@ -198,21 +202,22 @@ class StoredRow(TypedDict):
 
 
 class PlanRecord(Record):
-    """The record of one selection.
+    """The record of one selection, or of a row that arrived.
 
     Attributes:
+        selection: What was selected; None for what the record before says.
         tokens: The sequence length T by stream, where pooled views alone are stored.
-        order: The numbers of all episodes so far, in the plan's order.
+        order: The numbers of all episodes so far, in the plan's order; None where its own follow those before.
     """
 
     kind: ClassVar[str] = "plan"
     run: str
     record: int
-    selection: Selection
-    suite_parent: str | None
+    selection: Selection | None = None
+    suite_parent: str | None = None
     tokens: dict[str, int]
     episodes: list[StoredRow]
-    order: list[int]
+    order: list[int] | None = None
 
 
 @dataclass(frozen=True)
@@ -239,6 +244,18 @@ class StoredPlan:
         """Return the hash of the record that added the episode of this number."""
         return self.hashes[bisect_right(self.extents, number)]
 
+    def with_record(self, record: PlanRecord) -> "StoredPlan":
+        """Return the plan after a further record, whose rows follow those before."""
+        rows = [*self.rows, *record.episodes]
+        return StoredPlan(
+            rows,
+            self.selection if record.selection is None else record.selection,
+            record.suite_parent,
+            record.tokens,
+            (*self.extents, len(rows)),
+            (*self.hashes, record.hash),
+        )
+
 
 def plan_key(record: int) -> str:
     """Return the key of the plan record of this number; 0 is the first selection."""
@@ -261,37 +278,60 @@ def read_plans(location: Location, run: str, columns: Iterable[str]) -> StoredPl
     Raises:
         RunDamagedError: If a record is missing, was changed, or belongs elsewhere.
     """
-    plan, by_number = StoredPlan(), dict[int, RowColumns]()
+    listed = location.keys(PLANS)  # first: a record that is written meanwhile is read, and never missed
+    contents = location.read_all(PLANS, ".json")
+    rows: list[RowColumns] = []
+    by_number: dict[int, RowColumns] = {}
+    ids: set[str] = set()
+    records: list[PlanRecord] = []
+    extents: list[int] = []
     for number in count():
-        name = f"{location}/{plan_key(number)}"
-        try:
-            raw = location.read(plan_key(number))
-        except FileNotFoundError:
+        key = plan_key(number)
+        raw = contents.get(key.removeprefix(f"{PLANS}/"))
+        if raw is None:
             break
+        name = f"{location}/{key}"
         record = PlanRecord.parse(raw, name, RESTORE, run=run, record=number)
+        _check_rows(record, by_number, ids, columns, name)
         by_number |= {row["episode"]: row for row in record.episodes}
-        _check_rows(record, len(plan.rows), by_number, columns, name)
-        rows = [by_number[episode] for episode in record.order]
-        plan = StoredPlan(
-            rows, record.selection, record.suite_parent, record.tokens,
-            (*plan.extents, len(rows)), (*plan.hashes, record.hash),
-        )  # fmt: skip
-    missing = plan_key(len(plan.extents))
-    if later := [key for key in location.keys(PLANS) if _NUMBERED.fullmatch(key) and key > missing]:
+        if record.order is None:
+            rows += record.episodes
+        else:
+            rows = [by_number[episode] for episode in record.order]
+        records.append(record)
+        extents.append(len(rows))
+    missing = plan_key(len(records))
+    if later := [key for key in listed if _NUMBERED.fullmatch(key) and key > missing]:
         raise RunDamagedError(f"{location}/{missing} is missing, though {later[0]} is there. {RESTORE}")
-    return plan
+    if not records:
+        return StoredPlan()
+    selection = next((record.selection for record in reversed(records) if record.selection is not None), None)
+    if selection is None:
+        raise RunDamagedError(f"{location}/{plan_key(0)} lacks the selection. {RESTORE}")
+    return StoredPlan(
+        rows,
+        selection,
+        records[-1].suite_parent,
+        records[-1].tokens,
+        tuple(extents),
+        tuple(record.hash for record in records),
+    )
 
 
 def _check_rows(
-    record: PlanRecord, before: int, by_number: Mapping[int, RowColumns], columns: Iterable[str], name: str
+    record: PlanRecord, before: Mapping[int, RowColumns], ids: set[str], columns: Iterable[str], name: str
 ) -> None:
-    """Raise RunDamagedError unless new rows have all columns, and numbers from `before` on without a gap."""
+    """Raise RunDamagedError unless new rows have all columns, and numbers behind those `before` without a gap.
+
+    The ids of the new rows are added to `ids`.
+    """
     if lacking := [column for row in record.episodes for column in columns if column not in row]:
         raise RunDamagedError(f"{name} has an episode without {lacking[0]}. {RESTORE}")
     numbers = [row["episode"] for row in record.episodes]
-    ids = {row["episode_id"] for row in by_number.values()}
-    expected = list(range(before + len(numbers)))
-    if numbers != expected[before:] or sorted(record.order) != expected or len(ids) != len(expected):
+    total = len(before) + len(numbers)
+    ids |= {row["episode_id"] for row in record.episodes}
+    ordered = record.order is None or sorted(record.order) == list(range(total))
+    if numbers != list(range(len(before), total)) or not ordered or len(ids) != total:
         raise RunDamagedError(f"{name} numbers or orders its episodes in another way than plans do. {RESTORE}")
 
 

@@ -37,7 +37,7 @@ from probe_kit.runs.layout import (
     check_distinct,
     source_settings_of,
 )
-from probe_kit.runs.plan import RowColumns, StoredPlan, plan_key, read_plans
+from probe_kit.runs.plan import PlanRecord, RowColumns, StoredPlan, plan_key, read_plans
 from probe_kit.runs.records import RESTORE, Checksum, Record, Sums, read_plain
 from probe_kit.runs.run_folders import what_to_open
 from probe_kit.runs.store import Location, locate
@@ -217,6 +217,12 @@ class Root:
         self.stored_metadata.update(sized)
 
     # -- the plan --------------------------------------------------------------------------------------
+
+    def with_record(self, record: PlanRecord) -> "Root":
+        """Return the root of the run after a further plan record, without reading those before again."""
+        grown = Root(self.location, self.card)
+        grown.__dict__["stored_plan"] = self.stored_plan.with_record(record)  # the cache of `cached_property`
+        return grown
 
     @cached_property
     def stored_plan(self) -> StoredPlan:

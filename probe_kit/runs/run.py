@@ -65,7 +65,7 @@ from probe_kit.runs.provenance import (
 )
 from probe_kit.runs.records import RESTORE, Checksum
 from probe_kit.runs.root import read_label, read_root
-from probe_kit.runs.run_source import Origin, RunSource, select_items
+from probe_kit.runs.run_source import SERVED, Origin, RunSource, select_items
 from probe_kit.runs.store import Location, locate
 from probe_kit.runs.trajectories import Trajectories, judged, watch, with_outcomes
 
@@ -103,9 +103,11 @@ def open_run(path: Path | str | Location, allow_partial: bool = False) -> "Run":
     committed = len(run.episodes)
     if committed < run.planned and not allow_partial:
         failed = f" ({len(run.failed)} failed: {', '.join(run.failed)})" if run.failed else ""
+        remedy = "Finish it with the same `probe-kit extract`, or accept what is there"
+        if run.source.kind == SERVED:
+            remedy = "Clients played them and cannot repeat them: accept what is there"
         raise RunIncompleteError(
-            f"{path} has {committed} of {run.planned} episodes{failed}. Finish it with the same "
-            "`probe-kit extract`, or accept what is there (--partial, allow_partial=True)"
+            f"{path} has {committed} of {run.planned} episodes{failed}. {remedy} (--partial, allow_partial=True)"
         )
     return run
 

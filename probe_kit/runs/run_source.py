@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 ORIGIN = "origin"
 """The entry of a certificate that holds the origin of its process."""
 SUITE = "suite"
+SERVED = "served"
+"""The kind of a run whose observations clients sent to a policy server."""
 OF_SCENE = "scene."
 """The beginning of the name of a file that a field of the scene gives."""
 
@@ -82,7 +84,8 @@ class RunSource:
     @property
     def subject(self) -> str:
         """The things that its model was shown, in a word; for a source of your own its kind."""
-        return {"scene": "scenes", "lerobot": "recordings", "env": "environments"}.get(self.kind, self.kind)
+        words = {"scene": "scenes", "lerobot": "recordings", "env": "environments", SERVED: "served observations"}
+        return words.get(self.kind, self.kind)
 
     @classmethod
     def of(cls, settings: Mapping[str, Any]) -> "RunSource":
@@ -90,6 +93,8 @@ class RunSource:
         if DATASET in settings:
             name = f"{settings['recording']['name']}#{settings[DATASET]['meta_blake2b'][:12]}"
             kind = str(settings[DATASET].get("kind", "lerobot"))
+            if kind == SERVED:
+                return cls(kind, name, f"its model was served to clients ({name}), which acted elsewhere")
             subject = "recordings" if kind == "lerobot" else kind
             return cls(kind, name, f"it shows {subject} ({name}), and its model did not act")
         if ENVIRONMENT in settings:

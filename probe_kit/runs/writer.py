@@ -3,7 +3,7 @@
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import prod
 from typing import Any, cast
 
@@ -143,7 +143,7 @@ class RunWriter:
     Args:
         location: The place of the run.
         plan: The episodes to play. Those that the run lacks are appended to its plan; `self.plan` has the run's
-            numbers.
+            numbers. Without any, rows are added as they arrive, see `add`.
         settings: The settings without what a selection decides.
         provenance: The provenance of this process, by default of one that computes on the CPU.
         label: The name in tables of a run that begins here, by default the model's name. A run that is there keeps
@@ -162,6 +162,7 @@ class RunWriter:
         self.location, self.plan = location, plan
         self.provenance = provenance or provenance_here()
         self._begun = self._certified = False
+        self._ids: set[str] | None = None
         # As they will be read again: a tuple would differ from the stored list, and refuse to continue.
         self.settings = json.loads(canonical_json(settings))
         self._label = label or str(self.settings["model"])
@@ -208,11 +209,14 @@ class RunWriter:
             with self.location.locked(lambda: None), self.location.tended(PLANS):
                 root = self._grown()
         root.check()
-        root.set_lengths()
+        if root.plan:  # an array has no length before its first row arrives
+            root.set_lengths()
         return root
 
     def _lacks(self, root: Root) -> bool:
         """Whether the run does not plan all of this writer's episodes yet. Raises SettingsMismatchError."""
+        if not self.plan.episodes:
+            return False
         return not root.plan or bool(further_rows(root.plan, self.plan.columns, self.location))
 
     def _grown(self) -> Root:
@@ -245,17 +249,63 @@ class RunWriter:
         numbers = {row["episode_id"]: row["episode"] for row in before.rows}
         added = [row for row in rows if row["episode_id"] not in numbers]
         numbers |= {row["episode_id"]: len(before.rows) + position for position, row in enumerate(added)}
-        streams = () if self._with_tokens else self.plan.streams
         return PlanRecord(
             run=root.identity,
             record=len(before.extents),
             selection=json.loads(canonical_json(self.plan.selection)),
             suite_parent=self.plan.suite_parent,
-            # A later selection may have shorter instructions only; the arrays of before keep their length.
-            tokens={stream.name: max(stream.tokens, before.tokens.get(stream.name, 0)) for stream in streams},
+            tokens=self._tokens(root, self.plan.streams),
             episodes=[cast("StoredRow", {**row, "episode": numbers[row["episode_id"]]}) for row in added],
             order=[numbers[row["episode_id"]] for row in rows],
         )
+
+    def _tokens(self, root: Root, streams: Sequence[StoredStream]) -> dict[str, int]:
+        """Return the sequence lengths that a plan record says; empty where arrays are as long as that."""
+        # A later selection may have shorter instructions only; the arrays of before keep their length.
+        before = root.stored_plan.tokens
+        listed = () if self._with_tokens else streams
+        return {stream.name: max(stream.tokens, before.get(stream.name, 0)) for stream in listed}
+
+    def add(self, row: Row, streams: Sequence[StoredStream] = ()) -> Row:
+        """Plan a row that arrived, and return it with its number in the run; `write` then stores it.
+
+        Takes as long in a run of thousands of rows as in a short one: no earlier record is read again.
+
+        Args:
+            row: The row, with an id that the run does not plan yet.
+            streams: The streams with the sequence lengths of this row; empty for those of the writer's plan.
+
+        Raises:
+            SettingsMismatchError: For an id that the run plans already, and for more rows than a run holds.
+        """
+        while True:
+            root = self.root
+            number = len(root.stored_plan.rows)
+            if number >= ROOM:
+                raise SettingsMismatchError(
+                    f"{self.location} holds {ROOM:,} episodes, the most of a run. Choose another --out"
+                )
+            if self._ids is None:
+                self._ids = {stored["episode_id"] for stored in root.plan}
+            if row.episode_id in self._ids:
+                raise SettingsMismatchError(
+                    f"{self.location} has an episode {row.episode_id!r} already; give this one another id"
+                )
+            planned = replace(row, index=number)
+            selection = json.loads(canonical_json(self.plan.selection))
+            first = {} if root.stored_plan.extents else {"selection": selection, "suite_parent": None}
+            record = PlanRecord(
+                run=root.identity,
+                record=len(root.stored_plan.extents),
+                tokens=self._tokens(root, streams or self.plan.streams),
+                episodes=[cast("StoredRow", json.loads(canonical_json(planned.to_json())))],
+                **first,
+            )
+            if self.location.create(plan_key(record.record), record.to_bytes()):
+                self.root = root.with_record(record)
+                self._ids.add(row.episode_id)
+                return planned
+            self.root, self._ids = read_root(self.location), None  # another process was first
 
     @contextmanager
     def owned(self) -> Iterator[None]:
@@ -375,9 +425,12 @@ class RunWriter:
         stored = {name: value for name, value in optional.items() if value is not None}
         return Commit.model_validate({**parts, **stored})
 
-    def write_certificate(self, certificate: dict[str, Any]) -> None:
-        """Record what this process loaded and checked, once; the certificate of the first process stays whole."""
-        if not self._certified:
+    def write_certificate(self, certificate: dict[str, Any], again: bool = False) -> None:
+        """Record what this process loaded and checked, once; the certificate of the first process stays whole.
+
+        With `again` it is a further record, of what a process knows at its end alone.
+        """
+        if again or not self._certified:
             write_certificate(self.root, certificate, self.provenance)
             self._certified = True
 

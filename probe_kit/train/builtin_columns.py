@@ -126,7 +126,8 @@ class BuiltinColumns:
         """The names of the columns of a run of this kind; this run may still lack some."""
         if self._run.inputs is None:
             return builtin_names()
-        return [*(prefix_of(self._run) + name for name in self._recorded), *outcome_column(self._run)]
+        recorded = [prefix_of(self._run) + name for name in self._recorded]
+        return [*recorded, *outcome_column(self._run), *fact_columns(self._run)]
 
     def read(self, name: str) -> BuiltinColumn:
         """Return a column by its name, for every episode or captured inference that the run has.
@@ -146,6 +147,8 @@ class BuiltinColumns:
         if name == OUTCOME and OUTCOME in outcome_column(run):
             outcomes = tuple(run.episodes["outcome"].astype(str))
             return BuiltinColumn("binary", tuple(run.episodes[EPISODE].astype(str)), None, outcomes)
+        if (cells := fact_columns(run).get(name)) is not None:
+            return BuiltinColumn(None, tuple(run.episodes[EPISODE].astype(str)), None, tuple(cells))
         if name.startswith((RECORDED, PLAYED)):
             return self._of_source(name)
         raise UsageError(f"there is no built-in column {name!r}; there are: {', '.join(builtin_names())}")
@@ -173,7 +176,7 @@ class BuiltinColumns:
         if not name.startswith(prefix) or column not in columns:
             source = "recordings" if name.startswith(RECORDED) else "an environment of your own"
             available = (
-                ", ".join(prefix + known_column for known_column in columns)
+                ", ".join([*(prefix + known_column for known_column in columns), *fact_columns(run)])
                 or f"none, because the run is not of {source}"
             )
             raise UsageError(f"{run.location} has no column {name}; there are: {available}")
@@ -207,9 +210,17 @@ def prefix_of(run: RunReader) -> str:
 
 def outcome_column(run: RunReader) -> dict[str, list[str]]:
     """Return the column `env.outcome`, a text per episode; empty for a run in which all episodes end alike."""
-    if not run.in_own_environment or run.episodes["outcome"].nunique() < 2:
+    if not (run.in_own_environment or fact_columns(run)) or run.episodes["outcome"].nunique() < 2:
         return {}
     return {OUTCOME: run.episodes["outcome"].astype(str).tolist()}
+
+
+def fact_columns(run: RunReader) -> dict[str, list[Cell]]:
+    """Return what clients of a policy server said at the end of episodes, by name; None where one said nothing."""
+    if run.in_own_environment:  # its facts come with every step
+        return {}
+    names = [str(name) for name in run.episodes.columns if str(name).startswith(PLAYED)]
+    return {name: [None if cell != cell else cell for cell in run.episodes[name].tolist()] for name in names}
 
 
 def recorded_columns(run: RunReader) -> dict[str, Callable[[], NDArray[np.float64]]]:
@@ -279,7 +290,8 @@ def label_frame(run: RunReader) -> "pd.DataFrame":
             prefix_of(run) + name: list(_cells(run, name, read()[rows, list(inferences)]))
             for name, read in recorded_columns(run).items()
         }
-        sim |= {name: [cells[row] for row in rows] for name, cells in outcome_column(run).items()}
+        of_episodes: dict[str, Sequence[Cell]] = {**outcome_column(run), **fact_columns(run)}
+        sim |= {name: [cells[row] for row in rows] for name, cells in of_episodes.items()}
     for name in ("group_id", "category"):
         table[name] = run.episodes[name].iloc[rows].tolist()
     table |= sim

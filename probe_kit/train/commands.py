@@ -216,6 +216,7 @@ def facts_table(inventory: "Inventory", more_lines: Mapping[str, str]) -> "Table
         "failed": str(inventory.failed or ""),
         "outcomes": outcomes,
         "success": "" if inventory.success is None else inventory.success.sentence,
+        "bounds": inventory.bounds,
         "categories": ", ".join(inventory.categories),
         **inventory.streams,
         **{f"probes {probes.key}": _probes_in_words(probes, inventory) for probes in inventory.probes},

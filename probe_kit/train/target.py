@@ -394,7 +394,9 @@ def _check_recorded(
     run: RunReader, table: LabelTable, episodes: Sequence[str], frames: Sequence[int] | None
 ) -> None:
     """Raise UsageError for an episode that the data set lacks, or a frame that its episode lacks."""
-    count: int = run.settings["recording"][RECORDED_EPISODES]
+    count: int | None = run.settings["recording"][RECORDED_EPISODES]
+    if count is None:  # of episodes that arrived: how many there are, and how long, no data set says
+        return
     rows = zip(run.episodes[SOURCE].tolist(), run.episodes["recorded_frames"].tolist(), strict=True)
     lengths = {str(source): int(length) for source, length in rows}
     for row, episode in enumerate(episodes):

@@ -95,7 +95,9 @@ class AnswerController(ModelController["AnswerModel", "Prompt"]):
         self._choose_positions()
         observations = [self._question_observation(turn) for turn in turns]
         phrases_asked = [self._phrases.get(turn.row.columns["item_id"], NO_OBJECT) for turn in turns]
-        buffers = {row: turn.buffers for row, turn in enumerate(turns)} if self.streams else {}
+        buffers = {
+            row: turn.buffers for row, turn in enumerate(turns) if self.streams and turn.buffers is not None
+        }
         spoken: list[list[str]] = []
         forced: list[list[Forced]] = []
         for order in self.template.orders:
@@ -216,6 +218,7 @@ class AnswerController(ModelController["AnswerModel", "Prompt"]):
         if stream is None or reading.option_ids is None:
             return
         for turn, letters, logits in zip(turns, reading.option_ids, reading.option_logits, strict=True):
+            assert turn.buffers is not None, "the only inference of a question is captured"
             turn.buffers.wait()  # the residuals are read here, and may still be on their way from a GPU
             pooled = turn.buffers.pooled[stream.name][0]
             residuals = (pooled if stream.iterations is None else pooled[0])[:, stream.views.index("last")]

@@ -261,7 +261,7 @@ class Turn:
 
     Attributes:
         call: The number of inferences of the row that came before.
-        buffers: The buffers for the activations of the first calls.
+        buffers: The buffers for the activations of the first calls; None for an inference that is not captured.
         past: The chunks of the inferences before, oldest first, which the controller keeps where a policy averages
             them.
     """
@@ -269,7 +269,7 @@ class Turn:
     observation: Observation
     row: Row
     call: int
-    buffers: "EpisodeBuffers"
+    buffers: "EpisodeBuffers | None"
     past: list[NDArray[np.float32]] = field(default_factory=list)
 
     def derived_seed(self, of: str) -> int:
@@ -452,7 +452,11 @@ class PolicyController(ModelController["Policy", Observation]):
         observations = copied([turn.observation for turn in turns])
         seeds = [turn.derived_seed("inference") for turn in turns]
         infer = partial(self._chunks, [turn.observation for turn in turns], seeds)
-        captured = {row: turn.buffers for row, turn in enumerate(turns) if turn.call < self.captured_calls}
+        captured = {
+            row: turn.buffers
+            for row, turn in enumerate(turns)
+            if turn.buffers is not None and len(turn.buffers.roles) < self.captured_calls
+        }
         if not captured:
             with self._edited(observations):
                 return infer()
@@ -463,6 +467,15 @@ class PolicyController(ModelController["Policy", Observation]):
             captured,
             lambda: self._edited(observations),
         )
+
+    def infer_plainly(self, turn: Turn) -> NDArray[np.float32]:
+        """Return the chunk (chunk, D) of a turn as `infer` makes it, without a check, a proof or a capture."""
+        with self._acting():
+            begin_randomness(derive_seed("global", turn.derived_seed("call")))
+            observations = copied([turn.observation])
+            with self._edited(observations):
+                chunk: NDArray[np.float32] = self._chunks(observations, [turn.derived_seed("inference")])[0]
+        return chunk
 
     def _chunks(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
         """Return the chunks (B, chunk, D) of one call: a copy of the answer, which the policy cannot change later.

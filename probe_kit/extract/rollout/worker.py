@@ -36,7 +36,7 @@ from probe_kit.extract.sources.player import (
 from probe_kit.extract.sources.source import Played, Source
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.runs.commits import Seconds
-from probe_kit.runs.layout import VIDEOS
+from probe_kit.runs.layout import VIDEOS, FrameChoice
 from probe_kit.runs.plan import Row
 from probe_kit.runs.provenance import INPUT_CONTENT
 from probe_kit.runs.run_source import ORIGIN
@@ -324,46 +324,67 @@ class Worker:
 
     def _write(self, playing: Playing, ending: Ending) -> Done:
         """Write an episode, on the writing thread."""
-        outcome = playing.outcome(ending)
+        content = {INPUT_CONTENT: self._content} if self._content else {}
         try:
-            playing.buffers.wait()  # copies from a GPU may still be under way
-            record = playing.buffers.record(
-                playing.planned, outcome, trajectory=ending.trajectory, instruction_ids=playing.instruction_ids,
-                control_steps=playing.control_steps, seconds=Seconds(playing.seconds, ending.seconds),
-                inputs=ending.inputs or {}, pictures=self._pictures(playing.planned, outcome, ending),
-                frames=len(ending.small_frames) or None if self._settings.machine.frames == "all" else None,
-            )  # fmt: skip
-            with self._writer.location.explained_errors():
-                # Not before: the certificate holds fire counts and proofs, which the first inference gives.
-                self._writer.write_certificate(self._certificate())
-                self._writer.write(record)
+            return write_episode(self._writer, self._controller, self._settings, playing, ending, content)
         finally:
             playing.buffers.clear()
             self._free.put(playing.buffers)
-        return Done(playing.planned.index, outcome)
-
-    def _certificate(self) -> dict[str, Any]:
-        """Return the controller's certificate, inputs without content, and the origin of this process."""
-        certificate = self._controller.certificate()
-        content = {INPUT_CONTENT: self._content} if self._content else {}
-        origin = origin_of_process(self._settings, certificate["policy"]).to_json()
-        return {**certificate, **content, ORIGIN: origin}
-
-    def _pictures(self, planned: Row, outcome: Mapping[str, Any], ending: Ending) -> dict[str, bytes]:
-        """Return the pictures that are kept for people, as content by key."""
-        pictures = {}
-        if ending.small_frames:
-            frames = as_thumbnail(ending.small_frames, self._settings.machine.frames)
-            pictures[thumbnail_key(planned.index)] = frames
-        if ending.frames:
-            name = f"{planned.index:08d}-{planned.category}-{outcome['outcome']}.gif"
-            pictures[f"{VIDEOS}/{name}"] = _film(ending.frames)
-        return pictures
 
     def _is_filmed(self, planned: Row) -> bool:
         return self._settings.machine.video == "all" or (
             self._settings.machine.video == "first" and planned.index == 0
         )
+
+
+def write_episode(
+    writer: RunWriter,
+    controller: Controller,
+    settings: Settings,
+    playing: Playing,
+    ending: Ending,
+    certified: Mapping[str, Any],
+) -> Done:
+    """Write an episode that was played to its end, with the certificate of this process before its first one.
+
+    Args:
+        writer: The writer of the run, which plans the episode.
+        controller: The controller that inferred.
+        settings: The settings of the run.
+        playing: The episode; its buffers are the caller's again afterwards.
+        ending: Its ending.
+        certified: Further entries of the certificate.
+    """
+    outcome = playing.outcome(ending)
+    playing.buffers.wait()  # copies from a GPU may still be under way
+    record = playing.buffers.record(
+        playing.planned, outcome, trajectory=ending.trajectory, instruction_ids=playing.instruction_ids,
+        control_steps=playing.control_steps, seconds=Seconds(playing.seconds, ending.seconds),
+        inputs=ending.inputs or {}, pictures=_pictures(settings.machine.frames, playing.planned, outcome, ending),
+        frames=len(ending.small_frames) or None if settings.machine.frames == "all" else None,
+    )  # fmt: skip
+    with writer.location.explained_errors():
+        # Not before: the certificate holds fire counts and proofs, which the first inference gives.
+        writer.write_certificate({**certificate_of(controller, settings), **certified})
+        writer.write(record)
+    return Done(playing.planned.index, outcome)
+
+
+def certificate_of(controller: Controller, settings: Settings) -> dict[str, Any]:
+    """Return the controller's certificate with the origin of this process."""
+    certificate = controller.certificate()
+    return {**certificate, ORIGIN: origin_of_process(settings, certificate["policy"]).to_json()}
+
+
+def _pictures(frames: FrameChoice, planned: Row, outcome: Mapping[str, Any], ending: Ending) -> dict[str, bytes]:
+    """Return the pictures that are kept for people, as content by key."""
+    pictures = {}
+    if ending.small_frames:
+        pictures[thumbnail_key(planned.index)] = as_thumbnail(ending.small_frames, frames)
+    if ending.frames:
+        name = f"{planned.index:08d}-{planned.category}-{outcome['outcome']}.gif"
+        pictures[f"{VIDEOS}/{name}"] = _film(ending.frames)
+    return pictures
 
 
 @contextmanager

@@ -15,10 +15,13 @@ from probe_kit.extract.sources.environment import EnvSource
 from probe_kit.extract.sources.pictures import PictureFolder
 from probe_kit.extract.sources.recording import LeRobotSource
 from probe_kit.extract.sources.scene import SceneSettings
+from probe_kit.extract.sources.served import ServedSettings
 from probe_kit.extract.sources.source import SourceSettings
 
 ENTRY_POINTS = "probe_kit.sources"
 OWN: tuple[type[SourceSettings], ...] = (SceneSettings, LeRobotSource, EnvSource, PictureFolder)
+SERVED: tuple[type[SourceSettings], ...] = (ServedSettings,)
+"""The sources of other commands than `extract` and `ask`, which do not offer their options."""
 
 
 class BrokenSourceWarning(UserWarning):
@@ -28,7 +31,7 @@ class BrokenSourceWarning(UserWarning):
 def _third_party() -> Iterator[type[SourceSettings]]:
     """Yield the settings that entry points name; warn of each that cannot be used."""
     options = {option.parameter for kind in OWN for option in kind.command_options().values()}
-    kinds = {kind.model_fields["kind"].default for kind in OWN}
+    kinds = {kind.model_fields["kind"].default for kind in (*OWN, *SERVED)}
     for entry in entry_points(group=ENTRY_POINTS):
         try:
             settings = entry.load()
@@ -64,7 +67,7 @@ def _problem(settings: Any, kinds: set[str], options: set[str]) -> str:
 
 
 SOURCES: tuple[type[SourceSettings], ...] = (*OWN, *_third_party())
-"""The settings of all sources; the scene, which no option names, comes first."""
+"""The settings of the sources of `extract` and `ask`; the scene, which no option names, comes first."""
 
 
 def kinds_typed(typed: Collection[str]) -> dict[type[SourceSettings], str]:
@@ -75,7 +78,7 @@ def kinds_typed(typed: Collection[str]) -> dict[type[SourceSettings], str]:
 
 def kind_of(values: Mapping[str, Any]) -> type[SourceSettings]:
     """Return the class of a source's settings from their part of a file. Raises UsageError for an unknown kind."""
-    kinds = {kind.model_fields["kind"].default: kind for kind in SOURCES}
+    kinds = {kind.model_fields["kind"].default: kind for kind in (*SOURCES, *SERVED)}
     if values.get("kind") not in kinds:
         raise UsageError(f"source.kind is {values.get('kind')!r}; expected one of {', '.join(kinds)}")
     return kinds[values["kind"]]

@@ -154,8 +154,8 @@ class Player(ABC):
         return answer if isinstance(answer, Observation) else replace(answer, seconds=self._seconds)
 
 
-class InputsPlayer(Player):
-    """A player that keeps what labels and controls are made of: arrays of every inference, a hash of pictures."""
+class ShownInputs:
+    """The inputs that were shown in an episode: arrays of every inference, and a hash of pictures."""
 
     def _clear(self) -> None:
         self._inputs: dict[str, list[NDArray[Any]]] = {}
@@ -174,13 +174,17 @@ class InputsPlayer(Player):
         if stored:
             self._keep("pixels", np.stack([small_picture(picture) for picture in pictures]), most)
 
-    def dismiss(self) -> Ending:
-        """End the episode after its first observation: its model was asked."""
-        return self._ending({"outcome": CAPTURE_ONLY})
-
     def _ending(self, outcome: Mapping[str, Any], small_frames: SmallFrames = ()) -> Ending:
         inputs = {name: np.stack(values) for name, values in self._inputs.items()}
         return Ending({**outcome, "frames_blake2b": self._hash.hexdigest()}, [], small_frames, inputs=inputs)
+
+
+class InputsPlayer(ShownInputs, Player):
+    """A player that keeps what labels and controls are made of."""
+
+    def dismiss(self) -> Ending:
+        """End the episode after its first observation: its model was asked."""
+        return self._ending({"outcome": CAPTURE_ONLY})
 
 
 def small_picture(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:

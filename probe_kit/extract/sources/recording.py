@@ -94,7 +94,7 @@ def _every(value: Any) -> Any:
     return int(matched[1])
 
 
-def _pairs(option: str, example: str, value: Any) -> Any:
+def read_pairs_of(option: str, example: str, value: Any) -> Any:
     """Return CAMERA=VALUE texts, a dictionary, or pairs, as pairs. Raises UsageError."""
     if isinstance(value, Mapping):
         return tuple(value.items())
@@ -112,7 +112,7 @@ EVERY_CAMERA = "*"
 
 Cameras = Annotated[
     Pairs,
-    BeforeValidator(partial(_pairs, "--camera", f"base={IMAGES}top")),
+    BeforeValidator(partial(read_pairs_of, "--camera", f"base={IMAGES}top")),
     _option(
         "--camera",
         metavar="CAMERA=FEATURE",
@@ -123,7 +123,7 @@ Cameras = Annotated[
 
 
 def _features(value: Any) -> Any:
-    pairs = _pairs("--feature", f"{STATE}=state", value)
+    pairs = read_pairs_of("--feature", f"{STATE}=state", value)
     if strange := [name for name, _ in pairs if name not in (STATE, ACTION)]:
         raise UsageError(
             f"--feature {strange[0]}=…: expected {STATE} or {ACTION}, such as --feature {STATE}=state. Pictures "
@@ -132,7 +132,8 @@ def _features(value: Any) -> Any:
     return pairs
 
 
-def _turns(value: Any) -> Any:
+def read_turns(value: Any) -> Any:
+    """Return CAMERA=DEGREES texts, and degrees without a camera, as pairs. Raises UsageError."""
     turns = []
     several = [value] if isinstance(value, int | str) else value
     if isinstance(several, Sequence):  # degrees without a camera
@@ -142,7 +143,7 @@ def _turns(value: Any) -> Any:
             else text
             for text in several
         ]
-    for camera, degrees in _pairs("--rotate", "base=180", several):
+    for camera, degrees in read_pairs_of("--rotate", "base=180", several):
         if not is_count(str(degrees)):
             which = "" if camera == EVERY_CAMERA else f"{camera}="
             raise UsageError(f"--rotate {which}{degrees}; expected degrees, such as {which}180")
@@ -159,7 +160,7 @@ def _turns(value: Any) -> Any:
 
 Rotations = Annotated[
     tuple[tuple[str, int], ...],
-    BeforeValidator(_turns),
+    BeforeValidator(read_turns),
     typer.Option(
         "--rotate",
         metavar="[CAMERA=]DEGREES",

@@ -55,6 +55,7 @@ class SourceSettings(Part):
         moves: The fields that a later command may give anew, because a file or module lies elsewhere, with their
             help.
         played: The word before the name in a run's label; empty for a label without it.
+        of_run: Whether a later command reads the observations from the run itself.
     """
 
     kind: str
@@ -68,6 +69,7 @@ class SourceSettings(Part):
     refuses: ClassVar[tuple[str, ...]] = ()
     moves: ClassVar[Mapping[str, str]] = MappingProxyType({})
     played: ClassVar[str] = ""
+    of_run: ClassVar[bool] = False
 
     @property
     def name(self) -> str:

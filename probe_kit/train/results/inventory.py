@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-from probe_kit.runs.environment_success import EnvironmentSuccess
+from probe_kit.runs.environment_success import EnvironmentSuccess, bounds_of
 from probe_kit.runs.layout import PROBES
 from probe_kit.runs.reader import RunReader
 from probe_kit.runs.results import Bundle, unfinished_bundles
@@ -63,6 +63,7 @@ class Inventory:
         unfinished: Finished sites of interrupted sweeps, by key.
         wordings: Episodes by the wording they were asked in, empty for the items' own words alone.
         success: Success rates of a run in an environment; None for others and where no fact `success` is stored.
+        bounds: How the episodes of a policy server were bounded, in words; empty for other runs.
     """
 
     run: str
@@ -81,6 +82,7 @@ class Inventory:
     unfinished: Mapping[str, int]
     wordings: Mapping[str, int] = field(default_factory=dict)
     success: EnvironmentSuccess | None = None
+    bounds: str = ""
 
 
 def inventory(run: Any) -> Inventory:
@@ -103,6 +105,7 @@ def inventory(run: Any) -> Inventory:
         unfinished=unfinished_bundles(run.location, PROBES),
         wordings={name: len(run.in_wording(name).episodes) for name in run.wordings},
         success=EnvironmentSuccess.of(episodes),
+        bounds=bounds_of(episodes),
     )
 
 

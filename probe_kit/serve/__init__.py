@@ -1,0 +1,1 @@
+"""A policy server whose clients play: activations behind the sockets of benchmarks and robots."""

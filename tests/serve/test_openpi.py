@@ -1,0 +1,152 @@
+"""The wire of openpi, spoken by a client of the package websockets."""
+
+import asyncio
+import http.client
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+from websockets.exceptions import ConnectionClosedError, InvalidStatus
+from websockets.sync.client import ClientConnection, connect
+
+from probe_kit.hooks import Policy
+from probe_kit.serve.codec import pack, unpack
+from probe_kit.serve.server import Server
+from tests.support.served_sessions import WORDS, Opens, observation
+
+MARK = "probe_kit/episode"
+
+
+@contextmanager
+def serving(server: Server, stop_after: int | None = None) -> Iterator[str]:
+    """Serve on a thread until the body ends."""
+    ready = threading.Event()
+    loops: list[asyncio.AbstractEventLoop] = []
+
+    def began() -> None:
+        loops.append(asyncio.get_running_loop())
+        ready.set()
+
+    thread = threading.Thread(target=server.serve, args=(stop_after, began, lambda _: None))
+    thread.start()
+    assert ready.wait(20)
+    try:
+        yield server.address
+    finally:
+        if stop_after is None:
+            loops[0].call_soon_threadsafe(server.stop.set)
+        thread.join(30)
+    assert not thread.is_alive()
+
+
+def ask(connection: ClientConnection, message: dict[str, Any]) -> Any:
+    connection.send(pack(message))
+    answer = connection.recv(20)
+    return answer if isinstance(answer, str) else unpack(answer)
+
+
+def test_a_client_plays_an_episode_and_an_error_leaves_its_connection_open(opened: Opens) -> None:
+    server = opened(captured_calls=1)
+    with serving(server, stop_after=1) as address, connect(f"{address}/arm-1", compression=None) as client:
+        assert unpack(client.recv(20))["probe_kit"]["mark"] == MARK
+        first = ask(client, {**observation(0), MARK: {"id": "a"}})
+        assert first["actions"].dtype == np.float32
+        assert first["actions"].ndim == 2
+        assert set(first) == {"actions", "server_timing"}  # a client slices every other array too
+        refused = ask(client, {"prompt": WORDS, MARK: {"id": "a"}})
+        assert refused.startswith("ObservationError: the observation has no picture 'observation/image'")
+        assert len(refused.splitlines()) == 1
+        second = ask(client, {**observation(1), MARK: {"id": "a"}})
+        assert {"infer_ms", "prev_total_ms"} == set(second["server_timing"])
+        assert "beside an observation" in ask(client, {**observation(1), MARK: {"end": True}})
+        end = ask(client, {MARK: {"end": True, "facts": {"success": True}}})
+        assert end["actions"].shape == (0, first["actions"].shape[1])
+    run = server.close()
+    assert run is not None
+    assert run.episodes[["episode_id", "client", "outcome"]].to_numpy().tolist() == [["a", "arm-1", "success"]]
+
+
+@pytest.mark.slow
+def test_a_client_is_greeted_while_the_model_infers_for_one_that_vanishes(
+    opened: Opens, policy: Policy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    server, whole, begun = opened(captured_calls=1), type(policy).predict, threading.Event()
+
+    def slow(self: Policy, observations: Any, seeds: Any) -> Any:
+        begun.set()
+        time.sleep(1.5)
+        return whole(self, observations, seeds)
+
+    monkeypatch.setattr(type(policy), "predict", slow)
+    with serving(server) as address, connect(address) as first:
+        first.recv(20)
+        first.send(pack({**observation(0), MARK: {"id": "a"}}))
+        assert begun.wait(20)
+        began = time.monotonic()
+        with connect(address) as second:
+            second.recv(20)
+            assert time.monotonic() - began < 1
+            first.close_socket()
+            assert "actions" in ask(second, {**observation(1), MARK: {"id": "b"}})
+    run = server.close()
+    assert run is not None
+    assert sorted(run.episodes["episode_id"]) == ["a", "b"]
+
+
+def oversized(client: ClientConnection) -> None:
+    client.send(bytes((16 << 20) + 1))
+
+
+def unreadable(client: ClientConnection) -> None:
+    client.send(b"\xc1")
+
+
+def text(client: ClientConnection) -> None:
+    client.send("hello")
+
+
+@pytest.mark.parametrize(
+    ("send", "code"),
+    [
+        pytest.param(unreadable, 1007, marks=pytest.mark.slow),
+        pytest.param(oversized, 1009, marks=pytest.mark.slow),
+        pytest.param(text, 1007, marks=pytest.mark.slow),
+    ],
+)
+def test_a_message_that_cannot_be_read_closes_its_own_connection(
+    opened: Opens, send: Callable[[ClientConnection], None], code: int
+) -> None:
+    server = opened()
+    with serving(server) as address, connect(address, max_size=None) as client:
+        client.recv(20)
+        send(client)
+        with pytest.raises(ConnectionClosedError) as closed:
+            client.recv(20)
+        assert closed.value.rcvd is not None
+        assert closed.value.rcvd.code == code
+        with connect(address) as other:
+            assert unpack(other.recv(20))
+    assert server.close() is None
+
+
+def test_only_a_client_with_the_token_is_served_and_no_browser(opened: Opens) -> None:
+    server = opened(token="secret-1")
+    with serving(server) as address:
+        for headers in ({}, {"Authorization": "Api-Key secret-2"}, {"Authorization": "secret-1"}):
+            with pytest.raises(InvalidStatus, match="401"):
+                connect(address, additional_headers=headers)
+        with pytest.raises(InvalidStatus, match="403"):
+            connect(address, origin="http://localhost:1", additional_headers={"Authorization": "Api-Key secret-1"})  # type: ignore[arg-type]
+        with connect(address, additional_headers={"Authorization": "Api-Key secret-1"}) as client:
+            assert unpack(client.recv(20))
+        split = urlsplit(address)
+        question = http.client.HTTPConnection(str(split.hostname), split.port, timeout=20)
+        question.request("GET", "/healthz")
+        assert question.getresponse().read() == b"OK\n"
+        question.close()
+    server.close()

@@ -1,0 +1,320 @@
+"""Episodes of clients, the rules that bound them, and the run that they make."""
+
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+
+from probe_kit.errors import ObservationError, PolicyFailedError, SettingsMismatchError, UnitsError, UsageError
+from probe_kit.extract.rollout.worker import torch_threads
+from probe_kit.hashing import derive_seed
+from probe_kit.hooks import Policy
+from probe_kit.hooks.contract.observation import Observation
+from probe_kit.intervene.frame_session import Frames
+from probe_kit.intervene.sessions import ReplaySource
+from probe_kit.runs import Run, open_run
+from probe_kit.runs.verify import verify_run
+from probe_kit.serve import session as sessions
+from probe_kit.serve.marks import Mark
+from probe_kit.serve.server import Server
+from probe_kit.serve.session import Client, Line
+from probe_kit.train.target import Target
+from tests.support.served_sessions import WORDS, Opens, observation
+
+OTHER = "put the cube on the blue shape"
+
+
+def written(server: Server) -> Run:
+    """The run of what was played so far; sealing it would cost more than playing."""
+    server.session.wait()
+    return open_run(server.plan.location, allow_partial=True)
+
+
+def play(server: Server, client: Client, name: str, numbers: list[int], **facts: Any) -> list[np.ndarray]:
+    answers = [
+        server.session.answer(client, observation(number), Mark(name, step=5 * call))
+        for call, number in enumerate(numbers)
+    ]
+    server.session.end(client, Mark(end=True, facts=facts))
+    return answers
+
+
+def test_answers_are_those_of_the_policy_and_the_run_shows_them_again(opened: Opens, policy: Policy) -> None:
+    lines: list[Line] = []
+    server = opened(lines=lines)
+    client = server.session.connect("arm-1")
+    answers = play(server, client, "task/0", [0, 1, 2], success=True, score=0.5)
+    play(server, client, "task/1", [3], success=False)
+    assert server.close() is not None
+
+    for call, answer in enumerate(answers):
+        sent = observation(call)
+        shown = Observation(sent["observation/image"], sent["observation/state"].astype(np.float32), WORDS)
+        seed = derive_seed(derive_seed(0, "policy", "task/0"), "inference", call)
+        with torch_threads(1):  # as a server of a small policy infers
+            assert policy.predict([shown], [seed])[0].tobytes() == answer.tobytes()
+
+    run = open_run(server.plan.location)
+    assert run.sealed
+    assert verify_run(run.location, deep=True).problems == ()
+    assert run.episodes["outcome"].tolist() == ["success", "failure"]
+    assert run.episodes["inferences"].tolist() == [3, 1]
+    assert run.episodes[["began", "ended"]].to_numpy().tolist() == [["said", "said"]] * 2
+    assert run.control_steps.tolist() == [[0, 5], [0, -1]]
+    assert run.inputs is not None
+    assert (run.inputs.row("picture.base", 0)[1] == observation(1)["observation/image"]).all()
+    assert Target.of_run(run, "env.success").coded.classes == ("False", "True")
+    assert np.nanmax(Target.of_run(run, "dataset.state.0").coded.values) < 1
+    assert run.certificate["hooks_on_equals_hooks_off"]
+    assert "observation/wrist_image" in run.certificate["served"]["never_read"]
+    assert [(line.episode, line.captured, line.inferences) for line in lines] == [
+        ("task/0", 2, 3),
+        ("task/1", 1, 1),
+    ]
+
+    frames = Frames(run, ReplaySource())
+    for frame in frames.index:
+        assert frame.stored is not None
+        with torch_threads(1):
+            assert policy.predict([frame.observation], [frame.seed])[0].tobytes() == frame.stored.tobytes()
+
+
+@pytest.mark.slow
+def test_episodes_are_the_same_whoever_else_asks(opened: Opens) -> None:
+    one_by_one, together = opened("a"), opened("b")
+    client = one_by_one.session.connect()
+    for name, numbers in (("x", [0, 1]), ("y", [2, 3])):
+        play(one_by_one, client, name, numbers)
+    first, second = together.session.connect(), together.session.connect("other")
+    for call in range(2):
+        together.session.answer(second, observation(2 + call), Mark("y", step=5 * call))
+        together.session.answer(first, observation(call), Mark("x", step=5 * call))
+    for each in (first, second):
+        together.session.end(each, Mark(end=True))
+    runs = [server.close() for server in (one_by_one, together)]
+    bytes_of = []
+    for run in runs:
+        assert run is not None
+        assert run.inputs is not None
+        by_id = {name: row for row, name in enumerate(run.episodes["episode_id"])}
+        kinds = [run.rows("expert"), run.rows("backbone")]
+        bytes_of.append(
+            [
+                (kind[by_id[name]].tobytes(), run.inputs.row("prediction", by_id[name]).tobytes())
+                for name in "xy"
+                for kind in kinds
+            ]
+        )
+    assert bytes_of[0] == bytes_of[1]
+
+
+@pytest.mark.slow
+def test_an_id_that_comes_again_is_another_trial_and_a_connection_ends_its_episode(opened: Opens) -> None:
+    server = opened(captured_calls=1)
+    client = server.session.connect()
+    play(server, client, "a", [0])
+    server.session.answer(client, observation(1), Mark("a", "task"))
+    server.session.leave(client)
+    again = server.session.connect()
+    server.session.answer(again, observation(1), Mark("b"))
+    server.session.answer(again, observation(2, words=OTHER), Mark("b"))
+    run = server.close()
+    assert run is not None
+    columns = ["episode_id", "item_id", "group_id", "began", "ended", "client"]
+    assert run.episodes[columns].to_numpy().tolist() == [
+        ["a", "a", "a", "said", "said", "client-001"],
+        ["a#2", "a", "task", "again", "connection", "client-001"],
+        ["b", "b", "b", "said", "words", "client-002"],
+        ["b#2", "b", "b", "words", "connection", "client-002"],
+    ]
+    assert run.episodes["policy_seed"].nunique() == 4
+
+
+def test_what_cannot_be_shown_is_refused_by_name_and_the_episode_goes_on(opened: Opens) -> None:
+    server = opened(captured_calls=1)
+    client = server.session.connect()
+    small = observation(0, side=8)
+    server.session.answer(client, observation(0), Mark("a"))
+    wrong: dict[str, tuple[dict[str, Any], str]] = {
+        "size": (small, "(8, 8, 3); the run stores pictures of (48, 48, 3)"),
+        "kind": (
+            {**observation(1), "observation/image": np.zeros((48, 48, 3), np.float32)},
+            "float32 (48, 48, 3)",
+        ),
+        "camera": ({key: value for key, value in observation(1).items() if "image" not in key}, "no picture"),
+        "state": ({**observation(1), "observation/state": np.zeros(7)}, "has 7 numbers; expected 8"),
+        "lost": ({key: value for key, value in observation(1).items() if "state" not in key}, "no state"),
+        "finite": ({**observation(1), "observation/state": np.full(8, np.nan)}, "NaN or infinity"),
+        "large": ({**observation(1), "observation/state": np.full(8, 1e300)}, "NaN or infinity"),
+        "words": (observation(1, words=None), "no words"),
+        "control": (observation(1, words="put\x07 it"), "control characters"),
+    }
+    for sent, complaint in wrong.values():
+        with pytest.raises(ObservationError, match=re.escape(complaint)):
+            server.session.answer(client, sent, Mark("a"))
+    server.session.answer(client, observation(1), Mark("a", step=3))
+    with pytest.raises(ObservationError, match="step 3 of 'a' comes after step 3"):
+        server.session.answer(client, observation(1), Mark("a", step=3))
+    server.session.leave(client)
+    run = written(server)
+    assert server.session.refused == len(wrong) + 1
+    assert run.episodes[["episode_id", "inferences"]].to_numpy().tolist() == [["a", 2]]
+
+
+@pytest.mark.slow
+def test_the_first_observation_decides_sizes_only_if_it_was_answered(opened: Opens) -> None:
+    server = opened(captured_calls=1)
+    client = server.session.connect()
+    with pytest.raises(UnitsError, match="other units or another robot"):
+        server.session.answer(client, {**observation(0, 8), "observation/state": np.full(8, 90.0)}, Mark("a"))
+    server.session.answer(client, observation(0), Mark("a"))
+    run = server.close()
+    assert run is not None
+    assert run.settings["dataset"]["shapes"] == {"base": [48, 48, 3]}
+
+
+@pytest.mark.slow
+def test_a_policy_that_predicts_no_number_costs_its_own_episode(
+    opened: Opens, policy: Policy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    server = opened(captured_calls=1)
+    client = server.session.connect()
+    play(server, client, "good", [0])
+    whole = type(policy).predict
+
+    def spoilt(self: Policy, observations: Any, seeds: Any) -> Any:
+        return whole(self, observations, seeds) * np.float32(np.nan)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(type(policy), "predict", spoilt)
+        with pytest.raises(PolicyFailedError, match="NaN or infinity"):
+            server.session.answer(client, observation(1), Mark("bad"))
+    play(server, client, "bad", [1])
+    play(server, client, "next", [2])
+    run = server.close()
+    assert run is not None
+    assert run.episodes["episode_id"].tolist() == ["good", "next"]
+    assert "NaN or infinity" in run.failed["bad"]
+    assert server.session.failed == 1
+
+
+@pytest.mark.slow
+def test_a_fault_of_storing_changes_no_action_and_refuses_new_episodes_until_it_is_over(
+    opened: Opens, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    server = opened(captured_calls=1)
+    client = server.session.connect()
+    play(server, client, "a", [0])
+    server.session.wait()
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(sessions.RunWriter, "add", full)
+        assert play(server, client, "b", [1])[0].size
+        server.session.wait()
+        with pytest.raises(sessions.StoreError, match="no further episode begins"):
+            server.session.answer(client, observation(2), Mark("c"))
+    play(server, client, "c", [2])
+    server.session.leave(client)
+    run = written(server)
+    assert run.episodes["episode_id"].tolist() == ["a", "c"]
+    assert "full" in run.failed["b"]
+
+
+@pytest.mark.slow
+def test_the_same_command_continues_a_run_and_another_one_is_refused(opened: Opens) -> None:
+    server = opened(captured_calls=1)
+    play(server, server.session.connect(), "a", [0])
+    server.close()
+    with pytest.raises(SettingsMismatchError, match="captured_calls"):
+        opened(captured_calls=2)
+    with pytest.raises(SettingsMismatchError, match=r"dataset\.source"):
+        opened(captured_calls=1, source_name="other@1")
+    server = opened(captured_calls=1, source_name=None)
+    client = server.session.connect()
+    with pytest.raises(ObservationError, match="the run stores pictures"):
+        server.session.answer(client, observation(1, side=8), Mark("b"))
+    play(server, client, "a", [1])
+    run = server.close()
+    assert run is not None
+    assert run.episodes[["episode", "episode_id", "client"]].to_numpy().tolist() == [
+        [0, "a", "client-001"], [1, "a#2", "client-002"]
+    ]  # fmt: skip
+
+
+# -- clients without marks ---------------------------------------------------------------------------------------
+
+
+def test_rows_of_a_client_without_marks_are_split_and_its_group_is_not(
+    opened: Opens, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = [0.0]
+    monkeypatch.setattr(sessions, "monotonic", lambda: clock[0])
+    server = opened(captured_calls=1, pause=30.0)
+    client = server.session.connect("arm-1")
+
+    def send(number: float, words: str = WORDS, wait: float = 1.0) -> None:
+        clock[0] += wait
+        state = np.array([0.36 + 0.01 * number, 0.02, 0.08, 0, 0.05, 0, 0, 0.64])
+        server.session.answer(
+            client, {**observation(int(number)), "observation/state": state, "prompt": words}, None
+        )
+
+    for number in (0, 1, 2, 3):
+        send(number)
+    send(0.2)  # back at the beginning
+    send(1.2)
+    send(2.2, OTHER)
+    send(3.2, OTHER, wait=31)
+    server.session.leave(client)
+    run = written(server)
+    assert run.episodes[["episode_id", "began", "ended", "inferences"]].to_numpy().tolist() == [
+        ["arm-1/000001", "connection", "state", 4],
+        ["arm-1/000002", "state", "words", 2],
+        ["arm-1/000003", "words", "pause", 1],
+        ["arm-1/000004", "pause", "connection", 1],
+    ]
+    assert set(run.episodes["group_id"]) == {"arm-1"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("rule", "rows", "groups"), [("words", 2, {WORDS, OTHER}), ("connection", 2, {"client-001"})]
+)
+def test_the_user_says_what_bounds_episodes(opened: Opens, rule: str, rows: int, groups: set[str]) -> None:
+    server = opened(captured_calls=1, rule=rule)
+    client = server.session.connect()
+    for words in (WORDS, OTHER):
+        server.session.answer(client, observation(0, words=words), None)
+    run = server.close()
+    assert run is not None
+    assert len(run.episodes) == rows
+    assert set(run.episodes["group_id"]) == groups
+
+
+@pytest.mark.slow
+def test_with_said_episodes_others_are_refused_and_nothing_is_stored(opened: Opens) -> None:
+    server = opened(rule="said")
+    client = server.session.connect()
+    with pytest.raises(ObservationError, match="says no episode"):
+        server.session.answer(client, observation(0), None)
+    assert server.close() is None
+
+
+@pytest.mark.slow
+def test_every_third_inference_is_captured_and_small_pictures_are_not_shown_again(opened: Opens) -> None:
+    server = opened(captured_calls=2, every=3, keep="small")
+    client = server.session.connect()
+    for number in range(8):
+        server.session.answer(client, observation(number), Mark("a"))
+    run = server.close()
+    assert run is not None
+    assert run.control_steps.tolist() == [[0, 3]]
+    assert run.episodes[["frames", "inferences"]].to_numpy().tolist() == [[2, 8]]
+    assert run.inputs is not None
+    assert run.inputs.kinds == ("pixels", "prediction", "state")
+    with pytest.raises(UsageError, match="--keep small"):
+        Frames(run, ReplaySource())

@@ -1,0 +1,35 @@
+"""Settings and observations of small served sessions."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from probe_kit.extract import ExtractSettings
+from probe_kit.extract.sources.served import ServedSettings
+from probe_kit.serve.server import Server
+
+WORDS = "put the cube on the red shape"
+Opens = Callable[..., Server]
+
+
+def settings(**choices: Any) -> ExtractSettings:
+    served = ServedSettings.model_fields.keys()
+    source: dict[str, Any] = {
+        "cameras": {"base": "observation/image"}, "state": "observation/state", "source_name": "noise@1",
+        **{name: value for name, value in choices.items() if name in served},
+    }  # fmt: skip
+    others = {name: value for name, value in choices.items() if name not in served}
+    return ExtractSettings("pi0-tiny", source=ServedSettings(**source), **{"captured_calls": 2, **others})
+
+
+def observation(number: int, side: int = 48, words: str | None = WORDS) -> dict[str, Any]:
+    """An observation of noise as LIBERO's client builds it: float64 state near that of training."""
+    rng = np.random.default_rng(number)
+    usual, spread = np.array([0.39, 0.02, 0.08, 0, 0.05, 0, 0, 0.64]), np.array([0.03, 0.1, 0.03, 0, 0, 0, 0, 0.1])
+    sent: dict[str, Any] = {
+        "observation/image": rng.integers(0, 256, (side, side, 3), np.uint8),
+        "observation/wrist_image": rng.integers(0, 256, (side, side, 3), np.uint8),
+        "observation/state": usual + spread * rng.normal(size=8),
+    }
+    return sent if words is None else {**sent, "prompt": words}
