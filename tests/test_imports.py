@@ -38,7 +38,7 @@ MOST_LEVELS = 14
 READS_ONLY = (
     "probe_kit.runs",
     "probe_kit.hooks.contract.sites",
-    "probe_kit.hooks.contract.sites",
+    "probe_kit.hooks.contract.lineage",
     "probe_kit.env.scoring",
     "probe_kit.env.scoring",
     "probe_kit.env.scoring",

@@ -150,9 +150,7 @@ RandomWeights = Annotated[bool, _weights_option("--random-weights", help="Use un
 WeightsSeed = Annotated[int, _weights_option("--weights-seed", help="Seed of the untrained weights.")]
 Device = Annotated[
     str,
-    typer.Option(
-        "--device", help="Device of the model: cpu, cuda, cuda:1, … auto: a GPU where torch finds one, else cpu."
-    ),
+    typer.Option("--device", help="Device of the model: cpu, cuda, cuda:1, … auto: a GPU, else cpu."),
 ]
 
 # -- speed ------------------------------------------------------------------------------------------------------

@@ -44,7 +44,7 @@ ModelOrRun = Annotated[str, typer.Argument(metavar="MODEL|RUN", help="Model to d
 _OF_A_REPLAY = frozenset({"suite", "checkpoint", "model_option", "weights_seed", "device"})
 """Options of a new run that also name the present place of a stored run's model and suite."""
 Frames = Annotated[
-    int, typer.Option("--frames", min=6, max=1000, metavar="N", help="Number of frames, at least 6.")
+    int, typer.Option("--frames", min=6, max=1000, metavar="N", help="Number of frames.")
 ]
 Require = Annotated[
     common.Names | None,
@@ -52,7 +52,7 @@ Require = Annotated[
         "--require",
         parser=common.Names.parse,
         metavar="A,B,…",
-        help="Inputs that must change the action. Default: all inputs that vary in the data.",
+        help="Inputs that must change the action. Default: all that vary.",
     ),
 ]
 Paraphrases = Annotated[
@@ -67,7 +67,7 @@ Target = Annotated[
     typer.Option(
         "--target",
         metavar="COLUMN",
-        help="What the probes decode: a side, a built-in column, or a column of --labels.",
+        help="Label that is probed: a side or a column.",
     ),
 ]
 Labels = Annotated[
@@ -75,9 +75,7 @@ Labels = Annotated[
 ]
 Base = Annotated[
     str | None,
-    typer.Option(
-        "--base", metavar="CHECKPOINT", help="Also compare with the checkpoint that this one was fine-tuned from."
-    ),
+    typer.Option("--base", metavar="CHECKPOINT", help="Checkpoint before fine-tuning, to compare."),
 ]
 Inside = Annotated[
     bool,

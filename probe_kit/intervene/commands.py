@@ -123,9 +123,9 @@ Window = Annotated[
     str | None,
     _inside_option(
         "--window",
-        metavar="<both|first|last|N>",
+        metavar="WINDOW",
         help="Layers that a knockout cuts together. first: from the first layer to each. last: from each to the "
-        "last. both: first and last. N: every N neighbouring layers.",
+        "last. both: first and last (default). N: every N neighbouring layers.",
     ),
 ]
 Readers = Annotated[

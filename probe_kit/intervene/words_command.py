@@ -29,8 +29,8 @@ def words(
         common.Names | None,
         typer.Option(
             **common.LISTED,
-            help="List only units whose first tokens hold one of these words, such as slow,slowly,careful, and "
-            "compare their number with shuffled embeddings. A word must be a single token of the model.",
+            help="List only units whose first tokens hold one of these words, such as slow,careful, and compare "
+            "their number with shuffled embeddings. A word must be a single token.",
         ),
     ] = None,
     layers: Annotated[

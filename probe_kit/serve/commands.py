@@ -39,7 +39,12 @@ Host = Annotated[
         rich_help_panel="Network",
     ),
 ]
-Port = Annotated[int, typer.Option("--port", min=0, max=65535, help="Port of the server. 0: any free one.")]
+Port = Annotated[
+    int,
+    typer.Option(
+        "--port", min=0, max=65535, help="Port of the server. 0: any free one.", rich_help_panel="Network"
+    ),
+]
 TokenFile = Annotated[
     Path | None,
     typer.Option(
@@ -59,7 +64,8 @@ Metadata = Annotated[
     ),
 ]
 StopAfter = Annotated[
-    int | None, typer.Option("--stop-after", min=1, metavar="N", help="End after so many stored episodes.")
+    int | None,
+    common.further_option("--stop-after", min=1, metavar="N", help="End after so many stored episodes."),
 ]
 Out = Annotated[str, typer.Option("--out", metavar="FOLDER", help="Folder or s3://BUCKET/PREFIX/RUN of the run.")]
 
@@ -80,9 +86,9 @@ def serve(
 ) -> None:
     """Answer the wire of a benchmark or a robot, and store the activations of its episodes.
 
-    The client plays; a run of its episodes is written here, for train, diagnose, intervene, retention and view.
-    Clients of openpi need no change; one more key in their observations, probe_kit/episode, names episodes and
-    says how they ended. Ctrl-C commits what was played. The same command continues the run.
+    The client plays; a run of its episodes is written here. Clients of openpi need no change. One more key in
+    their observations, probe_kit/episode, names episodes. Ctrl-C commits what was played. The same command
+    continues the run.
 
     \b
     probe-kit serve --model pi0 --checkpoint DIR --out runs/libero --camera base=observation/image \\

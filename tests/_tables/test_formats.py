@@ -238,7 +238,9 @@ def test_a_column_of_numbers_stands_right_whatever_its_texts_look_like() -> None
 def test_no_table_searches_a_text_for_its_values() -> None:
     """LaTeX alone uses expressions, to escape texts and to spell its label."""
     for file in Path(content.__file__).parent.rglob("*.py"):
-        imports = [node for node in ast.walk(ast.parse(file.read_text("utf-8"))) if isinstance(node, ast.Import)]
+        imports = [
+            node for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))) if isinstance(node, ast.Import)
+        ]
         assert file.stem == "latex" or "re" not in [name.name for node in imports for name in node.names], file
 
 

@@ -2,7 +2,8 @@
 
 import numpy as np
 import pandas as pd
-from scipy import stats
+
+from probe_kit.statistics.share_limits import korn_graubard_limits
 
 
 def mover(mine: pd.DataFrame, theirs: pd.DataFrame) -> tuple[float, float]:
@@ -16,11 +17,10 @@ def mover(mine: pd.DataFrame, theirs: pd.DataFrame) -> tuple[float, float]:
         E, G, s = by_group["size"].sum(), len(by_group), (table["outcome"] == "correct").mean()
         rest = by_group["sum"] - s * by_group["size"]
         variance = (rest**2).sum() * G / (G - 1) / E**2
-        df = E**2 / (by_group["size"] ** 2).sum() - 1
-        n = min(s * (1 - s) / variance, E) * (stats.t.ppf(0.975, E - 1) / stats.t.ppf(0.975, df)) ** 2
-        limits = stats.beta.ppf([0.025, 0.975], [s * n, s * n + 1], [n - s * n + 1, n - s * n])
-        perfect = 0.025 ** (1 / G)  # no share is better known than where all groups agree
-        found.append((s, min(limits[0], perfect), max(limits[1], 1 - perfect)))
+        # The limits of one share have tests of their own in `tests/statistics`.
+        sums, sizes = (by_group[name].to_numpy(float) for name in ("sum", "size"))
+        low, high = korn_graubard_limits(sums[None], sizes)
+        found.append((s, float(low[0]), float(high[0])))
         rests.append(rest / E)
         variances.append(variance)
     (a, a_low, a_high), (b, b_low, b_high) = found

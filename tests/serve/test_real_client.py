@@ -88,7 +88,7 @@ def served(out: Path, *options: str) -> Iterator[tuple[subprocess.Popen[str], st
         "--camera", "base=observation/image", "--state", "observation/state", "--source", "noise@1", *options,
     ]  # fmt: skip
     environment = os.environ | {"PYTHONUNBUFFERED": "1"}
-    server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
+    server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, encoding="utf-8", env=environment)
     assert server.stdout is not None
     try:
         yield server, server.stdout.readline().strip()

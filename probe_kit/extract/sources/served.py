@@ -60,8 +60,7 @@ class ServedSettings(SourceSettings):
         typer.Option(
             "--camera",
             metavar="CAMERA=KEY",
-            help="Which picture of an observation a camera of the model gets, such as base=observation/image; "
-            "repeatable. Default: equal names, or the only picture.",
+            help="Which picture a camera of the model sees; repeatable. Default: equal names, or the only one.",
         ),
     ] = ()
     rotations: Annotated[
@@ -103,17 +102,15 @@ class ServedSettings(SourceSettings):
         typer.Option(
             "--source",
             metavar="NAME",
-            help="Name of what is served, such as libero_spatial@1. Runs of one name count as runs of one data "
-            "set. Default: a name that is drawn.",
+            help="Name of the benchmark or robot, such as libero_spatial@1: runs of one name share a data set.",
         ),
     ] = None
     rule: Annotated[
         EpisodeRule,
-        typer.Option(
+        _option(
             "--episodes",
-            help="What begins an episode without marks. guessed: other words, a pause, or a state that "
-            "returns. words: the same, and each instruction is a group. connection: each connection is one. said: "
-            "refuse such clients.",
+            help="What begins an episode without marks. guessed: other words, a pause or a state that returns. "
+            "words: as guessed, an instruction is a group. connection: each one. said: refuse such clients.",
         ),
     ] = "guessed"
     pause: Annotated[

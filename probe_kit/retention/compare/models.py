@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from probe_kit.errors import UsageError
+from probe_kit.hooks.contract.lineage import first_checkpoint
 from probe_kit.retention.estimators import ACTION, BACKBONE, Limits, PooledScores, limits
 from probe_kit.retention.rows.build import RowWithEstimates
 from probe_kit.runs.reader import RunReader
@@ -71,8 +72,9 @@ def split_checkpoint(checkpoint: str) -> tuple[str, int] | None:
 def origins_of(runs: Sequence[RunReader], declared: Mapping[str, str] | None = None) -> dict[str, str]:
     """Return the origin of every run's model, by location; runs of equal origin are of one model.
 
-    A run without a declared origin has the folder of its training where its checkpoint is one of several steps.
-    Otherwise it has its weights, or else its own location.
+    A run without a declared origin has the folder of its training where its checkpoint is one of several steps. A
+    released checkpoint that grew from another one that is compared too has the origin of that one; see
+    `hooks.contract.lineage`. Otherwise a run has its weights, or else its own location.
 
     Args:
         runs: The runs that are compared.
@@ -84,7 +86,18 @@ def origins_of(runs: Sequence[RunReader], declared: Mapping[str, str] | None = N
     places = {str(run.location): run for run in runs}
     if strange := [location for location in declared or {} if location not in places]:
         raise UsageError(f"an origin is declared of {strange[0]}; expected one of the runs {', '.join(places)}")
-    return {location: (declared or {}).get(location) or _origin(run) for location, run in places.items()}
+    firsts = {location: first_checkpoint(_released(run)) for location, run in places.items()}
+    with_sisters = {first for location, first in firsts.items() if first != _released(places[location])}
+    return {
+        location: (declared or {}).get(location)
+        or (firsts[location] if firsts[location] in with_sisters else _origin(run))
+        for location, run in places.items()
+    }
+
+
+def _released(run: RunReader) -> str:
+    """Return the checkpoint of a run without its revision; empty for untrained weights, which grew from none."""
+    return "" if card_of(run).get("random_weights") else checkpoint_of(run).partition("@")[0]
 
 
 def _origin(run: RunReader) -> str:

@@ -422,7 +422,7 @@ def test_without_sides_sentences_name_the_input_that_is_exchanged() -> None:
 
 def test_no_noun_of_a_sentence_is_replaced_in_its_text() -> None:
     for file in Path(kinds.__file__).parents[1].rglob("*.py"):
-        assert '.replace("image' not in file.read_text("utf-8"), file.name
+        assert '.replace("image' not in file.read_text(encoding="utf-8"), file.name
 
 
 @pytest.mark.parametrize("seed", [None, 1.0])

@@ -20,6 +20,7 @@ from probe_kit.retention import RetentionTable, retention_table
 from probe_kit.retention.behaviour import TableRun, distinct_labels
 from probe_kit.retention.columns.text import models_test
 from probe_kit.retention.compare.compare import Difference, ModelTest
+from probe_kit.retention.compare.models import origins_of
 from probe_kit.train import ArrayRun, load_results, save_results
 from tests.retention.asked_runs import SUITE, SaidRun, asked, episodes
 from tests.retention.paired_limits import mover
@@ -569,6 +570,21 @@ def sisters(probed_run: ProbedRun) -> list[ArrayRun]:
     ]
 
 
+def test_a_checkpoint_and_what_grew_from_it_are_one_model_as_their_lineage_says(probed_run: ProbedRun) -> None:
+    runs = sisters(probed_run)
+    names = ("openvla/openvla-7b@abc", "gen-robot/openvla-7b-rlvla-sft_16k", "gen-robot/openvla-7b-rlvla-rl@def")
+    others = ("me/openvla-7b-of-my-own", "", "lerobot/pi0")
+    for run, checkpoint in zip(runs, (*names, *others), strict=True):
+        object.__setattr__(run, "certificate", {"policy": {"family": "openvla", "checkpoint": checkpoint}})
+    assert list(origins_of(runs).values()) == ["openvla/openvla-7b"] * 3 + ["d", "e", "f"]
+    assert list(origins_of(runs[1:3]).values()) == ["openvla/openvla-7b"] * 2
+    assert list(origins_of(runs[:1]).values()) == ["a"], "nothing that grew from it is compared"
+    assert origins_of(runs[:2], {str(runs[1].location): "own"}) == {
+        str(runs[0].location): "openvla/openvla-7b",
+        str(runs[1].location): "own",
+    }
+
+
 @pytest.mark.slow
 def test_models_of_one_origin_are_averaged_first(probed_run: ProbedRun) -> None:
     runs = sisters(probed_run)
@@ -607,9 +623,12 @@ def test_a_smaller_group_with_a_larger_spread_has_an_interval_and_no_p() -> None
     assert test is not None
     assert (test.p, test.smallest_p) == (None, None)
     assert models_test(test, signed).text.startswith("– ")
-    other = ModelTest.of(many, [*few[:2], 0.5, 0.55, 0.45, 0.5])
-    assert other is not None
-    assert other.p is not None, "groups of equal size exchange whatever their spreads"
+    alike = ModelTest.of(many, [0.53, 0.5, 0.52, 0.51, 0.49, 0.5])
+    assert alike is not None
+    assert alike.p is not None
+    unlike = ModelTest.of(many, [*few[:2], 0.5, 0.55, 0.45, 0.5])
+    assert unlike is not None
+    assert unlike.p is None, "equal groups whose spreads differ by an F test do not exchange"
 
 
 def test_single_runs_have_no_p_over_models(probed_run: ProbedRun) -> None:
