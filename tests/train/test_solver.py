@@ -175,13 +175,16 @@ def test_steps_that_are_not_looked_back_at_never_go_in_circles(seed: int) -> Non
 
 
 def test_what_float32_gets_wrong_never_moves_the_optimum(monkeypatch: pytest.MonkeyPatch) -> None:
+    draw = np.random.default_rng(1)  # labels do not depend on the tests that ran before
     samples = Projection.fit(NOISE[:, :40]).train
-    labels = GENERATOR.random((90, 5)) < 0.5
+    labels = draw.random((90, 5)) < 0.5
     expected = list(LogisticSolver(samples).path(labels, STRENGTHS))
-    blurred = DenseDesign((samples.samples * (1 + 1e-3 * GENERATOR.random(samples.shape))).astype(np.float32))
+    blurred = DenseDesign((samples.samples * (1 + 1e-3 * draw.random(samples.shape))).astype(np.float32))
     monkeypatch.setattr(DenseDesign, "narrow", lambda _self: blurred)
     for one, other in zip(expected, LogisticSolver(samples).path(labels, STRENGTHS), strict=True):
-        assert (np.linalg.norm(one - other, axis=0) < 1e-8 * np.linalg.norm(one, axis=0)).all()
+        # Of balanced labels and a small C all weights are next to 0, where a share of them is no measure.
+        size = np.maximum(np.linalg.norm(one, axis=0), 0.01)
+        assert (np.linalg.norm(one - other, axis=0) < 1e-8 * size).all()
 
 
 def test_every_weight_given_back_has_an_exact_gradient_that_is_zero(monkeypatch: pytest.MonkeyPatch) -> None:
