@@ -62,11 +62,12 @@ def test_the_sample_report_is_of_the_probes_and_numbers_that_are_printed(sample:
         assert cells, row["category"]
         printed = dict(re.findall(r'data-heading="(\w+)[^"]*" data-sort="([^"]+)"', cells[0]))
         keys = {"backbone": "backbone", "success": "sr", "action": "action"}
-        assert {name: float(printed[name]) for name in keys} == {
-            name: round(100 * row[key]) for name, key in keys.items()
+        assert {name: round(float(printed[name]), 4) for name in keys} == {
+            name: round(row[key], 4) for name, key in keys.items()
         }
         retention = row["retention"]
-        assert printed.get("retention", "n/a") == ("n/a" if retention is None else str(round(retention, 2)))
+        sorts_by = printed.get("retention", "n/a")
+        assert sorts_by == "n/a" if retention is None else float(sorts_by) == pytest.approx(retention, abs=1e-3)
 
 
 def test_the_controls_of_the_sample_report_are_those_of_the_demo(sample: str) -> None:
