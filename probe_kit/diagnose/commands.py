@@ -43,9 +43,7 @@ _ACTING = frozenset(
 ModelOrRun = Annotated[str, typer.Argument(metavar="MODEL|RUN", help="Model to diagnose, or folder of a run.")]
 _OF_A_REPLAY = frozenset({"suite", "checkpoint", "model_option", "weights_seed", "device"})
 """Options of a new run that also name the present place of a stored run's model and suite."""
-Frames = Annotated[
-    int, typer.Option("--frames", min=6, max=1000, metavar="N", help="Number of frames.")
-]
+Frames = Annotated[int, typer.Option("--frames", min=6, max=1000, metavar="N", help="Number of frames.")]
 Require = Annotated[
     common.Names | None,
     typer.Option(

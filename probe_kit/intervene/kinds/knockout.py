@@ -423,15 +423,10 @@ def layers_read(rows: "Sequence[KnockoutEffect]") -> tuple[int, int] | None:
     losing = [row for row in rows if row.matters]
     if not losing:
         return None
-    growing, shrinking = (
-        [row for row in losing if row.first == 0],
-        [row for row in losing if row.last == readable - 1],
-    )
-    slides = [row for row in losing if row.first and row.last != readable - 1]
-    if slides:
+    if len({row.last - row.first for row in rows}) == 1:  # windows that slide
         return min(row.first for row in losing), max(row.last for row in losing)
-    begin = min((row.last for row in growing), default=0)
-    end = max((row.first for row in shrinking), default=readable - 1)
+    begin = min((row.last for row in losing if row.first == 0), default=0)
+    end = max((row.first for row in losing if row.last == readable - 1), default=readable - 1)
     return begin, end
 
 

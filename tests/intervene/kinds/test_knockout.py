@@ -46,7 +46,7 @@ def test_controls_are_as_many_tokens_of_other_roles() -> None:
     assert random_tokens(~keys, every, 3).sum() == 6  # there are no more
 
 
-def played(reads: dict[str, list[set[int]]], seed: int) -> ConditionOutcomes:
+def played(reads: dict[str, list[set[int]]], seed: int, window: str = "both") -> ConditionOutcomes:
     """A follower with the loss that its reading implies: a role is lost if all layers of one of its sets are cut.
 
     Actions of every condition have noise of their own, and a control loses nothing.
@@ -56,7 +56,7 @@ def played(reads: dict[str, list[set[int]]], seed: int) -> ConditionOutcomes:
     names, rows = list(plain.conditions), [plain.displacement[0], plain.displacement[1]]
     cells = [NO_CELL] * 2
     for role, sets in reads.items():
-        for first, last in windows("both", LAYERS):
+        for first, last in windows(window, LAYERS):
             cut = set(range(first, last + 1))
             is_lost = bool(sets) and all(needed & cut for needed in sets)
             for name in ("cut", "control-1", "control-2"):
@@ -93,6 +93,11 @@ def test_reading_in_one_layer_is_found_there_and_words_that_are_unread_are_not(s
         reading_of(roles["image"]),
     )
     assert "does not read language directly" in reading_of(roles["language"])
+
+
+@pytest.mark.parametrize(("layer", "outer"), [(0, (0, 1)), (2, (1, 3)), (5, (4, 5))])
+def test_windows_that_slide_give_the_outer_limits_of_all_that_lose(layer: int, outer: tuple[int, int]) -> None:
+    assert layers_read(read_by(played({"image": [{layer}]}, 0, "2"))["image"]) == outer
 
 
 @pytest.mark.parametrize("seed", range(5))
