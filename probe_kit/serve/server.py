@@ -159,10 +159,7 @@ def plan_server(settings: ExtractSettings, out: str) -> ServerPlan:
     location = locate(out)
     root = find_continuable(location)
     settings = _with_source_name(settings, root, location)
-    opened, source = open_checked(settings, location, fetch=False)
-    assert isinstance(opened, ExtractSettings)
-    assert isinstance(source, ServedSource)
-    _check_stored(opened, source, root, location)
+    opened, source = _open_source(settings, location, root, fetch=False)
     sizes = planned_sizes(opened, source.instructions)
     plan = ServerPlan(opened, source, location, stored=root)
     if sizes is None:
@@ -218,10 +215,7 @@ def open_server(
     token, drawn = _token(host, token_file)
     listener = _bound(host, port)
     try:
-        opened, source = open_checked(settings, location, policy is not None)
-        assert isinstance(opened, ExtractSettings)
-        assert isinstance(source, ServedSource)
-        _check_stored(opened, source, root, location)
+        opened, source = _open_source(settings, location, root, loaded=policy is not None)
         stored = None if root is None or not root.plan else read_run(location)
         policy = policy or Act().load(opened)
         assert policy is not None, "scripts are refused before"
@@ -263,6 +257,22 @@ def _with_source_name(settings: ExtractSettings, root: Root | None, location: Lo
         return settings
     drawn = f"session-{secrets.token_hex(4)}" if root is None else str(root.own_settings[DATASET]["source"])
     return settings.changed(source=source.changed(source_name=drawn))
+
+
+def _open_source(
+    settings: ExtractSettings, location: Location, root: Root | None, loaded: bool = False, fetch: bool = True
+) -> tuple[ExtractSettings, ServedSource]:
+    """Return the settings and the open source, checked as far as needs no model; arguments as of `open_checked`.
+
+    Raises:
+        SettingsMismatchError: If the place holds a run with other settings.
+        UsageError: For settings that cannot be served.
+    """
+    opened, source = open_checked(settings, location, loaded, fetch)
+    assert isinstance(opened, ExtractSettings)
+    assert isinstance(source, ServedSource)
+    _check_stored(opened, source, root, location)
+    return opened, source
 
 
 def _check_stored(settings: ExtractSettings, source: ServedSource, root: Root | None, location: Location) -> None:
