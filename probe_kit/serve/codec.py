@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import ObservationError
+from probe_kit.extract.sources.served_source import NUMBER_KINDS
 
 MOST_BYTES = 16 << 20
 MOST_ENTRIES, MOST_ITEMS, LONGEST_TEXT, DEEPEST = 256, 4096, 64 << 10, 8
 _MOST_VALUES = 20_000
 """The most entries and items of a message together: a small message may hold very many of them."""
-_KINDS = frozenset("biuf")
 _ARRAY, _SCALAR, _DATA, _DTYPE, _SHAPE = b"__ndarray__", b"__npgeneric__", b"data", b"dtype", b"shape"
 
 
@@ -123,7 +123,7 @@ def _dtype(name: Any) -> np.dtype[Any]:
         dtype = np.dtype(name) if isinstance(name, str) and len(name) <= DEEPEST else None
     except (TypeError, ValueError):
         dtype = None
-    if dtype is None or dtype.kind not in _KINDS or dtype.fields is not None:
+    if dtype is None or dtype.kind not in NUMBER_KINDS or dtype.fields is not None:
         raise ObservationError(f"an array has the type {name!r:.40}; expected numbers, such as uint8 or float32")
     return dtype
 
@@ -135,7 +135,7 @@ def pack(message: Mapping[str, Any]) -> bytes:
 
 
 def _packed(value: Any) -> Any:
-    if isinstance(value, np.ndarray) and value.dtype.kind in _KINDS:
+    if isinstance(value, np.ndarray) and value.dtype.kind in NUMBER_KINDS:
         array = np.asarray(value, order="C")
         return {_ARRAY: True, _DATA: array.tobytes(), _DTYPE: array.dtype.str, _SHAPE: list(array.shape)}
     raise TypeError(f"a message holds a {type(value).__name__}")

@@ -44,7 +44,7 @@ MOST_NUMBERS = 65_536
 """The most numbers of a state."""
 _BLANK = (224, 224, 3)
 """The shape of a picture before any was received; the pictures of the usual clients have it."""
-_KINDS = "biuf"
+NUMBER_KINDS = "biuf"
 """The kinds of arrays that hold numbers."""
 UNKNOWN_ACTIONS = "a policy server does not see which actions were executed"
 
@@ -311,7 +311,7 @@ class ServedSource(Source[ServedSettings]):
                     "start the server with another --state"
                 )
             numbers = np.asarray(value) if isinstance(value, np.ndarray | int | float) else None
-            if numbers is None or numbers.dtype.kind not in _KINDS or numbers.ndim > 1:
+            if numbers is None or numbers.dtype.kind not in NUMBER_KINDS or numbers.ndim > 1:
                 raise ObservationError(f"{key} is {_described(value)}; expected numbers of one axis")
             with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, and is refused below
                 parts.append(np.atleast_1d(numbers).astype(np.float32))
