@@ -50,7 +50,7 @@ def effective_episodes(
     """
     s, v = np.broadcast_arrays(np.asarray(shares, np.float64).clip(0, 1), variances)
     agree = (v <= NEGLIGIBLE_VARIANCE) | (s <= 0) | (s >= 1)
-    return np.minimum(s * (1 - s) / np.where(agree, 1.0, v), n_episodes), agree
+    return _effective(s, v, n_episodes), agree
 
 
 def group_shares(sums: Matrix, sizes: Matrix) -> tuple[Matrix, Matrix]:
