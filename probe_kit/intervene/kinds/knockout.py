@@ -158,13 +158,13 @@ class Knockout(Intervention):
         policy = session.policy
         backbone = backbone_of(policy)
         stream = policy.streams[backbone if self.readers else acting_stream(policy)]
-        if outside := [head for head in self.heads if head >= stream.heads]:
-            raise UsageError(f"{stream.name} has {stream.heads} heads, counted from 0; there is no {outside[0]}")
         if not stream.heads:
             raise UnsupportedInterventionError(
                 f"the heads of {stream.name} of {policy.card.family} cannot be reached, so that their attention "
                 "cannot be cut. Patch `kv` instead (--kind interchange --sites kv.*)"
             )
+        if outside := [head for head in self.heads if head >= stream.heads]:
+            raise UsageError(f"{stream.name} has {stream.heads} heads, counted from 0; there is no {outside[0]}")
         layers = stream.layers - 1
         conditions = [CLEAN_RUN, *([SOURCE_RUN] if has_sides(session.run) else [])]
         for role in self._roles(policy, backbone):
@@ -336,11 +336,6 @@ class KnockoutEffect(EffectRow):
         return span_text(self.first, self.last)
 
     @property
-    def is_whole(self) -> bool:
-        """Whether all layers are cut."""
-        return self.first == 0 and self.last == self.readable - 1
-
-    @property
     def is_resolved(self) -> bool:
         """Whether the loss or the change is as large as the resolution of its measure."""
         return is_resolved(self.size if self.lost is None else self.lost)
@@ -388,7 +383,7 @@ def knockout_effects(outcomes: ConditionOutcomes) -> list[KnockoutEffect]:
                 lost=None if share is None else 2 * share.value,
                 lost_ci=None if share is None else (2 * share.low, 2 * share.high),
                 size=float(size[at].mean()),
-                control_lost=float(np.mean(of_controls)) if of_controls else None,
+                control_lost=mean_of(np.array(of_controls)),
                 control_size=mean_of(size[test.controls]),
                 p=test.p,
                 p_fwe=test.p_fwe,
