@@ -21,7 +21,6 @@ from probe_kit.statistics.intervals import Accuracy
 from probe_kit.statistics.label_permutations import p_value
 from probe_kit.statistics.paired_tests import better_than_best, better_than_reference
 from probe_kit.statistics.retention import t_quantile
-from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.choices import CONTROLS, EVERYWHERE
 from probe_kit.train.control_features import LAYERS, PICTURED, ControlInputs, why_impossible
 from probe_kit.train.crossval.site_probe import SiteProbe
@@ -48,6 +47,11 @@ NOT_BY_DEFAULT = frozenset({"action", "position"})
 
 A policy's own action is no leak: whether a site exceeds it is another question. No model reads the layout: that
 `position` gives a label away is a fact of the table, for which no site can be blamed.
+"""
+ASKED_BELOW = 0.1
+"""p of a control's knowledge below which sites of a side must exceed it.
+
+Twice the usual 0.05: weak leaks of the pictures alone were shown in 6 % of experiments at 0.05, in 5 % at 0.1.
 """
 _SIDE_SEEDS = {RANDOM_FEATURES: "binding", UNTRAINED: "twin"}
 """Words in the seeds of the controls that sites of a side are compared with; of others their name.
@@ -185,8 +189,8 @@ def is_informative(inner: NDArray[np.floating], labels: NDArray[np.bool_], group
     """Return whether the inner folds of a control's probe of a side know more than the shares of the sides.
 
     They do if their log-likelihood is above that of the shares, by Student's one-sided test with groups as the
-    unit. The outer folds, on which sites are compared, do not take part: a control that happens to score well is
-    not chosen for that.
+    unit, at `ASKED_BELOW`. The outer folds, on which sites are compared, do not take part: a control that happens
+    to score well is not chosen for that.
 
     Args:
         inner: (F, G) log-likelihood of every group in the inner folds of each outer fold, 0 for the groups that
@@ -198,7 +202,7 @@ def is_informative(inner: NDArray[np.floating], labels: NDArray[np.bool_], group
     entropy = -sum(part * log(part) for part in (share, 1 - share) if part > 0)
     # Every group is in the inner folds of all outer folds but its own.
     gains = inner.sum(axis=0) / (len(inner) - 1) + entropy * sums_by_group(np.ones(labels.size), groups)
-    quantile = t_quantile(gains.size - 1, SIGNIFICANCE)
+    quantile = t_quantile(gains.size - 1, ASKED_BELOW)
     return bool(gains.mean() > quantile * gains.std(ddof=1) / sqrt(gains.size))
 
 
