@@ -104,6 +104,9 @@ class Browser:
             self.complaints.append(json.dumps(said["args"])[:600])
 
 
+_READY = "document.readyState === 'complete' && !document.querySelector('.loading')"
+
+
 class Page:
     """One page."""
 
@@ -120,9 +123,17 @@ class Page:
         )
 
     def open(self, address: str) -> None:
-        """Go to an address, and wait until the viewer shows no “Loading”."""
+        """Go to an address, and wait until the viewer shows no “Loading”.
+
+        An address with a token leads to the viewer's page, and from there a person goes to a place in it.
+        """
+        entrance, mark, place = address.partition("#")
+        if "?token=" in entrance:
+            self.call("Page.navigate", url=entrance)
+            self.wait(f"location.search === '' && {_READY}")
+            address = str(self.read("location.href")).partition("#")[0] + mark + place
         self.call("Page.navigate", url=address)
-        self.wait("document.readyState === 'complete' && !document.querySelector('.loading')")
+        self.wait(_READY)
 
     def read(self, expression: str) -> Any:
         """The value of an expression in the page; it may wait."""
@@ -140,8 +151,13 @@ class Page:
             time.sleep(0.03)
 
     def _is_true(self, expression: str) -> bool:
-        found = self.call("Runtime.evaluate", expression=f"Boolean({expression})", returnByValue=True)
-        return bool(found["result"].get("value"))
+        try:
+            answer = self.call("Runtime.evaluate", expression=f"Boolean({expression})", returnByValue=True)
+        except AssertionError as error:
+            if "navigated" in str(error):  # the page changes while it is asked
+                return False
+            raise
+        return bool(answer["result"].get("value"))
 
     def settle(self) -> None:
         """Wait until what the page has begun to draw is drawn."""
