@@ -3,13 +3,17 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from hashlib import sha256
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
 from probe_kit.diagnose.results import Change, Verdict
+from probe_kit.extract import ExtractSettings
+from probe_kit.extract.extraction import prepare
 from probe_kit.hooks.contract.observation import Observation
+from probe_kit.hooks.families.pi0.adapter import load_pi0_tiny
 from probe_kit.hooks.families.shared.lerobot.policy import MASK, TOKENS
 from probe_kit.intervene.open_session import load_policy_of
 from probe_kit.intervene.sessions import LoadPolicy, ReplaySource
@@ -68,6 +72,114 @@ def _hide(policy: Any, *, pictures: bool) -> None:
         return forward(attention_mask=mask, inputs_embeds=inputs_embeds, **others)
 
     joint.forward = masked
+
+
+def _hide_from_blocks(policy: Any, blocks: Sequence[int], *, words: bool = False) -> None:
+    """Hide the picture's tokens from these blocks of the action expert, and the words too where `words`."""
+    joint = policy.network.model.paligemma_with_expert
+    patches = _backbone(policy).vision_tower.vision_model.embeddings.position_embedding.weight.shape[0]
+
+    def masked(module: Any, arguments: tuple[Any, ...], keywords: dict[str, Any]) -> Any:
+        del module
+        mask = keywords["attention_mask"].clone()
+        # Behind the backbone's tokens are those of the expert itself: as many as there are queries.
+        hidden = mask.shape[-1] - mask.shape[-2] if words else patches
+        mask[..., :hidden] = torch.finfo(mask.dtype).min
+        return arguments, {**keywords, "attention_mask": mask}
+
+    for block in blocks:
+        attention = joint.gemma_expert.model.layers[block].self_attn
+        attention.register_forward_pre_hook(masked, with_kwargs=True)
+
+
+def _change_prefix(policy: Any, change: Callable[[Any], Any] | None, cached: Callable[[Any], None]) -> None:
+    """Change the mask of the backbone's own pass, and the keys and values that it leaves behind."""
+    joint = policy.network.model.paligemma_with_expert
+    forward = joint.forward
+
+    def changed(attention_mask: Any = None, inputs_embeds: Any = None, **others: Any) -> Any:
+        is_prefix = inputs_embeds[1] is None
+        mask = change(attention_mask.clone()) if is_prefix and change else attention_mask
+        outputs = forward(attention_mask=mask, inputs_embeds=inputs_embeds, **others)
+        if is_prefix:
+            cached(outputs[1])
+        return outputs
+
+    joint.forward = changed
+
+
+def keep_words_from_pictures(policy: Any) -> None:
+    """No word reads a picture token in the backbone."""
+    patches = _backbone(policy).vision_tower.vision_model.embeddings.position_embedding.weight.shape[0]
+
+    def masked(mask: Any) -> Any:
+        mask[:, :, patches:, :patches] = torch.finfo(mask.dtype).min
+        return mask
+
+    _change_prefix(policy, masked, lambda _: None)
+
+
+def read_pictures_in_the_last_block(policy: Any) -> None:
+    """Only block 2 of the expert reads picture tokens, and no word carries what they say."""
+    keep_words_from_pictures(policy)
+    _hide_from_blocks(policy, (0, 1))
+
+
+def read_words_only(policy: Any) -> None:
+    """No block of the expert reads picture tokens, and no word carries what they say."""
+    keep_words_from_pictures(policy)
+    _hide_from_blocks(policy, (0, 1, 2))
+
+
+TILE_TOKENS = (3, 5, 6, 7, 8, 9, 10, 11)
+"""Picture tokens of `pi0-tiny` that show the tiles, one for each word of an instruction of Color."""
+
+
+def read_pictures_through_words(policy: Any) -> None:
+    """The words' keys and values are those of the tiles, and the expert reads no picture token itself."""
+    patches = _backbone(policy).vision_tower.vision_model.embeddings.position_embedding.weight.shape[0]
+    words = slice(patches, patches + len(TILE_TOKENS))
+
+    def relay(cache: Any) -> None:
+        for layer in cache.layers:
+            for tensor in (layer.keys, layer.values):
+                tensor[:, :, words] = tensor[:, :, list(TILE_TOKENS)]
+
+    _change_prefix(policy, None, relay)
+    _hide_from_blocks(policy, (0, 1, 2))
+
+
+def read_nothing(policy: Any) -> None:
+    """The expert reads no token of the backbone: state and noise alone decide."""
+    _hide_from_blocks(policy, (0, 1, 2), words=True)
+
+
+Reading = Mapping[str, tuple[int, int] | None]
+"""By role, the first and last layer in which it is read; None where it is not."""
+READERS: Mapping[str, tuple[Edit, Reading]] = {
+    "the picture in block 2": (read_pictures_in_the_last_block, {"image": (2, 2)}),
+    "words only": (read_words_only, {"image": None, "language": (0, 2)}),
+    "the picture through the words": (read_pictures_through_words, {"image": None, "language": (2, 2)}),
+    "nothing": (read_nothing, {"image": None, "language": None}),
+}
+"""Policies for a knockout, and what they read of the instructions and pictures of Color."""
+
+
+def reader_run(edit: Edit, out: Path, seed: int, items: int = 12) -> tuple[Run, LoadPolicy]:
+    """The beginning of episodes that an edited policy plays, and the loader of that policy."""
+    policy: Any = load_pi0_tiny()
+    with torch.no_grad():
+        edit(policy)
+    settings = ExtractSettings(
+        "pi0-tiny",
+        categories=("color",),
+        items=items,
+        env_workers=0,
+        seed=seed,
+        max_steps=10,
+        accept_ignored_inputs=True,
+    )
+    return prepare(settings, out, model=policy).run(out, progress=lambda *_: None), edited(edit)
 
 
 def make_one_eyed(policy: Any) -> None:

@@ -14,8 +14,11 @@ orders, and what remains of the difference between the two is what the action st
     lost = 2 · Σ s (x_clean − x_cut) / Σ s (x_clean − x_swapped)
 
 over episodes, where x is the displacement and s the side of the correct picture. 1 is an action that no longer
-tells both orders apart, and 2 one that answers as after the swap. Without sides the size of the change, in spreads
-of the clean actions, is compared with that of the controls.
+tells both orders apart, and 2 one that answers as after the swap. Without sides, and where the pictures have no
+such effect, the size of the change, in spreads of the clean actions, is compared with that of the controls.
+
+A control cuts as many tokens. Where other roles have less than half as many, as the words beside a picture, there
+is none of that size; without sides a change then counts from a tenth of the spread on.
 """
 
 from collections.abc import Mapping, Sequence
@@ -202,7 +205,9 @@ class Knockout(Intervention):
                 seed = derive_seed(
                     "knockout", self.seed, context.pair.episode, context.pair.step, str(cell), *window
                 )
-                keys = random_tokens(keys, tokens.mask(backbone, ALL), seed)
+                wanted, keys = keys.sum(), random_tokens(keys, tokens.mask(backbone, ALL), seed)
+                if not has_sides(context.session.run) and 2 * keys.sum() < wanted:
+                    return ConditionResult(context.act())  # no control of that size: nothing is cut
             cut = AttentionCut(keys, readers, self.heads or None)
             with cut_attention(context.session.policy, dict.fromkeys(sites, cut)) as log:
                 return ConditionResult(context.act(), log)
@@ -365,9 +370,17 @@ def knockout_effects(outcomes: ConditionOutcomes) -> list[KnockoutEffect]:
     size = outcomes.size[rows] if outcomes.size is not None else np.abs(moved)
     exchange = outcomes.exchange() if outcomes.has_sides else None
     shares = [None if exchange is None else exchange.share(away) for away in moved]
-    # Where a picture has a side, a loss is a move away from the correct one; else any change counts.
-    tested = -correct * moved if outcomes.has_sides else size
-    tests = compare_with_controls(np.asarray(tested), cells, outcomes)
+    # A control that cut nothing is none.
+    is_cut = outcomes.edit_log[rows, :, 0].sum(axis=1) > 0
+    broken = {at for at, cell in enumerate(cells) if cell.is_control and not is_cut[at]}
+    # Where a picture has an effect, a loss is a move away from the correct one; else any change counts.
+    if any(share is not None for share in shares):
+        tested = -correct * moved
+    else:
+        lonely = [at for at in range(len(cells)) if not _has_control(cells, at, broken)]
+        tested = size.copy()
+        tested[lonely] -= NOTHING
+    tests = compare_with_controls(np.asarray(tested), cells, outcomes, broken_controls=broken)
     effects = []
     for at, (row, cell, test) in enumerate(zip(rows, cells, tests, strict=True)):
         right_before, right = correct * clean > 0, correct * outcomes.displacement[row] > 0
@@ -390,6 +403,12 @@ def knockout_effects(outcomes: ConditionOutcomes) -> list[KnockoutEffect]:
             )
         )
     return effects
+
+
+def _has_control(cells: Sequence[EditedCell], at: int, broken: set[int]) -> bool:
+    """Return whether a cell has a control that cut anything; a control is none of its own."""
+    controls = {number for number, other in enumerate(cells) if other.is_control_of(cells[at])}
+    return cells[at].is_control or bool(controls - broken)
 
 
 def layers_of(site_name: str) -> tuple[int, int]:
@@ -434,6 +453,8 @@ def reading_of(rows: "Sequence[KnockoutEffect]") -> str:
         if widest.lost is None
         else f"loss of {interval_cell(widest.lost, widest.lost_ci).text} of the picture's effect"
     )
+    if read is None and widest.lost is not None:
+        return f"the picture's effect does not come directly from {role}: a cut in {widest.layers} is a {loss}"
     if read is None:
         return f"the action does not read {role} directly: a cut in {widest.layers} is a {loss}"
     begin, end = read
