@@ -7,7 +7,8 @@ is a clean inference and a changed one, in drawn order, one directly behind the 
 machine disturb both alike. Prints, per way, the median of the pairs' ratios of processor time with its 95 %
 bootstrap interval, and of the times themselves the ratio of medians and of lower fifths. The second plain way says
 what the measurement itself adds. Changes take tokens over from an inference before another picture, with a ledger.
-A joint condition patches the picture and the words of every block of `kv`. Gradients are of one number at all
+A joint condition patches the picture and the words of every block of `kv`. A knockout cuts the attention of the
+expert to the picture, in one layer and in all, at every iteration. Gradients are of one number at all
 sites of backbone and `kv`: an inference with a graph, and a backward pass. The machine's load is printed first.
 """
 
@@ -23,9 +24,18 @@ from pathlib import Path
 import numpy as np
 from capture_subjects import LARGER, subject
 
-from probe_kit.hooks import Observation, Policy, Site, capture, gradients_at, load_policy
+from probe_kit.hooks import (
+    AttentionCut,
+    Observation,
+    Policy,
+    Site,
+    capture,
+    cut_attention,
+    gradients_at,
+    load_policy,
+)
 from probe_kit.hooks.capturing.edits import ReplaceWith, TokenSelection, apply_patch, apply_patches
-from probe_kit.hooks.contract.sites import KV
+from probe_kit.hooks.contract.sites import HEADS, KV
 
 EMBEDDED = "pi0-tiny"
 INSTRUCTION = "Put the cube on the red shape"
@@ -79,12 +89,28 @@ def ways(policy: Policy) -> dict[str, Callable[[], object]]:
         assert edit_log.fires == len(cells) * len(kv)
         return edit_log
 
+    heads = policy.streams["expert"].sites(HEADS) if policy.streams["expert"].heads else []
+
+    def cut(sites: Sequence[Site]) -> Callable[[], object]:
+        cuts = dict.fromkeys(sites, AttentionCut(policy.roles([seen])["backbone"][0].mask("image")))
+
+        def run() -> object:
+            with cut_attention(policy, cuts) as edit_log:
+                policy.infer_without_acting([seen], [0])
+            return edit_log
+
+        return run
+
     def slopes() -> object:
         return gradients_at(policy, [seen], [0], [*backbone, *kv], lambda chunks: chunks[0, :, 1].sum())
 
     further: dict[str, Callable[[], object]] = {}
     if kv:
         further[f"joint: 2 roles of {len(kv)} kv sites"] = joint
+    if heads:
+        layers = sorted({site.layer for site in heads})
+        further["knockout in 1 layer"] = cut([site for site in heads if site.layer == layers[0]])
+        further[f"knockout in {len(layers)} layers"] = cut(heads)
     if policy.interventions.gradients and policy.embodiment_mismatch() is None:
         further[f"gradients at {len(backbone) + len(kv)} sites"] = slopes
     return {

@@ -138,6 +138,13 @@ Heads = Annotated[
     Names | None,
     _inside_option("--heads", **LISTED, help="Heads that no longer read, counted from 0. Default: all."),
 ]
+ClosedLoopCut = Annotated[
+    bool,
+    _inside_option(
+        "--closed-loop",
+        help="Play whole episodes with the cut of a knockout at every inference, and show success rates.",
+    ),
+]
 _pairs_option = partial(typer.Option, rich_help_panel="Recordings and your own environment")
 Vary = Annotated[
     str | None,
@@ -221,6 +228,7 @@ def intervene(
     window: Window = None,
     readers: Readers = None,
     heads: Heads = None,
+    closed_loop: ClosedLoopCut = False,
     seed: common.Seed = 0,
     readout: ReadoutName = "first-chunk",
     suite: common.SuiteFolder = None,
@@ -260,7 +268,7 @@ def intervene(
         "sites": sites, "roles": roles, "direction": direction, "controls": controls,
         # Seed 0 is the default of every kind, and no kind without a seed refuses it.
         "coefficients": coefficients, "target_side": target_side, "seed": seed or None,
-        "window": window, "readers": readers, "heads": heads,
+        "window": window, "readers": readers, "heads": heads, "closed_loop": closed_loop or None,
     }  # fmt: skip
     kind_options = {name: value for name, value in inside.items() if value is not None}
     check_options(kind, kind_options)

@@ -1,16 +1,30 @@
 """A cut of attention: equal to scores of −∞ before the softmax, in the heads and positions that are cut alone."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional
 
 from probe_kit.errors import CaptureError, RolesMismatchError, UnknownSiteError, UsageError
-from probe_kit.hooks import AttentionCut, Observation, Policy, Site, capture_patterns, cut_attention, load_policy
+from probe_kit.hooks import (
+    AttentionCut,
+    ModelCard,
+    Observation,
+    Policy,
+    Roles,
+    Site,
+    Stream,
+    Tap,
+    capture_patterns,
+    cut_attention,
+    load_policy,
+)
 
 SEEN = Observation(
     np.random.default_rng(0).integers(0, 255, (224, 224, 3), dtype=np.uint8),
@@ -142,3 +156,85 @@ def test_a_position_that_is_left_with_nothing_to_read_is_an_error(policy: Policy
         cut_attention(policy, {site: AttentionCut(keys)}),
     ):
         act(policy)
+
+
+# -- a network whose formula is known ----------------------------------------------------------------------------
+
+
+class TwoReadings(nn.Module):
+    """Two layers of attention of one query to four tokens of scalar values; the second asks with the first."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.outputs = nn.ModuleList([nn.Identity(), nn.Identity()])
+        draw = np.random.default_rng(5)
+        self.keys, self.values = draw.normal(size=(2, 2, 4)), draw.normal(size=(2, 2, 4))  # (layer, head, token)
+
+    def forward(self, picture: Tensor) -> Tensor:
+        """(4,) brightness of the tokens -> the hidden state, a scalar."""
+        hidden = torch.ones(1)
+        for layer, output in enumerate(self.outputs):
+            key = torch.from_numpy(self.keys[layer]).float()[None, :, :, None]  # (1, H, T, 1)
+            value = (torch.from_numpy(self.values[layer]).float() * picture)[None, :, :, None]
+            query = hidden.expand(1, 2, 1, 1)
+            read = functional.scaled_dot_product_attention(query, key, value)
+            hidden = hidden + output(read.transpose(1, 2).flatten(2)).sum()
+        return hidden
+
+    def by_formula(self, picture: NDArray[np.float64], cut: NDArray[np.bool_], layers: tuple[int, ...]) -> float:
+        """The same in float64, with w_t = exp(h k_t) / Σ exp(h k) over the tokens left in these layers."""
+        hidden = 1.0
+        for layer in range(2):
+            left = ~cut if layer in layers else np.ones(4, bool)
+            weights = np.exp(hidden * self.keys[layer][:, left])
+            weights /= weights.sum(axis=1, keepdims=True)
+            hidden += float((weights * (self.values[layer] * picture)[:, left]).sum())
+        return hidden
+
+
+class ReadingPolicy(Policy):
+    """Acts by the hidden state of `TwoReadings`."""
+
+    role_names: ClassVar[Mapping[str, tuple[str, ...]]] = {"backbone": ("image.primary",), "expert": ("action",)}
+    streams = {"backbone": Stream("backbone", 1, 1), "expert": Stream("expert", 3, 1, 1, heads=2)}
+
+    def __init__(self) -> None:
+        self.network = TwoReadings()
+        self.card = ModelCard(
+            family="two readings", checkpoint="built", weights_sha256="0" * 64, random_weights=False, parameters=0,
+            dtype="float32", device="cpu", embodiment="7-DoF end-effector delta", cameras=("primary",), chunk=1,
+            execute=1,
+        )  # fmt: skip
+
+    def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+        self.check(seen, seeds)
+        with torch.inference_mode():
+            hidden = [float(self.network(torch.from_numpy(picture_of(one)).float())) for one in seen]
+        return np.array(hidden, np.float32)[:, None, None] * np.ones((1, 1, 7), np.float32)
+
+    def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
+        expected = {"backbone": ["image.primary"] * 4, "expert": ["action"]}
+        return {name: [Roles.from_labels(labels)] * len(seen) for name, labels in expected.items()}
+
+    def tap(self, site: Site) -> Tap:
+        return Tap(self.network.outputs[site.layer], 1)
+
+
+def picture_of(observation: Observation) -> NDArray[np.float64]:
+    return observation.image[0, :4, 0] / 255
+
+
+@pytest.mark.parametrize("layers", [(0,), (1,), (0, 1)], ids=str)
+@pytest.mark.parametrize("tokens", [(0,), (1, 3), (0, 2, 3)], ids=str)
+def test_the_effect_of_a_cut_in_a_network_of_two_layers_is_that_of_its_formula(
+    layers: tuple[int, ...], tokens: tuple[int, ...]
+) -> None:
+    policy, cut = ReadingPolicy(), np.isin(np.arange(4), tokens)
+    sites = [site for site in policy.streams["expert"].sites("heads") if site.layer in layers]
+    with cut_attention(policy, {site: AttentionCut(cut) for site in sites}):
+        changed = act(policy)[0, 0, 0]
+    picture, clean = picture_of(SEEN), act(policy)[0, 0, 0]
+    nothing = np.zeros(4, bool)
+    effect = policy.network.by_formula(picture, cut, layers) - policy.network.by_formula(picture, nothing, ())
+    assert abs(effect) > 1e-3
+    assert changed - clean == pytest.approx(effect, abs=1e-6)

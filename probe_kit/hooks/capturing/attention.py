@@ -15,16 +15,17 @@ Queries, keys, masks and scales are those that reach torch, behind rotation and 
 with the values of the same call it must give what the heads read. An attended token need not be used.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
+from weakref import WeakKeyDictionary, ref
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional
 from torch.overrides import TorchFunctionMode
 
@@ -125,6 +126,7 @@ TOLERANCE: Mapping[torch.dtype, float] = {torch.float32: 1e-4, torch.float16: 5e
 _FUSED: Callable[..., Any] = functional.scaled_dot_product_attention
 _SOFTMAX = (functional.softmax, torch.softmax, Tensor.softmax)
 _MATMUL = (torch.matmul, Tensor.matmul, Tensor.__matmul__)
+_OF_ATTENTION = frozenset({_FUSED, *_SOFTMAX, *_MATMUL})
 
 
 @contextmanager
@@ -152,11 +154,11 @@ def capture_patterns(
             f"{other[0]} has no attention pattern; expected sites of the quantity heads, such as "
             f"{other[0].stream}.{other[0].layer:02d}.{HEADS}"
         )
-    calls, used = _AttentionCalls(), 0
+    calls, used = _AttentionCalls(model, head_sites), 0
 
     def keep(site: Site, read: Tensor) -> Tensor:
         nonlocal used
-        pattern, _ = _attention_at(model, site, calls, read)
+        pattern, _ = calls.at(site, read)
         used += pattern.numel() * 4
         if used > most_bytes:
             raise UsageError(
@@ -165,7 +167,7 @@ def capture_patterns(
             )
         return pattern.cpu()
 
-    with calls, capture(model, head_sites, reduce=keep) as patterns:
+    with calls.watching(), capture(model, head_sites, reduce=keep) as patterns:
         yield patterns
 
 
@@ -215,52 +217,63 @@ def cut_attention(model: Model, cuts: Mapping[Site, AttentionCut]) -> Iterator[E
         count = model.stream_of(site).heads
         if outside := [head for head in cut.heads or () if not 0 <= head < count]:
             raise UsageError(f"{site} has {count} heads, counted from 0; there is no head {outside[0]}")
-    calls, active, log = _AttentionCalls(), ActiveEdits(), EditLog()
+    calls, active, log = _AttentionCalls(model, cuts), ActiveEdits(), EditLog()
+    hidden = {site: torch.from_numpy(cut.keys) for site, cut in cuts.items() if cut.keys.any()}
 
     def change(site: Site, read: Tensor) -> Tensor:
-        new = _without(model, site, calls, read, cuts[site])
+        new = _without(site, calls, read, cuts[site], hidden.get(site))
         active.fired.append((site, read, new))
         return new
 
-    with calls, edit(model, {site: partial(change, site) for site in cuts}):
+    with calls.watching(), edit(model, {site: partial(change, site) for site in cuts}):
         yield log
     log.entries += active.measured()
 
 
-def _without(model: Model, site: Site, calls: "_AttentionCalls", read: Tensor, cut: AttentionCut) -> Tensor:
-    """Return what the heads read (B, S, H · E) without the tokens that are cut."""
-    weights, values = _attention_at(model, site, calls, read)
-    if not cut.keys.any():
+def _without(
+    site: Site, calls: "_AttentionCalls", read: Tensor, cut: AttentionCut, hidden: Tensor | None
+) -> Tensor:
+    """Return what the heads read (B, S, H · E) without the tokens that are cut: `hidden` (T',), None for none."""
+    weights, values = calls.at(site, read)
+    if hidden is None:
         return read
-    if cut.keys.size > weights.shape[3]:
+    with torch._C.DisableTorchFunction():  # what is computed here is no attention of the model
+        without = _renormalised(site, weights, hidden) @ values
+        by_token = without.transpose(1, 2).to(read.dtype)
+        if cut.queries is None and cut.heads is None:
+            return by_token.flatten(2)
+        new = read.clone().view(*read.shape[:2], weights.shape[1], -1)
+        positions: NDArray[np.intp] = np.arange(read.shape[1])
+        if cut.queries is not None:
+            if cut.queries.size != read.shape[1]:
+                raise RolesMismatchError(
+                    f"{site} has {read.shape[1]} positions; {cut.queries.size} are chosen among"
+                )
+            positions = np.flatnonzero(cut.queries)
+        heads = range(weights.shape[1]) if cut.heads is None else cut.heads
+        rows, columns = torch.from_numpy(positions).to(read.device)[:, None], torch.tensor([*heads])
+        new[:, rows, columns] = by_token[:, rows, columns.to(read.device)]
+        return new.flatten(2)
+
+
+def _renormalised(site: Site, weights: Tensor, hidden: Tensor) -> Tensor:
+    """Return weights (B, H, S, T) that are 0 on the cut tokens and sum to 1 over the others."""
+    count = hidden.shape[0]
+    if count > weights.shape[3]:
         raise RolesMismatchError(
-            f"{cut.keys.size} tokens are to be cut or kept; {site} attends to {weights.shape[3]}. Take the roles "
+            f"{count} tokens are to be cut or kept; {site} attends to {weights.shape[3]}. Take the roles "
             "of the observation that is inferred"
         )
-    calls.is_paused = True
-    left = weights.clone()
-    left[..., : cut.keys.size].masked_fill_(torch.from_numpy(cut.keys).to(left.device), 0.0)
+    hidden = functional.pad(hidden.to(weights.device), (0, weights.shape[3] - count))
+    left = weights.masked_fill(hidden, 0.0)
     total = left.sum(dim=-1, keepdim=True)
     # A position that attended to nothing before, such as padding, has no weights to renormalise.
-    if bool(((total == 0) & (weights.sum(dim=-1, keepdim=True) > 0)).any()):
+    if float(total.min()) == 0 and bool(((total == 0) & (weights.sum(dim=-1, keepdim=True) > 0)).any()):
         raise CaptureError(
             f"{site}: the tokens that are left have no weight that float32 can hold, and cannot be renormalised. "
             "Cut fewer tokens"
         )
-    count = weights.shape[1]
-    without = (left / total.clamp_min(torch.finfo(left.dtype).tiny)) @ values
-    new = read.clone().view(*read.shape[:2], count, -1)
-    heads = list(range(count)) if cut.heads is None else list(cut.heads)
-    positions = slice(None)
-    if cut.queries is not None:
-        if cut.queries.size != read.shape[1]:
-            raise RolesMismatchError(f"{site} has {read.shape[1]} positions; {cut.queries.size} are chosen among")
-        positions = torch.from_numpy(np.flatnonzero(cut.queries)).to(read.device)  # type: ignore[assignment]
-    by_token = without.transpose(1, 2).to(read.dtype)
-    for head in heads:
-        new[:, positions, head] = by_token[:, positions, head]
-    calls.is_paused = False
-    return new.flatten(2)
+    return left / total.clamp_min(torch.finfo(left.dtype).tiny)
 
 
 def attended_roles(model: Model, roles: Mapping[str, Sequence[Roles]], site: Site, tokens: int) -> list[Roles]:
@@ -329,31 +342,124 @@ class _Attention:
     values: Tensor
 
 
-class _AttentionCalls(TorchFunctionMode):
-    """A mode that sees torch's calls while a model runs, and changes none; `last` is the latest attention."""
+_ATTENDS_INSIDE: "WeakKeyDictionary[nn.Module, bool]" = WeakKeyDictionary()
+"""Networks that were watched as a whole, and whether all attention was computed inside the modules that own it."""
 
-    def __init__(self) -> None:
+
+_OWNERS: "WeakKeyDictionary[nn.Module, WeakKeyDictionary[nn.Module, ref[nn.Module]]]" = WeakKeyDictionary()
+"""By network and module, the module that has it as a child."""
+
+
+class _AttentionCalls(TorchFunctionMode):
+    """A mode that sees torch's calls while a model runs, and changes none.
+
+    Attributes:
+        model: Model that runs.
+        taps: Taps of the sites whose attention is asked for.
+        last: Latest attention.
+        is_inside: Whether that was computed while a module ran that owns an output projection of a site.
+        are_inside: Whether all attention that was asked for was.
+    """
+
+    def __init__(self, model: Model, sites: Iterable[Site]) -> None:
         super().__init__()
+        self.model = model
+        self.taps = {site: model.tap(site) for site in sites}
         self.last: _Attention | None = None
-        self.is_paused = False
+        self.is_inside, self.are_inside = False, True
         self._shares: Tensor | None = None
+        self._depth = 0
+
+    @contextmanager
+    def watching(self) -> Iterator[None]:
+        """Watch the calls of the model while it runs.
+
+        Seeing each call costs as much as a third of a small model's inference. A network that was watched once,
+        and computed all attention inside its attention modules, is watched there alone.
+        """
+        network = getattr(self.model, "network", None)
+        owners = _owners(network, {tap.module for tap in self.taps.values()})
+        if network is None or owners is None:
+            with self:
+                yield
+            return
+        is_known = _ATTENDS_INSIDE.get(network, False)
+        with ExitStack() as stack:
+            for owner in owners:
+                enter, leave = partial(self._enter, is_known), partial(self._leave, is_known)
+                stack.callback(owner.register_forward_pre_hook(enter, prepend=True).remove)
+                stack.callback(owner.register_forward_hook(leave, always_call=True).remove)
+            if not is_known:
+                stack.enter_context(self)
+            yield
+        if not is_known and self.last is not None:
+            _ATTENDS_INSIDE[network] = self.are_inside
+
+    def at(self, site: Site, read: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the pattern (B, H, S, T) of the positions of a site, whose heads read `read` (B, S, H · E).
+
+        With it come the values (B, H, T, E) float32 that every head reads.
+
+        Raises:
+            CaptureError: If torch computed no attention, or one that does not give what the heads read.
+        """
+        tap, last = self.taps[site], self.last
+        if last is None:
+            raise CaptureError(
+                f"{site}: no attention that torch computes came before the output projection. Load the model with "
+                "the attention sdpa or eager; kernels of other libraries do not show what they weigh"
+            )
+        self.are_inside = self.are_inside and self.is_inside
+        with torch._C.DisableTorchFunction():
+            weights = last.weights()
+            values = _of_every_head(last.values, weights.shape[1]).float().to(weights.device)
+            computed = tap.rows.of((weights @ values).transpose(1, 2).flatten(2))[:, tap.tokens]
+        _check_reading(site, self.model.stream_of(site), weights.shape[1], computed, read)
+        return tap.rows.of(weights)[:, :, tap.tokens], tap.rows.of(values)
+
+    def _enter(self, watches: bool, *_: Any) -> None:
+        self._depth += 1
+        if watches and self._depth == 1:
+            self.last = None
+            self.__enter__()  # type: ignore[no-untyped-call]
+
+    def _leave(self, watches: bool, *_: Any) -> None:
+        if watches and self._depth == 1:
+            self.__exit__(None, None, None)  # type: ignore[no-untyped-call]
+        self._depth -= 1
+
+    def _note(self, attention: "_Attention | None") -> None:
+        self.last, self.is_inside = attention, self._depth > 0
 
     def __torch_function__(
         self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
     ) -> Any:
         del types
-        keywords = kwargs or {}
-        result = func(*args, **keywords)
-        if self.is_paused:
+        result = func(*args, **kwargs) if kwargs else func(*args)
+        if func not in _OF_ATTENTION:  # nearly all calls: each costs time
             return result
+        keywords = kwargs or {}
         if func is _FUSED:
-            self.last = _fused(*args, **keywords)
+            self._note(_fused(*args, **keywords))
         elif func in _SOFTMAX and result.dim() == 4:
             self._shares = result
         elif func in _MATMUL and self._shares is not None and _is_reading(self._shares, *args[:2]):
             shares, self._shares = self._shares, None
-            self.last = _Attention(shares.float, args[1])
+            self._note(_Attention(shares.float, args[1]))
         return result
+
+
+def _owners(network: object, modules: Collection[nn.Module]) -> list[nn.Module] | None:
+    """Return the modules that own others as direct children; None if one of these has no owner in the network."""
+    if not isinstance(network, nn.Module):
+        return None
+    if network not in _OWNERS:
+        _OWNERS[network] = WeakKeyDictionary(
+            {child: ref(module) for module in network.modules() for child in module.children()}
+        )
+    owners = [_OWNERS[network][module]() for module in modules if module in _OWNERS[network]]
+    present = [owner for owner in dict.fromkeys(owners) if owner is not None]
+    return present if len(owners) == len(modules) and None not in owners else None
 
 
 def _is_reading(shares: Tensor, weights: Tensor, values: Tensor) -> bool:
@@ -391,37 +497,16 @@ def _fused(
 
 def _of_every_head(heads: Tensor, count: int) -> Tensor:
     """Return keys or values (B, G, T, E) as (B, H, T, E), each of the G repeated for the heads that share it."""
-    return heads.repeat_interleave(count // heads.shape[1], dim=1)
-
-
-def _attention_at(model: Model, site: Site, calls: _AttentionCalls, read: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the pattern (B, H, S, T) of the positions of a site, whose heads read `read` (B, S, H · E).
-
-    With it come the values (B, H, T, E) float32 that every head reads.
-
-    Raises:
-        CaptureError: If torch computed no attention, or one that does not give what the heads read.
-    """
-    tap, stream = model.tap(site), model.stream_of(site)
-    if calls.last is None:
-        raise CaptureError(
-            f"{site}: no attention that torch computes came before the output projection. Load the model with "
-            "the attention sdpa or eager; kernels of other libraries do not show what they weigh"
-        )
-    calls.is_paused = True
-    weights = calls.last.weights()
-    values = _of_every_head(calls.last.values, weights.shape[1]).float()
-    computed = tap.rows.of((weights @ values.to(weights.device)).transpose(1, 2).flatten(2))[:, tap.tokens]
-    calls.is_paused = False
-    _check_reading(site, stream, weights.shape[1], computed, read)
-    return tap.rows.of(weights)[:, :, tap.tokens], tap.rows.of(values.to(weights.device))
+    batch, groups, *shape = heads.shape
+    return heads[:, :, None].expand(batch, groups, count // groups, *shape).flatten(1, 2)
 
 
 def _check_reading(site: Site, stream: Stream, heads: int, computed: Tensor, read: Tensor) -> None:
     """Raise CaptureError unless what a pattern gives is what the heads read."""
     if heads == stream.heads and computed.shape == read.shape:
-        limit = TOLERANCE.get(read.dtype, TOLERANCE[torch.float32]) * float(read.abs().max())
-        apart = float((computed - read.float().nan_to_num(0.0)).abs().max())
+        largest = partial(torch.linalg.vector_norm, ord=torch.inf)
+        limit = TOLERANCE.get(read.dtype, TOLERANCE[torch.float32]) * float(largest(read))
+        apart = float(largest(computed - read.float().nan_to_num(0.0)))
         if apart <= limit:
             return
         actual, expected = f"is off by {apart:.3g}", f"at most {limit:.3g}"

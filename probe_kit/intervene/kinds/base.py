@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from probe_kit._tables.content import Cell as TableCell
 from probe_kit._tables.numbers import NONE as NO_NUMBER
 from probe_kit._tables.numbers import Write, number, percent, signed
+from probe_kit.env.scoring import DEFAULT_RULE
 from probe_kit.errors import UsageError
 from probe_kit.extract.sources.inputs import INSTRUCTION
 from probe_kit.hashing import derive_seed
@@ -48,6 +49,7 @@ if TYPE_CHECKING:
 Values = NDArray[np.float64]
 OPTIONS = (
     "sites", "roles", "direction", "controls", "coefficients", "target_side", "seed", "window", "readers", "heads",
+    "closed_loop",
 )  # fmt: skip
 """Options of the command that a kind may take."""
 
@@ -248,6 +250,19 @@ class Intervention(Choice, ABC):
         """Return keys of the stored interventions that tables and figures read; None if none is preferred."""
         del run
         return None
+
+
+def check_recorded_rule(run: Run) -> None:
+    """Refuse a run whose outcomes are read by another rule than they were recorded by; a closed loop repeats them.
+
+    Raises:
+        UsageError: For another rule.
+    """
+    if run.rule != DEFAULT_RULE:
+        raise UsageError(
+            f"{run.location} is read by the rule {run.rule!r}; a closed loop repeats outcomes as they were "
+            f"recorded: open the run without another rule ({DEFAULT_RULE})"
+        )
 
 
 NONE = "none"

@@ -16,7 +16,6 @@ import numpy as np
 
 from probe_kit._tables.content import Cell as TableCell
 from probe_kit._tables.numbers import signed
-from probe_kit.env.scoring import DEFAULT_RULE
 from probe_kit.errors import UsageError
 from probe_kit.hooks.capturing.edits import EditLog, Identity, apply_patch
 from probe_kit.hooks.contract.sites import Site
@@ -26,6 +25,7 @@ from probe_kit.intervene.kinds.base import (
     AlongDirection,
     EffectColumn,
     EffectRow,
+    check_recorded_rule,
     common_columns,
     compare_with_controls,
     count_edits,
@@ -152,11 +152,7 @@ class ClosedLoop(AlongDirection):
             UsageError: For outcomes by another rule than they were recorded by.
         """
         super().check_run(run)
-        if run.rule != DEFAULT_RULE:
-            raise UsageError(
-                f"{run.location} is read by the rule {run.rule!r}; a closed loop repeats outcomes as they were "
-                f"recorded: open the run without another rule ({DEFAULT_RULE})"
-            )
+        check_recorded_rule(run)
 
     def conditions(self, session: "ReplaySession") -> Sequence[Condition]:
         """Return the identity patch, the image swap and every target.

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from probe_kit._tables.content import Cell as TableCell
 from probe_kit._tables.content import absent
-from probe_kit._tables.numbers import number, signed
+from probe_kit._tables.numbers import number, percent, signed
 from probe_kit.errors import EmptyRoleError, UnsupportedInterventionError, UsageError
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.declared import InterventionKind
@@ -43,6 +43,7 @@ from probe_kit.intervene.kinds.base import (
     EffectColumn,
     EffectRow,
     Intervention,
+    check_recorded_rule,
     common_columns,
     compare_with_controls,
     effect_table,
@@ -52,7 +53,9 @@ from probe_kit.intervene.kinds.base import (
     mean_of,
     p_of,
 )
+from probe_kit.intervene.kinds.closed_loop import CORRECT
 from probe_kit.intervene.outcomes import CLEAN, UNCHANGED, ConditionOutcomes
+from probe_kit.intervene.pairs import Pair
 from probe_kit.intervene.places import ALL, TILES, roles_of
 from probe_kit.intervene.replay import CLEAN_RUN, SOURCE_RUN, Condition, ConditionContext, ConditionResult
 from probe_kit.intervene.settings import FIRST_CHUNK, has_sides
@@ -87,6 +90,8 @@ class Knockout(Intervention):
         heads: Heads that no longer read, counted from 0; empty for all.
         controls: Number of controls per window and role.
         seed: Seed of the controls.
+        closed_loop: Whether whole episodes are played with the cut at every inference. The loss is then of where
+            the cube ends.
 
     Raises:
         UsageError: For another window, and for controls that are fewer than one in runs without sides.
@@ -104,6 +109,7 @@ class Knockout(Intervention):
         "heads": "heads that no longer read; default all",
         "controls": "cuts of as many random tokens of other roles; default 2",
         "seed": "of the controls; default 0",
+        "closed_loop": "play whole episodes with the cut at every inference",
     }
 
     roles: tuple[str, ...] = ()
@@ -112,6 +118,7 @@ class Knockout(Intervention):
     heads: tuple[int, ...] = ()
     controls: int = 2
     seed: int = 0
+    closed_loop: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -139,13 +146,26 @@ class Knockout(Intervention):
             raise UsageError(f"--heads has {wrong[0]!r}; expected numbers, counted from 0, such as 0,3")
         return super().from_options(run, heads=tuple(int(name) for name in names), **options)
 
+    def parameters(self) -> dict[str, Any]:
+        """Return its own settings; the readout of a closed loop is where the cube ends."""
+        own = super().parameters()
+        return {**own, "readout": "episode"} if self.closed_loop else own
+
     def check_run(self, run: Run) -> None:
-        """Refuse a run without sides where no control is to be compared with; raises as the base does too.
+        """Refuse a run that cannot be played, or without anything to compare with; raises as the base does too.
 
         Raises:
-            UsageError: For no control in a run without sides.
+            UsageError: For no control in a run without sides, and for episodes of a closed loop that are not of
+                the scene or are read by another rule than they were recorded by.
         """
         super().check_run(run)
+        if self.closed_loop and not has_sides(run):
+            raise UsageError(
+                f"--closed-loop plays episodes again, and {run.location} is no run of the scene. Leave it out, or "
+                "take a run of the scene"
+            )
+        if self.closed_loop:
+            check_recorded_rule(run)
         if not has_sides(run) and not self.controls:
             raise UsageError(
                 "--controls 0 leaves nothing to compare with: any cut changes an action. Take 1 or more"
@@ -214,6 +234,16 @@ class Knockout(Intervention):
 
         return Condition(str(cell), play, cell=cell)
 
+    def play(
+        self, session: "ReplaySession", pairs: Sequence[Pair], conditions: Sequence[Condition]
+    ) -> ConditionOutcomes:
+        """Play the first inferences of the pairs under every condition, or whole episodes in a closed loop."""
+        if not self.closed_loop:
+            return super().play(session, pairs, conditions)
+        from probe_kit.intervene.rollout import play_episodes
+
+        return play_episodes(session, pairs, conditions)
+
     @staticmethod
     def effects(measurement: Measurement) -> "list[KnockoutEffect]":
         """Return one row per category, role and window, controls among them."""
@@ -227,9 +257,12 @@ class Knockout(Intervention):
             f"From which tokens does it read? {context.subject}, knockout",
             ("category", "cut"),
             lines_of(cuts, lambda row: f"{row.role}, {row.layers}"),
-            {"What the action loses": _columns(not context.lacks_sides)},
+            {"What the action loses": _columns(cuts, not context.lacks_sides)},
             lambda row: row.matters,
-            before=["layers: those in which the acting part cannot read the tokens"],
+            before=[
+                "layers: those in which the acting part cannot read the tokens",
+                "every episode played again with the cut at every inference" if _is_played(cuts) else "",
+            ],
             after=[UNRESOLVED if any(not row.is_resolved for row in cuts) else ""],
         )
 
@@ -322,6 +355,8 @@ class KnockoutEffect(EffectRow):
         control_size: Mean `size` of the controls; None without any.
         p: The p-value of the loss beyond the controls; without sides of the change. None for controls.
         p_fwe: Family-wise p-value over all cuts of the category; None likewise.
+        success: Success rate of the episodes that were played with the cut; None without a closed loop.
+        success_clean: Success rate of the same episodes without it; None likewise.
     """
 
     first: int
@@ -334,6 +369,8 @@ class KnockoutEffect(EffectRow):
     control_size: float | None
     p: float | None
     p_fwe: float | None
+    success: float | None
+    success_clean: float | None
 
     @property
     def layers(self) -> str:
@@ -381,6 +418,7 @@ def knockout_effects(outcomes: ConditionOutcomes) -> list[KnockoutEffect]:
         tested = size.copy()
         tested[lonely] -= NOTHING
     tests = compare_with_controls(np.asarray(tested), cells, outcomes, broken_controls=broken)
+    ends = None if outcomes.episode_outcomes is None else (outcomes.episode_outcomes == CORRECT).mean(axis=1)
     effects = []
     for at, (row, cell, test) in enumerate(zip(rows, cells, tests, strict=True)):
         right_before, right = correct * clean > 0, correct * outcomes.displacement[row] > 0
@@ -400,6 +438,8 @@ def knockout_effects(outcomes: ConditionOutcomes) -> list[KnockoutEffect]:
                 control_size=mean_of(size[test.controls]),
                 p=test.p,
                 p_fwe=test.p_fwe,
+                success=None if ends is None else float(ends[row]),
+                success_clean=None if ends is None else float(ends[0]),
             )
         )
     return effects
@@ -453,6 +493,8 @@ def reading_of(rows: "Sequence[KnockoutEffect]") -> str:
         if widest.lost is None
         else f"loss of {interval_cell(widest.lost, widest.lost_ci).text} of the picture's effect"
     )
+    if widest.success is not None:
+        loss += f", success {percent(widest.success)} % instead of {percent(widest.success_clean)} %"
     if read is None and widest.lost is not None:
         return f"the picture's effect does not come directly from {role}: a cut in {widest.layers} is a {loss}"
     if read is None:
@@ -467,7 +509,12 @@ def reading_of(rows: "Sequence[KnockoutEffect]") -> str:
     return f"the action reads {role} in {span_text(begin, end)} ({loss}){behind}"
 
 
-def _columns(has_sides: bool) -> list[EffectColumn[KnockoutEffect]]:
+def _is_played(rows: "Sequence[KnockoutEffect]") -> bool:
+    """Return whether whole episodes were played."""
+    return any(row.success is not None for row in rows)
+
+
+def _columns(rows: "Sequence[KnockoutEffect]", has_sides: bool) -> list[EffectColumn[KnockoutEffect]]:
     """Return the columns of cuts; `has_sides` is whether a loss is a share of the picture's effect."""
     p = EffectColumn[KnockoutEffect](
         "p",
@@ -479,6 +526,12 @@ def _columns(has_sides: bool) -> list[EffectColumn[KnockoutEffect]]:
         lambda row: TableCell(row.size, number),
         "change: of the action, in spreads of the clean actions",
     )
+    if _is_played(rows):
+        change = EffectColumn[KnockoutEffect](
+            "success % (without)",
+            lambda row: TableCell(row.success, percent, after=f" ({percent(row.success_clean)})"),
+            "success: of the episodes that are played with the cut, and without it in brackets",
+        )
     controls = "controls: the same for as many random tokens of other roles"
     if not has_sides:
         return [change, EffectColumn("controls", lambda row: TableCell(row.control_size, number), controls), p]

@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from typer.testing import CliRunner
 
 from probe_kit.cli import app
 from probe_kit.errors import UsageError
-from probe_kit.intervene import ConditionOutcomes, Knockout
+from probe_kit.intervene import ConditionOutcomes, InterventionResult, Knockout, run_intervention
 from probe_kit.intervene.edited_cells import NO_CELL, EditedCell, columns_of
 from probe_kit.intervene.kinds.knockout import (
     KnockoutEffect,
@@ -21,8 +22,10 @@ from probe_kit.intervene.kinds.knockout import (
     reading_of,
     windows,
 )
+from probe_kit.intervene.stored import Measurement, stored_interventions
 from probe_kit.runs import Run
 from tests.intervene.answers import follower, outcomes_of
+from tests.support.organisms import READERS, reader_run
 
 LAYERS, EPISODES = 6, 48
 Losses = NDArray[np.float64]
@@ -92,7 +95,7 @@ def test_reading_in_one_layer_is_found_there_and_words_that_are_unread_are_not(s
         "behind layer 2 nothing is lost",
         reading_of(roles["image"]),
     )
-    assert "does not read language directly" in reading_of(roles["language"])
+    assert "effect does not come directly from language" in reading_of(roles["language"])
 
 
 @pytest.mark.parametrize(("layer", "outer"), [(0, (0, 1)), (2, (1, 3)), (5, (4, 5))])
@@ -125,6 +128,31 @@ def test_the_loss_is_twice_the_share_of_the_swap() -> None:
     assert widest.lost_ci[0] < 0.9 < widest.lost_ci[1]
 
 
+def unmoved_by_pictures(outcomes: ConditionOutcomes, changes: dict[str, float]) -> ConditionOutcomes:
+    """The same, with pictures that move no action and cuts of roles that change it by so many spreads."""
+    size = np.array([[changes.get(cell.role, 0.0) * (cell.direction == "cut")] for cell in outcomes.cells])
+    moved = np.broadcast_to(outcomes.displacement[0], outcomes.displacement.shape).copy()
+    return replace(outcomes, displacement=moved, size=np.repeat(size, moved.shape[1], axis=1))
+
+
+def test_where_the_picture_moves_nothing_any_change_counts() -> None:
+    roles = read_by(unmoved_by_pictures(played({"image": [], "language": []}, 0), {"language": 2.0}))
+    assert layers_read(roles["image"]) is None
+    assert layers_read(roles["language"]) == (0, LAYERS - 1)
+    assert "(change of 2.00 spreads)" in reading_of(roles["language"])
+
+
+@pytest.mark.parametrize(("change", "is_read"), [(0.05, False), (0.5, True)])
+def test_without_a_control_of_that_size_a_tenth_of_the_spread_counts(change: float, is_read: bool) -> None:
+    """A control that cut nothing is none."""
+    outcomes = unmoved_by_pictures(played({"image": []}, 0), {"image": change})
+    log = outcomes.edit_log.copy()
+    log[[cell.is_control for cell in outcomes.cells]] = 0
+    rows = read_by(replace(outcomes, edit_log=log))["image"]
+    assert (layers_read(rows) is not None) == is_read
+    assert rows[0].control_size is None
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
@@ -148,3 +176,31 @@ def test_a_knockout_of_a_run_is_stored_and_read_again(copy: Run) -> None:
     again = CliRunner().invoke(app, [*command, "--controls", "1"])
     assert "loaded the stored result" in again.stderr
     assert again.stdout == answer.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", READERS)
+def test_what_a_policy_reads_by_construction_is_named(name: str, tmp_path: Path) -> None:
+    """`benchmarks/knockout_organisms.py` has twenty draws of each."""
+    edit, truth = READERS[name]
+    run, load = reader_run(edit, tmp_path / "run", seed=0)
+    rows = by_role(run_intervention(run, Knockout(), load=load).effects)
+    assert {role: layers_read(rows[role]) for role in truth} == truth
+
+
+@pytest.mark.slow
+def test_a_cut_in_closed_loop_shows_success_rates_with_and_without_it(copy: Run) -> None:
+    command = ["intervene", str(copy.path), "--kind", "knockout", "--items", "1", "--window", "3"]
+    answer = CliRunner().invoke(app, [*command, "--controls", "0", "--roles", "image", "--closed-loop"])
+    assert answer.exit_code == 0, answer.output
+    assert "success % (without)" in answer.stdout
+    played = next(result for result in stored_interventions(copy) if result.settings.get("closed_loop"))
+    effect = InterventionResult.of_stored(played).effects[0]
+    success = (copy.episodes[copy.episodes["item_id"] == effect_item(played)]["outcome"] == "correct").mean()
+    assert effect.success_clean == pytest.approx(success)
+
+
+def effect_item(measurement: Measurement) -> str:
+    """The one item that was played."""
+    (item,) = set(measurement.outcomes.items.tolist())
+    return str(item)
