@@ -145,6 +145,15 @@ ClosedLoopCut = Annotated[
         help="Play whole episodes with the cut of a knockout at every inference, and show success rates.",
     ),
 ]
+Untrained = Annotated[
+    Path | None,
+    _inside_option(
+        "--untrained",
+        metavar="RUN",
+        help="Run of the same episodes with random weights. The same knockout, stored there, is shown beside this "
+        "one.",
+    ),
+]
 _pairs_option = partial(typer.Option, rich_help_panel="Recordings and your own environment")
 Vary = Annotated[
     str | None,
@@ -229,6 +238,7 @@ def intervene(
     readers: Readers = None,
     heads: Heads = None,
     closed_loop: ClosedLoopCut = False,
+    untrained: Untrained = None,
     seed: common.Seed = 0,
     readout: ReadoutName = "first-chunk",
     suite: common.SuiteFolder = None,
@@ -269,6 +279,7 @@ def intervene(
         # Seed 0 is the default of every kind, and no kind without a seed refuses it.
         "coefficients": coefficients, "target_side": target_side, "seed": seed or None,
         "window": window, "readers": readers, "heads": heads, "closed_loop": closed_loop or None,
+        "untrained": untrained,
     }  # fmt: skip
     kind_options = {name: value for name, value in inside.items() if value is not None}
     check_options(kind, kind_options)

@@ -16,17 +16,20 @@ from probe_kit.retention import RetentionRow, retention_table
 from probe_kit.retention.displays import (
     AttentionDisplay,
     DoseResponseDisplay,
+    KnockoutDisplay,
     SiteEffectDisplay,
     attention_curve,
     attention_on_picture,
     collect_figures,
     dose_response,
+    knockout_curve,
     site_effect_curve,
 )
 from probe_kit.retention.displays.interventions import _share
 from probe_kit.runs.thumbnails import as_thumbnail, thumbnail_key
 from probe_kit.train import ArrayRun, load_results
 from tests.intervene.answers import follower, habit, outcomes_of, store_outcomes
+from tests.intervene.kinds.test_knockout import played
 
 mpl.use("agg")
 SIGNAL = ([0.5, 0.9], [[0.7]])
@@ -330,3 +333,29 @@ def test_without_a_steering_there_is_no_such_figure(steered_run: ArrayRun) -> No
 )
 def test_small_changes_of_the_tokens_are_not_written_as_none(ratio: float, text: str) -> None:
     assert _share(ratio) == text
+
+
+# -- knockouts ---------------------------------------------------------------------------------------------------
+
+
+def test_a_knockout_shows_a_curve_a_role_over_its_controls(run: ArrayRun) -> None:
+    reads = {"image": [{2}], "language": []}
+    answers = played(reads, 0)
+    store(run, "knockout", answers)
+    display = KnockoutDisplay.from_run(run, "color")
+    curves = {(curve.role, curve.growth): curve for curve in display.curves}
+    assert curves.keys() == {(role, growth) for role in reads for growth in ("up to", "from")}
+    np.testing.assert_array_equal(curves["image", "up to"].layers, range(6))
+    np.testing.assert_array_equal(curves["image", "up to"].is_read, [False, False, True, True, True, True])
+    np.testing.assert_allclose(curves["image", "from"].lost, [90, 90, 90, 0, 0, 0], atol=10)
+    np.testing.assert_allclose(curves["language", "up to"].controls, 0, atol=5)
+    assert not curves["language", "from"].is_read.any()
+    labels = knockout_curve(run).legends[0].get_texts()
+    assert "image, up to the layer" in {label.get_text() for label in labels}
+    names = [figure.name for figure in collect_figures([run], retention_table([run]))]
+    assert any(name.endswith("knockout") for name in names)
+
+
+def test_without_a_knockout_there_is_no_such_figure(run: ArrayRun) -> None:
+    with pytest.raises(NoInterventionsError, match="--kind knockout"):
+        knockout_curve(run)

@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 Values = NDArray[np.float64]
 OPTIONS = (
     "sites", "roles", "direction", "controls", "coefficients", "target_side", "seed", "window", "readers", "heads",
-    "closed_loop",
+    "closed_loop", "untrained",
 )  # fmt: skip
 """Options of the command that a kind may take."""
 

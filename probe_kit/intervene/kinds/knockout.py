@@ -22,12 +22,14 @@ is none of that size; without sides a change then counts from a tenth of the spr
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._system.bounded_files import parse_json
+from probe_kit._system.escaping import as_argument
 from probe_kit._tables.content import Cell as TableCell
 from probe_kit._tables.content import absent
 from probe_kit._tables.numbers import number, percent, signed
@@ -59,7 +61,9 @@ from probe_kit.intervene.pairs import Pair
 from probe_kit.intervene.places import ALL, TILES, roles_of
 from probe_kit.intervene.replay import CLEAN_RUN, SOURCE_RUN, Condition, ConditionContext, ConditionResult
 from probe_kit.intervene.settings import FIRST_CHUNK, has_sides
-from probe_kit.intervene.stored import Measurement
+from probe_kit.intervene.stored import Measurement, StoredResult, stored_interventions, stored_results
+from probe_kit.runs.reader import RunReader
+from probe_kit.runs.records import as_json
 from probe_kit.runs.run import Run
 from probe_kit.statistics.significance import SIGNIFICANCE
 
@@ -92,6 +96,8 @@ class Knockout(Intervention):
         seed: Seed of the controls.
         closed_loop: Whether whole episodes are played with the cut at every inference. The loss is then of where
             the cube ends.
+        untrained: The same knockout in a network with random weights, as it is stored with that run; None for
+            none. `stored_twin` finds it.
 
     Raises:
         UsageError: For another window, and for controls that are fewer than one in runs without sides.
@@ -110,6 +116,7 @@ class Knockout(Intervention):
         "controls": "cuts of as many random tokens of other roles; default 2",
         "seed": "of the controls; default 0",
         "closed_loop": "play whole episodes with the cut at every inference",
+        "untrained": "run with random weights, whose knockout is shown beside this one",
     }
 
     roles: tuple[str, ...] = ()
@@ -119,6 +126,7 @@ class Knockout(Intervention):
     controls: int = 2
     seed: int = 0
     closed_loop: bool = False
+    untrained: Measurement | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -136,19 +144,25 @@ class Knockout(Intervention):
 
     @classmethod
     def from_options(cls, run: Run, **options: Any) -> Self:
-        """Return the kind with the heads as numbers.
+        """Return the kind with the heads as numbers, and with the knockout of the untrained network.
 
         Raises:
-            UsageError: For a head that is no number.
+            UsageError: For a head that is no number, and what `stored_twin` raises.
         """
         names = options.pop("heads", ())
         if wrong := [name for name in names if not str(name).isdecimal()]:
             raise UsageError(f"--heads has {wrong[0]!r}; expected numbers, counted from 0, such as 0,3")
-        return super().from_options(run, heads=tuple(int(name) for name in names), **options)
+        folder = options.pop("untrained", None)
+        kind = super().from_options(run, heads=tuple(int(name) for name in names), **options)
+        if folder is None:
+            return kind
+        from probe_kit.runs import open_run
+
+        return replace(kind, untrained=stored_twin(kind, run, open_run(folder)))
 
     def parameters(self) -> dict[str, Any]:
         """Return its own settings; the readout of a closed loop is where the cube ends."""
-        own = super().parameters()
+        own = super().parameters() | {"untrained": "" if self.untrained is None else self.untrained.key}
         return {**own, "readout": "episode"} if self.closed_loop else own
 
     def check_run(self, run: Run) -> None:
@@ -244,10 +258,32 @@ class Knockout(Intervention):
 
         return play_episodes(session, pairs, conditions)
 
+    def extra_files(
+        self, session: "ReplaySession", conditions: Sequence[Condition], outcomes: ConditionOutcomes
+    ) -> dict[str, bytes]:
+        """Return the effects of the same cuts in the untrained network, where there is one."""
+        del session, conditions, outcomes
+        if self.untrained is None:
+            return {}
+        rows = [row.to_json() for row in self.untrained.rows(knockout_effects) if not row.is_control]
+        kept = ("category", "role", "first", "last", "lost", "size")
+        return {UNTRAINED_FILE: as_json({"effects": [{name: row[name] for name in kept} for row in rows]})}
+
     @staticmethod
     def effects(measurement: Measurement) -> "list[KnockoutEffect]":
         """Return one row per category, role and window, controls among them."""
-        return measurement.rows(knockout_effects)
+        rows = measurement.rows(knockout_effects)
+        if not measurement.settings.get("untrained"):
+            return rows
+        stored = parse_json(measurement.read(UNTRAINED_FILE))["effects"]
+        twin = {(row["category"], row["role"], row["first"], row["last"]): row for row in stored}
+        beside = [twin.get((row.category, row.role, row.first, row.last), {}) for row in rows]
+        return [
+            row
+            if row.is_control
+            else replace(row, untrained_lost=other.get("lost"), untrained_size=other.get("size"))
+            for row, other in zip(rows, beside, strict=True)
+        ]
 
     @staticmethod
     def table(rows: "Sequence[KnockoutEffect]", context: Measurement) -> "Table":
@@ -293,8 +329,69 @@ class Knockout(Intervention):
             "still reach it through other tokens of the backbone (--kind interchange)."
         ]
 
+    @staticmethod
+    def keys_in_use(run: RunReader) -> set[str]:
+        """Return keys of the stored knockouts that figures read.
+
+        Raises:
+            RunDamagedError: If a stored intervention was changed.
+        """
+        return {result.stored.key for result in _preferred(run).values()}
+
 
 KIND = Knockout
+UNTRAINED_FILE = "untrained.json"
+"""The effects of the same cuts in a network with random weights."""
+_SAME = ("roles", "window", "readers", "heads", "closed_loop")
+"""Settings that two knockouts must share to be compared."""
+
+
+def stored_twin(kind: Knockout, run: Run, untrained: Run) -> Measurement:
+    """Return the newest stored knockout of an untrained network that cuts as `kind` does.
+
+    Args:
+        kind: The knockout that is compared.
+        run: Its run.
+        untrained: Run of the same episodes with random weights.
+
+    Raises:
+        UsageError: For the run itself, trained weights, other episodes, and where no such knockout is stored.
+    """
+    if untrained.location.address == run.location.address or not untrained.random_weights:
+        raise UsageError(
+            f"--untrained {untrained.location} has trained weights; expected a run of the same episodes that was "
+            "extracted with --random-weights"
+        )
+    if untrained.suite != run.suite:
+        raise UsageError(f"--untrained {untrained.location} is on {untrained.suite}; expected {run.suite}")
+    wanted = {name: kind.parameters()[name] for name in _SAME}
+    stored = [
+        result
+        for result in stored_interventions(untrained, Knockout.kind)
+        if {name: result.settings.get(name) for name in _SAME} == wanted
+    ]
+    if not stored:
+        raise UsageError(
+            f"{untrained.location} stores no knockout with these roles, window, readers and heads. Run "
+            f"`probe-kit intervene {as_argument(untrained.location)} --kind knockout` with the same options first"
+        )
+    return max(stored, key=lambda result: result.newest)
+
+
+def stored_knockouts(run: RunReader) -> dict[str, list["KnockoutEffect"]]:
+    """Return by category the effects of the stored knockout of most episodes, the newest of equal ones.
+
+    Closed loops are left out.
+
+    Raises:
+        RunDamagedError: If a stored intervention was changed.
+    """
+    return {category: knockout_effects(result.outcomes) for category, result in _preferred(run).items()}
+
+
+def _preferred(run: RunReader) -> dict[str, StoredResult]:
+    results = stored_results(run, Knockout.kind)
+    return {result.category: result for result in results if not result.stored.settings.get("closed_loop")}
 
 
 def acting_stream(policy: "Policy") -> str:
@@ -357,6 +454,8 @@ class KnockoutEffect(EffectRow):
         p_fwe: Family-wise p-value over all cuts of the category; None likewise.
         success: Success rate of the episodes that were played with the cut; None without a closed loop.
         success_clean: Success rate of the same episodes without it; None likewise.
+        untrained_lost: `lost` of the same cut in an untrained network; None without one, or without an effect.
+        untrained_size: `size` of the same; None without one.
     """
 
     first: int
@@ -371,6 +470,8 @@ class KnockoutEffect(EffectRow):
     p_fwe: float | None
     success: float | None
     success_clean: float | None
+    untrained_lost: float | None = None
+    untrained_size: float | None = None
 
     @property
     def layers(self) -> str:
@@ -466,6 +567,26 @@ def by_role(rows: "Sequence[KnockoutEffect]") -> dict[str, list[KnockoutEffect]]
     return parts
 
 
+def windows_by_growth(rows: "Sequence[KnockoutEffect]") -> dict[str, list[KnockoutEffect]]:
+    """Return the cuts of one role by how their windows grow.
+
+    `up to`: from the first layer. `from`: to the last. `around`: neighbours that slide. The cut of all layers
+    is in both of the first two.
+    """
+    if len(rows) > 1 and are_sliding(rows):
+        return {"around": list(rows)}
+    growths = {
+        "up to": [row for row in rows if row.first == 0],
+        "from": [row for row in rows if row.last == row.readable - 1],
+    }
+    return {growth: part for growth, part in growths.items() if len(part) > 1 or len(rows) == 1}
+
+
+def are_sliding(rows: "Sequence[KnockoutEffect]") -> bool:
+    """Return whether all cuts are of equally many layers."""
+    return len({row.last - row.first for row in rows}) == 1
+
+
 def layers_read(rows: "Sequence[KnockoutEffect]") -> tuple[int, int] | None:
     """Return the first and last layer in which a role is read, of the cuts of one role; None if it is not.
 
@@ -477,7 +598,7 @@ def layers_read(rows: "Sequence[KnockoutEffect]") -> tuple[int, int] | None:
     losing = [row for row in rows if row.matters]
     if not losing:
         return None
-    if len({row.last - row.first for row in rows}) == 1:  # windows that slide
+    if are_sliding(rows):
         return min(row.first for row in losing), max(row.last for row in losing)
     begin = min((row.last for row in losing if row.first == 0), default=0)
     end = max((row.first for row in losing if row.last == readable - 1), default=readable - 1)
@@ -533,8 +654,15 @@ def _columns(rows: "Sequence[KnockoutEffect]", has_sides: bool) -> list[EffectCo
             "success: of the episodes that are played with the cut, and without it in brackets",
         )
     controls = "controls: the same for as many random tokens of other roles"
+    twin = EffectColumn[KnockoutEffect](
+        "untrained",
+        lambda row: TableCell(row.untrained_size, number),
+        "untrained: change by the same cut in a network with random weights",
+    )
+    twins = [twin] if any(row.untrained_size is not None for row in rows) else []
     if not has_sides:
-        return [change, EffectColumn("controls", lambda row: TableCell(row.control_size, number), controls), p]
+        plain = EffectColumn[KnockoutEffect]("controls", lambda row: TableCell(row.control_size, number), controls)
+        return [change, plain, *twins, p]
     return [
         EffectColumn(
             "lost [95 %]",
@@ -544,6 +672,7 @@ def _columns(rows: "Sequence[KnockoutEffect]", has_sides: bool) -> list[EffectCo
         ),
         EffectColumn("controls", lambda row: TableCell(row.control_lost, number), controls),
         change,
+        *twins,
         EffectColumn(
             "wrong side",
             lambda row: TableCell(row.net, signed),

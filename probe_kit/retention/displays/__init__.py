@@ -11,10 +11,12 @@ from probe_kit.retention.displays.final_positions import FinalPositionsDisplay, 
 from probe_kit.retention.displays.interventions import (
     AttentionDisplay,
     DoseResponseDisplay,
+    KnockoutDisplay,
     SiteEffectDisplay,
     attention_curve,
     attention_on_picture,
     dose_response,
+    knockout_curve,
     site_effect_curve,
 )
 from probe_kit.retention.displays.iteration_maps import IterationMapDisplay, iteration_maps
@@ -52,6 +54,7 @@ __all__ = [
     "FinalPositionsDisplay",
     "HeatTableDisplay",
     "IterationMapDisplay",
+    "KnockoutDisplay",
     "KnowledgeActionDisplay",
     "KnownUsedDisplay",
     "LayerCurveDisplay",
@@ -77,6 +80,7 @@ __all__ = [
     "dose_response",
     "final_positions",
     "iteration_maps",
+    "knockout_curve",
     "layer_curve",
     "maps_side_by_side",
     "model_depths",

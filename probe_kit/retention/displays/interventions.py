@@ -1,7 +1,7 @@
 """Figures of stored interventions: where an answer passes and is read, attention, and doses of a direction."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, ClassVar, Self
 
@@ -28,6 +28,7 @@ from probe_kit.intervene.kinds.interchange import (
     stored_steering,
     unit_of_doses,
 )
+from probe_kit.intervene.kinds.knockout import KnockoutEffect, by_role, stored_knockouts, windows_by_growth
 from probe_kit.intervene.places import ALL, TILE_ROLES, PlaceName
 from probe_kit.retention.columns.text import title_of
 from probe_kit.retention.displays.display import (
@@ -553,4 +554,149 @@ def dose_figures(source: FigureSource) -> Iterator[ReportFigure]:
                 "the direction is added; filled: beyond random directions of the same norm (the band). One side "
                 "may be saturated, and beyond about two norms of the tokens any direction breaks the hand.",
                 drawn.position, partial(dose_response, drawn.run),
+            )  # fmt: skip
+
+
+# -- knockouts ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class CutCurve:
+    """What cuts of one role lose, by the layer at which their windows begin or end.
+
+    Attributes:
+        role: Role of the tokens that are cut.
+        growth: `up to`: layers 0 to x are cut. `from`: x to the last. `around`: neighbours, x in the middle.
+        layers: (K,) x, ascending.
+        lost: (K,) share of the picture's effect in percent, or the change of the action in spreads.
+        controls: (K,) the same of the controls; NaN without any.
+        is_read: (K,) whether a cut loses more than its controls, family-wise, and enough to matter.
+    """
+
+    role: str
+    growth: str
+    layers: NDArray[np.float64]
+    lost: NDArray[np.float64]
+    controls: NDArray[np.float64]
+    is_read: NDArray[np.bool_]
+
+
+@dataclass(kw_only=True)
+class KnockoutDisplay(Display):
+    """A curve a role by the layers in which the acting part no longer reads its tokens, over the controls.
+
+    Attributes:
+        curves: One for every role and growth of windows.
+        readable: Number of layers that could be cut.
+    """
+
+    measure: str = "lost % of the picture's effect"
+    category: str
+    curves: tuple[CutCurve, ...]
+    readable: int
+
+    @classmethod
+    def from_run(
+        cls, run: RunReader, category: str, stored: Mapping[str, Sequence[KnockoutEffect]] | None = None
+    ) -> Self:
+        """Read the knockout that is stored of a category.
+
+        Args:
+            run: The run that stores the knockout.
+            category: The category that is drawn.
+            stored: Result of `stored_knockouts`; None reads it from the run.
+
+        Raises:
+            NoInterventionsError: If there is none.
+        """
+        effects = (stored_knockouts(run) if stored is None else stored).get(category)
+        if not effects:
+            raise NoInterventionsError(
+                f"{run.location} has no stored knockout of {category!r}. Run "
+                f"`probe-kit intervene {as_argument(run.location)} --kind knockout`"
+            )
+        is_share = any(row.lost is not None for row in effects)
+        curves = [
+            _cut_curve(role, growth, rows, is_share)
+            for role, of_role in by_role(effects).items()
+            for growth, rows in windows_by_growth(of_role).items()
+        ]
+        return cls(
+            title=title_of(category),
+            measure=cls.measure if is_share else "change of the action, in spreads",
+            category=category,
+            curves=tuple(curves),
+            readable=effects[0].readable,
+            certificates=(ProvenanceLine.of_run(run),),
+        )
+
+    def draw(self, axes: "Axes") -> None:
+        """Draw a line for every role and growth, over the band of the controls of all of them."""
+        axes.axhline(0, color="0.45", lw=1, ls=(0, (1, 1)))
+        every = np.array(
+            [(x, y) for curve in self.curves for x, y in zip(curve.layers, curve.controls, strict=True)]
+        )
+        if (every := every[~np.isnan(every[:, 1])]).size:
+            places = np.unique(every[:, 0])
+            least, most = (np.array([of(every[every[:, 0] == x, 1]) for x in places]) for of in (np.min, np.max))
+            axes.fill_between(
+                places, np.minimum(least, 0), np.maximum(most, 0), color=GREY, alpha=0.35, lw=0,
+                label="as many random tokens of other roles",
+            )  # fmt: skip
+        roles = list(dict.fromkeys(curve.role for curve in self.curves))
+        for curve in self.curves:
+            line = replace(series(roles.index(curve.role)), dash="--" if curve.growth == "from" else "-")
+            label = f"{curve.role}, {curve.growth} the layer"
+            draw_series(axes, line, curve.layers, curve.lost, curve.is_read, label)
+        layer_axis(axes, self.readable)
+
+
+def _layer_drawn(row: KnockoutEffect, growth: str) -> float:
+    """Return the layer at which a cut is drawn: where its window ends, begins, or its middle."""
+    ends = {"up to": row.last, "from": row.first}
+    return float(ends.get(growth, (row.first + row.last) / 2))
+
+
+def _cut_curve(role: str, growth: str, rows: Sequence[KnockoutEffect], is_share: bool) -> CutCurve:
+    by_layer = sorted((_layer_drawn(row, growth), at) for at, row in enumerate(rows))
+    rows = [rows[at] for _, at in by_layer]
+
+    def column(values: list[float | None], factor: float) -> NDArray[np.float64]:
+        return np.array([np.nan if value is None else factor * value for value in values])
+
+    lost = [row.lost if is_share else row.size for row in rows]
+    controls = [row.control_lost if is_share else row.control_size for row in rows]
+    factor = 100.0 if is_share else 1.0
+    return CutCurve(
+        role,
+        growth,
+        np.array([layer for layer, _ in by_layer]),
+        column(lost, factor),
+        column(controls, factor),
+        np.array([row.matters for row in rows], bool),
+    )
+
+
+def knockout_curve(run: RunReader) -> "Figure":
+    """Return a figure with a panel per category of which a knockout is stored.
+
+    Raises:
+        NoInterventionsError: If there is none.
+    """
+    stored = stored_knockouts(run)
+    return in_panels([KnockoutDisplay.from_run(run, category, stored) for category in stored or ["any"]])
+
+
+@in_report(15)
+def knockout_figures(source: FigureSource) -> Iterator[ReportFigure]:
+    """Yield a figure per run that stores a knockout."""
+    for drawn in source.runs:
+        if stored_knockouts(drawn.run):
+            yield ReportFigure(
+                f"{drawn.stem}-knockout", "From which tokens the action reads", "interventions",
+                "What is lost when the acting part cannot attend to the tokens of one role, by the layers in "
+                "which they are cut: from the first up to this one, or from this one to the last. Filled: more "
+                "than as many random tokens of other roles (the band). What other tokens of the backbone carried "
+                "on is not cut.",
+                drawn.position, partial(knockout_curve, drawn.run),
             )  # fmt: skip

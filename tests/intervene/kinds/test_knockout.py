@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 from probe_kit.cli import app
 from probe_kit.errors import UsageError
+from probe_kit.extract import ExtractSettings, extract_run
 from probe_kit.intervene import ConditionOutcomes, InterventionResult, Knockout, run_intervention
 from probe_kit.intervene.edited_cells import NO_CELL, EditedCell, columns_of
 from probe_kit.intervene.kinds.knockout import (
@@ -22,8 +23,9 @@ from probe_kit.intervene.kinds.knockout import (
     reading_of,
     windows,
 )
-from probe_kit.intervene.stored import Measurement, stored_interventions
-from probe_kit.runs import Run
+from probe_kit.intervene.stored import stored_interventions
+from probe_kit.runs import Run, open_run
+from probe_kit.suite import Suite
 from tests.intervene.answers import follower, outcomes_of
 from tests.support.organisms import READERS, reader_run
 
@@ -196,11 +198,34 @@ def test_a_cut_in_closed_loop_shows_success_rates_with_and_without_it(copy: Run)
     assert "success % (without)" in answer.stdout
     played = next(result for result in stored_interventions(copy) if result.settings.get("closed_loop"))
     effect = InterventionResult.of_stored(played).effects[0]
-    success = (copy.episodes[copy.episodes["item_id"] == effect_item(played)]["outcome"] == "correct").mean()
-    assert effect.success_clean == pytest.approx(success)
+    of_category = copy.episodes[copy.episodes["category"] == effect.category]
+    repeated = of_category[of_category["item_id"].isin(played.outcomes.items)]
+    assert effect.success_clean == pytest.approx((repeated["outcome"] == "correct").mean())
 
 
-def effect_item(measurement: Measurement) -> str:
-    """The one item that was played."""
-    (item,) = set(measurement.outcomes.items.tolist())
-    return str(item)
+@pytest.mark.slow
+def test_the_same_cut_in_an_untrained_network_is_shown_beside_it(
+    copy: Run, small_suite: Suite, tmp_path: Path
+) -> None:
+    """The recorded run has random weights; a trained policy plays the same items."""
+    command = ["--kind", "knockout", "--window", "3", "--controls", "0", "--roles", "image"]
+    trained = tmp_path / "trained"
+    settings = ExtractSettings("pi0-tiny", suite=small_suite.folder, items=2, max_steps=2, env_workers=0)
+    extract_run(settings, trained)
+    runner = CliRunner()
+    before = runner.invoke(app, ["intervene", str(trained), *command, "--untrained", str(copy.path)])
+    assert "stores no knockout with these roles" in before.stderr
+    assert runner.invoke(app, ["intervene", str(copy.path), *command]).exit_code == 0
+    answer = runner.invoke(app, ["intervene", str(trained), *command, "--untrained", str(copy.path)])
+    assert answer.exit_code == 0, answer.output
+    assert "untrained" in answer.stdout
+    (stored,) = stored_interventions(open_run(trained))
+    twin = {row.category: row.size for row in knockout_effects_of(copy)}
+    for row in InterventionResult.of_stored(stored).effects:
+        assert row.untrained_size == pytest.approx(twin[row.category])
+
+
+def knockout_effects_of(run: Run) -> list[KnockoutEffect]:
+    """Of the newest stored knockout that plays no episodes."""
+    results = [one for one in stored_interventions(run) if not one.settings.get("closed_loop")]
+    return list(InterventionResult.of_stored(max(results, key=lambda one: one.newest)).effects)
