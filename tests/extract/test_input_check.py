@@ -230,31 +230,32 @@ def plain(colour: int) -> Observation:
 
 @pytest.mark.parametrize("vary", ["instruction", "picture", "state"])
 def test_a_donor_is_of_another_group_and_holds_another_value(vary: str) -> None:
-    given = frames()
-    pairs = draw_donors(given, vary, np.random.default_rng(0), 3)
-    assert {frame for frame, _ in pairs} == set(range(len(given)))
-    assert len(pairs) == len(set(pairs)) == 3 * len(given)
+    episode_frames = frames()
+    pairs = draw_donors(episode_frames, vary, np.random.default_rng(0), 3)
+    assert {frame for frame, _ in pairs} == set(range(len(episode_frames)))
+    assert len(pairs) == len(set(pairs)) == 3 * len(episode_frames)
     for frame, donor in pairs:
-        assert given[frame].group != given[donor].group
-        assert not same_input(given[frame].observation, given[donor].observation, vary)
+        assert episode_frames[frame].group != episode_frames[donor].group
+        assert not same_input(episode_frames[frame].observation, episode_frames[donor].observation, vary)
 
 
 def test_the_donor_of_a_picture_is_one_of_the_nearest_in_spreads_of_every_number_of_the_state() -> None:
-    given = frames(60)
-    states = np.stack([frame.state for frame in given])
+    episode_frames = frames(60)
+    states = np.stack([frame.state for frame in episode_frames])
     scaled = states / states.std(axis=0)
-    others = [
+    candidates = [
         number
-        for number, frame in enumerate(given)
-        if frame.group != given[0].group and not same_input(frame.observation, given[0].observation, "picture")
+        for number, frame in enumerate(episode_frames)
+        if frame.group != episode_frames[0].group
+        and not same_input(frame.observation, episode_frames[0].observation, "picture")
     ]
-    nearest = sorted(others, key=lambda number: float(np.linalg.norm(scaled[number] - scaled[0])))[:NEAREST]
-    assert drawn(given, 40) == set(nearest)
+    nearest = sorted(candidates, key=lambda number: float(np.linalg.norm(scaled[number] - scaled[0])))[:NEAREST]
+    assert drawn(episode_frames, 40) == set(nearest)
 
 
 def test_frames_that_are_equally_near_are_all_drawn() -> None:
-    given = [Frame.of(str(number), plain(number), str(number), 0) for number in range(3 * NEAREST)]
-    assert drawn(given, 300) == set(range(1, 3 * NEAREST))
+    episode_frames = [Frame.of(str(number), plain(number), str(number), 0) for number in range(3 * NEAREST)]
+    assert drawn(episode_frames, 300) == set(range(1, 3 * NEAREST))
 
 
 def test_a_picture_beyond_the_nearest_is_never_read() -> None:
@@ -265,13 +266,15 @@ def test_a_picture_beyond_the_nearest_is_never_read() -> None:
         read.append(frame.number)
         return plain(frame.number)
 
-    given = [Frame(f"{at}", f"{at}", 0, "go", np.array([float(at)]), observe, number=at) for at in range(100)]
-    ((_, donor),) = draw_donors(given, "picture", np.random.default_rng(0), of=[0])
+    episode_frames = [
+        Frame(f"{at}", f"{at}", 0, "go", np.array([float(at)]), observe, number=at) for at in range(100)
+    ]
+    ((_, donor),) = draw_donors(episode_frames, "picture", np.random.default_rng(0), of=[0])
     assert donor in range(1, NEAREST + 1)
     assert set(read) == set(range(NEAREST + 1))
 
 
 def test_a_frame_without_a_donor_is_left_out() -> None:
-    given = [Frame.of(str(number), plain(0), str(number), 0) for number in range(3)]
+    episode_frames = [Frame.of(str(number), plain(0), str(number), 0) for number in range(3)]
     for vary in ("instruction", "picture", "state"):
-        assert draw_donors(given, vary, np.random.default_rng(0)) == []
+        assert draw_donors(episode_frames, vary, np.random.default_rng(0)) == []

@@ -48,9 +48,9 @@ def test_named_pictures_reach_the_cameras_that_lerobot_gives_them(case: str) -> 
     from lerobot.processor.rename_processor import RenameObservationsProcessorStep
 
     cameras, pictures, renames = MAPS[case]
-    shown = {f"{IMAGES}{name}": name for name in pictures}
-    given: Any = RenameObservationsProcessorStep(rename_map=renames).observation(dict(shown))
-    expected = {camera: given[f"{IMAGES}{camera}"] for camera in cameras}
+    pictures_by_key = {f"{IMAGES}{name}": name for name in pictures}
+    renamed: Any = RenameObservationsProcessorStep(rename_map=renames).observation(dict(pictures_by_key))
+    expected = {camera: renamed[f"{IMAGES}{camera}"] for camera in cameras}
     pairs = mapped_pictures((), DeclaredInputs(cameras, renames=renames), pictures, True, "kitchen")
     in_order = dict(zip(cameras, pictures, strict=False))  # what the contract gives where nothing is mapped
     assert dict(pairs or in_order.items()) == expected
@@ -136,7 +136,7 @@ def test_a_rotation_of_a_camera_turns_the_picture_that_it_is_given(
     plain = open_environment(EnvSource(NAMED))
     observation = plain.reset(next(iter(plain.episodes()))).observation  # type: ignore[union-attr]
     pictures = {"front": observation.image, **observation.cameras}
-    shown = {**dict(zip(pairs, [decided.seen.image], strict=False)), **decided.seen.cameras}
-    assert [*shown] == [*pairs]
+    by_camera = {**dict(zip(pairs, [decided.seen.image], strict=False)), **decided.seen.cameras}
+    assert [*by_camera] == [*pairs]
     for camera, picture in pairs.items():
-        np.testing.assert_array_equal(shown[camera], np.rot90(pictures[picture], turns.get(picture, 0)))
+        np.testing.assert_array_equal(by_camera[camera], np.rot90(pictures[picture], turns.get(picture, 0)))
