@@ -39,8 +39,8 @@ def test_nothing_of_it_imports_torch() -> None:
         "import sys; from probe_kit._system.machine import check_device_name, what_is_here; "
         "check_device_name('cpu'); print(what_is_here(), 'torch' in sys.modules)"
     )
-    shown = subprocess.run([sys.executable, "-c", code], capture_output=True, encoding="utf-8", check=True).stdout
-    assert re.match(r"This machine has cpu \(\d+ cores?\).* False", shown)
+    output = subprocess.run([sys.executable, "-c", code], capture_output=True, encoding="utf-8", check=True).stdout
+    assert re.match(r"This machine has cpu \(\d+ cores?\).* False", output)
 
 
 def test_with_torch_there_it_names_what_torch_finds() -> None:
@@ -168,12 +168,12 @@ def test_a_package_of_the_users_own_is_installed_by_the_installer_that_the_envir
 
 
 def test_no_message_names_an_installer_of_its_own() -> None:
-    own = Path(imports.__file__)
-    found = [
+    imports_file = Path(imports.__file__)
+    mentions = [
         f"{path.relative_to(PACKAGE)}:{number}"
         for path in sorted(PACKAGE.rglob("*.py"))
-        if path != own
+        if path != imports_file
         for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1)
         if re.search(r"\b(uv|pip3?) (pip |sync|install|add)", line)
     ]
-    assert not found
+    assert not mentions

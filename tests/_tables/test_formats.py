@@ -78,8 +78,12 @@ def test_markdown_is_one_table_of_the_same_cells(table: Table) -> None:
     assert all({child.type for child in token.children or []} <= ALLOWED for token in inside)
     count, rows = len(table.headings), len(table.rows)
     cells = plain[1 + count : 1 + count + rows * count]
-    shown = [cell.text if not cell.alarm else f"🔴 {cell.text}" for row in table.rows for cell in row.cells]
-    assert [words(cell).replace("`", "") for cell in cells] == [words(cell).replace("`", "") for cell in shown]
+    expected_cells = [
+        cell.text if not cell.alarm else f"🔴 {cell.text}" for row in table.rows for cell in row.cells
+    ]
+    assert [words(cell).replace("`", "") for cell in cells] == [
+        words(cell).replace("`", "") for cell in expected_cells
+    ]
 
 
 ALLOWED = {"text", "text_special", "strong_open", "strong_close", "softbreak"}
@@ -98,8 +102,8 @@ def test_latex_has_a_line_per_row_whose_cells_read_back(table: Table) -> None:
     for line, row in zip(lines, table.rows, strict=True):
         cells = re.split(r"(?<!\\) ?& ?", line)
         assert len(cells) == len(row.cells)
-        for found, cell in zip(cells, row.cells, strict=True):
-            bare = re.sub(r"\\cellcolor\{\w+\} ?", "", found)
+        for latex_cell, cell in zip(cells, row.cells, strict=True):
+            bare = re.sub(r"\\cellcolor\{\w+\} ?", "", latex_cell)
             if r"\textcolor{red}{" in bare:
                 bare = bare.replace(r"\textcolor{red}{", "", 1).removesuffix("}")
             assert words(pattern.sub(lambda match: back[match[0]], bare)) == words(cell.text)
@@ -157,23 +161,23 @@ def test_a_console_of_any_width_truncates_nothing_and_runs_markup_as_text(table:
     console.print(table)
     text = console.file.getvalue()  # type: ignore[attr-defined]
     assert max(map(len, text.splitlines())) <= width
-    shown = words(text)
+    printed_words = words(text)
     for row in table.rows:
         for cell in row.cells[table.names :]:
-            assert words(cell.text) in shown
+            assert words(cell.text) in printed_words
 
 
 @SETTINGS
 @given(st.lists(st.fixed_dictionaries({"name": CELLS, "ci": st.sampled_from([(0.1, 0.2), None])}), min_size=1))
 def test_json_and_csv_hold_the_numbers_and_no_cell_that_a_spreadsheet_computes(numbers: list[dict]) -> None:
     table = Table.of("t", ("name",), [("x",)], numbers=tuple(numbers))
-    plain = [{"name": one["name"], "ci": one["ci"] and list(one["ci"])} for one in numbers]
+    plain = [{"name": record["name"], "ci": record["ci"] and list(record["ci"])} for record in numbers]
     assert json.loads(table.to_json()) == plain
-    for line, one in zip(csv.DictReader(io.StringIO(table.to_csv())), numbers, strict=True):
-        assert line["name"].lstrip("'") == one["name"].lstrip("'")
+    for line, record in zip(csv.DictReader(io.StringIO(table.to_csv())), numbers, strict=True):
+        assert line["name"].lstrip("'") == record["name"].lstrip("'")
         assert line["name"][0] not in "=+-@"
         if any(other["ci"] for other in numbers):
-            assert (line["ci_low"], line["ci_high"]) == (("0.1", "0.2") if one["ci"] else ("", ""))
+            assert (line["ci_low"], line["ci_high"]) == (("0.1", "0.2") if record["ci"] else ("", ""))
 
 
 # -- what single formats promise ---------------------------------------------------------------------------------
@@ -289,8 +293,8 @@ def test_columns_without_content_and_those_that_need_room_are_left_out() -> None
     table = Table.of("t", ("a", Heading("b", is_detail=True), "c"), [("x", "1", "–"), ("y", "2", "")]).filled()
     assert table.columns == ("a", "b")
     assert table.details(False) is None
-    assert (shown := table.details(True)) is not None
-    assert shown.columns == ("a", "b")
+    assert (detailed_table := table.details(True)) is not None
+    assert detailed_table.columns == ("a", "b")
 
 
 def test_equal_headings_are_told_apart_by_the_name_over_them_where_a_page_has_one_line() -> None:

@@ -49,7 +49,7 @@ def a_table() -> Table:
 
 
 @pytest.mark.parametrize(
-    "shown",
+    "content",
     [
         HOSTILE,
         Text(HOSTILE),
@@ -59,9 +59,9 @@ def a_table() -> Table:
     ],
     ids=["text", "Text", "table", "marked", "fitting table"],
 )
-def test_markup_and_escapes_of_others_are_shown_and_not_obeyed(shown: object) -> None:
+def test_markup_and_escapes_of_others_are_shown_and_not_obeyed(content: object) -> None:
     console = terminal()
-    console.print(shown)
+    console.print(content)
     assert SHOWN in written(console)
     assert "\x1b[2J" not in written(console)
     assert "\u202e" not in written(console)
@@ -97,10 +97,10 @@ def test_where_no_terminal_is_lines_are_said_of_work(capsys: pytest.CaptureFixtu
 def test_json_keeps_every_sign_and_lets_none_out(capsys: pytest.CaptureFixture[str]) -> None:
     hostile = "\x9b31m\u202e\x7f\ud800 \x1b Δ"
     print_json({hostile: [hostile]})
-    said = capsys.readouterr().out
-    assert not set("\x9b\u202e\x7f\ud800\x1b") & set(said)
-    assert "Δ" in said
-    assert json.loads(said) == {hostile: [hostile]}
+    output = capsys.readouterr().out
+    assert not set("\x9b\u202e\x7f\ud800\x1b") & set(output)
+    assert "Δ" in output
+    assert json.loads(output) == {hostile: [hostile]}
 
 
 def test_other_formats_are_shown_and_not_obeyed(capsys: pytest.CaptureFixture[str]) -> None:
@@ -130,12 +130,12 @@ class Clock:
 
 def lines_of(steps: list[tuple[float, int]], total: int) -> list[str]:
     """What is said when `done` of `total` are finished at each time."""
-    clock, said = Clock(), list[str]()
-    beat = Heartbeat("episodes", said.append, clock)
-    for seconds, done in steps:
+    clock, lines = Clock(), list[str]()
+    beat = Heartbeat("episodes", lines.append, clock)
+    for seconds, finished in steps:
         clock.seconds = seconds
-        beat(done, total, "correct")
-    return said
+        beat(finished, total, "correct")
+    return lines
 
 
 def test_the_last_line_is_said_once_however_many_events_bring_the_end() -> None:
@@ -144,10 +144,10 @@ def test_the_last_line_is_said_once_however_many_events_bring_the_end() -> None:
 
 
 def test_long_work_says_a_line_now_and_then_and_one_at_the_end() -> None:
-    said = lines_of([(second, second) for second in range(1, 601)], 600)
-    assert len(said) == 1 + int((600 - FIRST) // EVERY) + 1
-    assert said[0] == "episodes: 10/600 after 10 s, 1.0 per s, about 9 min 50 s left"
-    assert said[-1] == "episodes: 600/600 after 10 min 00 s, 1.0 per s"
+    lines = lines_of([(second, second) for second in range(1, 601)], 600)
+    assert len(lines) == 1 + int((600 - FIRST) // EVERY) + 1
+    assert lines[0] == "episodes: 10/600 after 10 s, 1.0 per s, about 9 min 50 s left"
+    assert lines[-1] == "episodes: 600/600 after 10 min 00 s, 1.0 per s"
 
 
 def test_short_work_says_one_line() -> None:
@@ -167,9 +167,9 @@ def test_a_slow_site_is_counted_by_the_hour() -> None:
 
 
 def test_loading_a_model_is_no_part_of_the_rate() -> None:
-    said = lines_of([(40.0, 1), (41.0, 2), (100.0, 61)], 100)
-    assert said[0] == "episodes: 1/100 after 40 s"
-    assert said[-1] == "episodes: 61/100 after 1 min 40 s, 1.0 per s, about 39 s left"
+    lines = lines_of([(40.0, 1), (41.0, 2), (100.0, 61)], 100)
+    assert lines[0] == "episodes: 1/100 after 40 s"
+    assert lines[-1] == "episodes: 61/100 after 1 min 40 s, 1.0 per s, about 39 s left"
 
 
 @pytest.mark.parametrize(("seconds", "words"), [(0.2, "0 s"), (59.6, "1 min 00 s"), (3599.9, "1 h 00 min")])
@@ -179,12 +179,12 @@ def test_durations_carry_over(seconds: float, words: str) -> None:
 
 @pytest.mark.parametrize("terminal", [True, False])
 def test_bars_are_for_terminals_and_lines_for_logs(terminal: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    shown = io.StringIO()
-    monkeypatch.setattr(console, "err", Console(file=shown, force_terminal=terminal, width=80, markup=False))
+    output = io.StringIO()
+    monkeypatch.setattr(console, "err", Console(file=output, force_terminal=terminal, width=80, markup=False))
     with console.progress() as bar:
         console.counter(bar, "drawing [items]")(3, 3)
-    assert ("━" in shown.getvalue()) is terminal
-    assert ("drawing [items]: 3/3" in shown.getvalue()) is not terminal
+    assert ("━" in output.getvalue()) is terminal
+    assert ("drawing [items]: 3/3" in output.getvalue()) is not terminal
 
 
 COMMANDS = (
@@ -211,10 +211,10 @@ def run_command(words: tuple[str, ...], run: Path, redirection: str) -> subproce
 @pytest.mark.parametrize("redirection", ["| true", "| head -c 1", ">&-", ">&- 2>&-", "> /dev/full"])
 @pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
 def test_no_command_ends_in_a_traceback(little_runs: Path, words: tuple[str, ...], redirection: str) -> None:
-    done = run_command(words, little_runs / "run", redirection)
-    assert "Traceback" not in done.stderr
-    assert "InternalError" not in done.stderr
-    assert "Exception ignored" not in done.stderr
+    completed = run_command(words, little_runs / "run", redirection)
+    assert "Traceback" not in completed.stderr
+    assert "InternalError" not in completed.stderr
+    assert "Exception ignored" not in completed.stderr
 
 
 @pytest.mark.parametrize(
