@@ -109,17 +109,21 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("family", choices=list(FAMILIES))
     parser.add_argument("file", type=Path)
-    chosen = parser.parse_args()
+    arguments = parser.parse_args()
     with torch.device("meta"):
-        tensors = FAMILIES[chosen.family]()
+        tensors = FAMILIES[arguments.family]()
     keys = {
         name: {"shape": list(tensor.shape), "dtype": str(tensor.dtype).removeprefix("torch.")}
         for name, tensor in sorted(tensors.items())
     }
-    source = f"lerobot {lerobot.__version__}, {(FAMILIES[chosen.family].__doc__ or '').rstrip('.')}; meta device"
+    source = (
+        f"lerobot {lerobot.__version__}, {(FAMILIES[arguments.family].__doc__ or '').rstrip('.')}; meta device"
+    )
     content = json.dumps({"source": source, "keys": keys}).encode()
-    chosen.file.write_bytes(gzip.compress(content, mtime=0))
-    print(f"{len(keys)} tensors, {sum(one.numel() * one.element_size() for one in tensors.values()) / 1e9:.2f} GB")
+    arguments.file.write_bytes(gzip.compress(content, mtime=0))
+    print(
+        f"{len(keys)} tensors, {sum(data.numel() * data.element_size() for data in tensors.values()) / 1e9:.2f} GB"
+    )
 
 
 if __name__ == "__main__":
