@@ -1,6 +1,7 @@
-"""Names and docstrings of the package use the field's words.
+"""Names and docstrings use the field's words.
 
-A name says what it holds; a docstring begins with a verb or a noun.
+A name says what it holds, in the package as in tests, scripts and benchmarks. A docstring of the package begins
+with a verb or a noun.
 """
 
 import ast
@@ -9,7 +10,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from tests.support.parsed import PACKAGE, nodes, package_trees
+from tests.support.parsed import PACKAGE, nodes, package_trees, trees_outside_the_package
 
 FILLERS = frozenset(
     [
@@ -133,6 +134,15 @@ def test_the_package_is_written_in_the_words_of_the_field(check: str) -> None:
         for line, text in CHECKS[check](tree)
     ]
     assert not wrong, f"{RULES[check]}\n" + "\n".join(wrong)
+
+
+def test_names_of_tests_scripts_and_benchmarks_say_what_they_hold() -> None:
+    wrong = [
+        f"{file.relative_to(PACKAGE.parent)}:{line}: {name}"
+        for file, tree in trees_outside_the_package().items()
+        for line, name in fillers(tree)
+    ]
+    assert not wrong, f"{RULES['names']}\n" + "\n".join(wrong)
 
 
 @pytest.mark.parametrize(

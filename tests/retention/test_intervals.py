@@ -375,11 +375,11 @@ def test_two_runs_that_differ_in_one_group_are_not_surer_alike_than_two_that_nev
     right = outcome_table(32, 0, 0)
     wrong = right.copy()
     wrong.loc[wrong["item_id"] == wrong["item_id"].iloc[0], "outcome"] = "wrong"
-    here, there = (Rate.pooled([success_share(outcomes, "suite")]) for outcomes in (right, wrong))
-    same, other = here.minus(here).interval, here.minus(there).interval
+    first, second = (Rate.pooled([success_share(outcomes, "suite")]) for outcomes in (right, wrong))
+    same, other = first.minus(first).interval, first.minus(second).interval
     assert same.low < 0 < same.high
     assert other.low >= same.low
     assert other.high >= same.high
-    assert there.interval.low < here.interval.low, "a group that is wrong makes nothing surer"
+    assert second.interval.low < first.interval.low, "a group that is wrong makes nothing surer"
     several = Rate.pooled([success_share(outcomes, "suite") for outcomes in (right, wrong)])
-    assert there.interval.low < several.interval.low < several.value < several.interval.high
+    assert second.interval.low < several.interval.low < several.value < several.interval.high

@@ -251,7 +251,7 @@ def test_of_the_hub_one_step_is_downloaded(
 
     listed = [file.relative_to(hub).as_posix() for file in hub.rglob("*") if file.is_file()]
     monkeypatch.setattr("huggingface_hub.snapshot_download", download)
-    monkeypatch.setattr("huggingface_hub.HfApi.list_repo_files", lambda _, _name, **_further: listed)
+    monkeypatch.setattr("huggingface_hub.HfApi.list_repo_files", lambda _, _name, **_keywords: listed)
     monkeypatch.setattr("probe_kit.hooks.checkpoints.checkpoint.unreachable", lambda: "")
     assert find_parts("some/run", None, unread=True).weights == cache
     assert not list(cache.rglob("*.pt"))
