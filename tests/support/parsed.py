@@ -29,19 +29,6 @@ def package_trees() -> dict[Path, ast.Module]:
 
 
 @cache
-def trees_outside_the_package() -> dict[Path, ast.Module]:
-    """Return the tree of every file of tests (without the fence, which stays as it is), scripts and benchmarks."""
-    root = PACKAGE.parent
-    fence = root / "tests" / "acceptance"
-    return {
-        path: parsed(path)
-        for folder in ("tests", "scripts", "benchmarks")
-        for path in sorted((root / folder).rglob("*.py"))
-        if not path.is_relative_to(fence)
-    }
-
-
-@cache
 def package_nodes[Node: ast.AST](kind: type[Node]) -> list[tuple[Path, Node]]:
     """Return every node of a kind, such as `ast.Call`, with its file."""
     return [
