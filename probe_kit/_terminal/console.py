@@ -31,6 +31,7 @@ from rich.text import Text
 
 from probe_kit._system.escaping import UNSAFE, terminal_safe
 from probe_kit._system.json_text import json_text
+from probe_kit._system.line_breaks import keep_numbers_whole
 
 for _stream in ("stdout", "stderr"):
     if getattr(sys, _stream) is None:  # closed by the caller (`>&-`): its number must not go to the next file
@@ -40,7 +41,27 @@ PAGE = 120
 """The columns of a table that is written to a file or a pipe, where no terminal says how many there are."""
 
 
-class SafeConsole(Console):
+_HELD = "\ufdd0"
+"""A blank at which no line is broken, while rich wraps; Unicode has no character of this number."""
+
+
+class WholeNumbersConsole(Console):
+    """A console that breaks no line between a number and its unit. What it writes has plain blanks there."""
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
+        """Draw; texts are wrapped where `keep_numbers_whole` leaves blanks."""
+        if isinstance(renderable, str):
+            renderable = self.render_str(renderable)
+        if isinstance(renderable, Text):
+            held = keep_numbers_whole(renderable.plain, _HELD)
+            if held != renderable.plain:
+                renderable = renderable.copy()
+                renderable.plain = held
+        for segment in super().render(renderable, options):
+            yield segment._replace(text=segment.text.replace(_HELD, " ")) if _HELD in segment.text else segment
+
+
+class SafeConsole(WholeNumbersConsole):
     """A console on which text is text: it reads no markup, and writes no escape sequence but its own."""
 
     def __init__(self, **options: Any) -> None:
@@ -82,6 +103,19 @@ out = SafeConsole(width=None if sys.stdout.isatty() or "COLUMNS" in os.environ e
 """The console of results: what a script would read."""
 err = SafeConsole(stderr=True)
 """The console of progress, plans and notes."""
+
+
+@contextmanager
+def whole_numbers_in_help() -> Iterator[None]:
+    """Wrap help that typer prints in the body as all other text; typer takes its console from no caller."""
+    from typer import rich_utils
+
+    names = vars(rich_utils)
+    former, names["Console"] = names["Console"], WholeNumbersConsole
+    try:
+        yield
+    finally:
+        names["Console"] = former
 
 
 def split(text: str | None) -> tuple[str, ...] | None:

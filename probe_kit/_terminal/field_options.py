@@ -19,6 +19,7 @@ from pydantic.fields import FieldInfo
 from typer.models import OptionInfo
 
 from probe_kit._system.complaints import UNKNOWN, complaints_of, in_words
+from probe_kit._terminal.console import whole_numbers_in_help
 from probe_kit.errors import UsageError
 
 
@@ -208,7 +209,8 @@ class PanelledHelp(typer.core.TyperCommand):
         panels = self._further_panels()
         ctx.meta[_MAIN_ONLY] = bool(panels)
         try:
-            super().format_help(ctx, formatter)
+            with whole_numbers_in_help():
+                super().format_help(ctx, formatter)
         finally:
             ctx.meta[_MAIN_ONLY] = False
         if panels:
@@ -216,7 +218,8 @@ class PanelledHelp(typer.core.TyperCommand):
 
     def format_whole_help(self, ctx: Any, formatter: Any) -> None:
         """Print all panels."""
-        super().format_help(ctx, formatter)
+        with whole_numbers_in_help():
+            super().format_help(ctx, formatter)
 
     def _further_panels(self) -> list[str]:
         panels = [panel for parameter in self.params if (panel := _panel_of(parameter))]

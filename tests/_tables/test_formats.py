@@ -234,7 +234,7 @@ def test_a_column_of_numbers_stands_right_whatever_its_texts_look_like() -> None
     assert table.texts[0] == ("a", "n = 3", "3 of 4", "–", "n/a", "0.5 [0.1, 0.9]")
     assert table.texts[1] == ("b", "–", "[1, 2]", "–", "7 of 9", "–")
     assert "{lrlrrr}" in table.to_latex()
-    assert '<span class="limits">[0.1, 0.9]</span>' in table._repr_html_()
+    assert '<span class="limits">[0.1,\u00a00.9]</span>' in table._repr_html_()
     assert '<span class="limits">[1, 2]</span>' not in table._repr_html_()
     assert [sort_key(cell, True) for cell in (rows[0][1], rows[1][1], rows[1][5])] == [3.0, None, None]
 

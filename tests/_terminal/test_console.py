@@ -10,11 +10,13 @@ import sys
 from pathlib import Path
 
 import pytest
+import typer
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
 import probe_kit
+from probe_kit._system.line_breaks import keep_numbers_whole
 from probe_kit._tables import table as tables
 from probe_kit._terminal import console
 from probe_kit._terminal.console import (
@@ -28,6 +30,7 @@ from probe_kit._terminal.console import (
     print_text,
     spoken,
 )
+from probe_kit._terminal.field_options import PanelledHelp
 
 HOSTILE = "[bold red]x[/] [/unopened] \x1b[2J\u202e:warning:"
 SHOWN = "[bold red]x[/] [/unopened] ␛[2J\ufffd:warning:"
@@ -249,3 +252,65 @@ def test_every_style_of_a_printed_line_is_read_as_one_and_no_values_styles_are()
     assert {name: texts for name, texts in unread.items() if texts} == {}
     assert unread_marks('say("next: [bold]probe-kit demo[/]")') == ["next: [bold]probe-kit demo[/]"]
     assert marked("[bold]{}[/]", "[red]mine[/]").plain == "[red]mine[/]"
+
+
+# -- numbers and their units ----------------------------------------------------------------------------------
+
+QUANTITIES = [
+    "65 %",
+    "0.62 [0.55, 0.70]",
+    "12.5 cm",
+    "3 h",
+    "12 min",
+    "p = 0.03",
+    "p < 0.001",
+    "1,024 GB",
+    "± 0.2",
+]
+PROSE = " so ".join(f"it says that {quantity} stays" for quantity in QUANTITIES * 4)
+WIDTHS = pytest.mark.parametrize("width", [40, 60, 80])
+
+
+def assert_numbers_are_whole(text: str) -> None:
+    rows = [" ".join(line.strip(" │").split()) for line in text.splitlines()]
+    assert len(rows) > 10, "the text was wrapped"
+    for quantity in QUANTITIES:
+        # an interval stays whole, but may stand below its value
+        whole = re.search(r"\[.*\]", quantity)
+        assert sum(row.count(whole[0] if whole else quantity) for row in rows) == 4, quantity
+
+
+@WIDTHS
+def test_sentences_and_cells_break_no_line_between_a_number_and_its_unit(width: int) -> None:
+    for renderable in (
+        PROSE,
+        Text(PROSE, style="dim"),
+        tables.Table.of("t", ("n", "text"), [("a", PROSE)], overflow="wrap"),
+    ):
+        stream = io.StringIO()
+        SafeConsole(file=stream, width=width).print(renderable)
+        assert_numbers_are_whole(stream.getvalue())
+        assert stream.getvalue().isprintable() or set(stream.getvalue()) <= set(PROSE + "antex \n─━│╶")
+
+
+@pytest.mark.parametrize(("width", "of_command"), [(40, True), (60, False), (80, False)])
+def test_help_breaks_no_line_between_a_number_and_its_unit(
+    width: int, of_command: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    app = typer.Typer()
+
+    @app.command(cls=PanelledHelp, help=PROSE if of_command else "Measure.")
+    def measure(limit: int = typer.Option(1, help="Most." if of_command else PROSE)) -> None:
+        """Measure."""
+
+    monkeypatch.setattr("typer.rich_utils.MAX_WIDTH", width)
+    with pytest.raises(SystemExit):
+        app(["--help"])
+    assert_numbers_are_whole(capsys.readouterr().out)
+
+
+@pytest.mark.parametrize("text", ["a = b", "items = 12", "m 5 steps", "5 m/s", "24 items", "[1, 2, 3] 4", "x % 2"])
+def test_only_blanks_within_a_quantity_are_held(text: str) -> None:
+    held = keep_numbers_whole(text, "~")
+    assert held.replace("~", " ") == text
+    assert "~" not in held.replace("~%", "").replace(",~3]", "")

@@ -136,7 +136,7 @@ def vlm(path: Path) -> SaidRun:
 def text_of(page: str) -> str:
     """What a reader can see or point at; the page's own code serves both kinds of run."""
     page = re.sub(r"<style>.*?</style>|<script>.*?</script>", "", page, flags=re.DOTALL)
-    return html.unescape(page)
+    return html.unescape(page).replace("\u00a0", " ")
 
 
 def formats(runs: list[SaidRun]) -> Mapping[str, str]:
@@ -185,7 +185,7 @@ def test_a_run_of_answers_is_described_as_answering(printed_formats: Mapping[str
 
 def test_the_summary_says_how_many_answers_are_right(printed_formats: Mapping[str, str]) -> None:
     share = 100 * RIGHT["color"].mean()
-    assert f"the VLM answers right in {share:.0f}\u00a0%" in printed_formats["report"]
+    assert f"the VLM answers right in {share:.0f} %" in printed_formats["report"]
 
 
 @pytest.mark.slow

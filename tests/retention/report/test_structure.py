@@ -132,7 +132,7 @@ def test_a_heading_and_a_verdict_lead_to_their_meaning(page: Page) -> None:
     for link in links:
         entry = page.element_with_id(link.attributes["href"].removeprefix("#"))
         assert entry.tag == "dt"
-        assert entry.text.replace(" ", "") == link.text.replace("\u00a0", "").replace(" ", "")
+        assert "".join(entry.text.split()) == "".join(link.text.split())
     (verdict,) = [
         element for element in page.all("a") if element.inside("td") and element.text == "shown, success not shown"
     ]
