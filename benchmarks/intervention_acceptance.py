@@ -22,7 +22,7 @@ from probe_kit.demo.pipeline import (
     Agreement,
     Organism,
     findings,
-    probed,
+    probe_organism,
 )
 from probe_kit.errors import CaptureChangedActionError
 from probe_kit.intervene import (
@@ -72,7 +72,7 @@ class Trial:
 def acted(organism: Organism, suite: Suite, folder: Path, steps: int | None, untrained: Run | None) -> Run:
     """The organism's episodes, probes and `follow`; what `demo --compare` made of the same suite is reused."""
     shorter = organism if steps is None else replace(organism, max_steps=steps)
-    run, _ = probed(shorter, suite, folder, FULL.permutations, lambda _: lambda *_: None, untrained)
+    run, _ = probe_organism(shorter, suite, folder, FULL.permutations, lambda _: lambda *_: None, untrained)
     return run
 
 

@@ -19,7 +19,7 @@ import lerobot
 import torch
 from lerobot.configs.types import FeatureType, PolicyFeature
 
-from probe_kit.models.building import replaced
+from probe_kit.models.building import replace_attributes
 
 PICTURE = {"observation.images.image": PolicyFeature(FeatureType.VISUAL, (3, 224, 224))}
 
@@ -38,7 +38,7 @@ def pi0_fast() -> dict[str, torch.Tensor]:
     from lerobot.policies.pi0_fast.configuration_pi0_fast import PI0FastConfig
 
     nothing = SimpleNamespace(from_pretrained=lambda *_, **__: None)
-    with replaced(modeling_pi0_fast, {"AutoProcessor": nothing, "AutoTokenizer": nothing}):
+    with replace_attributes(modeling_pi0_fast, {"AutoProcessor": nothing, "AutoTokenizer": nothing}):
         return modeling_pi0_fast.PI0FastPolicy(_on_meta(PI0FastConfig(device="cpu"))).state_dict()
 
 

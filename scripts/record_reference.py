@@ -29,8 +29,8 @@ from safetensors.torch import load_file
 from torch import Tensor
 from transformers import AutoTokenizer
 
-from probe_kit.models.building import replaced
-from probe_kit.models.pi0 import PaliGemmaSize, Pi0Size, resized
+from probe_kit.models.building import replace_attributes
+from probe_kit.models.pi0 import PaliGemmaSize, Pi0Size, resize_network
 
 MODULES: dict[str, Any] = {"pi0": modeling_pi0, "pi05": modeling_pi05, "pi0_fast": modeling_pi0_fast}
 POLICIES: dict[str, Callable[[Any], Any]] = {
@@ -53,10 +53,10 @@ def lerobots_policy(checkpoint: Path) -> Any:
     if config.type == "pi0_fast":
         config.text_tokenizer_name = str(checkpoint)
         size = PaliGemmaSize.from_file(checkpoint / "dims.json")
-        with resized(modeling_pi0_fast, size, config), packaged_fast(checkpoint):
+        with resize_network(modeling_pi0_fast, size, config), packaged_fast(checkpoint):
             policy: Any = POLICIES[config.type](config)
     else:
-        with resized(MODULES[config.type], Pi0Size.from_file(checkpoint / "dims.json"), config):
+        with resize_network(MODULES[config.type], Pi0Size.from_file(checkpoint / "dims.json"), config):
             policy = POLICIES[config.type](config)
     tensors = load_file(checkpoint / "model.safetensors")
     tensors.setdefault(EMBEDDING, tensors[HEAD])
@@ -75,7 +75,7 @@ def packaged_fast(checkpoint: Path) -> Iterator[None]:
     def read(name: str, **_: Any) -> Any:
         return UniversalActionProcessor.from_pretrained_local(str(checkpoint / name))
 
-    with replaced(modeling_pi0_fast, {"AutoProcessor": SimpleNamespace(from_pretrained=read)}):
+    with replace_attributes(modeling_pi0_fast, {"AutoProcessor": SimpleNamespace(from_pretrained=read)}):
         yield
 
 

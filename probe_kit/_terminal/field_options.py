@@ -40,14 +40,14 @@ class Part(BaseModel):
         try:
             super().__init__(**dict(zip(names, first, strict=False)), **values)
         except ValidationError as error:
-            raise UsageError(_unknown(type(self).__name__, error) or in_words(error)) from None
+            raise UsageError(_complaint_of_unknown(type(self).__name__, error) or in_words(error)) from None
 
     def changed(self, **values: Any) -> Self:
         """Return the group with other values, which are checked."""
         return type(self)(**(dict(self) | values))
 
 
-def _unknown(subject: str, error: ValidationError) -> str:
+def _complaint_of_unknown(subject: str, error: ValidationError) -> str:
     """Return a sentence on a field that the model `subject` lacks; empty if that is not the first mistake."""
     path, text = next(complaints_of(error))
     return f"{subject} has no setting {'.'.join(map(str, path))}; leave it out" if text == UNKNOWN else ""
@@ -115,7 +115,7 @@ def command_with(
             }
             command(typed, **{parameter.name: values[parameter.name] for parameter in parameters})
 
-        required_names = _required(models)
+        required_names = _required_parameters(models)
         required = [parameter for parameter in added.values() if parameter.name in required_names]
         optional = [parameter for parameter in (*parameters, *added.values()) if parameter not in required]
         ordered = [*required, *sorted(optional, key=lambda parameter: _panel(parameter) is not None)]
@@ -131,7 +131,7 @@ def command_with(
     return decorate
 
 
-def _required(models: Iterable[type[BaseModel]]) -> set[str]:
+def _required_parameters(models: Iterable[type[BaseModel]]) -> set[str]:
     """Return the parameters that every command line has: those of required fields of the first model."""
     first = next(iter(models), None)
     return (

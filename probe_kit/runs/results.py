@@ -185,7 +185,7 @@ def write_bundle(
         for name, content in files.items():
             content_sum = Checksum.of(content)
             if name not in former or former[name][1] != content_sum:
-                actual = name if before is None else _renamed(name, content_sum)
+                actual = name if before is None else _rename_key(name, content_sum)
                 location.write(f"{folder}/{actual}", content)
                 files_now[name] = actual, content_sum
         # Files, then times, then the head that names them, and only then are former files removed: a crash in
@@ -224,7 +224,7 @@ def tidy_bundle(location: Location, home: str, key: str) -> None:
         location.remove(f"{home}/.{key}{PARTIAL}")
 
 
-def _renamed(name: str, content_sum: Checksum) -> str:
+def _rename_key(name: str, content_sum: Checksum) -> str:
     path = PurePosixPath(name)
     return f"{path.stem}-{content_sum.digest[:_SHORT]}{path.suffix}"
 

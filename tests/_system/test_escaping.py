@@ -21,10 +21,10 @@ from probe_kit._system.escaping import (
     as_argument,
     csv_of_frame,
     csv_of_rows,
-    escaped,
+    escape_formula,
     markdown_safe,
     terminal_safe,
-    unescaped,
+    unescape,
     without_folders,
 )
 from probe_kit._system.table_cells import plain_cell
@@ -61,19 +61,19 @@ texts = st.text(st.sampled_from("=+-@'\t\r\n ,\"aé＝0"), max_size=6)
 
 @pytest.mark.parametrize("text", FORMULAS)
 def test_a_text_that_would_be_computed_gets_a_mark_in_front(text: str) -> None:
-    assert escaped(text) == f"'{text}"
-    assert unescaped(escaped(text)) == text
+    assert escape_formula(text) == f"'{text}"
+    assert unescape(escape_formula(text)) == text
 
 
 @pytest.mark.parametrize("cell", [-0.5, -3, float("nan"), None, True, "", "a=b", "x-1", "'quoted'", "5 − 2"])
 def test_numbers_and_plain_texts_stay_as_they_are(cell: object) -> None:
-    assert escaped(cell) is cell
+    assert escape_formula(cell) is cell
 
 
 @given(texts)
 def test_every_text_comes_back(text: str) -> None:
-    assert unescaped(escaped(text)) == text
-    assert not escaped(text).lstrip().startswith(("=", "+", "-", "@"))
+    assert unescape(escape_formula(text)) == text
+    assert not escape_formula(text).lstrip().startswith(("=", "+", "-", "@"))
 
 
 @given(rows=st.lists(st.tuples(texts, texts), max_size=4))

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from probe_kit._system import imports, machine
-from probe_kit._system.counting import counted
+from probe_kit._system.counting import plural
 from probe_kit._system.imports import install_command, install_folder_command
 from probe_kit._system.machine import check_device_name, same_scheduling, what_is_here
 from probe_kit.errors import UsageError
@@ -92,7 +92,7 @@ def test_encoding_av1_makes_a_thread_of_root_a_real_time_one_otherwise(tmp_path:
     ],
 )
 def test_a_noun_is_in_the_plural_unless_there_is_one(number: int, noun: str, text: str) -> None:
-    assert counted(number, noun) == text
+    assert plural(number, noun) == text
 
 
 PACKAGE = Path(imports.__file__).parents[1]

@@ -20,7 +20,7 @@ from probe_kit._tables.formats import names, render
 from probe_kit._tables.formats.latex import _SPECIAL, MOST_COLUMNS
 from probe_kit._tables.html import sort_key
 from probe_kit._tables.numbers import number
-from probe_kit._tables.table import Cell, Heading, Legend, Row, Table, absent, grouped
+from probe_kit._tables.table import Cell, Heading, Legend, Row, Table, absent, group_headings
 
 HOSTILE = [
     "<img src=x onerror=alert(1)>", "</script><b>", "[text](https://evil.example)", "**bold**", "a | b",
@@ -184,7 +184,7 @@ def test_json_and_csv_hold_the_numbers_and_no_cell_that_a_spreadsheet_computes(n
 
 WIDE = Table.of(
     "Rates: a model",
-    (Heading("system"), Heading("category"), *grouped(("first", ("rate %",)), ("second", ("interval",)))),
+    (Heading("system"), Heading("category"), *group_headings(("first", ("rate %",)), ("second", ("interval",)))),
     [
         ("a policy with a long name", "color", "98.1", "[90, 99]"),
         ("a policy with a long name", "mean", "72.5", "[60, 80]"),
@@ -268,7 +268,10 @@ def test_columns_that_do_not_fit_are_left_out_by_name() -> None:
 def test_a_wide_tabular_is_divided_between_groups_and_each_has_its_lines_width() -> None:
     heads = (("a", 6), ("b", 6), ("c", 2), ("", 2))
     names = iter(f"c{at}" for at in range(1, 17))
-    columns = (Heading("c0"), *grouped(*((head, [next(names) for _ in range(count)]) for head, count in heads)))
+    columns = (
+        Heading("c0"),
+        *group_headings(*((head, [next(names) for _ in range(count)]) for head, count in heads)),
+    )
     text = Table.of("wide", columns, [("0", *map(Cell, range(1, 17)))]).to_latex()
     counts = [line.count("&") + 1 for line in text.splitlines() if line.startswith(("c0", "0 "))]
     assert counts == [MOST_COLUMNS, MOST_COLUMNS, 5, 5]
@@ -299,7 +302,7 @@ def test_columns_without_content_and_those_that_need_room_are_left_out() -> None
 
 def test_equal_headings_are_told_apart_by_the_name_over_them_where_a_page_has_one_line() -> None:
     table = Table.of(
-        "t", grouped(("", ["n"]), ("left", ["rate"]), ("right", ["rate", "p"])), [("x", "1", "2", "3")]
+        "t", group_headings(("", ["n"]), ("left", ["rate"]), ("right", ["rate", "p"])), [("x", "1", "2", "3")]
     )
     assert table.full_headings == ("n", "left rate", "right rate", "p")
 

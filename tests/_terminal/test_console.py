@@ -25,10 +25,10 @@ from probe_kit._terminal.console import (
     Heartbeat,
     SafeConsole,
     counter,
-    marked,
+    duration,
+    markup,
     print_json,
     print_text,
-    spoken,
 )
 from probe_kit._terminal.field_options import PanelledHelp
 
@@ -57,7 +57,7 @@ def a_table() -> Table:
         HOSTILE,
         Text(HOSTILE),
         a_table(),
-        marked("[bold]{}[/]", HOSTILE),
+        markup("[bold]{}[/]", HOSTILE),
         tables.Table.of(HOSTILE, (HOSTILE, HOSTILE), [(HOSTILE, HOSTILE)], notes=[HOSTILE]),
     ],
     ids=["text", "Text", "table", "marked", "fitting table"],
@@ -72,12 +72,12 @@ def test_markup_and_escapes_of_others_are_shown_and_not_obeyed(content: object) 
 
 def test_our_own_styles_still_work() -> None:
     console = SafeConsole(file=io.StringIO(), force_terminal=True, width=80, color_system="standard")
-    console.print(marked("[bold red]{}[/]: {}", "E", "[red]"))
+    console.print(markup("[bold red]{}[/]: {}", "E", "[red]"))
     assert written(console) == "\x1b[1;31mE\x1b[0m: [red]\n"
 
 
 def test_a_template_holds_as_many_values_as_places_and_none_is_read_again() -> None:
-    assert marked("[dim]{}[/] and {}", "{} {}", "[/dim]").plain == "{} {} and [/dim]"
+    assert markup("[dim]{}[/] and {}", "{} {}", "[/dim]").plain == "{} {} and [/dim]"
 
 
 def test_a_bar_and_a_waiting_line_show_names_as_they_are() -> None:
@@ -177,7 +177,7 @@ def test_loading_a_model_is_no_part_of_the_rate() -> None:
 
 @pytest.mark.parametrize(("seconds", "words"), [(0.2, "0 s"), (59.6, "1 min 00 s"), (3599.9, "1 h 00 min")])
 def test_durations_carry_over(seconds: float, words: str) -> None:
-    assert spoken(seconds) == words
+    assert duration(seconds) == words
 
 
 @pytest.mark.parametrize("terminal", [True, False])
@@ -233,11 +233,11 @@ STYLE = re.compile(r"\[(?:/|/?(?:bold|dim|italic|underline|red|green|yellow|cyan
 
 
 def unread_marks(source: str) -> list[str]:
-    """The texts with marks that `marked` does not read; docstrings are no output."""
+    """The texts with marks that `markup` does not read; docstrings are no output."""
     tree = ast.parse(source)
     read: set[int] = set()
     for node in ast.walk(tree):
-        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "marked":
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "markup":
             read |= {id(part) for argument in node.args[:1] for part in ast.walk(argument)}
         if isinstance(node, ast.Expr):
             read.add(id(node.value))
@@ -251,7 +251,7 @@ def test_every_style_of_a_printed_line_is_read_as_one_and_no_values_styles_are()
     unread = {name: unread_marks(source) for name, source in sources.items() if STYLE.search(source)}
     assert {name: texts for name, texts in unread.items() if texts} == {}
     assert unread_marks('say("next: [bold]probe-kit demo[/]")') == ["next: [bold]probe-kit demo[/]"]
-    assert marked("[bold]{}[/]", "[red]mine[/]").plain == "[red]mine[/]"
+    assert markup("[bold]{}[/]", "[red]mine[/]").plain == "[red]mine[/]"
 
 
 # -- numbers and their units ----------------------------------------------------------------------------------

@@ -18,7 +18,7 @@ from probe_kit.demo.pipeline import (
     UNTRAINED_NETWORK,
     VLM,
     Finding,
-    measured,
+    measure_truth,
     organism_table,
     settings_of,
     source_of,
@@ -107,9 +107,9 @@ def test_what_the_trained_one_follows_is_the_control_of_those_that_follow_nothin
 ) -> None:
     use = UseVerdict(behaviour="undecided", reason="why", lacks_control=bounded)
     alone = replace(row(0.4, p), image_swap=SwapEffect(use=use))
-    assert measured(alone, is_shown) == expected
+    assert measure_truth(alone, is_shown) == expected
     follows = UseVerdict(behaviour="used", reason="why")
-    assert measured(replace(alone, image_swap=SwapEffect(use=follows)), is_shown) == "used"
+    assert measure_truth(replace(alone, image_swap=SwapEffect(use=follows)), is_shown) == "used"
 
 
 @pytest.mark.slow

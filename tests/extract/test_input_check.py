@@ -13,7 +13,7 @@ from probe_kit.cli import app
 from probe_kit.env import SceneSpec
 from probe_kit.errors import IgnoredInputsError, InstructionError
 from probe_kit.extract import AskSettings, ExtractSettings, LeRobotSource, ask_run, prepare
-from probe_kit.extract.rollout.controllers import varied
+from probe_kit.extract.rollout.controllers import vary_observation
 from probe_kit.extract.sources.inputs import NEAREST, PICTURE, Frame, draw_donors, same_input
 from probe_kit.hooks import Edit, Observation, Policy, Site, Tap
 from probe_kit.hooks.families.pi0.adapter import load_pi0_tiny
@@ -169,14 +169,14 @@ def letters(text: str) -> tuple[int, ...]:
 
 
 def test_other_words_of_as_many_tokens_are_tried_first_and_then_all_others() -> None:
-    variants = varied(observation("lift it"), ["drop it now", "lift it", "push it", "what?"], letters)
+    variants = vary_observation(observation("lift it"), ["drop it now", "lift it", "push it", "what?"], letters)
     texts = [variant.instruction for variant in variants["instruction"]]
     assert texts == ["push it", "it lift", "drop it now", "what?"]
 
 
 def test_a_single_word_without_alternatives_and_a_picture_of_one_colour_are_not_varied() -> None:
     plain = np.full((4, 4, 3), 7, np.uint8)
-    variants = varied(observation("push", plain), ["push"], letters)
+    variants = vary_observation(observation("push", plain), ["push"], letters)
     assert {name: list(observations) for name, observations in variants.items()} == {
         "picture": [],
         "instruction": [],
@@ -185,14 +185,16 @@ def test_a_single_word_without_alternatives_and_a_picture_of_one_colour_are_not_
 
 def test_a_blank_picture_changes_nothing_but_the_picture() -> None:
     clean = observation("lift it")
-    (blank,) = varied(clean, [], letters)["picture"]
+    (blank,) = vary_observation(clean, [], letters)["picture"]
     assert not same_input(clean, blank, PICTURE)
     assert len(np.unique(blank.image.reshape(-1, 3), axis=0)) == 1
     assert (blank.instruction, blank.state.tolist()) == (clean.instruction, clean.state.tolist())
 
 
 def test_another_spelling_of_an_instruction_is_no_other_instruction() -> None:
-    (words, *_) = varied(observation("lift it"), ["Lift it.", "LIFT  IT", "push it"], letters)["instruction"]
+    (words, *_) = vary_observation(observation("lift it"), ["Lift it.", "LIFT  IT", "push it"], letters)[
+        "instruction"
+    ]
     assert words.instruction == "push it"
 
 

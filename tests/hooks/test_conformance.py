@@ -28,11 +28,11 @@ from probe_kit.hooks.conformance.check import (
     Outcome,
     SkipTest,
     check,
+    expect_refusal,
     package_of,
     place_of,
-    refused,
     require_bits,
-    tried,
+    try_check,
 )
 from probe_kit.hooks.conformance.subject import AnswerSubject, PolicySubject, Subject
 from probe_kit.hooks.families.pi0.adapter import Pi0
@@ -48,7 +48,7 @@ def of(error: BaseException | None) -> Outcome:
         if error is not None:
             raise error
 
-    return tried("name", "A promise.", "Do it.", body, "tests.hooks")
+    return try_check("name", "A promise.", "Do it.", body, "tests.hooks")
 
 
 def test_no_error_is_passed_and_a_skip_has_its_reason() -> None:
@@ -90,14 +90,14 @@ def test_ctrl_c_ends_the_command() -> None:
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background ignores it
     try:
         with pytest.raises(KeyboardInterrupt):
-            tried("name", "A promise.", "Do it.", lambda: os.kill(os.getpid(), signal.SIGINT), "tests")
+            try_check("name", "A promise.", "Do it.", lambda: os.kill(os.getpid(), signal.SIGINT), "tests")
     finally:
         signal.signal(signal.SIGINT, before)
 
 
 def test_what_an_adapter_changed_in_the_process_is_put_back() -> None:
     folder = Path.cwd()
-    tried("name", "A promise.", "Do it.", lambda: os.chdir("/"), "tests")
+    try_check("name", "A promise.", "Do it.", lambda: os.chdir("/"), "tests")
     assert Path.cwd() == folder
 
 
@@ -531,12 +531,12 @@ def test_a_failure_carries_the_advice_of_its_check_unless_it_has_its_own() -> No
 
 
 def test_an_error_of_another_kind_is_not_taken_for_a_refusal() -> None:
-    with pytest.raises(CheckFailedError, match="no error; expected: KeyError"), refused("it", KeyError):
+    with pytest.raises(CheckFailedError, match="no error; expected: KeyError"), expect_refusal("it", KeyError):
         pass
-    with pytest.raises(ValueError, match="other"), refused("it", KeyError):
+    with pytest.raises(ValueError, match="other"), expect_refusal("it", KeyError):
         raise ValueError("other")
     unsaid = pytest.raises(CheckFailedError, match="a message about it that says 'name'")
-    with unsaid, refused("it", KeyError, says="name"):
+    with unsaid, expect_refusal("it", KeyError, says="name"):
         raise KeyError("nothing")
 
 

@@ -15,7 +15,7 @@ from probe_kit.hooks import load_model
 from probe_kit.hooks.checkpoints.checkpoint import (
     cached_folder,
     hub_files,
-    pinned,
+    pin_revision,
     pinned_commits,
     without_revision,
 )
@@ -58,7 +58,7 @@ def offline(monkeypatch: pytest.MonkeyPatch, server: Hub) -> Hub:
 def test_a_revision_names_the_commit_that_is_read(revision: str, age: int) -> None:
     folder = checkpoint_folder(f"{REPO}{revision}")
     assert (folder / "config.json").read_text(encoding="utf-8") == f'{{"age": {age}}}'
-    assert pinned(f"{REPO}{revision}") == f"{REPO}@{NEW if age == 2 else OLD}"
+    assert pin_revision(f"{REPO}{revision}") == f"{REPO}@{NEW if age == 2 else OLD}"
     assert cached_folder(f"{REPO}{revision}") == folder
     assert without_revision(f"{REPO}{revision}") == REPO
     assert hub_files(f"{REPO}{revision}") == ["config.json"]
@@ -176,7 +176,7 @@ def test_a_local_folder_with_an_at_sign_is_a_folder(tmp_path: Path, monkeypatch:
     monkeypatch.chdir(tmp_path)
     Path("lab/tiny@v1").mkdir(parents=True)
     assert checkpoint_folder("lab/tiny@v1") == Path("lab/tiny@v1")
-    assert pinned("lab/tiny@v1") == "lab/tiny@v1"
+    assert pin_revision("lab/tiny@v1") == "lab/tiny@v1"
 
 
 def test_labels_name_the_revision_also_one_with_slashes() -> None:

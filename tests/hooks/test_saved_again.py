@@ -23,7 +23,7 @@ from probe_kit.errors import CheckpointError, InstructionError, WeightsError
 from probe_kit.hooks import Observation, Prompt, load_model
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.families.shared.vlm import Prefill
-from probe_kit.models.checkpoint_files import LANGUAGE_FIRST, SIGLIP_TOWER, picture_values, renamed
+from probe_kit.models.checkpoint_files import LANGUAGE_FIRST, SIGLIP_TOWER, picture_values, rename_tensor
 from tests.support import saved_again
 from tests.support.every_checkpoint import WRITERS, families
 from tests.support.saved_again import CLASSES, LAYOUTS, copied, join_processor, rename_weights
@@ -83,7 +83,7 @@ def test_names_of_a_module_stay_as_they_are() -> None:
         "model.vision_tower.vision_model.encoder.layers.1.mlp.fc1.bias",
         "model.multi_modal_projector.linear.weight",
     ):
-        assert renamed(name, (*LANGUAGE_FIRST, *SIGLIP_TOWER)) == name
+        assert rename_tensor(name, (*LANGUAGE_FIRST, *SIGLIP_TOWER)) == name
 
 
 def test_a_tensor_that_another_naming_lacks_is_still_missed_by_name(tmp_path: Path) -> None:

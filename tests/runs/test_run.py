@@ -41,7 +41,7 @@ from probe_kit.runs.store import locate
 from probe_kit.runs.writer import RunWriter
 from probe_kit.train import load_results, train_probes
 from probe_kit.train.builtin_columns import label_frame
-from probe_kit.view.commands import _opened
+from probe_kit.view.commands import _open_runs
 from tests.support.recorded_run import ACTION, CALLS, CHUNK, EVERY, SHORT, recorded_plan, write_recorded_run
 from tests.support.rehashing import rehash
 
@@ -410,7 +410,7 @@ def test_names_of_runs_can_be_copied_from_a_narrow_terminal(folder: Path, monkey
 
 
 def test_the_viewer_opens_all_runs_of_a_folder(folder: Path) -> None:
-    assert [run.location.name for run in _opened([str(folder)], True)] == ["b", "a"]
+    assert [run.location.name for run in _open_runs([str(folder)], True)] == ["b", "a"]
 
 
 def test_inputs_are_read_as_they_were_shown_and_nan_behind_the_last_frame(shown_run: Run) -> None:

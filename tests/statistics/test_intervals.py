@@ -24,8 +24,8 @@ from probe_kit.statistics.bootstrap import (
     reach,
     student_interval,
     unlike,
-    unseen,
-    widened,
+    unseen_quantiles,
+    widen_draws,
 )
 from probe_kit.statistics.folds import OUTER_FOLDS, SHARED_TRAINING
 from probe_kit.statistics.intervals import (
@@ -94,17 +94,17 @@ def test_groups_that_differ_anyway_are_drawn_as_they_are() -> None:
     each = np.random.default_rng(0).binomial(4, 0.6, 75)[:, None] / 4
     draws = bootstrap_means(each, np.arange(75), 0)
     assert (reach(each) == 0).all()
-    wide = widened(draws, each.mean(axis=0), each, 0)
+    wide = widen_draws(draws, each.mean(axis=0), each, 0)
     np.testing.assert_array_equal(*(np.percentile(values, [1, 2.5, 50, 97.5, 99]) for values in (wide, draws)))
 
 
 def test_draws_keep_their_order_and_equal_ones_have_one_order_for_all() -> None:
     each = (np.arange(12) > 0).astype(float)[:, None]
     draws = bootstrap_means(each, np.arange(12), 0)
-    wide = widened(draws, each.mean(axis=0), each, 0)
+    wide = widen_draws(draws, each.mean(axis=0), each, 0)
     order = np.argsort(wide[:, 0], kind="stable")
     assert (np.diff(draws[order, 0]) >= 0).all()
-    again = widened(draws + 1e-15 * draw_groups(12, 3)[:, :1], each.mean(axis=0), each, 0)
+    again = widen_draws(draws + 1e-15 * draw_groups(12, 3)[:, :1], each.mean(axis=0), each, 0)
     np.testing.assert_allclose(again, wide, atol=1e-9)
 
 
@@ -116,7 +116,7 @@ def test_how_many_are_unlike_most() -> None:
 def test_what_was_not_seen_lies_within_the_bounds_and_about_the_value() -> None:
     for bounds, value in product((SHARES, GAINS), (0.0, 0.4, 1.0)):
         each = np.full((10, 1), value)
-        percentiles = unseen(np.array([value]), each, bounds=bounds)[:, 0]
+        percentiles = unseen_quantiles(np.array([value]), each, bounds=bounds)[:, 0]
         assert bounds[0] <= percentiles[0] < percentiles[-1] <= bounds[1]
         assert (np.diff(percentiles) >= 0).all()
         assert percentiles[percentiles.size // 2 - 1] <= value <= percentiles[percentiles.size // 2]

@@ -288,7 +288,7 @@ def attended_roles(model: Model, roles: Mapping[str, Sequence[Roles]], site: Sit
         behind = roles.get(acting or "", stream_roles)
     elif len(stream_roles[0]) == tokens and model.prompt_kv is None:
         return list(stream_roles)
-    joined = [_joined(first, last, tokens) for first, last in zip(before, behind, strict=True)]
+    joined = [_join_roles(first, last, tokens) for first, last in zip(before, behind, strict=True)]
     if any(row is None for row in joined):
         raise RolesMismatchError(
             f"{site} attends to {tokens} positions; {backbone} has {len(before[0])} and {stream.name} "
@@ -297,7 +297,7 @@ def attended_roles(model: Model, roles: Mapping[str, Sequence[Roles]], site: Sit
     return [row for row in joined if row is not None]
 
 
-def _joined(before: Roles, behind: Roles, tokens: int) -> Roles | None:
+def _join_roles(before: Roles, behind: Roles, tokens: int) -> Roles | None:
     """The roles of `before`, then `behind`: once or, of a single position, as often as `tokens` in all have room.
 
     The result is None if they do not fit.
@@ -347,7 +347,7 @@ class _AttentionCalls(TorchFunctionMode):
         if self.is_paused:
             return result
         if func is _FUSED:
-            self.last = _fused(*args, **keywords)
+            self.last = _fused_attention(*args, **keywords)
         elif func in _SOFTMAX and result.dim() == 4:
             self._shares = result
         elif func in _MATMUL and self._shares is not None and _is_reading(self._shares, *args[:2]):
@@ -361,7 +361,7 @@ def _is_reading(shares: Tensor, weights: Tensor, values: Tensor) -> bool:
     return weights.shape == shares.shape and values.dim() == 4 and values.shape[2] == shares.shape[3]
 
 
-def _fused(
+def _fused_attention(
     query: Tensor,
     key: Tensor,
     value: Tensor,
@@ -376,7 +376,7 @@ def _fused(
         return None
 
     def weights() -> Tensor:
-        keys = _of_every_head(key, query.shape[1]).float()
+        keys = _repeat_for_heads(key, query.shape[1]).float()
         factor = query.shape[-1] ** -0.5 if scale is None else scale
         logits = query.float() @ keys.transpose(2, 3) * factor
         mask = attn_mask
@@ -389,7 +389,7 @@ def _fused(
     return _Attention(weights, value)
 
 
-def _of_every_head(heads: Tensor, count: int) -> Tensor:
+def _repeat_for_heads(heads: Tensor, count: int) -> Tensor:
     """Return keys or values (B, G, T, E) as (B, H, T, E), each of the G repeated for the heads that share it."""
     return heads.repeat_interleave(count // heads.shape[1], dim=1)
 
@@ -410,7 +410,7 @@ def _attention_at(model: Model, site: Site, calls: _AttentionCalls, read: Tensor
         )
     calls.is_paused = True
     weights = calls.last.weights()
-    values = _of_every_head(calls.last.values, weights.shape[1]).float()
+    values = _repeat_for_heads(calls.last.values, weights.shape[1]).float()
     computed = tap.rows.of((weights @ values.to(weights.device)).transpose(1, 2).flatten(2))[:, tap.tokens]
     calls.is_paused = False
     _check_reading(site, stream, weights.shape[1], computed, read)

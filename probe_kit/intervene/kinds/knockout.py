@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from probe_kit._tables.content import Cell as TableCell
 from probe_kit._tables.content import absent
-from probe_kit._tables.numbers import number, signed
+from probe_kit._tables.numbers import number, with_sign
 from probe_kit.errors import EmptyRoleError, UnsupportedInterventionError, UsageError
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.declared import InterventionKind
@@ -472,7 +472,7 @@ def _columns(has_sides: bool) -> list[EffectColumn[KnockoutEffect]]:
         change,
         EffectColumn(
             "wrong side",
-            lambda row: TableCell(row.net, signed),
+            lambda row: TableCell(row.net, with_sign),
             "wrong side: share of episodes whose action leaves the correct picture's side, minus those that come",
         ),
         p,

@@ -10,7 +10,7 @@ from probe_kit.errors import OwnEnvironmentError
 from probe_kit.extract import EnvSource, Step
 from probe_kit.extract.sources.environment_source import (
     EnvironmentSource,
-    arranged,
+    arrange_pictures,
     mapped_pictures,
     open_environment,
 )
@@ -98,17 +98,17 @@ def test_a_step_has_the_pictures_of_the_cameras_and_the_lens_of_the_first_pictur
     front, wrist = (np.full((2, 3, 3), value, np.uint8) for value in (1, 2))
     lens = np.eye(3, dtype=np.float32)
     step = Step(Observation(front, np.zeros(2, np.float32), "push", lens, {"wrist": wrist}))
-    same = arranged(step, (("base", "front"), ("side", "wrist")), "front", "kitchen").observation
-    exchanged = arranged(step, (("base", "wrist"), ("side", "front")), "front", "kitchen").observation
+    same = arrange_pictures(step, (("base", "front"), ("side", "wrist")), "front", "kitchen").observation
+    exchanged = arrange_pictures(step, (("base", "wrist"), ("side", "front")), "front", "kitchen").observation
     assert (same.image, same.cameras["side"], same.intrinsics) == (front, wrist, lens)
     assert (exchanged.image is wrist, exchanged.cameras["side"] is front, exchanged.intrinsics) == (
         True,
         True,
         None,
     )
-    assert arranged(step, (), "front", "kitchen") is step
+    assert arrange_pictures(step, (), "front", "kitchen") is step
     with pytest.raises(OwnEnvironmentError, match=r"kitchen shows front, wrist, and no 'top'\. Correct"):
-        arranged(step, (("base", "top"),), "front", "kitchen")
+        arrange_pictures(step, (("base", "top"),), "front", "kitchen")
 
 
 @pytest.mark.parametrize(

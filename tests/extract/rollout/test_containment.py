@@ -34,7 +34,7 @@ from probe_kit.errors import (
 from probe_kit.extract import ExtractSettings, extract_run, prepare
 from probe_kit.extract.sources.player import LONGEST_TRACEBACK, add_traceback, traceback_of
 from probe_kit.hooks import Observation
-from probe_kit.hooks.checkpoints.third_party import contained, while_acting
+from probe_kit.hooks.checkpoints.third_party import contain_policy, while_acting
 from probe_kit.hooks.families.pi0.adapter import Pi0, load_pi0_tiny
 from probe_kit.hooks.family import Family
 from probe_kit.runs import Run, open_run
@@ -371,7 +371,7 @@ def test_the_limit_ends_a_process_that_holds_the_interpreter() -> None:
 
 
 def test_a_call_within_its_limit_is_not_ended_later() -> None:
-    with contained(0.2):
+    with contain_policy(0.2):
         pass
     time.sleep(0.3)
     assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)

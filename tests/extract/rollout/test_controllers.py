@@ -26,12 +26,12 @@ from probe_kit.extract.rollout.controllers import (
     executed_actions,
     with_rotation_vectors,
 )
-from probe_kit.extract.rollout.tasks import check_reachable, fitted
+from probe_kit.extract.rollout.tasks import check_reachable, fit_source
 from probe_kit.extract.sources.scene import SceneSettings
 from probe_kit.extract.sources.scene_source import SceneSource
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks import ModelCard, Observation, load_policy
-from probe_kit.intervene.rollout import executed
+from probe_kit.intervene.rollout import executed_chunk
 from probe_kit.runs.plan import Row
 from probe_kit.suite import Suite
 from tests.support.spatialvla_checkpoints import write_checkpoint
@@ -86,7 +86,7 @@ def test_a_replayed_episode_executes_what_the_run_did(rotation: Any, exponent: f
         run=SimpleNamespace(settings=settings), policy=SimpleNamespace(card=SimpleNamespace(ensemble=exponent))
     )
     replayed = executed_actions(past, 2, exponent, rotation)
-    np.testing.assert_array_equal(executed(cast(Any, session), past), replayed)
+    np.testing.assert_array_equal(executed_chunk(cast(Any, session), past), replayed)
     assert replayed.shape == ((2, 7) if exponent is None else (1, 7))
     head = executed_actions(past, 2, exponent)
     if rotation == "roll-pitch-yaw":
@@ -218,8 +218,8 @@ def test_intrinsics_project_as_the_camera_does_whatever_the_picture_size() -> No
 
 def test_a_batch_that_changes_numbers_and_a_camera_that_is_not_there_are_refused(small_suite: Suite) -> None:
     source, two = SceneSource(SceneSettings(scene=SceneSpec()), small_suite), ExtractSettings("pi0", batch=2)
-    fitted(replace(CARD, batch=1, needs=frozenset({"intrinsics", "state"})), two.changed(batch=1), source)
+    fit_source(replace(CARD, batch=1, needs=frozenset({"intrinsics", "state"})), two.changed(batch=1), source)
     with pytest.raises(UsageError, match="--batch 2 with mine, which takes at most 1"):
-        fitted(replace(CARD, batch=1), two, source)
+        fit_source(replace(CARD, batch=1), two, source)
     with pytest.raises(UsageError, match=r"reads camera\.wrist"):
-        fitted(replace(CARD, needs=frozenset({"camera.wrist"})), two, source)
+        fit_source(replace(CARD, needs=frozenset({"camera.wrist"})), two, source)

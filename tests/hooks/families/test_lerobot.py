@@ -36,7 +36,7 @@ from probe_kit.hooks.families.shared.lerobot.pipelines import (
 from probe_kit.hooks.families.shared.lerobot.policy import TEXT_FILES
 from probe_kit.hooks.families.shared.lerobot.window import PictureWindow, read_window
 from probe_kit.hooks.registry import find_family
-from probe_kit.models.pi0 import PaliGemmaSize, Pi0Size, resized
+from probe_kit.models.pi0 import PaliGemmaSize, Pi0Size, resize_network
 from tests.support.every_checkpoint import WRITERS
 from tests.support.lerobot_pipelines import changed, raw, save_pipelines, without_hub
 from tests.support.molmoact2_checkpoints import write_molmoact2
@@ -202,7 +202,7 @@ def test_pi05_acts_as_lerobots_own_loading_processors_and_policy_bit_for_bit(
     modes = {"VISUAL": "IDENTITY", "STATE": mode, "ACTION": mode}
     before, behind = save_pipelines(folder, normalization_mapping=modes, dtype=dtype)
     every = Pi05.load(str(folder))
-    with resized(modeling_pi05, Pi0Size.from_file(folder / "dims.json"), every.config):
+    with resize_network(modeling_pi05, Pi0Size.from_file(folder / "dims.json"), every.config):
         theirs = modeling_pi05.PI05Policy.from_pretrained(folder).eval()
     for cameras in (CAMERAS, CAMERAS[:1]):
         ours = every.with_cameras(cameras)
@@ -243,7 +243,7 @@ def _fast_acts_as_lerobot(folder: Path, patch: pytest.MonkeyPatch) -> Any:
         patch.setattr(
             modeling_pi0_fast, name, SimpleNamespace(from_pretrained=lambda *_, returned=component, **__: returned)
         )
-    with resized(modeling_pi0_fast, PaliGemmaSize.from_file(folder / "dims.json"), ours.config):
+    with resize_network(modeling_pi0_fast, PaliGemmaSize.from_file(folder / "dims.json"), ours.config):
         theirs = modeling_pi0_fast.PI0FastPolicy.from_pretrained(folder).eval()
     for observation in observations():
         packed = before(raw(observation, {"base": observation.image}))

@@ -22,7 +22,13 @@ from probe_kit.errors import (
     WeightsError,
 )
 from probe_kit.hooks import Prompt, load_model
-from probe_kit.hooks.families.shared.taps import on_the_prompt, recomputed, recording_weights, returned, shares
+from probe_kit.hooks.families.shared.taps import (
+    on_the_prompt,
+    recompute_weights,
+    recording_weights,
+    returned_weights,
+    shares,
+)
 from probe_kit.hooks.families.shared.text import Frame, FramedText
 from probe_kit.hooks.families.shared.token_decoder import ALL, CHECKPOINT, TOP, chooser, top_of
 from probe_kit.hooks.registry import find_family
@@ -69,8 +75,8 @@ def test_llamas_last_position_is_weighed_as_eager_attention_weighs_it() -> None:
 
     with (
         torch.inference_mode(),
-        recording_weights(attentions, noting("returned"), returned),
-        recording_weights(attentions, noting("recomputed"), recomputed),
+        recording_weights(attentions, noting("returned"), returned_weights),
+        recording_weights(attentions, noting("recomputed"), recompute_weights),
     ):
         for ids in ([[1, 2, 3, 4, 5, 6]], [[7]], [[8]]):
             network(input_ids=torch.tensor(ids), past_key_values=cache, use_cache=True)
@@ -105,12 +111,12 @@ def test_an_attention_with_a_norm_of_queries_or_a_soft_cap_is_refused_not_recomp
     attention = getattr(transformers, f"{network}Model")(config).layers[0].self_attn
     step = {"Qwen3": "q_norm", "Gemma2": "attn_logit_softcapping"}[network]
     with pytest.raises(UnsupportedInterventionError, match=rf"{network}Attention .*{step}.*Patch `kv`"):
-        recomputed(attention, (torch.zeros(1, 1, 32),), {}, None)
+        recompute_weights(attention, (torch.zeros(1, 1, 32),), {}, None)
 
 
 def test_an_attention_of_another_kind_is_refused() -> None:
     with pytest.raises(UnsupportedInterventionError, match="Patch `kv`"):
-        recomputed(torch.nn.Identity(), (), {}, None)
+        recompute_weights(torch.nn.Identity(), (), {}, None)
 
 
 def logits(rows: int) -> torch.Tensor:

@@ -14,7 +14,7 @@ import pytest
 from rich.console import Console
 from scipy import stats
 
-from probe_kit._tables.numbers import points, signed
+from probe_kit._tables.numbers import points, with_sign
 from probe_kit.errors import UsageError
 from probe_kit.retention import RetentionTable, retention_table
 from probe_kit.retention.behaviour import TableRun, distinct_labels
@@ -636,7 +636,7 @@ def test_a_smaller_group_with_a_larger_spread_has_an_interval_and_no_p() -> None
     test = ModelTest.of(few, many)
     assert test is not None
     assert (test.p, test.smallest_p) == (None, None)
-    assert models_test(test, signed).text.startswith("– ")
+    assert models_test(test, with_sign).text.startswith("– ")
     alike = ModelTest.of(many, [0.53, 0.5, 0.52, 0.51, 0.49, 0.5])
     assert alike is not None
     assert alike.p is not None

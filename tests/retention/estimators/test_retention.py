@@ -527,7 +527,10 @@ def test_a_run_minus_its_equal_is_nothing_in_every_number_and_narrow(scored: Cal
 def test_runs_on_the_same_groups_are_paired_and_others_are_not(scored: Callable[..., StreamScores]) -> None:
     """Two runs that are right about the same items: their difference is known better than that of strangers."""
     strong = pooled(scored([0.5, 0.85], [[0.6, 0.75]]))
-    same, other = pooled(scored([0.5, 0.8], [[0.6, 0.7]])), pooled(scored([0.5, 0.8], [[0.6, 0.7]], other_category=True))
+    same, other = (
+        pooled(scored([0.5, 0.8], [[0.6, 0.7]])),
+        pooled(scored([0.5, 0.8], [[0.6, 0.7]], other_category=True)),
+    )
     for name in strong.names:
         paired, apart = strong.accuracy_difference(same, name), strong.accuracy_difference(other, name)
         assert strong.covariance_with(other)[0, 0] == 0

@@ -15,7 +15,7 @@ from probe_kit.errors import SuiteError, UnknownCategoryError, UsageError
 from probe_kit.suite import load_suite, validate_suite
 from probe_kit.suite.converters import convert
 from probe_kit.suite.converters.act2answer import BoundingBoxWarning, object_of, read_tile
-from probe_kit.suite.converters.candidates import trimmed
+from probe_kit.suite.converters.candidates import trim
 from probe_kit.suite.converters.vlthink import upright_board
 from tests.conftest import SHARED
 from tests.support.act2answer_tiles import THICKNESS, WIDTH, art, write_tile
@@ -79,7 +79,7 @@ def test_the_authors_boards_are_upright_as_their_scene_turns_them() -> None:
         tile = read_tile(board, yaw=0)
         np.testing.assert_allclose(tile.size, (0.11, 0.11, 0.006), atol=1e-6)
         upright = upright_board(board)
-        ours = trimmed(tile.picture)
+        ours = trim(tile.picture)
         ours.thumbnail((600, 600), Image.Resampling.LANCZOS)
         np.testing.assert_array_equal(np.asarray(ours), np.asarray(upright), err_msg=str(board))
         released = np.asarray(read_tile(board).picture)

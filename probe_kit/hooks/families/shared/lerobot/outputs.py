@@ -34,7 +34,7 @@ def lerobot_outputs(load: Callable[..., LerobotPolicy], folder: Path, recorded: 
     policy = load(str(folder / "checkpoint"), dtype="float32")
     if "in_lang_tokens" in recorded:
         policy = policy.with_cameras([camera for camera in policy.cameras if f"in_image_{camera}" in recorded])
-        batch = _prepared(policy, recorded)
+        batch = _prepare_inputs(policy, recorded)
     else:
         batch = policy.batch(_observations(policy, recorded))
     replayed, activations, calls = watch(
@@ -55,7 +55,7 @@ def lerobot_outputs(load: Callable[..., LerobotPolicy], folder: Path, recorded: 
     return Outputs(produced, valid={} if valid is None else dict.fromkeys(_MASKED, valid))
 
 
-def _prepared(policy: LerobotPolicy, recorded: Arrays) -> dict[str, Tensor]:
+def _prepare_inputs(policy: LerobotPolicy, recorded: Arrays) -> dict[str, Tensor]:
     images = {
         f"{IMAGES}{camera}": torch.from_numpy(recorded[f"in_image_{camera}"]) for camera in policy.shown_cameras
     }
