@@ -276,8 +276,8 @@ def assert_numbers_are_whole(text: str) -> None:
     assert len(rows) > 10, "the text was wrapped"
     for quantity in QUANTITIES:
         # an interval stays whole, but may stand below its value
-        whole = re.search(r"\[.*\]", quantity)
-        assert sum(row.count(whole[0] if whole else quantity) for row in rows) == 4, quantity
+        interval = re.search(r"\[.*\]", quantity)
+        assert sum(row.count(interval[0] if interval else quantity) for row in rows) == 4, quantity
 
 
 @WIDTHS
