@@ -148,7 +148,7 @@ def bench_verifying(suite: Suite, run: Path, gigabytes: float, repeats: int) -> 
     many = tuple(_numbered(plan.episodes[0], number) for number in range(episodes))
     writer = RunWriter(locate(run), _of_many(suite, plan, many), settings("none"))
     record = episode(plan, 0)
-    with writer.owned():
+    with writer.claim():
         for planned in many:
             writer.write(replace(record, planned=planned))
         seal(run)

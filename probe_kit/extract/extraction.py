@@ -142,7 +142,7 @@ class Extraction:
             if not force and addition.episodes:
                 check_if_full(space_needed(addition, self.settings), location)
             writer = self.writer(location)
-            with writer.owned():
+            with writer.claim():
                 check_exclusive(location, GROUP_FILE, writer.root.stored_metadata[GROUP_FILE])
                 if self.settings.label is not None:
                     label_run(location, run_label(self.settings))

@@ -177,7 +177,7 @@ def write_bundle(
         files: The contents by name; former files that are not given stay as they are.
         times: The times of events by name (UTC, ISO 8601), which replace the former ones.
     """
-    with location.tended(f"{home}/{key}"):
+    with location.take_turns(f"{home}/{key}"):
         folder, run = f"{home}/{key}", _identity(location)
         before = read_bundle(location, home, key) if is_complete(location, home, key) else None
         former = dict(before.files) if before else {}
@@ -220,7 +220,7 @@ def is_complete(location: Location, home: str, key: str) -> bool:
 
 def tidy_bundle(location: Location, home: str, key: str) -> None:
     """Remove what killed processes left of a complete bundle: files and folders that never counted."""
-    with location.tended(f"{home}/{key}"):
+    with location.take_turns(f"{home}/{key}"):
         location.remove(f"{home}/.{key}{PARTIAL}")
 
 

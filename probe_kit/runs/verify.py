@@ -53,7 +53,7 @@ def seal(path: Path | str | Location, deep: bool = False) -> bool:
             other records. By default only missing objects are noticed.
     """
     location = Run(locate(path)).location
-    with location.locked(lambda: None), location.tended(DATA):  # a folder that is never exchanged
+    with location.locked(lambda: None), location.take_turns(DATA):  # a folder that is never exchanged
         run = read_run(location)
         if deep and not run.root.left_out:
             run.restore_records()

@@ -319,7 +319,7 @@ class Failures:
             DiskSpaceError: For a folder that cannot be written.
             StoreError: For an object store that cannot be written.
         """
-        with self._location.explained_errors(), self._location.tended(FOLDER):
+        with self._location.explained_errors(), self._location.take_turns(FOLDER):
             pass
 
     def of(self, cell: Cell, probes: str = "") -> Failure | None:

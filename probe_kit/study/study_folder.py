@@ -262,7 +262,7 @@ class StudyFolder:
         newest = self._newest(lambda other: (other.model, other.paths) == (cell.model, cell.paths))
         if model.same(self._models.get(name)) and (newest is None or newest.contents == contents):
             return
-        with self._location.explained_errors(), self._location.tended(RECORDS):
+        with self._location.explained_errors(), self._location.take_turns(RECORDS):
             self._location.write(f"{RECORDS}/{name}", model.to_bytes())
         self._models[name] = model
 

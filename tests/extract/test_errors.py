@@ -272,11 +272,11 @@ def test_a_worker_holds_the_run_itself(settings: ExtractSettings, tmp_path: Path
 
 def test_a_worker_that_joins_forgets_no_failure(settings: ExtractSettings, tmp_path: Path) -> None:
     writer = prepare(settings).writer(Folder(tmp_path / "run"))
-    with writer.owned():
+    with writer.claim():
         writer.give_up(3, "it fell over")
         with writer.joined():
             pass
     with writer.joined():
         assert list(writer.location.read_all("failed", ".json"))
-    with writer.owned():
+    with writer.claim():
         assert not list(writer.location.read_all("failed", ".json"))

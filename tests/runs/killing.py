@@ -49,7 +49,7 @@ def rollout(plan: Plan, number: int) -> writer.EpisodeRecord:
 def extract(run: str, plan: Plan) -> None:
     """What an extraction does with its episodes."""
     writing = writer.RunWriter(locate(run), plan, SETTINGS)
-    with writing.owned(), writing.location.explained_errors():
+    with writing.claim(), writing.location.explained_errors():
         for number in writing.remaining():
             writing.write(rollout(plan, number))
         verify.seal(run)

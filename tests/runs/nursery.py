@@ -27,7 +27,7 @@ def extract(run: str, suite: str) -> None:
     """What an extraction does with its episodes."""
     plan = little_plan(load_suite(Path(suite)))
     writer = RunWriter(locate(run), plan, little_settings())
-    with writer.owned():
+    with writer.claim():
         certify(writer)
         for number in writer.remaining():
             writer.write(episode(plan, number))

@@ -515,7 +515,7 @@ def write(run: Path | str, server_suite: Suite) -> Run:
     """What an extraction does with its episodes."""
     plan = little_plan(server_suite, episodes=EPISODES)
     writer = little_writer(locate(run), plan)
-    with writer.owned():
+    with writer.claim():
         for number in writer.remaining():
             writer.write(episode(plan, number))
         seal(run)

@@ -123,7 +123,7 @@ class Extraction(RuleBasedStateMachine):
     def resume(self) -> None:
         """A new process comes along."""
         self.writer = RunWriter(locate(self.folder / "run"), self.plan, choices(self.calls, "all", "zstd"))
-        with self.writer.owned():
+        with self.writer.claim():
             self.writer.begin()
             assert self.writer.remaining() == [n for n in range(self.count) if n not in self.committed]
         assert not list((self.folder / "run").rglob("*.tmp")), "leftovers are cleared"

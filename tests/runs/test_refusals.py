@@ -174,7 +174,7 @@ def extracted(run: str, suite: Suite) -> None:
     """What `extract` does with two episodes."""
     plan = little_plan(suite, episodes=2)
     writer = little_writer(locate(run), plan)
-    with writer.owned():
+    with writer.claim():
         for number in writer.remaining():
             writer.write(episode(plan, number))
         seal(run)

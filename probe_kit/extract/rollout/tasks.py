@@ -317,6 +317,6 @@ class Ask(_Task):
     def fit(self, settings: AskSettings, source: Source[Any], model: "AnswerModel | None") -> Fitted:
         """Show the source to the model, and choose how its answers are read."""
         assert model is not None, "no script answers"
-        source = source.watched(model.card.cameras)
+        source = source.for_cameras(model.card.cameras)
         settings = fit_source(model.card, settings, source)
         return settings, source, AnswerController(model, source, settings), None

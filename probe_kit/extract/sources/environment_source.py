@@ -604,7 +604,7 @@ class EnvironmentSource(Source[EnvSource]):
 
     # -- a model -------------------------------------------------------------------------------------
 
-    def watched(self, cameras: Sequence[str]) -> Self:
+    def for_cameras(self, cameras: Sequence[str]) -> Self:
         """Set up the first chosen episode; no action is executed, so that facts are those of `reset`."""
         return self._begun(DeclaredInputs(tuple(cameras[:1])), False)
 

@@ -233,7 +233,7 @@ class PictureSource(Source[PictureFolder]):
         """Return the first camera: a row has one picture."""
         return (declared.cameras if declared else (CAMERA,))[:1]
 
-    def watched(self, cameras: Sequence[str]) -> Self:
+    def for_cameras(self, cameras: Sequence[str]) -> Self:
         """Show the pictures to the model's first camera."""
         self.cameras = list(cameras[:1])
         return self

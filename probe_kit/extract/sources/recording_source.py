@@ -110,7 +110,7 @@ class RecordingSource(Source[LeRobotSource]):
         """Return the same recordings with a row per chosen frame."""
         return type(self)(self.settings, self.folder, 1)
 
-    def watched(self, cameras: Sequence[str]) -> Self:
+    def for_cameras(self, cameras: Sequence[str]) -> Self:
         """Map the model's first camera, and read all numbers of the chosen episodes."""
         mapped = self.mapped(DeclaredInputs(tuple(cameras[:1])))
         fetch_episodes(mapped.folder, mapped.episodes, mapped.features)

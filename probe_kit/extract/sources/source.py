@@ -184,7 +184,7 @@ class Source[Chosen: SourceSettings](ABC):
         """Return the source with a row per question, which is about the row's first observation."""
         return self
 
-    def watched(self, cameras: Sequence[str]) -> Self:
+    def for_cameras(self, cameras: Sequence[str]) -> Self:
         """Return the source as it is shown to a model with these cameras that answers and does not act.
 
         Raises an error for cameras that get no picture.

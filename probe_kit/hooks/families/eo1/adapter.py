@@ -216,6 +216,6 @@ class Eo1(PackedPolicy):
         shared = (decoder.layers, decoder.norm, int(decoder.config.hidden_size))
         return {"backbone": token_stack(*shared, None), "expert": token_stack(*shared, steps, first=1)}
 
-    def watched(self) -> dict[str, nn.Module]:
+    def recorded_modules(self) -> dict[str, nn.Module]:
         """Return the module of the velocity."""
         return {"velocity": self.network.model.action_out_proj}

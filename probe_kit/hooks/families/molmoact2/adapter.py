@@ -406,7 +406,7 @@ class MolmoAct2(PackedPolicy):
 
     # -- verification ------------------------------------------------------------------------------------
 
-    def watched(self) -> dict[str, nn.Module]:
+    def recorded_modules(self) -> dict[str, nn.Module]:
         """Return the module of the velocity."""
         return {"velocity": self.network._backbone().action_expert.final_layer}
 

@@ -462,7 +462,7 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
         ids = self.tokens(batch, range(len(batch[TOKENS])))
         return {"actions": np.stack([chunk.values for chunk in self.chunks(ids)]), "tokens": numpy_of(ids)}
 
-    def watched(self) -> dict[str, nn.Module]:
+    def recorded_modules(self) -> dict[str, nn.Module]:
         """Return the module of the logits."""
         return {"logits": self.network.model.paligemma_with_expert.paligemma.lm_head}
 

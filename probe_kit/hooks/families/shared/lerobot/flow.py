@@ -119,7 +119,7 @@ class LerobotFlow(DenoisingPolicy):
 
     # -- verification ------------------------------------------------------------------------------------
 
-    def watched(self) -> dict[str, nn.Module]:
+    def recorded_modules(self) -> dict[str, nn.Module]:
         """Return the velocity, and the connector of a backbone that has one."""
         model = self.network.model
         connected = hasattr(model, "vlm_with_expert")

@@ -38,13 +38,13 @@ def lerobot_outputs(load: Callable[..., LerobotPolicy], folder: Path, recorded: 
     else:
         batch = policy.batch(_observations(policy, recorded))
     replayed, activations, calls = watch(
-        policy, lambda: policy.replay(batch, recorded), policy.watched(), policy.watched_inputs()
+        policy, lambda: policy.replay(batch, recorded), policy.recorded_modules(), policy.watched_inputs()
     )
     run = RecordedRun(batch, recorded, activations, calls)
     produced: dict[str, Produce] = {
         **{name: partial(numpy_of, values) for name, values in batch.items()},
         **stream_outputs(policy, activations),
-        **{name: partial(run.outputs, name) for name in policy.watched() if calls[name]},
+        **{name: partial(run.outputs, name) for name in policy.recorded_modules() if calls[name]},
         **{name: partial(np.asarray, values) for name, values in replayed.items()},
         "actions_unnormalized": lambda: policy.action_units.restore(np.asarray(replayed["actions"], np.float32)),
         **policy.further_outputs(run),
