@@ -65,16 +65,16 @@ class Benchmark:
 
     def ways(self, host: bool) -> dict[str, Callable[[], Output]]:
         """By name, as far as the family has them; the clean one first."""
-        found: dict[str, Callable[[], Output]] = {
+        by_way: dict[str, Callable[[], Output]] = {
             "plain": self.plain, "pooled": self.pooled, "tokens": self.tokens,
         }  # fmt: skip
         if host:
-            found |= {"pooled to host": self.pooled_to_host, "tokens to host": self.tokens_to_host}
+            by_way |= {"pooled to host": self.pooled_to_host, "tokens to host": self.tokens_to_host}
         with hidden_states(self.subject) as counts:
             self.plain()
         if counts and min(counts) > 0:
-            found["output_hidden_states"] = self.output_hidden_states
-        return found | ({"raw hooks": self.raw_hooks} if self.subject.layers else {})
+            by_way["output_hidden_states"] = self.output_hidden_states
+        return by_way | ({"raw hooks": self.raw_hooks} if self.subject.layers else {})
 
     def pooled(self) -> Output:
         """Every site reduced to its views on the device."""
@@ -107,9 +107,11 @@ class Benchmark:
 
     def raw_hooks(self) -> Output:
         """What one writes in five minutes."""
-        kept: list[Tensor] = []
+        copies: list[Tensor] = []
         handles = [
-            layer.register_forward_hook(lambda _m, _i, output: kept.append(_first(output).detach().cpu().clone()))
+            layer.register_forward_hook(
+                lambda _m, _i, output: copies.append(_first(output).detach().cpu().clone())
+            )
             for layer in self.subject.layers
         ]
         try:
@@ -127,9 +129,9 @@ class Benchmark:
             self._hosts[with_tokens] = Capturer(self.model, self.streams, with_tokens, "numbers"), sets
         capturer, sets = self._hosts[with_tokens]
         sets.reverse()
-        for own in sets[0].values():
-            own.wait()  # from the inference before last
-            own.roles = []
+        for transfer in sets[0].values():
+            transfer.wait()  # from the inference before last
+            transfer.roles = []
         return capturer.run(self.plain, lambda numbers: numbers, self.subject.roles, sets[0])
 
 
@@ -156,8 +158,8 @@ def count_operations(run: Callable[[], Output]) -> int:
 def counted(family: str, options: argparse.Namespace, folder: Path) -> str:
     """The operations of one family at released depth, as a row."""
     dtype = options.dtype or "float32"
-    made = subject(family, folder, options.device, dtype, options.batch, sizes=DEEP)
-    benchmark = Benchmark(made, options.device)
+    loaded = subject(family, folder, options.device, dtype, options.batch, sizes=DEEP)
+    benchmark = Benchmark(loaded, options.device)
     ways = {name: way for name, way in benchmark.ways(host=True).items() if name in COUNTED}
     for way in ways.values():
         way()
@@ -167,7 +169,7 @@ def counted(family: str, options: argparse.Namespace, folder: Path) -> str:
         for name, count in counts.items()
         if name != "plain"
     )
-    return f"{family}: plain {counts['plain']} operations, {len(made.model.sites())} sites: {captured}"
+    return f"{family}: plain {counts['plain']} operations, {len(loaded.model.sites())} sites: {captured}"
 
 
 def _first(output: Tensor | tuple[Tensor, ...]) -> Tensor:
@@ -193,9 +195,9 @@ def measure(run: Callable[[], Output], device: str) -> float:
 def line(family: str, options: argparse.Namespace, folder: Path) -> str:
     """The cost of capturing one family, as a row."""
     dtype, sizes = options.dtype or _default_dtype(family, options.device), FULL if options.full else LARGER
-    made = subject(family, folder, options.device, dtype, options.batch, options.checkpoint, sizes)
+    loaded = subject(family, folder, options.device, dtype, options.batch, options.checkpoint, sizes)
     torch.set_num_threads(options.threads)
-    benchmark = Benchmark(made, options.device)
+    benchmark = Benchmark(loaded, options.device)
     ways, reference = benchmark.ways(options.host), benchmark.plain()
     for name, way in ways.items():
         assert np.array_equal(way(), reference), f"{family}: {name} changed what comes out"
@@ -210,16 +212,16 @@ def line(family: str, options: argparse.Namespace, folder: Path) -> str:
     if options.trace:
         path = Path(options.trace)
         trace(benchmark.tokens_to_host, str(path.with_stem(f"{path.stem}-{family}")))
-    card, sites = made.model.card, len(made.model.sites())
-    tokens = ", ".join(f"{len(rows[0])} {name}" for name, rows in made.roles.items())
-    found = "  ".join(
+    card, sites = loaded.model.card, len(loaded.model.sites())
+    tokens = ", ".join(f"{len(rows[0])} {name}" for name, rows in loaded.roles.items())
+    summary = "  ".join(
         f"{name} {statistics.median(of):.3f} ({min(of):.2f}–{max(of):.2f})"
         for name, of in ratios.items()
         if name != "plain"
     )
     return (
         f"{family}: {card.parameters / 1e6:.0f} M {card.dtype} on {card.device}, {sites} sites, tokens {tokens}, "
-        f"plain {1e3 * statistics.median(plain):.0f} ms × {options.repeats}: {found}"
+        f"plain {1e3 * statistics.median(plain):.0f} ms × {options.repeats}: {summary}"
     )
 
 
@@ -250,14 +252,14 @@ def main() -> None:
     options = parser.parse_args()
     make, sizes = (counted, DEEP) if options.count else (line, FULL if options.full else LARGER)
     for family in options.families.split(",") if options.families else sizes:
-        kept = options.keep / f"{family}.txt" if options.keep else None
-        if kept is None or not kept.exists():
+        result_file = options.keep / f"{family}.txt" if options.keep else None
+        if result_file is None or not result_file.exists():
             with tempfile.TemporaryDirectory() as folder:
-                found = make(family, options, Path(folder))
-            if kept is not None:
-                kept.parent.mkdir(parents=True, exist_ok=True)
-                kept.write_text(found, encoding="utf-8")
-        print(kept.read_text(encoding="utf-8") if kept else found, flush=True)
+                result_line = make(family, options, Path(folder))
+            if result_file is not None:
+                result_file.parent.mkdir(parents=True, exist_ok=True)
+                result_file.write_text(result_line, encoding="utf-8")
+        print(result_file.read_text(encoding="utf-8") if result_file else result_line, flush=True)
 
 
 if __name__ == "__main__":

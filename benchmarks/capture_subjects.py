@@ -293,8 +293,8 @@ class Subject:
         """The layer modules of every stored stream."""
         taps = [self.model.tap(site).module for site in self.model.sites() if not site.iteration]
         names = {id(module): name for name, module in self._network.named_modules()}
-        found = {names[id(tap)].rpartition(".")[0]: None for tap in taps if id(tap) in names}
-        numbered = [name for name in found if name.rpartition(".")[2].isdigit()]
+        layer_names = {names[id(tap)].rpartition(".")[0]: None for tap in taps if id(tap) in names}
+        numbered = [name for name in layer_names if name.rpartition(".")[2].isdigit()]
         return [self._network.get_submodule(name) for name in numbered]
 
     @property
@@ -305,7 +305,7 @@ class Subject:
             for module in self._network.modules()
             if isinstance(getattr(module, "layers", None), nn.ModuleList)
             and hasattr(getattr(module, "config", None), "output_hidden_states")
-            and any(layer is own for layer in self.layers for own in module.layers)
+            and any(layer is candidate for layer in self.layers for candidate in module.layers)
         ]
 
     @property
@@ -329,15 +329,17 @@ def subject(
     model = load_model(family, checkpoint, device, dtype, random_weights=True, **options)
     scene = SceneSpec()
     picture, state = np.zeros((*scene.picture_shape, 3), np.uint8), np.zeros(8, np.float32)
-    one = Observation(picture, state, INSTRUCTION, scene.intrinsics)
-    seen = [one] * min(batch, model.card.batch or batch)
+    example = Observation(picture, state, INSTRUCTION, scene.intrinsics)
+    observations = [example] * min(batch, model.card.batch or batch)
     if isinstance(model, Policy):
         policy = model  # named, for the closure
         return Subject(
-            policy, lambda: policy.infer_without_acting(seen, list(range(len(seen)))), policy.roles(seen)
+            policy,
+            lambda: policy.infer_without_acting(observations, list(range(len(observations)))),
+            policy.roles(observations),
         )
     assert isinstance(model, AnswerModel)
-    questions = [Prompt(one, "Which of them is red?", ("a", "b")) for one in seen]
+    questions = [Prompt(observation, "Which of them is red?", ("a", "b")) for observation in observations]
     return Subject(model, lambda: model.read(questions).option_logits, model.asked_roles(questions))
 
 
@@ -346,9 +348,9 @@ def written(family: str, folder: Path, sizes: Mapping[str, Values] = LARGER) -> 
     write, _ = WRITERS[family]
     if family == "magma":  # weights that steer its answers fit the tiny network only
         write = partial(magma_checkpoints.write_checkpoint, steered=False, shards=1)
-    place = write(folder)
-    _enlarge(place, sizes[family])
-    return place
+    checkpoint = write(folder)
+    _enlarge(checkpoint, sizes[family])
+    return checkpoint
 
 
 @contextmanager

@@ -84,7 +84,10 @@ def raw_bytes(family: str, tokens: bool) -> int:
 def streams_of(family: str) -> list[StoredStream]:
     """What a run of the released size stores."""
     declared = known_families()[family].declared[""]
-    return [StoredStream.of(one.stream, one.tokens, view_names(one.roles)) for one in declared]
+    return [
+        StoredStream.of(declaration.stream, declaration.tokens, view_names(declaration.roles))
+        for declaration in declared
+    ]
 
 
 @dataclass(frozen=True)
@@ -118,15 +121,15 @@ def main() -> None:
     parser.add_argument("--set", nargs="*", default=[], metavar="INPUT=VALUE")
     parser.add_argument("--gpus", type=int, nargs="*", default=[1, 8, 64])
     options = parser.parse_args()
-    inputs = {name: one.value for name, one in INPUTS.items()}
+    inputs = {name: setting.value for name, setting in INPUTS.items()}
     for text in options.set:
         name, _, value = text.partition("=")
         if name not in inputs:
             parser.error(f"{name!r} is no input; expected one of {', '.join(inputs)}")
         inputs[name] = float(value)
-    for name, one in INPUTS.items():
-        source = one.source if inputs[name] == one.value else "given"
-        print(f"{name:10}{inputs[name]:>14,g}  {one.unit:26} {source}")
+    for name, setting in INPUTS.items():
+        source = setting.source if inputs[name] == setting.value else "given"
+        print(f"{name:10}{inputs[name]:>14,g}  {setting.unit:26} {source}")
     print()
     for part in STUDY:
         print(_part(part.name, part.episodes, part.episodes * part.calls, inputs))
@@ -138,10 +141,10 @@ def main() -> None:
         for tokens in (False, True):
             raw, pooled = raw_bytes(family, tokens), raw_bytes(family, False)
             for gpus in options.gpus:
-                found = estimate(inputs, pooled, raw - pooled, gpus)
-                rate, hours = f"{gpus / found.per_worker:.2f}", f"{found.hours:.1f}"
-                kept, disk = "all" if tokens else "pooled", f"{found.disk / 1e12:.2f}"
-                print(_line(family, kept, str(gpus), f"{raw / 1e6:.1f}", rate, hours, disk, found.bound))
+                cost = estimate(inputs, pooled, raw - pooled, gpus)
+                rate, hours = f"{gpus / cost.per_worker:.2f}", f"{cost.hours:.1f}"
+                stored_tokens, disk = "all" if tokens else "pooled", f"{cost.disk / 1e12:.2f}"
+                print(_line(family, stored_tokens, str(gpus), f"{raw / 1e6:.1f}", rate, hours, disk, cost.bound))
 
 
 def _part(name: str, episodes: int, calls: int, inputs: dict[str, float]) -> str:

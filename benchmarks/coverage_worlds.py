@@ -88,8 +88,8 @@ def draw(world: World, seed: int) -> DataSet:
 def _noise(generator: np.random.Generator, sites: int, group_of: NDArray[np.intp]) -> Matrix:
     """(S, E, D) standard normal values."""
     of_group = neighbours(generator.standard_normal((sites, int(group_of[-1]) + 1, WIDTH)))
-    own = neighbours(generator.standard_normal((sites, group_of.size, WIDTH)))
-    values: Matrix = np.sqrt(OF_GROUP) * of_group[:, group_of] + np.sqrt(1 - OF_GROUP) * own
+    individual = neighbours(generator.standard_normal((sites, group_of.size, WIDTH)))
+    values: Matrix = np.sqrt(OF_GROUP) * of_group[:, group_of] + np.sqrt(1 - OF_GROUP) * individual
     return values
 
 

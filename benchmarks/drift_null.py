@@ -62,17 +62,17 @@ def main() -> None:
     """Draw, count verdicts, and print their shares."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--draws", type=int, default=20)
-    draws, table, found = parser.parse_args().draws, episodes(), Counter[str]()
+    draws, table, verdict_counts = parser.parse_args().draws, episodes(), Counter[str]()
     for draw in range(draws):
         generator = np.random.default_rng(draw)
         with TemporaryDirectory() as home:
             before, after = (random_run(Path(home) / name, table, generator) for name in ("before", "after"))
-            found.update(one.verdict for one in measure_drift(before, after))
-    total = found.total()
-    for verdict, count in found.most_common():
+            verdict_counts.update(drift.verdict for drift in measure_drift(before, after))
+    total = verdict_counts.total()
+    for verdict, count in verdict_counts.most_common():
         above = binomtest(count, total, SIGNIFICANCE, alternative="greater").pvalue
-        said = f"; more than 5 %? p = {above:.3f}" if verdict in WRONG else ""
-        print(f"{verdict}: {count} of {total} ({count / total:.1%}){said}")
+        warning = f"; more than 5 %? p = {above:.3f}" if verdict in WRONG else ""
+        print(f"{verdict}: {count} of {total} ({count / total:.1%}){warning}")
 
 
 if __name__ == "__main__":

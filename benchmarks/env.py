@@ -98,8 +98,8 @@ def speed(episodes: int) -> None:
     env.close()
     print(f"picture 640x480   naive {1e3 * frames[0]:6.1f} ms   ours {1e3 * frames[1]:6.1f} ms")
     print(f"expert episodes   naive {naive:6.2f} /s   ours {ours:6.2f} /s   {ours / naive:.1f} times, one core")
-    (one, one_cpu), (two, two_cpu) = (workers(count, episodes) for count in (1, 2))
-    print(f"worker processes  one   {one:6.2f} /s   two  {two:6.2f} /s   {two / one:.2f} times, wall clock")
+    (single, one_cpu), (two, two_cpu) = (workers(count, episodes) for count in (1, 2))
+    print(f"worker processes  one   {single:6.2f} /s   two  {two:6.2f} /s   {two / single:.2f} times, wall clock")
     print(f"CPU per episode   one   {1e3 * one_cpu:6.0f} ms   two  {1e3 * two_cpu:6.0f} ms   "
           f"{2 * one_cpu / two_cpu:.2f} times on two idle cores")  # fmt: skip
 

@@ -195,10 +195,10 @@ def bench_loop(suite: Suite, folder: Path, items: int, repeats: int) -> None:
 def inference_cpu(extraction: Extraction) -> float:
     """CPU seconds of one inference by itself, the least of three."""
     policy = extraction.controller.model
-    seen = Observation(
+    observation = Observation(
         np.zeros((480, 640, 3), np.uint8), np.zeros(8, np.float32), "Put the cube on the red square"
     )
-    return min(seconds(lambda: policy.act([seen], [0]))[1] for _ in range(3))
+    return min(seconds(lambda: policy.act([observation], [0]))[1] for _ in range(3))
 
 
 def episode_cost(extraction: Extraction, captured_calls: int, out: Path) -> tuple[float, float]:

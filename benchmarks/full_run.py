@@ -56,7 +56,7 @@ class Played:
 
 def play(plan: Plan, scene: SceneSpec, per_script: int) -> dict[str, list[Played]]:
     """Episodes of the plan, far apart, by the side on which the cube ended."""
-    found: dict[str, list[Played]] = defaultdict(list)
+    by_side: dict[str, list[Played]] = defaultdict(list)
     stride = max(1, len(plan.episodes) // per_script)
     for script in SCRIPTS:
         stage = ScenePlayer(scene, PlayerOptions("ends", script=script))
@@ -66,12 +66,12 @@ def play(plan: Plan, scene: SceneSpec, per_script: int) -> dict[str, list[Played
                 assert isinstance(ending, Ending)
                 assert ending.small_frames
                 assert ending.trajectory is not None
-                found[ending.outcome["side_placed"]].append(
+                by_side[ending.outcome["side_placed"]].append(
                     Played(ending.outcome, ending.small_frames, ending.trajectory)
                 )
         finally:
             stage.close()
-    return found
+    return by_side
 
 
 def episode(planned: Row, played: dict[str, list[Played]], knows: bool) -> tuple[EpisodeRecord, Played]:
@@ -81,9 +81,9 @@ def episode(planned: Row, played: dict[str, list[Played]], knows: bool) -> tuple
     other = "right" if correct == "left" else "left"
     weights = (0.7, 0.2, 0.1) if knows else (0.3, 0.3, 0.4)
     placed = str(draw.choice([correct, other, "none"], p=weights))
-    one = played[placed][int(draw.integers(len(played[placed])))]
+    played_episode = played[placed][int(draw.integers(len(played[placed])))]
     outcome = {
-        **one.outcome,
+        **played_episode.outcome,
         "outcome": "oob" if placed == "none" else "correct" if placed == correct else "wrong",
     }
     pooled = {}
@@ -94,7 +94,9 @@ def episode(planned: Row, played: dict[str, list[Played]], knows: bool) -> tuple
         pooled[stream.name] = values
     roles = [{"backbone": [("language", 0, 816)], "expert": [("action", 0, 51)]}]
     arrays = {"pooled": pooled, "tokens": {}}
-    return EpisodeRecord(planned, outcome, arrays, roles, one.trajectory, control_steps=[0]), one
+    return EpisodeRecord(
+        planned, outcome, arrays, roles, played_episode.trajectory, control_steps=[0]
+    ), played_episode
 
 
 def planned_run(suite: Suite, episodes: int) -> Plan:
@@ -114,7 +116,7 @@ def write_full_run(folder: Path, episodes: int, say: Callable[[str], None] = pri
     began = time.process_time()
     suite, scene = small_suite(folder / "suite", episodes), SceneSpec()
     plan = planned_run(suite, episodes)
-    known = set(list(dict.fromkeys(one.content.item.category for one in plan.episodes))[::2])
+    known_categories = set(list(dict.fromkeys(entry.content.item.category for entry in plan.episodes))[::2])
     settings = {
         "model": "synthetic", "weights_sha256": None, "random_weights": False, "captured_calls": 1,
         "tokens": "pooled", "codec": "zstd", "seed": SEED,
@@ -128,8 +130,8 @@ def write_full_run(folder: Path, episodes: int, say: Callable[[str], None] = pri
         played = play(plan, scene, 12)
         for number in remaining:
             planned = plan.episodes[number]
-            record, one = episode(planned, played, planned.content.item.category in known)
-            writer.write(replace(record, pictures={thumbnail_key(number): as_thumbnail(one.ends)}))
+            record, played_episode = episode(planned, played, planned.content.item.category in known_categories)
+            writer.write(replace(record, pictures={thumbnail_key(number): as_thumbnail(played_episode.ends)}))
         say(f"written: {len(remaining)} episodes, {time.process_time() - began:.0f} CPU-s")
         began = time.process_time()
         seal(folder / "run")

@@ -88,21 +88,21 @@ def bench_writing(suite: Suite, folder: Path, width: int, repeats: int) -> None:
         "nothing": lambda _content: "0" * 64,
     }  # fmt: skip
     for codec in ("zstd", "fast", "none"):
-        found: dict[str, list[Seconds]] = {name: [] for name in ways}
+        seconds_by_way: dict[str, list[Seconds]] = {name: [] for name in ways}
         for repeat in range(repeats):
             for name, digest in ways.items():
                 writer = RunWriter(locate(folder / f"{codec}-{name}-{repeat}"), plan, settings(codec))
                 if digest is None:
-                    found[name].append(seconds(partial(write, writer, records)))
+                    seconds_by_way[name].append(seconds(partial(write, writer, records)))
                     continue
                 with (
                     patch(f"{RECORDING}.digest", digest),
                     patch(f"{RECORDING}.block_digest", lambda _part: "0" * 16),
                 ):
-                    found[name].append(seconds(partial(write, writer, records)))
-        for name, turns in found.items():
+                    seconds_by_way[name].append(seconds(partial(write, writer, records)))
+        for name, turns in seconds_by_way.items():
             wall, cpu = medians(turns)
-            without = medians(found["nothing"])[1]
+            without = medians(seconds_by_way["nothing"])[1]
             print(f"write --codec {codec:4} {name:8} {raw / wall:6.0f} MB/s {raw / cpu:6.0f} MB/CPU-s, "
                   f"{cpu / without:.2f} x the CPU of nothing")  # fmt: skip
 
@@ -148,7 +148,7 @@ def bench_verifying(suite: Suite, run: Path, gigabytes: float, repeats: int) -> 
     many = tuple(_numbered(plan.episodes[0], number) for number in range(episodes))
     writer = RunWriter(locate(run), _of_many(suite, plan, many), settings("none"))
     record = episode(plan, 0)
-    with writer.owned():
+    with writer.claim():
         for planned in many:
             writer.write(replace(record, planned=planned))
         seal(run)
@@ -160,14 +160,14 @@ def bench_verifying(suite: Suite, run: Path, gigabytes: float, repeats: int) -> 
         "verify --deep": partial(verify_run, run, deep=True),
     }
     for where in ("disk", "memory"):
-        found: dict[str, list[Seconds]] = {name: [] for name in ways}
+        seconds_by_way: dict[str, list[Seconds]] = {name: [] for name in ways}
         for _ in range(repeats):
             for name, work in ways.items():
                 (forget if where == "disk" else read_all)(files)
-                found[name].append(seconds(work))
-        for name, turns in found.items():
+                seconds_by_way[name].append(seconds(work))
+        for name, turns in seconds_by_way.items():
             wall, cpu = medians(turns)
-            ratio = medians(found["reading alone"])[0] / wall
+            ratio = medians(seconds_by_way["reading alone"])[0] / wall
             print(f"{size:.0f} MB in {len(files)} files from {where}, {name} {size / wall:6.0f} MB/s "
                   f"({size / cpu:.0f} per CPU-s), {ratio:.2f} of the speed of reading")  # fmt: skip
 
@@ -184,14 +184,14 @@ def large_run(suite: Suite, run: Path, episodes: int) -> None:
     del commit[HASH]
     for number in range(1, episodes):
         objects = {}
-        for key, known in commit["objects"].items():
+        for key, object_record in commit["objects"].items():
             new = key.replace("/c/0/", f"/c/{number}/", 1)
-            objects[new] = known
+            objects[new] = object_record
             (run / DATA / new).parent.mkdir(parents=True)
             os.link(run / DATA / key, run / DATA / new)
-        one = {**commit, "episode": number, "episode_id": many[number].episode_id, "objects": objects}
+        commit_fields = {**commit, "episode": number, "episode_id": many[number].episode_id, "objects": objects}
         write_seconds(writer.root, number, replace(NOT_MEASURED, inference=0.0, simulation=0.0))
-        write_commit(writer.location, Commit.model_validate(one))
+        write_commit(writer.location, Commit.model_validate(commit_fields))
 
 
 def _of_many(suite: Suite, plan: Plan, episodes: tuple[Row, ...]) -> Plan:

@@ -22,7 +22,7 @@ from probe_kit.demo.pipeline import (
     Agreement,
     Organism,
     findings,
-    probed,
+    probe_organism,
 )
 from probe_kit.errors import CaptureChangedActionError
 from probe_kit.intervene import (
@@ -48,11 +48,11 @@ class Property:
 
     name: str
     holds: bool | None
-    seen: str
+    measured: str
 
     def __str__(self) -> str:
-        said = {True: "true", None: "undecided", False: "FALSE"}[self.holds]
-        return f"{said:12}  {self.name}: {self.seen}"
+        word = {True: "true", None: "undecided", False: "FALSE"}[self.holds]
+        return f"{word:12}  {self.name}: {self.measured}"
 
 
 @dataclass(frozen=True)
@@ -64,32 +64,32 @@ class Trial:
     used: tuple[str, ...]
     unused: tuple[str, ...]
 
-    def done(self, asked: Intervention) -> InterventionResult:
+    def result_of(self, intervention: Intervention) -> InterventionResult:
         """The result of one intervention; a stored one is loaded."""
-        return run_intervention(self.run, asked, self.source)
+        return run_intervention(self.run, intervention, self.source)
 
 
 def acted(organism: Organism, suite: Suite, folder: Path, steps: int | None, untrained: Run | None) -> Run:
     """The organism's episodes, probes and `follow`; what `demo --compare` made of the same suite is reused."""
     shorter = organism if steps is None else replace(organism, max_steps=steps)
-    run, _ = probed(shorter, suite, folder, FULL.permutations, lambda _: lambda *_: None, untrained)
+    run, _ = probe_organism(shorter, suite, folder, FULL.permutations, lambda _: lambda *_: None, untrained)
     return run
 
 
 def verdicts(runs: Sequence[tuple[Organism, Run]]) -> Iterator[Property]:
     """Every organism and category."""
     holds: dict[Agreement, bool | None] = {"true": True, "undecided": None, "wrong": False}
-    for one in findings(runs):
-        use = one.row.image_swap.use
+    for finding in findings(runs):
+        use = finding.row.image_swap.use
         moved = "" if use is None else f"; {use.reason}"
-        seen = f"{one.measured} (truth: {one.expected}){moved}"
-        yield Property(f"verdict of {one.organism}, {one.category}", holds[one.agreement], seen)
+        observed = f"{finding.measured} (truth: {finding.expected}){moved}"
+        yield Property(f"verdict of {finding.organism}, {finding.category}", holds[finding.agreement], observed)
 
 
 def maps(trial: Trial, last: int) -> Iterator[Property]:
     """Where the answer passes: the whole at the beginning, nothing at the end, nowhere what is not used."""
     categories = (*trial.used, *trial.unused)
-    effects = trial.done(Interchange(categories=categories))
+    effects = trial.result_of(Interchange(categories=categories))
     check = effects.certificate["replay"]
     yield Property(
         "clean inferences are the run's bit for bit", check["equal"] == check["compared"] > 0,
@@ -111,63 +111,63 @@ def maps(trial: Trial, last: int) -> Iterator[Property]:
             bool(located) == (category in trial.used), ", ".join(located) or "nowhere",
         )  # fmt: skip
         if category in trial.used:
-            whole = rows["backbone.00", "all"].effect
+            full_effect = rows["backbone.00", "all"].effect
             yield Property(
                 f"{category}: all tokens of the first layer are the whole exchange",
-                whole is not None and abs(whole - 1) < 0.01, shown(whole),
+                full_effect is not None and abs(full_effect - 1) < 0.01, formatted_share(full_effect),
             )  # fmt: skip
 
 
 def last_located(trial: Trial) -> tuple[str, str] | None:
     """The last place, and there the role with the largest effect, of what is located in every used category."""
-    effects = trial.done(Interchange(categories=(*trial.used, *trial.unused)))
+    effects = trial.result_of(Interchange(categories=(*trial.used, *trial.unused)))
     everywhere: dict[tuple[str, str], list[float]] = {}
     for row in effects.effects:
         if row.category in trial.used and row.is_localised and row.role != "all":
             everywhere.setdefault((row.sites, row.role), []).append(row.effect or 0.0)
-    found = {name: min(shares) for name, shares in everywhere.items() if len(shares) == len(trial.used)}
-    return max(found, key=lambda name: (name[0], found[name]), default=None)
+    least_share = {name: min(shares) for name, shares in everywhere.items() if len(shares) == len(trial.used)}
+    return max(least_share, key=lambda name: (name[0], least_share[name]), default=None)
 
 
 def memories(trial: Trial) -> Iterator[Property]:
     """One block is read, and the others are not."""
-    effects = trial.done(Interchange(categories=trial.used, sites=("kv.*",), roles=("all",)))
+    effects = trial.result_of(Interchange(categories=trial.used, sites=("kv.*",), roles=("all",)))
     for category in trial.used:
-        found = {row.sites: row.effect for row in effects.effects if row.category == category}
-        read = [place for place, effect in found.items() if effect is not None and effect >= 0.95]
-        rest = [effect for place, effect in found.items() if place not in read]
-        holds = len(read) == 1 and all(effect is not None and abs(effect) <= 0.05 for effect in rest)
+        effect_by_site = {row.sites: row.effect for row in effects.effects if row.category == category}
+        read = [site for site, effect in effect_by_site.items() if effect is not None and effect >= 0.95]
+        other_effects = [effect for site, effect in effect_by_site.items() if site not in read]
+        holds = len(read) == 1 and all(effect is not None and abs(effect) <= 0.05 for effect in other_effects)
         yield Property(
             f"{category}: the keys and values of one block carry ≥ .95, of the others ≤ .05", holds,
-            ", ".join(f"{place} {shown(effect)}" for place, effect in found.items()),
+            ", ".join(f"{site} {formatted_share(effect)}" for site, effect in effect_by_site.items()),
         )  # fmt: skip
 
 
-def directions(trial: Trial, place: str, role: str) -> Iterator[Property]:
+def directions(trial: Trial, site: str, role: str) -> Iterator[Property]:
     """Along one direction it passes, along a random one it does not; what is not used turns nothing."""
     categories = (*trial.used, *trial.unused)
-    effects = trial.done(
-        Interchange(
-            categories=categories, sites=(place,), roles=(role,), direction="mean-difference:1", controls=1
-        )
+    effects = trial.result_of(
+        Interchange(categories=categories, sites=(site,), roles=(role,), direction="mean-difference:1", controls=1)
     )
-    steered = trial.done(
-        Steering(categories=trial.used, sites=(place,), role=role, coefficients=(4.0,), controls=1)
+    steered = trial.result_of(
+        Steering(categories=trial.used, sites=(site,), role=role, coefficients=(4.0,), controls=1)
     )
     for category in categories:
-        own, control = pair(effects.effects, category)
+        along, control = pair(effects.effects, category)
         if category in trial.unused:
             yield Property(
-                f"{category}: rank 1 at {place} {role} turns ≤ .1", abs(own.net) <= 0.1, f"turned {own.net:+.2f}"
+                f"{category}: rank 1 at {site} {role} turns ≤ .1",
+                abs(along.net) <= 0.1,
+                f"turned {along.net:+.2f}",
             )
             continue
         yield Property(
-            f"{category}: rank 1 along the mean differences of positions at {place} {role} ≥ .8",
-            own.effect is not None and own.effect >= 0.8, shown(own.effect),
+            f"{category}: rank 1 along the mean differences of positions at {site} {role} ≥ .8",
+            along.effect is not None and along.effect >= 0.8, formatted_share(along.effect),
         )  # fmt: skip
         yield Property(
             f"{category}: its random control ≤ .05",
-            control.effect is not None and abs(control.effect) <= 0.05, shown(control.effect),
+            control.effect is not None and abs(control.effect) <= 0.05, formatted_share(control.effect),
         )  # fmt: skip
         _, orthogonal = pair([row for row in steered.effects if row.coefficient != "0"], category)
         yield Property(
@@ -178,11 +178,11 @@ def directions(trial: Trial, place: str, role: str) -> Iterator[Property]:
 
 def loops(trial: Trial, cell: str, items: int) -> Iterator[Property]:
     """The identity patch gives the run's own episodes again."""
-    asked = ClosedLoop(
+    loop = ClosedLoop(
         categories=(*trial.used, *trial.unused), items=items, targets=(cell,), direction="none", controls=0
     )
     try:
-        effects = trial.done(asked)
+        effects = trial.result_of(loop)
     except CaptureChangedActionError as error:
         yield Property("closed loop, coefficient 0: the run's own outcomes", False, str(error))
         return
@@ -196,12 +196,14 @@ def loops(trial: Trial, cell: str, items: int) -> Iterator[Property]:
 
 def pair(rows: Sequence[PatchEffect], category: str) -> tuple[PatchEffect, PatchEffect]:
     """The change of one category along its direction, and along the random one beside it."""
-    own = [row for row in rows if row.category == category]
-    (first,), (second,) = ([row for row in own if row.is_control == control] for control in (False, True))
+    category_rows = [row for row in rows if row.category == category]
+    (first,), (second,) = (
+        [row for row in category_rows if row.is_control == control] for control in (False, True)
+    )
     return first, second
 
 
-def shown(effect: float | None) -> str:
+def formatted_share(effect: float | None) -> str:
     """A share of the whole exchange."""
     return "n/a" if effect is None else f"{effect:.3f}"
 
@@ -234,20 +236,23 @@ def main() -> int:
     folder, steps = arguments.folder, arguments.steps
     untrained = acted(UNTRAINED_NETWORK, suite, folder, steps, None)
     runs = [
-        (one, untrained if one == UNTRAINED_NETWORK else acted(one, suite, folder, steps, untrained))
-        for one in ORGANISMS
+        (
+            organism,
+            untrained if organism == UNTRAINED_NETWORK else acted(organism, suite, folder, steps, untrained),
+        )
+        for organism in ORGANISMS
     ]
     run = dict(runs)[TRAINED]
     used, unused = (tuple(name for name, of in truth.items() if of == kind) for kind in ("used", "not used"))
     trial = Trial(run, ReplaySource(suite.folder), used, unused)
     weights = str(run.weights_sha256)[:12]
     print(f"{run.label}, weights {weights}, {run.suite}, suite seed {arguments.seed}, {arguments.items} items")
-    found = []
-    for one in properties(trial, runs, arguments.loop):
-        print(one, flush=True)
-        found.append(one.holds)
-    print(f"{found.count(True)} of {len(found)} hold, {found.count(None)} undecided, {found.count(False)} false")
-    return 0 if all(found) else 1
+    holds = []
+    for claim in properties(trial, runs, arguments.loop):
+        print(claim, flush=True)
+        holds.append(claim.holds)
+    print(f"{holds.count(True)} of {len(holds)} hold, {holds.count(None)} undecided, {holds.count(False)} false")
+    return 0 if all(holds) else 1
 
 
 if __name__ == "__main__":

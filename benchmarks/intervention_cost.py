@@ -46,80 +46,80 @@ def policy_of(family: str, device: str) -> Policy:
     if family == EMBEDDED:
         return load_policy(family, device=device)
     with tempfile.TemporaryDirectory() as folder:
-        made = subject(family, Path(folder), device, None, 1).model
-    assert isinstance(made, Policy)
-    return made
+        model = subject(family, Path(folder), device, None, 1).model
+    assert isinstance(model, Policy)
+    return model
 
 
 def observations() -> tuple[Observation, Observation]:
     """Two pictures of noise, one state."""
     draw = np.random.default_rng(0)
     state = np.array([0.29, 0.0, 0.16, 0.0, 0.0, 0.0, 0.0, 1.0], np.float32)
-    own, other = (draw.integers(0, 256, (480, 640, 3), dtype=np.uint8) for _ in range(2))
-    return Observation(own, state, INSTRUCTION), Observation(other, state, INSTRUCTION)
+    picture, other = (draw.integers(0, 256, (480, 640, 3), dtype=np.uint8) for _ in range(2))
+    return Observation(picture, state, INSTRUCTION), Observation(other, state, INSTRUCTION)
 
 
 def ways(policy: Policy) -> dict[str, Callable[[], object]]:
     """By name, what is timed."""
-    seen, other = observations()
+    observation, other = observations()
     backbone, expert = (policy.streams[name].sites() for name in ("backbone", "expert"))
     kv = [] if policy.prompt_kv is None else [site for name in KV for site in policy.prompt_kv.sites(name)]
     acting = [site for site in expert if site.layer == policy.streams["expert"].layers - 1]
     with capture(policy, [*backbone, *acting, *kv]) as source:
         policy.infer_without_acting([other], [0])
-    roles = policy.roles([seen])
+    roles = policy.roles([observation])
 
     def changed(sites: list[Site]) -> Callable[[], object]:
         tokens = TokenSelection.of(roles[sites[0].stream][0].valid, policy.card.device)
 
         def run() -> object:
             with apply_patch(policy, sites, tokens, ReplaceWith(source, tokens.count)) as edit_log:
-                policy.infer_without_acting([seen], [0])
+                policy.infer_without_acting([observation], [0])
             assert edit_log.fires == len(sites)
             return edit_log
 
         return run
 
     def joint() -> object:
-        own = policy.roles([seen])["backbone"][0]
-        cells = [TokenSelection.of(own.mask(role), policy.card.device) for role in ("image", "language")]
-        changes = {site: [(one, ReplaceWith(source, one.count)) for one in cells] for site in kv}
+        prompt_roles = policy.roles([observation])["backbone"][0]
+        cells = [TokenSelection.of(prompt_roles.mask(role), policy.card.device) for role in ("image", "language")]
+        changes = {site: [(cell, ReplaceWith(source, cell.count)) for cell in cells] for site in kv}
         with apply_patches(policy, changes) as edit_log:
-            policy.infer_without_acting([seen], [0])
+            policy.infer_without_acting([observation], [0])
         assert edit_log.fires == len(cells) * len(kv)
         return edit_log
 
     heads = policy.streams["expert"].sites(HEADS) if policy.streams["expert"].heads else []
 
     def cut(sites: Sequence[Site]) -> Callable[[], object]:
-        cuts = dict.fromkeys(sites, AttentionCut(policy.roles([seen])["backbone"][0].mask("image")))
+        cuts = dict.fromkeys(sites, AttentionCut(policy.roles([observation])["backbone"][0].mask("image")))
 
         def run() -> object:
             with cut_attention(policy, cuts) as edit_log:
-                policy.infer_without_acting([seen], [0])
+                policy.infer_without_acting([observation], [0])
             return edit_log
 
         return run
 
     def slopes() -> object:
-        return gradients_at(policy, [seen], [0], [*backbone, *kv], lambda chunks: chunks[0, :, 1].sum())
+        return gradients_at(policy, [observation], [0], [*backbone, *kv], lambda chunks: chunks[0, :, 1].sum())
 
-    further: dict[str, Callable[[], object]] = {}
+    joint_ways: dict[str, Callable[[], object]] = {}
     if kv:
-        further[f"joint: 2 roles of {len(kv)} kv sites"] = joint
+        joint_ways[f"joint: 2 roles of {len(kv)} kv sites"] = joint
     if heads:
         layers = sorted({site.layer for site in heads})
-        further["knockout in 1 layer"] = cut([site for site in heads if site.layer == layers[0]])
-        further[f"knockout in {len(layers)} layers"] = cut(heads)
+        joint_ways["knockout in 1 layer"] = cut([site for site in heads if site.layer == layers[0]])
+        joint_ways[f"knockout in {len(layers)} layers"] = cut(heads)
     if policy.interventions.gradients and policy.embodiment_mismatch() is None:
-        further[f"gradients at {len(backbone) + len(kv)} sites"] = slopes
+        joint_ways[f"gradients at {len(backbone) + len(kv)} sites"] = slopes
     return {
-        "plain": lambda: policy.infer_without_acting([seen], [0]),
-        "plain again": lambda: policy.infer_without_acting([seen], [0]),
+        "plain": lambda: policy.infer_without_acting([observation], [0]),
+        "plain again": lambda: policy.infer_without_acting([observation], [0]),
         "one backbone site": changed(backbone[2:3]),
         f"all {len(backbone)} backbone sites": changed(backbone),
         f"expert's end, {len(acting)} iterations": changed(acting),
-        **further,
+        **joint_ways,
     }
 
 
@@ -139,19 +139,19 @@ def main() -> None:
         for name, run in draw.sample(list(every.items()), len(every)):
             first = draw.random() < 0.5
             before = timed(plain) if first else 0.0
-            own = timed(run)
+            baseline = timed(run)
             other = before if first else timed(plain)
             if pair >= 2:  # the first two warm up
-                times[name].append((own, other))
-    for name, found in times.items():
-        own, other = (sorted(column) for column in zip(*found, strict=True))
-        low, high = interval([changed / unchanged for changed, unchanged in found])
+                times[name].append((baseline, other))
+    for name, pairs in times.items():
+        baseline, other = (sorted(column) for column in zip(*pairs, strict=True))
+        low, high = interval([changed / unchanged for changed, unchanged in pairs])
         print(
-            f"{name:30} {1000 * statistics.median(own):8.2f} ms  of plain: "
-            f"{statistics.median(changed / unchanged for changed, unchanged in found):6.3f} "
-            f"[{low:.3f}, {high:.3f}] median of {len(found)} pairs, "
-            f"{statistics.median(own) / statistics.median(other):6.3f} medians, "
-            f"{fifth(own) / fifth(other):6.3f} lower fifths"
+            f"{name:30} {1000 * statistics.median(baseline):8.2f} ms  of plain: "
+            f"{statistics.median(changed / unchanged for changed, unchanged in pairs):6.3f} "
+            f"[{low:.3f}, {high:.3f}] median of {len(pairs)} pairs, "
+            f"{statistics.median(baseline) / statistics.median(other):6.3f} medians, "
+            f"{fifth(baseline) / fifth(other):6.3f} lower fifths"
         )
 
 

@@ -45,19 +45,19 @@ NAMES = (
 class Count:
     """Cells, and those in which something was found."""
 
-    found: int = 0
+    hits: int = 0
     cells: int = 0
 
-    def note(self, found: bool) -> None:
+    def note(self, is_hit: bool) -> None:
         """One more."""
-        self.found += found
+        self.hits += is_hit
         self.cells += 1
 
     def __str__(self) -> str:
         from scipy.stats import binomtest
 
-        p = binomtest(self.found, self.cells, SIGNIFICANCE, alternative="greater").pvalue if self.cells else 1.0
-        return f"{self.found} / {self.cells}, p of more than 5 %: {p:.3f}"
+        p = binomtest(self.hits, self.cells, SIGNIFICANCE, alternative="greater").pvalue if self.cells else 1.0
+        return f"{self.hits} / {self.cells}, p of more than 5 %: {p:.3f}"
 
 
 def shuffled(answers: ConditionOutcomes, draw: np.random.Generator) -> ConditionOutcomes:
@@ -105,15 +105,15 @@ class Frames:
     bench: ReplaySession
     questions: Sequence[Pair]
 
-    def answers(self, policy: Policy, asked: ImageSwap | Interchange, file: Path) -> ConditionOutcomes:
+    def answers(self, policy: Policy, intervention: ImageSwap | Interchange, file: Path) -> ConditionOutcomes:
         """The outcomes of one policy; loaded from `file` if it exists."""
         if not file.is_file():
             self.bench.policy = policy
-            conditions = asked.conditions(self.bench)
+            conditions = intervention.conditions(self.bench)
             parts = [replay(self.bench, [question], conditions) for question in self.questions]
-            found = ConditionOutcomes.joined(parts)
+            outcomes = ConditionOutcomes.joined(parts)
             partial = file.with_suffix(".partial")
-            partial.write_bytes(found.to_bytes())
+            partial.write_bytes(outcomes.to_bytes())
             partial.replace(file)
         return ConditionOutcomes.from_bytes(file.read_bytes())
 
@@ -129,9 +129,9 @@ def run_of(folder: Path, suite: Suite, model: str) -> Run:
 def report(title: str, counts: dict[str, Count]) -> None:
     """Print one table."""
     print(title)
-    for name, found in counts.items():
-        if found.cells:
-            print(f"  {name:45} {found}")
+    for name, count in counts.items():
+        if count.cells:
+            print(f"  {name:45} {count}")
 
 
 def measure(frames: Frames, model: str, folder: Path, networks: Iterable[int], inside: int, shuffles: int) -> None:
@@ -142,8 +142,8 @@ def measure(frames: Frames, model: str, folder: Path, networks: Iterable[int], i
         policy = load_policy(model, random_weights=True, weights_seed=seed)
         count_outside(frames.answers(policy, ImageSwap(), folder / f"follow-{seed}.npz"), suite, of_networks)
         if seed < inside:
-            found = frames.answers(policy, Interchange(), folder / f"interchange-{seed}.npz")
-            count_inside(found, suite, of_networks)
+            outcomes = frames.answers(policy, Interchange(), folder / f"interchange-{seed}.npz")
+            count_inside(outcomes, suite, of_networks)
         print(f"network {seed}: {of_networks[NAMES[0]]}; {of_networks[NAMES[2]]}", flush=True)
     trained = load_policy(model)
     outside = frames.answers(trained, ImageSwap(), folder / "follow-trained.npz")
@@ -171,7 +171,7 @@ def main() -> None:
     run = run_of(arguments.folder, suite, arguments.model)
     with open_session(run, ReplaySource(suite.folder)) as bench, bench.ready():
         items = dict.fromkeys(run.episodes["item_id"].astype(str))
-        questions = [replace(one, stored=None) for item in items for one in bench.pairs(item)]
+        questions = [replace(pair, stored=None) for item in items for pair in bench.pairs(item)]
         frames = Frames(run, bench, questions)
         networks = range(arguments.networks)
         measure(frames, arguments.model, arguments.folder, networks, arguments.inside, arguments.shuffles)

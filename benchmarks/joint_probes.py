@@ -126,10 +126,10 @@ def alone_seconds(
             pass
 
     seconds = OUTER_FOLDS * INNER_FOLDS * processor_seconds(one_inner)
-    kept: list[FittedFold] = []
+    fitted: list[FittedFold] = []
     quality = InnerQuality(np.zeros(labels.shape[1]), np.zeros(len(labels)))
-    once = processor_seconds(lambda: kept.append(probe._fit_fold(samples, labels, outer, strengths, quality)))
-    return seconds + OUTER_FOLDS * once, kept[0].decisions
+    once = processor_seconds(lambda: fitted.append(probe._fit_fold(samples, labels, outer, strengths, quality)))
+    return seconds + OUTER_FOLDS * once, fitted[0].decisions
 
 
 def main() -> None:
@@ -163,8 +163,8 @@ def main() -> None:
         patch("probe_kit.train.solver.design_matrix.IN_MEMORY", arguments.rival_memory * 2**30),
     ):
         if arguments.part != "alone":
-            seconds, found = together(samples, labels, folds, console)
-            strengths, decisions = found[0].strengths, found[0].decisions
+            seconds, fitted = together(samples, labels, folds, console)
+            strengths, decisions = fitted[0].strengths, fitted[0].decisions
             if arguments.decisions:
                 np.save(arguments.decisions, decisions)
         elif arguments.decisions:
@@ -188,21 +188,23 @@ def together(
     before = peak_memory()
     once = processor_seconds(lambda: sites.append(JointSite.of(samples, folds)))
     console.print(f"machine: {single:.0f} GFLOP/s in float32, {double:.0f} in float64; {once:.1f} s once")
-    found: list[FittedFold] = []
+    fitted: list[FittedFold] = []
     with patch.object(probe, "JointProblems", Counted):  # every product is made, and counted
-        solving = processor_seconds(lambda: found.extend(cross_validate_jointly(sites[0], samples, labels, folds)))
+        solving = processor_seconds(
+            lambda: fitted.extend(cross_validate_jointly(sites[0], samples, labels, folds))
+        )
     count, width = samples.features.shape
     moments = 4 * count * width**2 / 1e9
     work = Counted.work
     bound = (moments + work.single) / single + work.double / double
     console.print(f"{labels_at_once(sites[0], folds)} columns at once; alike: {sites[0].alike}")
-    console.print(f"chosen C: {[float(fold.strengths[0]) for fold in found]}")
+    console.print(f"chosen C: {[float(fold.strengths[0]) for fold in fitted]}")
     console.print(f"products: {moments + work.single:.0f} GFLOP in float32, {work.double:.0f} in float64")
     console.print(
         f"together: {once:.1f} s once and {solving:.1f} s; {bound / (once + solving):.0%} of the rate; "
         f"peak memory {peak_memory():.2f} GB, {before:.2f} before"
     )
-    return once + solving, found
+    return once + solving, fitted
 
 
 def peak_memory() -> float:

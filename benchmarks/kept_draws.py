@@ -20,14 +20,14 @@ def kept_draws(
         return np.array([draw(seed) for seed in seeds])
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{re.sub(r'[^a-z0-9]+', '-', name.lower())}.jsonl"
-    kept = dict(_read(path))
+    stored = dict(_read(path))
     with path.open("a", encoding="utf-8") as file:
         for seed in seeds:
-            if seed not in kept:
-                kept[seed] = [float(number) for number in draw(seed)]
-                file.write(json.dumps([seed, kept[seed]]) + "\n")
+            if seed not in stored:
+                stored[seed] = [float(number) for number in draw(seed)]
+                file.write(json.dumps([seed, stored[seed]]) + "\n")
                 file.flush()
-    return np.array([kept[seed] for seed in seeds])
+    return np.array([stored[seed] for seed in seeds])
 
 
 def _read(path: Path) -> Iterable[tuple[int, list[float]]]:
@@ -35,9 +35,9 @@ def _read(path: Path) -> Iterable[tuple[int, list[float]]]:
     if not path.exists():
         return
     text = path.read_text(encoding="utf-8")
-    whole = text[: text.rfind("\n") + 1]
-    if whole != text:
-        path.write_text(whole, encoding="utf-8")
-    for line in whole.splitlines():
+    complete_lines = text[: text.rfind("\n") + 1]
+    if complete_lines != text:
+        path.write_text(complete_lines, encoding="utf-8")
+    for line in complete_lines.splitlines():
         seed, numbers = json.loads(line)
         yield seed, numbers

@@ -85,15 +85,15 @@ def draw(world: LabelWorld, seed: int) -> tuple[float, tuple[float, float], bool
     generator = np.random.default_rng(seed)
     labels, group_of = world.labels(generator)
     folds = nested_folds(np.zeros(labels.size), group_of, seed, stratified_folds)
-    here, there = (
+    signal_scores, reference_scores = (
         probe_site(Samples.pooled(features), labels, np.empty((labels.size, 0)), folds, "continuous").scores
         for features in (world.features(labels, group_of, generator) for _ in range(2))
     )
     deviations = squared_deviations(labels, [fold.outer for fold in folds])
-    interval = explained_interval(here, deviations, group_of, SHARED_TRAINING)
-    above = better_than_reference(here[None], there, group_of, seed, SHARED_PROBE)[0]
-    best = better_than_best(here[None], there[None], group_of, seed, SHARED_PROBE)[0]
-    return float(here.mean()), interval, bool(above < SIGNIFICANCE), bool(best < SIGNIFICANCE)
+    interval = explained_interval(signal_scores, deviations, group_of, SHARED_TRAINING)
+    above = better_than_reference(signal_scores[None], reference_scores, group_of, seed, SHARED_PROBE)[0]
+    best = better_than_best(signal_scores[None], reference_scores[None], group_of, seed, SHARED_PROBE)[0]
+    return float(signal_scores.mean()), interval, bool(above < SIGNIFICANCE), bool(best < SIGNIFICANCE)
 
 
 def rows(worlds: list[LabelWorld], draws: int, seed: int) -> Iterator[tuple[str, ...]]:
@@ -103,7 +103,7 @@ def rows(worlds: list[LabelWorld], draws: int, seed: int) -> Iterator[tuple[str,
         truth = float(np.mean([score for score, *_ in drawn]))
         covered = np.mean([low <= truth <= high for _, (low, high), *_ in drawn])
         width = np.median([high - low for _, (low, high), *_ in drawn])
-        reference, best = (np.mean([one[at] for one in drawn]) for at in (2, 3))
+        reference, best = (np.mean([outcome[at] for outcome in drawn]) for at in (2, 3))
         yield world.name, f"{truth:.2f}", f"{covered:.1%}", f"{width:.2f}", f"{reference:.1%}", f"{best:.1%}"
 
 

@@ -121,10 +121,10 @@ def main() -> None:
             work, seeds = partial(drawn, kind, task, fitted), range(options.labels)
             if options.jobs > 1:
                 with Pool(options.jobs) as pool:
-                    found = np.array(pool.map(work, seeds, chunksize=1))
+                    draws_p = np.array(pool.map(work, seeds, chunksize=1))
             else:
-                found = np.array(kept_draws(options.keep, f"{task} labels, {kind}, {fitted} sites", seeds, work))
-            site, family = (found < SIGNIFICANCE).mean(axis=0)
+                draws_p = np.array(kept_draws(options.keep, f"{task} labels, {kind}, {fitted} sites", seeds, work))
+            site, family = (draws_p < SIGNIFICANCE).mean(axis=0)
             rates = f"{site:.3f}" if options.one_site else f"{site:.3f} / {family:.3f}"
             print(f"{task:11} {kind:28} {rates}", flush=True)
 

@@ -97,16 +97,16 @@ def p_values(world: World, seed: int, by_item: bool = False, nested: bool = Fals
     groups = np.repeat(np.arange(world.groups), 4)
     pattern = np.tile([True, False, False, True], world.groups)
     labels = pattern ^ (generator.random(world.groups) < 0.5)[groups]
-    kept = labels | (generator.random(labels.size) >= world.missing)
-    items = np.arange(labels.size)[kept] // 2
+    present = labels | (generator.random(labels.size) >= world.missing)
+    items = np.arange(labels.size)[present] // 2
     sign = np.where(labels, 1.0, -1.0)[:, None]
     layers = []
     for _ in range(SITES):
-        of_group, own = (generator.standard_normal((world.groups, WIDTH)) for _ in range(2))
+        of_group, group_offsets = (generator.standard_normal((world.groups, WIDTH)) for _ in range(2))
         of_item = np.repeat(generator.standard_normal((2 * world.groups, WIDTH)), 2, axis=0)
         features = generator.standard_normal((labels.size, WIDTH)) + world.shared * (of_group[groups] + of_item)
-        layers.append((features + world.mirrored * sign * own[groups])[kept])
-    labels, groups = labels[kept], groups[kept]
+        layers.append((features + world.mirrored * sign * group_offsets[groups])[present])
+    labels, groups = labels[present], groups[present]
     if by_item:
         permuted = flip_items(labels, items, PERMUTATIONS, seed + OTHER)
     else:
@@ -140,19 +140,19 @@ def correlated(
 
 def control_alarms(accuracy: float, draws: int, sites: int, neighbours: float) -> tuple[float, float]:
     """How often any of the sites exceeds an equally accurate random-features control, and untrained network."""
-    groups, found = np.repeat(np.arange(75), 4), []
+    groups, alarms = np.repeat(np.arange(75), 4), []
     for seed in range(draws):
         generator = np.random.default_rng(seed)
-        here, there = (correlated(generator, sites, accuracy, neighbours) for _ in range(2))
+        site_scores, other_scores = (correlated(generator, sites, accuracy, neighbours) for _ in range(2))
         layers = [correlated(generator, 1, accuracy)[0] for _ in range(LAYERS)]
         reference = np.mean(layers, axis=0)
-        found.append(
+        alarms.append(
             [
-                better_than_reference(here, reference, groups, seed + OTHER).min() < LEVEL,
-                better_than_best(here, there, groups, seed + OTHER).min() < LEVEL,
+                better_than_reference(site_scores, reference, groups, seed + OTHER).min() < LEVEL,
+                better_than_best(site_scores, other_scores, groups, seed + OTHER).min() < LEVEL,
             ]
         )
-    random_features, untrained = np.mean(found, axis=0)
+    random_features, untrained = np.mean(alarms, axis=0)
     return float(random_features), float(untrained)
 
 
@@ -185,13 +185,13 @@ def main() -> None:
         for world in (world for world in WORLDS if world.name.startswith(names)):
             nested, seeds = arguments.probe == "nested", range(arguments.draws)
             name = f"{arguments.probe} {world.name}"
-            found = kept_draws(arguments.keep, name, seeds, partial(p_values, world, nested=nested)) <= LEVEL
+            alarms = kept_draws(arguments.keep, name, seeds, partial(p_values, world, nested=nested)) <= LEVEL
             rivals = seeds[: arguments.rival_draws]
             rival = np.mean([p_values(world, seed, True, nested)[0] <= LEVEL for seed in rivals] or [np.nan])
-            hits = found.sum(axis=0)
-            above = min(binomtest(int(n), len(found), LEVEL, alternative="greater").pvalue for n in hits)
+            hits = alarms.sum(axis=0)
+            above = min(binomtest(int(n), len(alarms), LEVEL, alternative="greater").pvalue for n in hits)
             console.print(
-                f"{world.name:30} p ≤ 0.05: site {found[:, 0].mean():5.1%}, family {found[:, 1].mean():5.1%}; "
+                f"{world.name:30} p ≤ 0.05: site {alarms[:, 0].mean():5.1%}, family {alarms[:, 1].mean():5.1%}; "
                 f"more than 5 %? p = {above:.3f}; flips of items {rival:6.1%}",
                 highlight=False,
             )

@@ -81,8 +81,8 @@ def main() -> None:
     options = parser.parse_args()
     device = options.device or found_device()
     commands = parts(device)
-    chosen = options.only.split(",") if options.only else list(commands)
-    if unknown := [name for name in chosen if name not in commands]:
+    selected = options.only.split(",") if options.only else list(commands)
+    if unknown := [name for name in selected if name not in commands]:
         parser.error(f"--only {unknown[0]}; expected one of {', '.join(commands)}")
     print(machine(device), flush=True)
     if device == "cpu":
@@ -92,7 +92,7 @@ def main() -> None:
         )
     environment = {**os.environ, **({"OMP_NUM_THREADS": "1"} if device == "cpu" else {})}
     failed = []
-    for name in chosen:
+    for name in selected:
         print(f"\n== {name}: {' '.join(commands[name][1:])}", flush=True)
         if subprocess.run(commands[name], cwd=HERE.parent, env=environment, check=False).returncode:
             failed.append(name)

@@ -90,13 +90,13 @@ def main() -> None:
     parser.add_argument("--permutations", type=int, default=200)
     parser.add_argument("--folds", type=int, default=1)
     parser.add_argument("--sites", type=int, default=1, help="of the model, for the scaled time")
-    asked = parser.parse_args()
+    arguments = parser.parse_args()
     console = Console(width=115, highlight=False)
-    samples = Samples.pooled(features(asked.episodes, asked.width))
-    real, items = labels_of(asked.episodes)
-    labels = np.column_stack([real, flip_items(real, items, asked.permutations, seed=0)])
+    samples = Samples.pooled(features(arguments.episodes, arguments.width))
+    real, items = labels_of(arguments.episodes)
+    labels = np.column_stack([real, flip_items(real, items, arguments.permutations, seed=0)])
     folds = nested_folds(real, items, seed=0)
-    spent, done = {"coordinates": 0.0, "inner": 0.0, "outer": 0.0}, {"inner": Work(), "outer": Work()}
+    spent, work_done = {"coordinates": 0.0, "inner": 0.0, "outer": 0.0}, {"inner": Work(), "outer": Work()}
     fit, turn, work, setting = Projection.fit.__func__, Projection.__call__, Work(), Work()  # type: ignore[attr-defined]
 
     def total() -> Work:
@@ -104,7 +104,7 @@ def main() -> None:
 
     def timed_fit(cls: type[Projection], features: object) -> Projection:
         start = time.process_time()
-        made: Projection = fit(cls, features)
+        projection: Projection = fit(cls, features)
         spent["coordinates"] += time.process_time() - start
         count, width = samples_shape(features)
         if count >= width >= WORTH_NARROWING:
@@ -112,7 +112,7 @@ def main() -> None:
             setting.double += (3 * count + width) * width**2 / 1e9
         else:
             setting.double += 3 * count * width**2 / 1e9
-        return made
+        return projection
 
     def timed_turn(self: Projection, features: NDArray[np.float64]) -> object:
         start = time.process_time()
@@ -128,22 +128,22 @@ def main() -> None:
         patch.object(Projection, "__call__", timed_turn),
     ):
         single, double = rate(np.float32), rate(np.float64)
-        for fold in folds[: asked.folds]:
+        for fold in folds[: arguments.folds]:
             start = time.process_time()
             strengths, quality = probe.choose_strengths(samples, labels, fold.inner[:1])
             spent["inner"] += time.process_time() - start
-            done["inner"] = total() - done["outer"]
+            work_done["inner"] = total() - work_done["outer"]
             start = time.process_time()
             probe._fit_fold(samples, labels, fold.outer, strengths, quality)
             spent["outer"] += time.process_time() - start
-            done["outer"] = total() - done["inner"]
+            work_done["outer"] = total() - work_done["inner"]
     seconds = spent["inner"] + spent["outer"]
-    bound = {part: of.single / single + of.double / double for part, of in done.items()}
-    whole, least = (
-        (OUTER_FOLDS * INNER_FOLDS * of["inner"] + OUTER_FOLDS * of["outer"]) / asked.folds
+    bound = {part: of.single / single + of.double / double for part, of in work_done.items()}
+    full, least = (
+        (OUTER_FOLDS * INNER_FOLDS * of["inner"] + OUTER_FOLDS * of["outer"]) / arguments.folds
         for of in (spent, bound)
     )
-    console.print(f"N = {asked.episodes:,}, D = {asked.width:,}, {labels.shape[1]} label columns")
+    console.print(f"N = {arguments.episodes:,}, D = {arguments.width:,}, {labels.shape[1]} label columns")
     console.print(f"machine: {single:.0f} GFLOP/s in float32, {double:.0f} in float64")
     console.print(
         f"inner {spent['inner']:.1f} s, outer {spent['outer']:.1f} s, "
@@ -152,15 +152,15 @@ def main() -> None:
     console.print(
         f"products: {work.single:.0f} GFLOP in float32, {work.double:.0f} in float64; "
         f"coordinates {setting.single:.0f} and {setting.double:.0f}, "
-        f"eigenvectors about {2 * asked.folds * 9 * asked.width**3 / 1e9:.0f}"
+        f"eigenvectors about {2 * arguments.folds * 9 * arguments.width**3 / 1e9:.0f}"
     )
     console.print(
         f"{sum(bound.values()) / seconds:.0%} of the rate, {bound['inner'] / spent['inner']:.0%} in the inner set "
-        f"and {least / whole:.0%} of a site (of both sets, as if float32 paid nothing: "
+        f"and {least / full:.0%} of a site (of both sets, as if float32 paid nothing: "
         f"{(total().single + total().double) / double / seconds:.0%})"
     )
     console.print(
-        f"a site, scaled: {whole:.0f} s; {asked.sites} sites: {asked.sites * whole / 3600:.1f} CPU-hours"
+        f"a site, scaled: {full:.0f} s; {arguments.sites} sites: {arguments.sites * full / 3600:.1f} CPU-hours"
     )
     console.print(f"peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6:.2f} GB")
 

@@ -64,14 +64,14 @@ class Experiment:
 def draw(items: int, strength: float, seed: int) -> tuple[float, float, float, float]:
     """Held-out accuracy of the signal, and p against the mean layer, the best layer and the untrained network."""
     experiment = Experiment(items, seed)
-    here = experiment.sites([strength if at in CARRIERS else 0.0 for at in range(SITES)])
+    scores = experiment.sites([strength if at in CARRIERS else 0.0 for at in range(SITES)])
     untrained, layers = (experiment.sites([0.0] * count) for count in (SITES, LAYERS))
     groups, best = experiment.groups, layers[layers.sum(axis=1).argmax()].astype(float)
     return (
-        float(here[list(CARRIERS)].mean()),
-        float(better_than_reference(here, layers.mean(axis=0), groups, seed).min()),
-        float(better_than_reference(here, best, groups, seed).min()),
-        float(better_than_best(here, untrained, groups, seed).min()),
+        float(scores[list(CARRIERS)].mean()),
+        float(better_than_reference(scores, layers.mean(axis=0), groups, seed).min()),
+        float(better_than_reference(scores, best, groups, seed).min()),
+        float(better_than_best(scores, untrained, groups, seed).min()),
     )
 
 
@@ -81,7 +81,7 @@ def strength_for(items: int, accuracy: float, seed: int, draws: int = 12) -> flo
     for step in range(7):
         middle = (low + high) / 2
         seeds = [derive_seed("strength", seed, items, accuracy, step, number) for number in range(draws)]
-        reached = np.mean([Experiment(items, own).sites([middle]).mean() for own in seeds])
+        reached = np.mean([Experiment(items, draw_seed).sites([middle]).mean() for draw_seed in seeds])
         low, high = (middle, high) if reached < accuracy else (low, middle)
     return (low + high) / 2
 
@@ -92,7 +92,7 @@ def rows(counts: list[int], accuracies: list[float], draws: int, seed: int) -> I
         for accuracy in accuracies:
             strength = strength_for(items, accuracy, seed)
             seeds = [derive_seed("power", seed, items, accuracy, number) for number in range(draws)]
-            drawn = np.array([draw(items, strength, own) for own in seeds])
+            drawn = np.array([draw(items, strength, draw_seed) for draw_seed in seeds])
             simulated = simulate(items, accuracy - 0.5, SITES, 200)
             mean, best, untrained = (drawn[:, 1:] < SIGNIFICANCE).mean(axis=0)
             yield (

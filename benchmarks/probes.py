@@ -91,9 +91,12 @@ def compare(n_episodes: int, permutations: int, device: str | None) -> Table:
     table.add_row("probe_kit", f"{1e3 * ours / problems:.3f}", f"{ours:.1f}", "1")
     if device is not None:
         probe_kit_seconds(samples_of_site, 0, device)  # the first use of a device is slow
-        there = probe_kit_seconds(samples_of_site, permutations, device)
+        our_seconds = probe_kit_seconds(samples_of_site, permutations, device)
         table.add_row(
-            f"probe_kit, {device}", f"{1e3 * there / problems:.3f}", f"{there:.1f}", f"{there / ours:.2f}"
+            f"probe_kit, {device}",
+            f"{1e3 * our_seconds / problems:.3f}",
+            f"{our_seconds:.1f}",
+            f"{our_seconds / ours:.2f}",
         )
     for name, samples, tolerance in (
         ("scikit-learn, tol 1e-10", raw, 1e-10),

@@ -102,12 +102,12 @@ def opened(page: Path) -> tuple[float, int, int, float]:
         noted.write_text(text.replace("</title>", f"</title>{_NOTE}", 1), encoding="utf-8")
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
         arguments = [BROWSER, *_FLAGS, f"--user-data-dir={profile}", "--dump-dom", noted.as_uri()]
-        shown = subprocess.run(arguments, capture_output=True, encoding="utf-8", check=True, timeout=300).stdout
+        output = subprocess.run(arguments, capture_output=True, encoding="utf-8", check=True, timeout=300).stdout
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    found = re.search(r"<title>times (\[.*?\])</title>", shown)
-    if found is None:
+    match = re.search(r"<title>times (\[.*?\])</title>", output)
+    if match is None:
         raise SystemExit(f"{page} did not finish loading in {BROWSER}")
-    milliseconds, cards, elements = json.loads(found[1])
+    milliseconds, cards, elements = json.loads(match[1])
     processor = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     return milliseconds, cards, elements, processor
 
@@ -124,10 +124,13 @@ def bench_opening(folder: Path, repeats: int = 5) -> None:
     for _ in range(repeats):
         for name, path in pages.items():
             turns[name].append(opened(path))
-    for name, found in turns.items():
-        times, processor = sorted(turn[0] / 1e3 for turn in found), median(turn[3] for turn in found)
+    for name, opening_times in turns.items():
+        times, processor = (
+            sorted(turn[0] / 1e3 for turn in opening_times),
+            median(turn[3] for turn in opening_times),
+        )
         print(f"{name}: loaded after {median(times):.2f} s ({times[0]:.2f} to {times[-1]:.2f}), whole browser "
-              f"{processor:.1f} CPU-s; {found[0][1]} cards, {found[0][2]} elements")  # fmt: skip
+              f"{processor:.1f} CPU-s; {opening_times[0][1]} cards, {opening_times[0][2]} elements")  # fmt: skip
 
 
 def main() -> None:
@@ -138,9 +141,9 @@ def main() -> None:
     parser.add_argument("--permutations", type=int, default=20)
     parser.add_argument("--only")
     options = parser.parse_args()
-    made = [str(Path(__file__).with_name("full_run.py")), str(options.folder)]
-    made += ["--episodes", str(options.episodes), "--permutations", str(options.permutations)]
-    subprocess.run([sys.executable, *made], check=True)
+    full_run_command = [str(Path(__file__).with_name("full_run.py")), str(options.folder)]
+    full_run_command += ["--episodes", str(options.episodes), "--permutations", str(options.permutations)]
+    subprocess.run([sys.executable, *full_run_command], check=True)
     run = options.folder / "run"
     print(f"of which frames {_size(run / 'frames')}, probes {_size(run / 'probes')}")
     print(f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")

@@ -72,51 +72,51 @@ def twelves(count: int) -> Iterator[tuple[int, ...]]:
 
 def covered(intervals: Sequence[Interval], truth: float) -> str:
     """Coverage of all intervals, of those with limits, the share without, and the median width."""
-    bounded = [one for one in intervals if one.bounded]
-    every = np.mean([not one.bounded or one.low <= truth <= one.high for one in intervals])
+    bounded = [interval for interval in intervals if interval.bounded]
+    every = np.mean([not interval.bounded or interval.low <= truth <= interval.high for interval in intervals])
     if not bounded:
         return f"{every:.1%}, all open"
-    held = np.mean([one.low <= truth <= one.high for one in bounded])
-    width = np.median([one.high - one.low for one in bounded])
-    return f"{every:.1%}, {held:.1%}, {1 - len(bounded) / len(intervals):.0%}, {width:.2f}"
+    coverage = np.mean([interval.low <= truth <= interval.high for interval in bounded])
+    width = np.median([interval.high - interval.low for interval in bounded])
+    return f"{every:.1%}, {coverage:.1%}, {1 - len(bounded) / len(intervals):.0%}, {width:.2f}"
 
 
-def held(intervals: Sequence[Interval], truth: float) -> str:
+def share_covered(intervals: Sequence[Interval], truth: float) -> str:
     """Coverage and median width of intervals that always have limits."""
-    share = np.mean([one.low <= truth <= one.high for one in intervals])
-    return f"{share:.1%} {np.median([one.high - one.low for one in intervals]):.2f}"
+    share = np.mean([interval.low <= truth <= interval.high for interval in intervals])
+    return f"{share:.1%} {np.median([interval.high - interval.low for interval in intervals]):.2f}"
 
 
-def score_rows(found: Study) -> Iterator[tuple[str, ...]]:
+def score_rows(sampled: Study) -> Iterator[tuple[str, ...]]:
     """A row per stream: truth, bias, spread over draws against the claimed, coverage."""
-    scores = [Scores.of(fit) for fit in found.fits]
+    scores = [Scores.of(fit) for fit in sampled.fits]
     for row, stream in enumerate(STREAMS):
-        rates = [Rate(0.5 + float(fit.above[row]), accuracy_interval(fit, row)) for fit in found.fits]
-        means = [Rate.mean([rates[at] for at in chosen]) for chosen in twelves(len(rates))]
-        truth, above = float(found.truth[row]), found.above[:, row]
+        rates = [Rate(0.5 + float(fit.above[row]), accuracy_interval(fit, row)) for fit in sampled.fits]
+        means = [Rate.mean([rates[at] for at in positions]) for positions in twelves(len(rates))]
+        truth, above = float(sampled.truth[row]), sampled.above[:, row]
         bias = "" if truth else f"{100 * above.mean():+.1f} ± {100 * above.std(ddof=1) / len(above) ** 0.5:.1f}"
-        claimed = np.sqrt(np.mean([one.covariance[row, row] for one in scores]))
+        claimed = np.sqrt(np.mean([category_scores.covariance[row, row] for category_scores in scores]))
         yield (
-            found.world.name,
+            sampled.world.name,
             stream,
             f"{50 + 100 * truth:.1f}",
             bias,
             f"{100 * above.std(ddof=1):.1f}",
             f"{100 * claimed:.1f}",
-            held([rate.interval for rate in rates], 0.5 + truth),
-            held([mean.interval for mean in means], 0.5 + truth),
+            share_covered([rate.interval for rate in rates], 0.5 + truth),
+            share_covered([mean.interval for mean in means], 0.5 + truth),
         )
 
 
-def retention_row(found: Study) -> tuple[str, ...] | None:
+def retention_row(sampled: Study) -> tuple[str, ...] | None:
     """Retention of a category and of a mean of twelve; None without a backbone."""
-    if not found.truth[1]:
+    if not sampled.truth[1]:
         return None
-    ratio = float(found.truth[0] / found.truth[1])
-    scores = [Scores.of(fit) for fit in found.fits]
-    means = [Scores.mean([scores[at] for at in chosen]) for chosen in twelves(len(scores))]
-    each, mean = ([retention(one).interval for one in part] for part in (scores, means))
-    return found.world.name, f"{ratio:.2f}", covered(each, ratio), covered(mean, ratio)
+    ratio = float(sampled.truth[0] / sampled.truth[1])
+    scores = [Scores.of(fit) for fit in sampled.fits]
+    means = [Scores.mean([scores[at] for at in positions]) for positions in twelves(len(scores))]
+    each, mean = ([retention(part_scores).interval for part_scores in part] for part in (scores, means))
+    return sampled.world.name, f"{ratio:.2f}", covered(each, ratio), covered(mean, ratio)
 
 
 def main() -> None:
@@ -141,11 +141,11 @@ def main() -> None:
         for world in worlds:
             if not world.name.startswith(tuple(arguments.only.split(";"))):
                 continue
-            found = study(world, arguments.draws, arguments.seed, pool)
-            for row in score_rows(found):
+            sampled = study(world, arguments.draws, arguments.seed, pool)
+            for row in score_rows(sampled):
                 of_scores.add_row(*row)
                 console.print("  ".join(row), style="dim", highlight=False)
-            if (row := retention_row(found)) is not None:
+            if (row := retention_row(sampled)) is not None:
                 of_retention.add_row(*row)
                 console.print("  ".join(row), style="dim", highlight=False)
     console.print(of_scores, of_retention)

@@ -66,7 +66,7 @@ def draw(groups: int, kind: str, accuracy: float, alike: float, seed: int) -> tu
     sums = balanced_sums(probe.decisions[None, :], labels, fold_numbers([fold.outer for fold in folds]), group_of)
     names = np.arange(groups).astype(str)
     limits = [of(names, sums.sums[0], sums.sizes).interval() for of in (Accuracy, Share)]
-    return float(sums.accuracies[0]), *((one.low, one.high) for one in limits)  # type: ignore[return-value]
+    return float(sums.accuracies[0]), *((interval.low, interval.high) for interval in limits)  # type: ignore[return-value]
 
 
 def rows(groups: tuple[int, ...], alike: tuple[float, ...], draws: int, seed: int) -> Iterator[tuple[str, ...]]:
@@ -75,10 +75,10 @@ def rows(groups: tuple[int, ...], alike: tuple[float, ...], draws: int, seed: in
         cells = []
         for accuracy in ACCURACIES:
             seeds = [derive_seed("scores", seed, count, kind, accuracy, shared, number) for number in range(draws)]
-            drawn = [draw(count, kind, accuracy, shared, own) for own in seeds]
+            drawn = [draw(count, kind, accuracy, shared, draw_seed) for draw_seed in seeds]
             truth = float(np.mean([score for score, *_ in drawn]))
             texts = []
-            for limits in ([one[1] for one in drawn], [one[2] for one in drawn]):
+            for limits in ([outcome[1] for outcome in drawn], [outcome[2] for outcome in drawn]):
                 covered = np.mean([low - 1e-9 <= truth <= high + 1e-9 for low, high in limits])
                 texts.append(f"{covered:.0%} {np.median([high - low for low, high in limits]):.2f}")
             cells.append(f"{truth:.2f}: {texts[0]} ({texts[1]})")
@@ -168,11 +168,13 @@ def leak(groups: int, brighter: float, seed: int) -> tuple[float, float, float, 
     layers = np.array([(probed(layer()).decisions > 0) == labels for _ in range(LAYERS)], float)
     control = probed(pixels)
     right = ((control.decisions > 0) == labels).astype(float)
-    asked = is_informative(sums_by_group(control.inner, group_of), labels, group_of)
+    is_tested = is_informative(sums_by_group(control.inner, group_of), labels, group_of)
     best = int(sites.mean(axis=1).argmax())
     exceeds = better_than_reference(sites, layers.mean(axis=0), group_of, seed)[best] < SIGNIFICANCE
-    shown = exceeds and (not asked or better_than_reference(sites, right, group_of, seed)[best] < SIGNIFICANCE)
-    return float(sites.mean()), float(layers.mean()), float(right.mean()), asked, shown, exceeds
+    is_shown = exceeds and (
+        not is_tested or better_than_reference(sites, right, group_of, seed)[best] < SIGNIFICANCE
+    )
+    return float(sites.mean()), float(layers.mean()), float(right.mean()), is_tested, is_shown, exceeds
 
 
 def leaks(draws: int, seed: int) -> Table:
@@ -232,15 +234,15 @@ def _rises(steps: Matrix) -> str:
 def _limits_of_streams(right: Matrix, sizes: Matrix, sites: int) -> Matrix:
     """(N, 2) limits of streams of tied sites, of (N, G) right decisions."""
     fold_of, names = np.arange(sizes.size) % 5, [f"g{number:03d}" for number in range(sizes.size)]
-    found = []
+    bounds = []
     for sums in right:
         scores = GroupSums(np.repeat(sums[None], sites, axis=0), sizes)
         inner = np.where(fold_of == np.arange(5)[:, None], 0.0, scores.sums[:, None, :])
         interval = accuracy_interval(
             crossfit([StreamScores.of(scores, inner, fold_of, np.arange(sites))], names), 0
         )
-        found.append((interval.low, interval.high))
-    return np.array(found)
+        bounds.append((interval.low, interval.high))
+    return np.array(bounds)
 
 
 # -- success rates of very unequal groups --------------------------------------------------------------------

@@ -142,10 +142,10 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=2000, help="episodes of the long run")
     parser.add_argument("--model", default="pi0-tiny")
     parser.add_argument("--checkpoint", default=None)
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
-        adding(Path(name), given.episodes)
-        requests(Path(name), given.model, given.checkpoint, given.requests)
+        adding(Path(name), arguments.episodes)
+        requests(Path(name), arguments.model, arguments.checkpoint, arguments.requests)
 
 
 if __name__ == "__main__":

@@ -95,21 +95,21 @@ def main() -> None:
     parser.add_argument("--gpus", type=int, default=2)
     parser.add_argument("--models", type=int, default=8)
     parser.add_argument("--items", type=int, default=8)
-    chosen = parser.parse_args()
+    arguments = parser.parse_args()
     import ray
 
-    names = [f"m{seed}" for seed in range(chosen.models)]
+    names = [f"m{seed}" for seed in range(arguments.models)]
     with TemporaryDirectory() as folder:
         file = Path(folder) / "study.toml"
-        models = "".join(MODEL.format(seed=seed) for seed in range(chosen.models))
+        models = "".join(MODEL.format(seed=seed) for seed in range(arguments.models))
         text = STUDY.format(
-            out=f"{folder}/out", items=chosen.items, models=models, long=names[::2], short=names[1::2]
+            out=f"{folder}/out", items=arguments.items, models=models, long=names[::2], short=names[1::2]
         )
         file.write_text(text.replace("'", '"'), encoding="utf-8")
         tasks = tasks_of(plan_study(load_study(file)))
-        ray.init(num_cpus=chosen.gpus, num_gpus=chosen.gpus, include_dashboard=False, log_to_driver=False)
+        ray.init(num_cpus=arguments.gpus, num_gpus=arguments.gpus, include_dashboard=False, log_to_driver=False)
         began = time.monotonic()
-        with Waiting(chosen.gpus, len(tasks)) as waiting:
+        with Waiting(arguments.gpus, len(tasks)) as waiting:
             failures: list[Failure] = []
 
             def note(event: object) -> None:
@@ -120,9 +120,11 @@ def main() -> None:
         seconds = time.monotonic() - began
         ray.shutdown()
     assert not failures, failures
-    left, whole = (100 * sum(shares) / len(shares) for shares in (waiting.while_left, waiting.whole))
-    print(f"{len(tasks)} models on {chosen.gpus} GPUs in {seconds:.0f} s")
-    print(f"GPUs without a model: {left:.1f} % while models are left, {whole:.1f} % from first start to last end")
+    left, overall = (100 * sum(shares) / len(shares) for shares in (waiting.while_left, waiting.whole))
+    print(f"{len(tasks)} models on {arguments.gpus} GPUs in {seconds:.0f} s")
+    print(
+        f"GPUs without a model: {left:.1f} % while models are left, {overall:.1f} % from first start to last end"
+    )
 
 
 if __name__ == "__main__":

@@ -35,21 +35,21 @@ def main() -> None:
     parser.add_argument("--seeds", default="0")
     parser.add_argument("--width", type=int, default=96, help="units of a random layer; 96 is pi0-tiny's backbone")
     parser.add_argument("--categories", default=None)
-    asked = parser.parse_args()
-    categories = asked.categories.split(",") if asked.categories else None
-    seeds = [int(seed) for seed in asked.seeds.split(",")]
-    found: dict[str, list[tuple[float, float]]] = {}
+    options = parser.parse_args()
+    categories = options.categories.split(",") if options.categories else None
+    seeds = [int(seed) for seed in options.seeds.split(",")]
+    accuracies: dict[str, list[tuple[float, float]]] = {}
     with threadpool_limits(1), TemporaryDirectory() as scratch:
         for seed in seeds:
-            suite = build_suite(Path(scratch) / str(seed), categories, asked.items, seed)
-            for category, scores in free_accuracy(suite, asked.width).items():
-                found.setdefault(category, []).append(scores)
+            suite = build_suite(Path(scratch) / str(seed), categories, options.items, seed)
+            for category, scores in free_accuracy(suite, options.width).items():
+                accuracies.setdefault(category, []).append(scores)
     table = Table(
-        title=f"random-features, {asked.items} items, width {asked.width}: best and mean of {LAYERS} layers, %"
+        title=f"random-features, {options.items} items, width {options.width}: best and mean of {LAYERS} layers, %"
     )
     for heading in ("category", "accuracy"):
         table.add_column(heading)
-    for category, scores in found.items():
+    for category, scores in accuracies.items():
         table.add_row(category, _cell(scores))
     Console().print(table)
 
@@ -60,7 +60,7 @@ def free_accuracy(suite: Suite, width: int) -> dict[str, tuple[float, float]]:
     run = ArrayRun(suite.folder, "none", suite.identity, _episodes(suite), {(Site("backbone", 0), "mean"): blank})
     sweep = Sweep.of(run, "side.correct", None, views=("mean",), permutations=0, seed=0)
     inputs = ControlInputs(run, sweep.samples, True, suite)
-    found = {}
+    accuracy_by_category = {}
     for category in track(suite.categories, suite.identity, console=Console(stderr=True)):
         problem = sweep.problems[category]
         accuracies = []
@@ -68,8 +68,8 @@ def free_accuracy(suite: Suite, width: int) -> dict[str, tuple[float, float]]:
             layer = inputs.layer(problem.positions, width, derive_seed("binding", 0, number))
             decisions = problem.fit(Samples.pooled(layer)).decisions
             accuracies.append(float(correctness(decisions, problem.labels).mean()))
-        found[category] = (max(accuracies), float(np.mean(accuracies)))
-    return found
+        accuracy_by_category[category] = (max(accuracies), float(np.mean(accuracies)))
+    return accuracy_by_category
 
 
 def _episodes(suite: Suite) -> pd.DataFrame:

@@ -44,38 +44,38 @@ def policy_of(subject: str, folder: Path, device: str) -> Policy:
     return load_policy(family, str(written(family, folder / subject)), device, random_weights=True, **options)
 
 
-def seconds(policy: Policy, seen: list[Observation], repeats: int, device: str) -> float:
+def seconds(policy: Policy, examples: list[Observation], repeats: int, device: str) -> float:
     """Of one call with these observations."""
     on_gpu = device.startswith("cuda")
     clock = time.perf_counter if on_gpu else time.process_time
-    found = []
+    durations = []
     for _ in range(repeats):
         if on_gpu:
             torch.cuda.synchronize()
         began = clock()
-        policy.act(seen, range(len(seen)))
+        policy.act(examples, range(len(examples)))
         if on_gpu:
             torch.cuda.synchronize()
-        found.append(clock() - began)
-    return min(found)
+        durations.append(clock() - began)
+    return min(durations)
 
 
 def measure(policy: Policy, batches: list[int], repeats: int, device: str) -> None:
     """Print a line per batch."""
     most = policy.card.batch
-    seen = observations(max(batches))
-    alone = np.concatenate([policy.act([one], [seed]) for seed, one in enumerate(seen)])
+    examples = observations(max(batches))
+    alone = np.concatenate([policy.act([observation], [seed]) for seed, observation in enumerate(examples)])
     first = None
     for batch in batches:
         if most is not None and batch > most:
             print(f"  batch {batch:>3}: its card allows {most} per call, since more change its numbers")
             return
-        taken = seconds(policy, seen[:batch], repeats, device)
-        first = first or taken
-        apart = float(np.abs(policy.act(seen[:batch], range(batch)) - alone[:batch]).max())
+        spent = seconds(policy, examples[:batch], repeats, device)
+        first = first or spent
+        apart = float(np.abs(policy.act(examples[:batch], range(batch)) - alone[:batch]).max())
         print(
-            f"  batch {batch:>3}: {1e3 * taken:9.1f} ms a call, {batch / taken:8.2f} inferences / s, "
-            f"{first * batch / taken:5.2f} of batch 1; apart {apart:.1e}",
+            f"  batch {batch:>3}: {1e3 * spent:9.1f} ms a call, {batch / spent:8.2f} inferences / s, "
+            f"{first * batch / spent:5.2f} of batch 1; apart {apart:.1e}",
             flush=True,
         )
 

@@ -67,8 +67,8 @@ class World:
     def at_one_spot(self, random: np.random.Generator) -> "World":
         """Return the same robot at one place of its workspace, where it moves a tenth to a thirtieth as far."""
         share = random.uniform(10, 30, JOINTS)
-        place = self.centers + self.between * random.standard_normal(JOINTS)
-        return replace(self, centers=place, between=self.between / share, within=self.within / share)
+        centre = self.centers + self.between * random.standard_normal(JOINTS)
+        return replace(self, centers=centre, between=self.between / share, within=self.within / share)
 
     def play(self, episodes: int, random: np.random.Generator) -> Episodes:
         """Return episodes: a smooth motion around a place of each, and actions that follow it."""
@@ -77,13 +77,13 @@ class World:
     def _episode(self, random: np.random.Generator) -> dict[str, NDArray[np.float32]]:
         frames = int(random.integers(*self.lengths))
         time = np.linspace(0, 1, frames)[:, None]
-        place = self.centers + self.between * random.standard_normal(JOINTS)
+        centre = self.centers + self.between * random.standard_normal(JOINTS)
         waves = sum(
             random.standard_normal(JOINTS) * np.cos(np.pi * k * time + random.uniform(0, 6)) for k in (1, 2, 3)
         )
         # Some numbers are bent, so that their distribution is not symmetric.
         bent = (1 - self.skew) * waves + self.skew * (waves**2 - 1.5) / 1.5
-        joints = place + self.within * bent / 1.22 + 0.02 * self.within * random.standard_normal((frames, JOINTS))
+        joints = centre + self.within * bent / 1.22 + 0.02 * self.within * random.standard_normal((frames, JOINTS))
         share = np.clip(self.closed + random.normal(0, 0.1), 0.02, 0.98)
         gripper = np.where(time[:, 0] < share, 0.02, 0.98) + random.normal(0, 0.005, frames)
         state = np.column_stack([joints, gripper, np.full(frames, self.constant)])
@@ -113,8 +113,10 @@ def expected_of(folder: LeRobotFolder, feature: str, mode: str, complete: bool) 
     """Return the statistics of a checkpoint that was trained on a data set, as its processor has them."""
     stored = json.loads((folder.path / "meta" / "stats.json").read_text(encoding="utf-8"))[feature]
     low, high = (np.asarray(stored[name], np.float32) for name in MODES[mode])
-    beside = {name: np.asarray(numbers, np.float32) for name, numbers in stored.items()} if complete else {}
-    statistics = Normaliser(mode, low, high, 1e-8, "file", stored=beside).statistics
+    other_statistics = (
+        {name: np.asarray(numbers, np.float32) for name, numbers in stored.items()} if complete else {}
+    )
+    statistics = Normaliser(mode, low, high, 1e-8, "file", stored=other_statistics).statistics
     assert statistics is not None
     return statistics
 
@@ -124,8 +126,8 @@ def compare(
 ) -> Units:
     """Compare chosen episodes of a data set as `dataset show` does."""
     reader = LeRobotFrames(folder)
-    chosen = range(len(folder.lengths)) if episodes is None else episodes
-    frames = [reader.numbers(episode, [feature])[feature].astype(np.float32) for episode in chosen]
+    compared_episodes = range(len(folder.lengths)) if episodes is None else episodes
+    frames = [reader.numbers(episode, [feature])[feature].astype(np.float32) for episode in compared_episodes]
     return compare_units(expected, frames, folder.names(feature), folder.statistics(feature))
 
 
@@ -200,7 +202,7 @@ def checkpoints(training: LeRobotFolder, feature: str) -> Iterator[FeatureStatis
     yield expected_of(training, feature, "MIN_MAX", complete=False)
 
 
-def measure(folder: Path, seed: int, own: Counter[Any], other: Counter[Any]) -> None:
+def measure(folder: Path, seed: int, same_counts: Counter[Any], other: Counter[Any]) -> None:
     """Add the outcomes of one world to the counts, with a third of the changes."""
     random = np.random.default_rng(seed)
     world = World.draw(random)
@@ -222,7 +224,7 @@ def measure(folder: Path, seed: int, own: Counter[Any], other: Counter[Any]) -> 
         for expected in checkpoints(training, feature):
             for name, (data, selected) in sets.items():
                 outcome = compare(expected, data, feature, selected)
-                own[name, "refused" if outcome.are_other else "warned" if outcome.misfits else "fits"] += 1
+                same_counts[name, "refused" if outcome.are_other else "warned" if outcome.misfits else "fits"] += 1
     for name in list(CHANGES)[seed % SHARES :: SHARES]:
         kind, change = CHANGES[name]
         for origin, numbers in (("own", episodes), ("fresh", fresh)):
@@ -230,11 +232,11 @@ def measure(folder: Path, seed: int, own: Counter[Any], other: Counter[Any]) -> 
             for feature in FEATURES:
                 for expected in checkpoints(training, feature):
                     outcome = compare(expected, data, feature)
-                    named = any(misfit.kind == kind for misfit in outcome.misfits)
+                    is_named = any(misfit.kind == kind for misfit in outcome.misfits)
                     weight = "refused" if outcome.are_other else "warned" if outcome.misfits else "missed"
                     group = origin if origin == "own" or count >= 10 else "few"
                     other[name, group, feature, weight] += 1
-                    other[name, group, feature, "named"] += named
+                    other[name, group, feature, "named"] += is_named
 
 
 def main() -> None:
@@ -245,14 +247,14 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, help="for the data sets; a temporary one by default")
     options = parser.parse_args()
     logging.disable(logging.WARNING)
-    own, other = Counter[Any](), Counter[Any]()
+    same_counts, other = Counter[Any](), Counter[Any]()
     for seed in range(options.seed, options.seed + options.worlds):
         with tempfile.TemporaryDirectory(dir=options.folder) as folder:
-            measure(Path(folder), seed, own, other)
+            measure(Path(folder), seed, same_counts, other)
         print(f"world {seed}", file=sys.stderr)
     print("unchanged data                          comparisons  refused %  warned %")
-    for name in dict.fromkeys(name for name, _ in own):
-        counts = [own[name, weight] for weight in ("refused", "warned", "fits")]
+    for name in dict.fromkeys(name for name, _ in same_counts):
+        counts = [same_counts[name, weight] for weight in ("refused", "warned", "fits")]
         total = sum(counts)
         print(f"{name:40}{total:11}{100 * counts[0] / total:11.1f}{100 * counts[1] / total:10.1f}")
     heads = f"{'comparisons':>11}{'refused %':>11}{'warned %':>10}{'missed %':>10}{'named %':>9}"
@@ -265,8 +267,10 @@ def main() -> None:
         print(
             f"{name:26}{origin:7}{feature:19}{total:11}{shares[0]:11.1f}{shares[1]:15.1f}{shares[2]:10.1f}{shares[3]:9.1f}"
         )
-    refused = sum(count for (name, weight), count in own.items() if name.startswith("own") and weight == "refused")
-    compared = sum(count for (name, _), count in own.items() if name.startswith("own"))
+    refused = sum(
+        count for (name, weight), count in same_counts.items() if name.startswith("own") and weight == "refused"
+    )
+    compared = sum(count for (name, _), count in same_counts.items() if name.startswith("own"))
     bound = Counter[str]()
     for (name, _, _, weight), count in other.items():
         if name in BOUND and weight != "named":

@@ -105,17 +105,17 @@ def _rates(kind: Rates, groups: int, draws: int, seed: int) -> str:
     generator = np.random.default_rng(derive_seed("rates", seed, kind.name, groups))
     shares = [Share.of(*kind.draw(groups, generator)) for _ in range(draws)]
     limits = [share.interval() for share in shares]
-    held = np.mean([one.low <= kind.rate <= one.high for one in limits])
-    width = np.median([one.high - one.low for one in limits])
+    coverage = np.mean([interval.low <= kind.rate <= interval.high for interval in limits])
+    width = np.median([interval.high - interval.low for interval in limits])
     means, gaps = [], []
     for _ in range(draws):
-        chosen = generator.permutation(draws)[:12]
-        mean = mean_interval([shares[at].value for at in chosen], [limits[at] for at in chosen])
+        positions = generator.permutation(draws)[:12]
+        mean = mean_interval([shares[at].value for at in positions], [limits[at] for at in positions])
         means.append(mean.low <= kind.rate <= mean.high)
-        a, b = chosen[:2]
+        a, b = positions[:2]
         gap = difference_interval(shares[a].value, limits[a], shares[b].value, limits[b])
         gaps.append(gap.low <= 0 <= gap.high)
-    return f"{held:.1%} {width:.2f}, {np.mean(means):.1%}, {np.mean(gaps):.1%}"
+    return f"{coverage:.1%} {width:.2f}, {np.mean(means):.1%}, {np.mean(gaps):.1%}"
 
 
 def _steep(groups: int) -> Sizes:
@@ -137,8 +137,8 @@ def unequal(draws: int, seed: int) -> Table:
                 generator = np.random.default_rng(derive_seed("unequal", seed, name, rate, alike, groups))
                 kind = Rates(name, rate, alike, size)
                 limits = [Share.of(*kind.draw(groups, generator)).interval() for _ in range(draws)]
-                shares.append(np.mean([one.low <= rate <= one.high for one in limits]))
-                widths.append(np.median([one.high - one.low for one in limits]))
+                shares.append(np.mean([interval.low <= rate <= interval.high for interval in limits]))
+                widths.append(np.median([interval.high - interval.low for interval in limits]))
             cells.append(f"{min(shares):.1%}, {np.mean(shares):.1%}, {np.mean(widths):.2f}")
         table.add_row(name, *cells)
     return table
@@ -152,11 +152,11 @@ def draw_right(
     above: NDArray[np.float64], group_of: NDArray[np.intp], generator: np.random.Generator
 ) -> NDArray[np.bool_]:
     """(S, E) correctness of sites with (S,) accuracies above chance; neighbours and groups are alike."""
-    of_group, own = (
+    of_group, individual = (
         neighbours(generator.standard_normal((above.size, count)))
         for count in (int(group_of[-1]) + 1, group_of.size)
     )
-    values = np.sqrt(OF_GROUP) * of_group[:, group_of] + np.sqrt(1 - OF_GROUP) * own
+    values = np.sqrt(OF_GROUP) * of_group[:, group_of] + np.sqrt(1 - OF_GROUP) * individual
     right: NDArray[np.bool_] = values < ndtri(0.5 + above)[:, None]
     return right
 
@@ -167,7 +167,7 @@ def absent(draws: int, seed: int) -> Table:
     table = Table("sites", "groups", "one site at the bound", "all sites at the bound", "nothing", title=title)
     for sites in SITES:
         for groups in (24, 40, 75, 150):
-            found = []
+            cells = []
             generator = np.random.default_rng(derive_seed("absent threshold", seed, sites, groups))
             best = [
                 _sites(np.full(sites, 0.5), groups, generator).accuracies.max() for _ in range(max(draws, 200))
@@ -179,9 +179,9 @@ def absent(draws: int, seed: int) -> Table:
                 generator = np.random.default_rng(derive_seed("absent", seed, sites, groups, name))
                 shares = 0.5 + (np.zeros(sites) if name == "nothing" else above)
                 drawn = (_sites(shares, groups, generator) for _ in range(draws))
-                said = [is_absent(at_most(one), findable(one, threshold)) for one in drawn]
-                found.append(f"{np.mean(said):.1%}")
-            table.add_row(str(sites), str(groups), *found)
+                declared_absent = [is_absent(at_most(outcome), findable(outcome, threshold)) for outcome in drawn]
+                cells.append(f"{np.mean(declared_absent):.1%}")
+            table.add_row(str(sites), str(groups), *cells)
     return table
 
 
@@ -203,7 +203,7 @@ def models(draws: int, seed: int) -> Table:
         values = 0.5 + generator.normal(0, np.hypot(0.08, 0.03), (draws, 2, count))
         p = [exchange_p(*pair) for pair in values]
         out = [not interval.low <= 0 <= interval.high for interval in (welch_interval(*pair) for pair in values)]
-        alarms = np.mean([one.p <= SIGNIFICANCE for one in p])
+        alarms = np.mean([result.p <= SIGNIFICANCE for result in p])
         table.add_row(f"{count} + {count}", f"{alarms:.1%}", f"{p[0].smallest:.3f}", f"{np.mean(out):.1%}")
     return table
 
@@ -219,9 +219,9 @@ def spreads(draws: int, seed: int) -> Table:
         generator = np.random.default_rng(derive_seed("spreads", seed, few, many, spread))
         pairs = [(generator.normal(0, 0.08 * spread, few), generator.normal(0, 0.08, many)) for _ in range(draws)]
         small = np.array([exchange_p(*pair).p <= SIGNIFICANCE for pair in pairs])
-        shown = np.array([is_exchangeable(*pair) for pair in pairs])
+        exchangeable = np.array([is_exchangeable(*pair) for pair in pairs])
         out = [not interval.low <= 0 <= interval.high for interval in (welch_interval(*pair) for pair in pairs)]
-        shares = (f"{share:.1%}" for share in (small.mean(), (small & shown).mean(), np.mean(out)))
+        shares = (f"{share:.1%}" for share in (small.mean(), (small & exchangeable).mean(), np.mean(out)))
         table.add_row(f"{few} + {many}", f"× {spread}", *shares)
     return table
 
@@ -250,10 +250,10 @@ def missing(draws: int, seed: int) -> Table:
         "left missing", "backbone", "action", "ratio of the means", "±", title="missing episodes of one side"
     )
     above = np.array([_probed(derive_seed("missing", seed, number)) for number in range(draws)])
-    for place, share in enumerate(MISSING):
-        here = above[:, place]
-        expert, backbone = here.mean(axis=0)
-        each = (here[:, 0] - expert / backbone * here[:, 1]) / backbone
+    for column, share in enumerate(MISSING):
+        scores = above[:, column]
+        expert, backbone = scores.mean(axis=0)
+        each = (scores[:, 0] - expert / backbone * scores[:, 1]) / backbone
         error = each.std(ddof=1) / np.sqrt(draws) if draws > 1 else np.nan
         numbers = (backbone, expert, expert / backbone, error)
         table.add_row(f"{share:.0%}", *(f"{number:.3f}" for number in numbers))
@@ -267,22 +267,27 @@ def _probed(seed: int) -> NDArray[np.float64]:
     labels = np.tile([True, False], 2 * PAIRS)
     drawn = generator.random(labels.size)
     features = [_features(labels, strength, generator) for strength in (0.20, 0.32, 0.26, 0.50, 0.75, 0.6)]
-    found = []
+    fits = []
     for share in MISSING:
-        kept = ~labels | (drawn >= share)
-        folds = nested_folds(labels[kept], groups[kept], seed=0)
+        present = ~labels | (drawn >= share)
+        folds = nested_folds(labels[present], groups[present], seed=0)
         fold_of = fold_numbers([fold.outer for fold in folds])
         nothing = np.empty((fold_of.size, 0), np.bool_)
-        probes = [probe_site(Samples.pooled(one[kept]), labels[kept], nothing, folds) for one in features]
-        decisions, inner = (np.array([getattr(one, part) for one in probes]) for part in ("decisions", "inner"))
-        sums = balanced_sums(decisions, labels[kept], fold_of, groups[kept])
-        by_group, fold_of_group = sums_by_group(inner, groups[kept]), fold_of_groups(fold_of, groups[kept])
+        probes = [
+            probe_site(Samples.pooled(site_features[present]), labels[present], nothing, folds)
+            for site_features in features
+        ]
+        decisions, inner = (
+            np.array([getattr(probe, part) for probe in probes]) for part in ("decisions", "inner")
+        )
+        sums = balanced_sums(decisions, labels[present], fold_of, groups[present])
+        by_group, fold_of_group = sums_by_group(inner, groups[present]), fold_of_groups(fold_of, groups[present])
         streams = [
             StreamScores.of(sums.only(rows), by_group[rows], fold_of_group, [0, 1, 2])
             for rows in ([0, 1, 2], [3, 4, 5])
         ]
-        found.append(crossfit(streams, np.unique(groups[kept]).astype(str).tolist()).above)
-    return np.array(found)
+        fits.append(crossfit(streams, np.unique(groups[present]).astype(str).tolist()).above)
+    return np.array(fits)
 
 
 def _features(labels: NDArray[np.bool_], strength: float, generator: np.random.Generator) -> NDArray[np.float64]:
@@ -314,12 +319,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--only", default=";".join(SECTIONS), help="sections, separated by semicolons")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=1)
-    asked = parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
     console = Console(width=170)
-    error = binomtest(round(0.95 * asked.draws), asked.draws).proportion_ci()
-    console.print(f"{asked.draws} draws: 95 % is known to {error.low:.1%} … {error.high:.1%}", highlight=False)
-    with ProcessPoolExecutor(asked.workers) as pool:
-        for table in pool.map(partial(_run, draws=asked.draws, seed=asked.seed), asked.only.split(";")):
+    error = binomtest(round(0.95 * options.draws), options.draws).proportion_ci()
+    console.print(f"{options.draws} draws: 95 % is known to {error.low:.1%} … {error.high:.1%}", highlight=False)
+    with ProcessPoolExecutor(options.workers) as pool:
+        for table in pool.map(partial(_run, draws=options.draws, seed=options.seed), options.only.split(";")):
             console.print(table)
 
 

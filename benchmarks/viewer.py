@@ -69,12 +69,12 @@ def seconds_to(page: Any, address: str, drawn: str) -> float:
 
 def measure_views(browser: Any, base: str, where: str) -> None:
     """Seconds, heap and elements of each view in a fresh page. base: address of the page without a view."""
-    for name, (place, drawn) in VIEWS.items():
+    for name, (fragment, drawn) in VIEWS.items():
         page = browser.page()
         page.call("Performance.enable")
-        took = seconds_to(page, f"{base}{place}", drawn)
+        took = seconds_to(page, f"{base}{fragment}", drawn)
         page.call("HeapProfiler.collectGarbage")
-        metrics = {one["name"]: one["value"] for one in page.call("Performance.getMetrics")["metrics"]}
+        metrics = {metric["name"]: metric["value"] for metric in page.call("Performance.getMetrics")["metrics"]}
         nodes = page.read("document.querySelectorAll('*').length")
         heap = metrics["JSHeapUsedSize"] / 1e6
         report(f"{where}: {name}", f"{took:.2f} s, {heap:.0f} MB, {nodes} elements")
@@ -105,8 +105,8 @@ def measure_server(browser: Any, run: str) -> None:
         report("address to the name of the run", f"{time.perf_counter() - began:.2f} s")
         page.wait(VIEWS["overview"][1])
         report("address to the drawn overview", f"{time.perf_counter() - began:.2f} s")
-        for name, (place, drawn) in VIEWS.items():
-            took = seconds_to(page, f"{address.partition('?')[0]}{place}", drawn)
+        for name, (fragment, drawn) in VIEWS.items():
+            took = seconds_to(page, f"{address.partition('?')[0]}{fragment}", drawn)
             report(f"served, again: {name}", f"{took:.2f} s")
 
 
@@ -150,15 +150,15 @@ def extraction_seconds(episodes: int, frames: str, out: Path) -> float:
 def measure_frames(folder: Path) -> None:
     """CPU seconds per episode with the first and last frame, and with all of them."""
     few, many = FRAME_EPISODES
-    found: dict[tuple[str, int], list[float]] = defaultdict(list)
+    seconds_by_size: dict[tuple[str, int], list[float]] = defaultdict(list)
     for repeat in range(FRAME_REPEATS):  # in turn, since the speed of a shared machine drifts
         for count in FRAME_EPISODES:
             for frames in ("ends", "all"):
                 seconds = extraction_seconds(count, frames, folder / f"{frames}-{count}-{repeat}")
-                found[frames, count].append(seconds)
+                seconds_by_size[frames, count].append(seconds)
     took = {}
     for frames in ("ends", "all"):
-        took[frames] = (min(found[frames, many]) - min(found[frames, few])) / (many - few)
+        took[frames] = (min(seconds_by_size[frames, many]) - min(seconds_by_size[frames, few])) / (many - few)
         report(f"extract --frames {frames}", f"{took[frames]:.3f} CPU-s an episode")
     report("--frames all costs", f"{100 * (took['all'] / took['ends'] - 1):.0f} %")
 

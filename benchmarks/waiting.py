@@ -65,11 +65,11 @@ class Clock:
     @contextmanager
     def around_players(self) -> Iterator[None]:
         """Time the answers of all players."""
-        asked: dict[int, list[str]] = defaultdict(list)
+        requests: dict[int, list[str]] = defaultdict(list)
 
         def asking(ask: Callable[..., None]) -> Callable[..., None]:
             def noted(player: Any, method: str, *arguments: Any, then: Any = None) -> None:
-                asked[id(player)] = [method] if then is None else [method, then[0]]
+                requests[id(player)] = [method] if then is None else [method, then[0]]
                 ask(player, method, *arguments, then=then)
 
             return noted
@@ -78,7 +78,7 @@ class Clock:
             def timed(player: Any) -> Any:
                 began = time.perf_counter()
                 answered = answer(player)
-                methods = asked[id(player)]
+                methods = requests[id(player)]
                 self.answers.append((methods[0], began, time.perf_counter()))
                 if isinstance(answered, Ending) and len(methods) > 1:
                     del methods[0]
@@ -96,10 +96,10 @@ class Clock:
     def stages(self) -> str:
         """The share of every stage in the time after the first call."""
         (_, start, _), (_, end, _) = self.calls[0], self.calls[-1]
-        seconds = {"model": sum(done - began for began, done, _ in self.calls[1:])}
+        seconds = {"model": sum(ended - began for began, ended, _ in self.calls[1:])}
         for name, method in (("scenes begin", "begin"), ("actions are executed", "advance")):
-            waits = [(max(began, start), min(done, end)) for of, began, done in self.answers if of == method]
-            seconds[name] = sum(max(0.0, done - began) for began, done in waits)
+            waits = [(max(began, start), min(ended, end)) for of, began, ended in self.answers if of == method]
+            seconds[name] = sum(max(0.0, ended - began) for began, ended in waits)
         seconds["all else"] = end - start - sum(seconds.values())
         return ", ".join(f"{name} {share / (end - start):.1%}" for name, share in seconds.items())
 
@@ -107,7 +107,7 @@ class Clock:
     def words(self) -> str:
         """Share of the time after the first call in which the model waited, and what a call took."""
         (_, start, processor), (_, end, processor_end) = self.calls[0], self.calls[-1]
-        works = sum(done - began for began, done, _ in self.calls[1:])
+        works = sum(ended - began for began, ended, _ in self.calls[1:])
         count = len(self.calls) - 1
         return (
             f"waited {1 - works / (end - start):6.1%} of {end - start:5.1f} s, {count} calls of "
@@ -118,13 +118,13 @@ class Clock:
 
 def _spread() -> None:
     """This process to the first core it may use, its children and theirs to the others."""
-    first, *others = sorted(os.sched_getaffinity(0))
-    if not others:
+    first, *other_cores = sorted(os.sched_getaffinity(0))
+    if not other_cores:
         return
-    here = psutil.Process()
-    for child in here.children(recursive=True):
-        child.cpu_affinity(others)
-    for thread in here.threads():
+    this_process = psutil.Process()
+    for child in this_process.children(recursive=True):
+        child.cpu_affinity(other_cores)
+    for thread in this_process.threads():
         os.sched_setaffinity(thread.id, {first})
 
 
@@ -172,13 +172,13 @@ def main() -> None:
                     options={"statistics": "bridge"},
                     **({"dtype": "bfloat16"} if subject == "full" else {}),
                 )
-            chosen = prepare(settings.changed(batch="auto"))
-            print(f"{subject}: {chosen.calibration.words}", flush=True)
+            prepared = prepare(settings.changed(batch="auto"))
+            print(f"{subject}: {prepared.calibration.words}", flush=True)
             print(
-                f"  simulators beside it: {measure(chosen, folder / f'{subject}-beside', options.spread)}",
+                f"  simulators beside it: {measure(prepared, folder / f'{subject}-beside', options.spread)}",
                 flush=True,
             )
-            alone = prepare(settings.changed(env_workers=0, batch=chosen.calibration.batch))
+            alone = prepare(settings.changed(env_workers=0, batch=prepared.calibration.batch))
             print(f"  none beside it:       {measure(alone, folder / f'{subject}-alone', False)}", flush=True)
 
 

@@ -15,10 +15,10 @@ import typer
 import typer.core
 
 from probe_kit._system.escaping import terminal_safe
-from probe_kit._terminal.console import marked, out, say
+from probe_kit._terminal.console import markup, out, say
 from probe_kit._terminal.error_reporting import report_error
 from probe_kit._terminal.field_options import PanelledHelp
-from probe_kit._terminal.interruption import begun
+from probe_kit._terminal.interruption import heed_signals
 from probe_kit.check_adapter.command import check_adapter
 from probe_kit.demo.commands import demo
 from probe_kit.diagnose.commands import diagnose
@@ -82,7 +82,7 @@ class Commands(typer.core.TyperGroup):
     def invoke(self, ctx: Any) -> Any:
         """Run the chosen command."""
         try:
-            begun()
+            heed_signals()
             return self._run(ctx)
         except _FOR_TYPER:
             raise
@@ -189,7 +189,7 @@ def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
 @cache
 def _say_warning(text: str) -> None:
     """Print a text once: Python forgets which it has shown wherever a library catches warnings."""
-    say(marked("[yellow]warning:[/] {}", text))
+    say(markup("[yellow]warning:[/] {}", text))
 
 
 def main() -> None:

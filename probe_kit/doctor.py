@@ -20,7 +20,7 @@ from typing import Any, Literal
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
-from probe_kit._system.counting import counted
+from probe_kit._system.counting import plural
 from probe_kit._system.imports import install_command
 from probe_kit._system.machine import cores_here
 from probe_kit.errors import SceneError
@@ -83,7 +83,7 @@ def _python() -> Finding:
 def _processor() -> Finding:
     count = cores_here()
     advice = "" if count > 1 else "Two cores halve the time of the demo: simulation and inference overlap"
-    return Finding("processor", "ok" if count > 1 else "note", f"{counted(count, 'core')} usable", advice)
+    return Finding("processor", "ok" if count > 1 else "note", f"{plural(count, 'core')} usable", advice)
 
 
 def _memory() -> Finding:
@@ -289,7 +289,7 @@ def _extras() -> list[Finding]:
 
 
 def _extra(name: str, packages: list[str]) -> Finding:
-    versions = {package: _installed(package) for package in packages}
+    versions = {package: _installed_version(package) for package in packages}
     lacking = [package for package, version in versions.items() if version is None]
     if lacking:
         return Finding(f"extra {name}", "note", f"without {', '.join(lacking)}", f"`{install_command(name)}`")
@@ -298,7 +298,7 @@ def _extra(name: str, packages: list[str]) -> Finding:
     )
 
 
-def _installed(package: str) -> str | None:
+def _installed_version(package: str) -> str | None:
     try:
         return version(package)
     except PackageNotFoundError:

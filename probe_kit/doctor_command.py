@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from probe_kit._terminal.console import err, marked, out, print_json, say
+from probe_kit._terminal.console import err, markup, out, print_json, say
 from probe_kit._terminal.options import AsJson
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ def doctor(
     missing = any(finding.state == "missing" for finding in findings)
     if not missing:
         commands = "probe-kit demo", "probe-kit diagnose MODEL"
-        say(marked("next: [bold]{}[/]; [bold]{}[/] says which inputs a policy uses", *commands))
+        say(markup("next: [bold]{}[/]; [bold]{}[/] says which inputs a policy uses", *commands))
     raise typer.Exit(1 if missing else 0)
 
 

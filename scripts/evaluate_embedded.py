@@ -41,7 +41,7 @@ def main(
     policy: Annotated[bool, typer.Option(help="Have the policy act.")] = True,
 ) -> None:
     """Act, ask, print."""
-    place = SceneSpec.preset(scene, early_stop=early_stop)
+    scene_spec = SceneSpec.preset(scene, early_stop=early_stop)
     with progress() as bar:
         suite = build_suite(
             out / f"suite-{suite_seed}",
@@ -50,11 +50,17 @@ def main(
             seed=suite_seed,
             progress=counter(bar, "suite"),
         )
-        runs = [_asked(out, suite, place, prompt, counter(bar, prompt)) for prompt in prompts.split(",") if prompt]
+        runs = [
+            _ask_scene(out, suite, scene_spec, prompt, counter(bar, prompt))
+            for prompt in prompts.split(",")
+            if prompt
+        ]
         if policy:
-            settings = ExtractSettings(TRAINED.model, checkpoint, suite=suite.folder, scene=place, frames="none")
+            settings = ExtractSettings(
+                TRAINED.model, checkpoint, suite=suite.folder, scene=scene_spec, frames="none"
+            )
             name = "acted" if checkpoint is None else Path(checkpoint).name
-            runs.append(extract_run(settings, _folder(out, suite, place, name), counter(bar, "episodes")))
+            runs.append(extract_run(settings, _folder(out, suite, scene_spec, name), counter(bar, "episodes")))
     for cells in (HEADING, ["---"] * len(HEADING), *map(_cells, _rows(runs))):
         typer.echo(f"| {' | '.join(cells)} |")
 
@@ -65,7 +71,7 @@ def _rows(runs: list[Run]) -> list[RetentionRow]:
     return [row for run, rule in judged for row in retention_table([run], rule=rule).rows if row.category != MEAN]
 
 
-def _asked(out: Path, suite: Suite, scene: SceneSpec, prompt: str, count: Callable[..., None]) -> Run:
+def _ask_scene(out: Path, suite: Suite, scene: SceneSpec, prompt: str, count: Callable[..., None]) -> Run:
     settings = AskSettings(VLM.model, suite=suite.folder, scene=scene, prompt=TEMPLATES[prompt], frames="none")
     return ask_run(settings, _folder(out, suite, scene, prompt), count)
 

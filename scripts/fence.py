@@ -262,8 +262,8 @@ def decode_labels(fence: Fence) -> None:
         options = ("--permutations", permutations, "--controls", ",".join(controls) or "none", "--task", task)
         call("train", "acting", "--target", target, *options)
         labels = pk.Target.of_run(run, target, task=task)
-        found = pk.train_probes(run, target=labels, permutations=permutations, controls=controls)
-        add_probes(fence, "acting", f"label {target}, {task}", found)
+        results = pk.train_probes(run, target=labels, permutations=permutations, controls=controls)
+        add_probes(fence, "acting", f"label {target}, {task}", results)
     add_retention(fence, "acting", "label retention", "acting", "--target", "sim.tool_y")
 
 
@@ -292,8 +292,18 @@ def intervene_on_scenes(fence: Fence) -> None:
 def show_recordings(fence: Fence) -> None:
     """Show frames of a LeRobotDataset that lerobot itself writes."""
     write_recording(Path("recording"), episodes=10, frames=4)
-    shown = ("--dataset", "recording", "--camera", "base=observation.images.top", "--select", "every:2")
-    call("extract", "--model", "pi0-tiny", *shown, "--label", "recording", "--accept-units", "--out", "shown")
+    source_options = ("--dataset", "recording", "--camera", "base=observation.images.top", "--select", "every:2")
+    call(
+        "extract",
+        "--model",
+        "pi0-tiny",
+        *source_options,
+        "--label",
+        "recording",
+        "--accept-units",
+        "--out",
+        "shown",
+    )
     run = pk.open_run("shown")
     add_episodes(fence, "recording", run)
     add_activations(fence, "recording", run)
@@ -301,8 +311,8 @@ def show_recordings(fence: Fence) -> None:
     target = "dataset.next.reward"
     call("train", "shown", "--target", target, "--permutations", 31, "--controls", "step,state")
     labels = pk.Target.of_run(run, target)
-    found = pk.train_probes(run, target=labels, permutations=31, controls=("step", "state"))
-    add_probes(fence, "recording", f"label {target}", found)
+    results = pk.train_probes(run, target=labels, permutations=31, controls=("step", "state"))
+    add_probes(fence, "recording", f"label {target}", results)
 
 
 def play_own_environment(fence: Fence) -> None:
@@ -315,8 +325,8 @@ def play_own_environment(fence: Fence) -> None:
     add_inputs(fence, "environment", run, "state", "action", "pixels")
     target = "env.away"
     call("train", "environment", "--target", target, "--permutations", 31)
-    found = pk.train_probes(run, target=pk.Target.of_run(run, target), permutations=31)
-    add_probes(fence, "environment", f"label {target}", found)
+    results = pk.train_probes(run, target=pk.Target.of_run(run, target), permutations=31)
+    add_probes(fence, "environment", f"label {target}", results)
     add_retention(fence, "environment", "label retention", "environment", "--target", "env.away")
 
 
@@ -331,7 +341,7 @@ def write_recording(folder: Path, episodes: int, frames: int) -> None:
             "shape": (48, 64, 3),
             "names": ["height", "width", "channels"],
         },
-        "observation.state": {"dtype": "float32", "shape": (8,), "names": [f"s{place}" for place in range(8)]},
+        "observation.state": {"dtype": "float32", "shape": (8,), "names": [f"s{index}" for index in range(8)]},
         "action": {"dtype": "float32", "shape": (7,), "names": None},
         "next.reward": number,
     }
@@ -403,9 +413,9 @@ def compare_two_policies(fence: Fence) -> None:
     for folder in sorted(Path("two/asked").iterdir()):
         add_episodes(fence, f"asked {folder.name}", pk.open_run(folder))
     for score in ("text", "logits", "order-balanced"):
-        asked = [*sorted(map(str, Path("two/asked").iterdir())), "two/pi0-tiny", "two/pi0-tiny-state"]
+        run_folders = [*sorted(map(str, Path("two/asked").iterdir())), "two/pi0-tiny", "two/pi0-tiny-state"]
         add_retention(
-            fence, "two policies", f"answers by {score}", *asked, "--compare", "vlm-vla", "--score", score
+            fence, "two policies", f"answers by {score}", *run_folders, "--compare", "vlm-vla", "--score", score
         )
 
 
@@ -500,9 +510,9 @@ def numeric_platform() -> dict[str, str]:
     # Not scikit-learn: 1.8.0 and 1.9.1 give the same bits, in the default part and in `erase`, which calls it.
     names = ("torch", "numpy", "scipy", "pybullet", "pillow", "opencv-python-headless", "transformers", "lerobot")
     libraries = {
-        f"{one['internal_api']} {one.get('version')} {one.get('architecture', '')}".strip()
-        for one in threadpool_info()
-        if one["user_api"] == "blas"
+        f"{library['internal_api']} {library.get('version')} {library.get('architecture', '')}".strip()
+        for library in threadpool_info()
+        if library["user_api"] == "blas"
     }
     return {
         "machine": platform.machine(),

@@ -20,11 +20,11 @@ def reference_parser(description: str) -> argparse.ArgumentParser:
 
 
 def write_reference(
-    checkpoint: Path, folder: Path, found: dict[str, np.ndarray], recorded: str, modules: Sequence[ModuleType]
+    checkpoint: Path, folder: Path, outputs: dict[str, np.ndarray], recorded: str, modules: Sequence[ModuleType]
 ) -> None:
     """Write the folder. recorded: its title and origin, in Markdown. modules: those whose versions it names."""
     shutil.copytree(checkpoint, folder / "checkpoint", dirs_exist_ok=True)
-    np.savez_compressed(folder / "reference.npz", **found)
+    np.savez_compressed(folder / "reference.npz", **outputs)
     versions = {module.__name__: module.__version__ for module in modules}
     text = f"# Golden reference: {recorded}. {json.dumps(versions)}\n"
     (folder / "README.md").write_text(text, encoding="utf-8")

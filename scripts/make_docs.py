@@ -46,30 +46,37 @@ def main() -> None:
     demo: Path = options.folder / "demo"
     content = json.loads(DATA.read_text(encoding="utf-8"))
     with progress() as bar:
-        made = run_demo(demo, lambda stage: counter(bar, stage))
-        content["demo"] = _measured(_of_trained(made), QUICK)
+        finished_demo = run_demo(demo, lambda stage: counter(bar, stage))
+        content["demo"] = _measured(_of_trained(finished_demo), QUICK)
         if not options.demo_only:
             content["compare"] = _compared(options.folder / "compare", lambda stage: counter(bar, stage))
     DATA.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     for page in (README, *PAGES):
         page.write_text(filled(page.read_text(encoding="utf-8"), content), encoding="utf-8")
-    write_report([made.vlm_run, made.run], ROOT / "docs" / SAMPLE, made.table, pictures=SAMPLE_PICTURES)
+    write_report(
+        [finished_demo.vlm_run, finished_demo.run],
+        ROOT / "docs" / SAMPLE,
+        finished_demo.table,
+        pictures=SAMPLE_PICTURES,
+    )
     draw_picture(demo, content["demo"]["probes"])
     shutil.copyfile(demo / "episode.gif", ROOT / "docs" / "episode.gif")
     sheet = [sys.executable, str(ROOT / "benchmarks" / "env.py"), "sheet", str(ROOT / "docs" / "scenes.png")]
     subprocess.run(sheet, check=True)
 
 
-def _of_trained(made: Demo) -> list[Finding]:
+def _of_trained(demo: Demo) -> list[Finding]:
     return [
         Finding(TRAINED.name, row.category, TRAINED.expected(row.category), verdict(row), row)
-        for row in made.table.rows
+        for row in demo.table.rows
         if row.run.mode == "acts"
     ]
 
 
 def _compared(folder: Path, stage: NamedProgress) -> dict[str, Any]:
-    return _measured([one for one in compare_organisms(folder, stage) if one.row.run.mode == "acts"], FULL)
+    return _measured(
+        [finding for finding in compare_organisms(folder, stage) if finding.row.run.mode == "acts"], FULL
+    )
 
 
 def _measured(findings: Iterable[Finding], size: Size) -> dict[str, Any]:

@@ -48,12 +48,14 @@ def record(checkpoint: Path, seed: int) -> dict[str, np.ndarray]:
     entered: list[list[torch.Tensor]] = [[] for _ in range(len(decoder.layers) + 1)]
     normed, velocity, caches = [], [], []
     for number, module in enumerate([*(layer.input_layernorm for layer in decoder.layers), decoder.norm]):
-        module.register_forward_pre_hook(lambda _, given, own=entered[number]: own.append(given[0].clone()))
+        module.register_forward_pre_hook(
+            lambda _, arguments, collected=entered[number]: collected.append(arguments[0].clone())
+        )
     decoder.norm.register_forward_hook(lambda _, __, output: normed.append(output.clone()))
     policy.model.action_out_proj.register_forward_hook(lambda _, __, output: velocity.append(output.clone()))
     policy.model.vlm_backbone.model.register_forward_hook(
         lambda _, __, output: caches.append(
-            [(own.keys.clone(), own.values.clone()) for own in output.past_key_values.layers]
+            [(layer.keys.clone(), layer.values.clone()) for layer in output.past_key_values.layers]
         )
     )
     torch.manual_seed(seed)
@@ -62,32 +64,32 @@ def record(checkpoint: Path, seed: int) -> dict[str, np.ndarray]:
     actions = policy.predict_action_chunk(batch)
     keys, values = (torch.stack([row[part].transpose(1, 2).flatten(2) for row in caches[0]]) for part in (0, 1))
     steps = range(1, policy.config.num_denoise_steps + 1)
-    found = {
+    outputs = {
         **{name: batch[name] for name in ("input_ids", "attention_mask", "pixel_values", "image_grid_thw")},
-        "backbone_resid": torch.stack([own[0] for own in entered]),
+        "backbone_resid": torch.stack([entering[0] for entering in entered]),
         "backbone_final_norm": normed[0],
         "keys": keys,
         "values": values,
-        "expert_resid": torch.stack([torch.stack([own[step] for own in entered]) for step in steps]),
+        "expert_resid": torch.stack([torch.stack([entering[step] for entering in entered]) for step in steps]),
         "expert_final_norm": torch.stack([normed[step] for step in steps]),
         "velocity": torch.stack(velocity),
         "in_noise": noise,
         "actions": actions,
         "actions_unnormalized": behind(actions),
     }
-    arrays = {name: value.detach().numpy() for name, value in found.items()}
+    arrays = {name: value.detach().numpy() for name, value in outputs.items()}
     return arrays | {"in_raw_state": state, "in_image": picture, "in_task": np.array(TASK)}
 
 
 def main() -> None:
     """Write the reference beside a copy of the checkpoint."""
-    chosen = reference_parser(str(__doc__).splitlines()[0]).parse_args()
-    found = record(chosen.checkpoint, chosen.seed)
+    arguments = reference_parser(str(__doc__).splitlines()[0]).parse_args()
+    outputs = record(arguments.checkpoint, arguments.seed)
     recorded = (
         "eo1\n\nRecorded by `scripts/record_eo1.py` with lerobot's own loading, processors and sampling; "
         "random weights"
     )
-    write_reference(chosen.checkpoint, chosen.folder, found, recorded, (torch, transformers, lerobot))
+    write_reference(arguments.checkpoint, arguments.folder, outputs, recorded, (torch, transformers, lerobot))
 
 
 if __name__ == "__main__":

@@ -45,54 +45,54 @@ def record(checkpoint: Path, seed: int) -> dict[str, np.ndarray]:
             "task": TASK,
         }
     )
-    found: dict[str, Any] = {name: batch[name] for name in ("input_ids", "pixel_values", "state")}
+    outputs: dict[str, Any] = {name: batch[name] for name in ("input_ids", "pixel_values", "state")}
     inner, head = policy._groot_model, policy._groot_model.action_head
-    inputs, own = inner.prepare_input(policy._filter_groot_inputs(batch, include_action=False))
+    inputs, model_inputs = inner.prepare_input(policy._filter_groot_inputs(batch, include_action=False))
     prompt = inner.backbone(inputs)
-    found["backbone_end"] = prompt.backbone_features
-    found["backbone_final_norm"] = head.vlln(prompt.backbone_features)
-    read, bridge = head.vl_self_attention(found["backbone_final_norm"], return_all_hidden_states=True)
-    found["bridge_resid"] = torch.stack(bridge)
+    outputs["backbone_end"] = prompt.backbone_features
+    outputs["backbone_final_norm"] = head.vlln(prompt.backbone_features)
+    read, bridge = head.vl_self_attention(outputs["backbone_final_norm"], return_all_hidden_states=True)
+    outputs["bridge_resid"] = torch.stack(bridge)
     torch.manual_seed(seed)
     moved = torch.randn(1, head.action_horizon, head.action_dim)
-    found["in_noise"] = moved
-    features = head.state_encoder(own.state, own.embodiment_id)
+    outputs["in_noise"] = moved
+    features = head.state_encoder(model_inputs.state, model_inputs.embodiment_id)
     columns: dict[str, list[Tensor]] = {"expert_resid": [], "velocity": []}
     for step in range(head.num_inference_timesteps):
         time = torch.tensor([int(step / head.num_inference_timesteps * head.num_timestep_buckets)])
-        noisy = head.action_encoder(moved, time, own.embodiment_id)
+        noisy = head.action_encoder(moved, time, model_inputs.embodiment_id)
         noisy = noisy + head.position_embedding(torch.arange(noisy.shape[1]))
         out, hidden = head.model(
             torch.cat([features, noisy], 1), read, time, return_all_hidden_states=True,
             image_mask=prompt.image_mask, backbone_attention_mask=prompt.backbone_attention_mask,
         )  # fmt: skip
-        velocity = head.action_decoder(out, own.embodiment_id)[:, -head.action_horizon :]
+        velocity = head.action_decoder(out, model_inputs.embodiment_id)[:, -head.action_horizon :]
         moved = moved + velocity / head.num_inference_timesteps
         columns["expert_resid"].append(torch.stack(hidden))
         columns["velocity"].append(velocity)
-    found |= {name: torch.stack(values) for name, values in columns.items()}
+    outputs |= {name: torch.stack(values) for name, values in columns.items()}
     torch.manual_seed(seed)
-    found["actions"] = policy.predict_action_chunk(batch)
-    length, numbers = found["actions"].shape[1:]
-    apart = float((found["actions"] - moved[:, :length, :numbers]).abs().max())
+    outputs["actions"] = policy.predict_action_chunk(batch)
+    length, numbers = outputs["actions"].shape[1:]
+    apart = float((outputs["actions"] - moved[:, :length, :numbers]).abs().max())
     if apart > 1e-6:
         raise SystemExit(f"lerobot's modules, called one by one, give actions that are off by {apart:.3g}")
-    found["actions_unnormalized"] = behind(found["actions"])
-    arrays = {name: value.detach().numpy() for name, value in found.items()}
+    outputs["actions_unnormalized"] = behind(outputs["actions"])
+    arrays = {name: value.detach().numpy() for name, value in outputs.items()}
     return arrays | {"in_raw_state": state, "in_image": picture, "in_task": np.array(TASK)}
 
 
 def main() -> None:
     """Write the reference beside a copy of the checkpoint, without the base model's weights."""
-    chosen = reference_parser(str(__doc__).splitlines()[0]).parse_args()
-    checkpoint, folder = chosen.checkpoint.resolve(), chosen.folder.resolve()
+    arguments = reference_parser(str(__doc__).splitlines()[0]).parse_args()
+    checkpoint, folder = arguments.checkpoint.resolve(), arguments.folder.resolve()
     with torch.inference_mode():
-        found = record(checkpoint, chosen.seed)
+        outputs = record(checkpoint, arguments.seed)
     recorded = (
         "groot\n\nRecorded by `scripts/record_groot.py` with lerobot's own loading, processors and modules; "
         "random weights"
     )
-    write_reference(checkpoint, folder, found, recorded, (torch, transformers, diffusers, lerobot))
+    write_reference(checkpoint, folder, outputs, recorded, (torch, transformers, diffusers, lerobot))
     for weights in (folder / "checkpoint" / "base").glob("*.safetensors*"):
         weights.unlink()
 

@@ -19,7 +19,7 @@ import lerobot
 import torch
 from lerobot.configs.types import FeatureType, PolicyFeature
 
-from probe_kit.models.building import replaced
+from probe_kit.models.building import replace_attributes
 
 PICTURE = {"observation.images.image": PolicyFeature(FeatureType.VISUAL, (3, 224, 224))}
 
@@ -38,7 +38,7 @@ def pi0_fast() -> dict[str, torch.Tensor]:
     from lerobot.policies.pi0_fast.configuration_pi0_fast import PI0FastConfig
 
     nothing = SimpleNamespace(from_pretrained=lambda *_, **__: None)
-    with replaced(modeling_pi0_fast, {"AutoProcessor": nothing, "AutoTokenizer": nothing}):
+    with replace_attributes(modeling_pi0_fast, {"AutoProcessor": nothing, "AutoTokenizer": nothing}):
         return modeling_pi0_fast.PI0FastPolicy(_on_meta(PI0FastConfig(device="cpu"))).state_dict()
 
 
@@ -109,17 +109,21 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("family", choices=list(FAMILIES))
     parser.add_argument("file", type=Path)
-    chosen = parser.parse_args()
+    arguments = parser.parse_args()
     with torch.device("meta"):
-        tensors = FAMILIES[chosen.family]()
+        tensors = FAMILIES[arguments.family]()
     keys = {
         name: {"shape": list(tensor.shape), "dtype": str(tensor.dtype).removeprefix("torch.")}
         for name, tensor in sorted(tensors.items())
     }
-    source = f"lerobot {lerobot.__version__}, {(FAMILIES[chosen.family].__doc__ or '').rstrip('.')}; meta device"
+    source = (
+        f"lerobot {lerobot.__version__}, {(FAMILIES[arguments.family].__doc__ or '').rstrip('.')}; meta device"
+    )
     content = json.dumps({"source": source, "keys": keys}).encode()
-    chosen.file.write_bytes(gzip.compress(content, mtime=0))
-    print(f"{len(keys)} tensors, {sum(one.numel() * one.element_size() for one in tensors.values()) / 1e9:.2f} GB")
+    arguments.file.write_bytes(gzip.compress(content, mtime=0))
+    print(
+        f"{len(keys)} tensors, {sum(data.numel() * data.element_size() for data in tensors.values()) / 1e9:.2f} GB"
+    )
 
 
 if __name__ == "__main__":

@@ -29,8 +29,8 @@ from safetensors.torch import load_file
 from torch import Tensor
 from transformers import AutoTokenizer
 
-from probe_kit.models.building import replaced
-from probe_kit.models.pi0 import PaliGemmaSize, Pi0Size, resized
+from probe_kit.models.building import replace_attributes
+from probe_kit.models.pi0 import PaliGemmaSize, Pi0Size, resize_network
 
 MODULES: dict[str, Any] = {"pi0": modeling_pi0, "pi05": modeling_pi05, "pi0_fast": modeling_pi0_fast}
 POLICIES: dict[str, Callable[[Any], Any]] = {
@@ -53,10 +53,10 @@ def lerobots_policy(checkpoint: Path) -> Any:
     if config.type == "pi0_fast":
         config.text_tokenizer_name = str(checkpoint)
         size = PaliGemmaSize.from_file(checkpoint / "dims.json")
-        with resized(modeling_pi0_fast, size, config), packaged_fast(checkpoint):
+        with resize_network(modeling_pi0_fast, size, config), packaged_fast(checkpoint):
             policy: Any = POLICIES[config.type](config)
     else:
-        with resized(MODULES[config.type], Pi0Size.from_file(checkpoint / "dims.json"), config):
+        with resize_network(MODULES[config.type], Pi0Size.from_file(checkpoint / "dims.json"), config):
             policy = POLICIES[config.type](config)
     tensors = load_file(checkpoint / "model.safetensors")
     tensors.setdefault(EMBEDDING, tensors[HEAD])
@@ -75,19 +75,23 @@ def packaged_fast(checkpoint: Path) -> Iterator[None]:
     def read(name: str, **_: Any) -> Any:
         return UniversalActionProcessor.from_pretrained_local(str(checkpoint / name))
 
-    with replaced(modeling_pi0_fast, {"AutoProcessor": SimpleNamespace(from_pretrained=read)}):
+    with replace_attributes(modeling_pi0_fast, {"AutoProcessor": SimpleNamespace(from_pretrained=read)}):
         yield
 
 
-def stack(model: Any, entering: Tensor, mask: Tensor, positions: Tensor, **further: Any) -> tuple[Tensor, Tensor]:
+def stack(
+    model: Any, entering: Tensor, mask: Tensor, positions: Tensor, **block_options: Any
+) -> tuple[Tensor, Tensor]:
     """(L + 1, B, T, D) entering each block and the norm, and (B, T, D) behind the norm."""
     model.config._attn_implementation = "eager"
-    condition = further.get("adarms_cond")
-    rotary, stream, found = model.rotary_emb(entering, positions), entering, [entering.clone()]
+    condition = block_options.get("adarms_cond")
+    rotary, stream, streams = model.rotary_emb(entering, positions), entering, [entering.clone()]
     for block in model.layers:
-        stream = block(stream, attention_mask=mask, position_ids=positions, position_embeddings=rotary, **further)
-        found.append(stream.clone())
-    return torch.stack(found), model.norm(stream, condition)[0]
+        stream = block(
+            stream, attention_mask=mask, position_ids=positions, position_embeddings=rotary, **block_options
+        )
+        streams.append(stream.clone())
+    return torch.stack(streams), model.norm(stream, condition)[0]
 
 
 def record(policy: Any, batch: dict[str, Tensor], noise: Tensor) -> dict[str, np.ndarray]:
@@ -97,17 +101,17 @@ def record(policy: Any, batch: dict[str, Tensor], noise: Tensor) -> dict[str, np
     state = [policy.prepare_state(batch)] if policy.config.type == "pi0" else []
     images, image_masks = policy._preprocess_images(batch)
     tokens, token_mask = batch["observation.language.tokens"], batch["observation.language.attention_mask"]
-    found: dict[str, Tensor] = {"prep_images": torch.stack(images), "prep_image_masks": torch.stack(image_masks)}
+    outputs: dict[str, Tensor] = {"prep_images": torch.stack(images), "prep_image_masks": torch.stack(image_masks)}
     if state:
-        found["prep_state"] = state[0]
-    found["vision_resid"] = torch.stack([vision_streams(joint, image) for image in images])
+        outputs["prep_state"] = state[0]
+    outputs["vision_resid"] = torch.stack([vision_streams(joint, image) for image in images])
 
     embedded, pad, attends = model.embed_prefix(images, image_masks, tokens, token_mask)
     positions = torch.cumsum(pad, dim=1) - 1
     mask = module.prepare_attention_masks_4d(module.make_att_2d_masks(pad, attends))
     cache = transformers.DynamicCache()
-    found |= {"prefix_embs": embedded.clone(), "prefix_pad": pad, "prefix_position_ids": positions}
-    found["backbone_resid"], found["backbone_final_norm"] = stack(
+    outputs |= {"prefix_embs": embedded.clone(), "prefix_pad": pad, "prefix_position_ids": positions}
+    outputs["backbone_resid"], outputs["backbone_final_norm"] = stack(
         joint.paligemma.model.language_model, embedded, mask, positions, past_key_values=cache
     )
 
@@ -122,24 +126,24 @@ def record(policy: Any, batch: dict[str, Tensor], noise: Tensor) -> dict[str, np
         time = torch.full((len(noise),), 1 - step / steps)
         suffix, suffix_pad, suffix_attends, condition = model.embed_suffix(*state, moved, time)
         before = pad[:, None, :].expand(len(pad), suffix.shape[1], pad.shape[1])
-        seen = torch.cat([before, module.make_att_2d_masks(suffix_pad, suffix_attends)], dim=2)
+        visible = torch.cat([before, module.make_att_2d_masks(suffix_pad, suffix_attends)], dim=2)
         places = pad.sum(-1)[:, None] + torch.cumsum(suffix_pad, dim=1) - 1
-        further = {} if condition is None else {"adarms_cond": condition}
+        block_options = {} if condition is None else {"adarms_cond": condition}
         resid, normed = stack(
-            joint.gemma_expert.model, suffix, module.prepare_attention_masks_4d(seen), places,
-            past_key_values=module.clone_past_key_values(cache), **further,
+            joint.gemma_expert.model, suffix, module.prepare_attention_masks_4d(visible), places,
+            past_key_values=module.clone_past_key_values(cache), **block_options,
         )  # fmt: skip
         velocity = model.action_out_proj(normed[:, -policy.config.chunk_size :])
         moved = moved - velocity / steps
         for name, value in zip(columns, (resid, normed, velocity, moved), strict=True):
             columns[name].append(value)
-    found |= {name: torch.stack(values) for name, values in columns.items()}
-    found["actions_padded"] = moved
-    found["actions"] = policy.predict_action_chunk(batch, noise=noise)
-    apart = float((found["actions"] - moved[..., : found["actions"].shape[-1]]).abs().max())
+    outputs |= {name: torch.stack(values) for name, values in columns.items()}
+    outputs["actions_padded"] = moved
+    outputs["actions"] = policy.predict_action_chunk(batch, noise=noise)
+    apart = float((outputs["actions"] - moved[..., : outputs["actions"].shape[-1]]).abs().max())
     if apart > 1e-6:
         raise SystemExit(f"lerobot's blocks, called one by one, give actions that are off by {apart:.3g}")
-    return {name: value.detach().numpy() for name, value in found.items()}
+    return {name: value.detach().numpy() for name, value in outputs.items()}
 
 
 def record_tokens(policy: Any, batch: dict[str, Tensor]) -> dict[str, np.ndarray]:
@@ -148,40 +152,40 @@ def record_tokens(policy: Any, batch: dict[str, Tensor]) -> dict[str, np.ndarray
     decoder, mask_of = joint.paligemma.model.language_model, modeling_pi0_fast.prepare_attention_masks_4d
     images, image_masks = policy._preprocess_images(batch)
     tokens, token_mask = batch["observation.language.tokens"], batch["observation.language.attention_mask"]
-    found: dict[str, Tensor] = {"prep_images": torch.stack(images)}
-    found["vision_resid"] = torch.stack([vision_streams(joint, image) for image in images])
-    rows, one = len(tokens), torch.ones((len(tokens), 1), dtype=torch.bool)
+    outputs: dict[str, Tensor] = {"prep_images": torch.stack(images)}
+    outputs["vision_resid"] = torch.stack([vision_streams(joint, image) for image in images])
+    rows, ones = len(tokens), torch.ones((len(tokens), 1), dtype=torch.bool)
     begin = torch.full((rows, 1), policy._paligemma_tokenizer.bos_token_id)
     entering, pad, attends, _, _ = model.embed_prefix_fast(
-        images, image_masks, torch.cat([tokens, begin], dim=1), torch.cat([token_mask, one], dim=1)
+        images, image_masks, torch.cat([tokens, begin], dim=1), torch.cat([token_mask, ones], dim=1)
     )
     cache, places = transformers.DynamicCache(), torch.cumsum(pad, dim=1) - 1
     columns: dict[str, list[Tensor]] = {"action_resid": [], "action_final_norm": [], "logits": []}
-    chosen: list[Tensor] = []
+    drawn_tokens: list[Tensor] = []
     end = policy._paligemma_tokenizer.convert_tokens_to_ids("|")
-    while not chosen or not bool((torch.stack(chosen) == end).any(dim=0).all()):
+    while not drawn_tokens or not bool((torch.stack(drawn_tokens) == end).any(dim=0).all()):
         resid, normed = stack(decoder, entering, mask_of(attends), places, past_key_values=cache)
-        if not chosen:
-            found |= {"prefix_pad": pad[:, :-1], "backbone_resid": resid[:, :, :-1]}
-            found["backbone_final_norm"] = normed[:, :-1]
+        if not drawn_tokens:
+            outputs |= {"prefix_pad": pad[:, :-1], "backbone_resid": resid[:, :, :-1]}
+            outputs["backbone_final_norm"] = normed[:, :-1]
         logits = joint.paligemma.lm_head(normed[:, -1])
         for name, value in zip(columns, (resid[:, :, -1:], normed[:, -1:], logits), strict=True):
             columns[name].append(value)
-        chosen.append(logits.argmax(dim=-1))
-        if len(chosen) == policy.config.max_decoding_steps:
+        drawn_tokens.append(logits.argmax(dim=-1))
+        if len(drawn_tokens) == policy.config.max_decoding_steps:
             break
-        entering, pad = joint.embed_language_tokens(chosen[-1][:, None]), torch.cat([pad, one], dim=1)
+        entering, pad = joint.embed_language_tokens(drawn_tokens[-1][:, None]), torch.cat([pad, ones], dim=1)
         places, attends = pad.sum(dim=1, keepdim=True) - 1, pad[:, None]
-    found |= {name: torch.stack(values[:CAPTURED]) for name, values in columns.items()}
-    found["logits"] = torch.stack(columns["logits"])
-    found["tokens"] = torch.stack(chosen, dim=1)
+    outputs |= {name: torch.stack(values[:CAPTURED]) for name, values in columns.items()}
+    outputs["logits"] = torch.stack(columns["logits"])
+    outputs["tokens"] = torch.stack(drawn_tokens, dim=1)
     theirs = model.sample_actions_fast_kv_cache(
         images, image_masks, tokens, token_mask, policy.config.max_decoding_steps
     )
-    if not torch.equal(theirs[:, : len(chosen)], found["tokens"]):
+    if not torch.equal(theirs[:, : len(drawn_tokens)], outputs["tokens"]):
         raise SystemExit("lerobot's blocks, called one by one, put out other tokens than lerobot's sampling")
-    found["actions"] = policy.predict_action_chunk(batch)
-    return {name: value.detach().numpy() for name, value in found.items()}
+    outputs["actions"] = policy.predict_action_chunk(batch)
+    return {name: value.detach().numpy() for name, value in outputs.items()}
 
 
 def record_layers(checkpoint: Path, config: Any, seed: int) -> dict[str, np.ndarray]:
@@ -193,15 +197,15 @@ def record_layers(checkpoint: Path, config: Any, seed: int) -> dict[str, np.ndar
 
     from probe_kit.hooks.families.molmoact2.adapter import lerobots_policy, network_config
 
-    place, rng = checkpoint / config.checkpoint_path, np.random.default_rng(seed)
-    policy = lerobots_policy(config, network_config(place), place)
+    checkpoint_path, rng = checkpoint / config.checkpoint_path, np.random.default_rng(seed)
+    policy = lerobots_policy(config, network_config(checkpoint_path), checkpoint_path)
     policy.load_state_dict(load_file(checkpoint / "model.safetensors"))
     config.action_mode, config.dataset_feature_names = "continuous", {"action": [*"xyzabc", "gripper"]}
     low, high = quantiles(checkpoint, "preprocessor", "observation.state")
     least, most = quantiles(checkpoint, "postprocessor", "action")
     statistics = {"observation.state": {"q01": low, "q99": high}, "action": {"q01": least, "q99": most}}
     tensors = {
-        key: {name: torch.from_numpy(own) for name, own in rows.items()} for key, rows in statistics.items()
+        key: {name: torch.from_numpy(array) for name, array in rows.items()} for key, rows in statistics.items()
     }
     before, behind = make_molmoact2_pre_post_processors(config, tensors)
     tasks = ("put the cube on the star", "put the cube on the moon")
@@ -214,17 +218,19 @@ def record_layers(checkpoint: Path, config: Any, seed: int) -> dict[str, np.ndar
             "task": list(tasks),
         }
     )
-    found: dict[str, Any] = {name: batch[name] for name in ("input_ids", "attention_mask", "pixel_values")}
+    recorded: dict[str, Any] = {name: batch[name] for name in ("input_ids", "attention_mask", "pixel_values")}
     backbone, inputs = policy._backbone(), policy._model_inputs(batch)
-    found["vision_resid"] = tower_streams(backbone, inputs)
+    recorded["vision_resid"] = tower_streams(backbone, inputs)
     outputs = backbone(**inputs, use_cache=True, output_hidden_states=True)
-    found["backbone_resid"] = torch.stack(outputs.hidden_states[:-1])
-    found["backbone_final_norm"] = outputs.last_hidden_state
+    recorded["backbone_resid"] = torch.stack(outputs.hidden_states[:-1])
+    recorded["backbone_final_norm"] = outputs.last_hidden_state
     states = backbone._extract_kv_states(outputs.past_key_values)
-    found |= {name: torch.stack([own[part] for own in states]) for part, name in enumerate(("keys", "values"))}
+    recorded |= {
+        name: torch.stack([entry[part] for entry in states]) for part, name in enumerate(("keys", "values"))
+    }
     expert, steps = backbone.action_expert, config.num_inference_steps
     moved = torch.randn((len(tasks), config.chunk_size, 32), generator=torch.Generator().manual_seed(seed))
-    found["in_noise"] = moved
+    recorded["in_noise"] = moved
     padded = batch["action_dim_is_pad"]
     moved = moved.masked_fill(padded[:, None], 0)
     context = expert.prepare_context(
@@ -246,14 +252,16 @@ def record_layers(checkpoint: Path, config: Any, seed: int) -> dict[str, np.ndar
         values = (torch.stack([*entering, stream]), expert.final_layer.norm(stream), velocity)
         for name, value in zip(columns, values, strict=True):
             columns[name].append(value)
-    found |= {name: torch.stack(values) for name, values in columns.items()}
+    recorded |= {name: torch.stack(values) for name, values in columns.items()}
     generator = torch.Generator().manual_seed(seed)
-    found["actions"] = policy.predict_action_chunk(batch, generator=generator, inference_action_mode="continuous")
-    apart = float((found["actions"] - moved[..., : len(least)]).abs().max())
+    recorded["actions"] = policy.predict_action_chunk(
+        batch, generator=generator, inference_action_mode="continuous"
+    )
+    apart = float((recorded["actions"] - moved[..., : len(least)]).abs().max())
     if apart > 1e-6:
         raise SystemExit(f"lerobot's blocks, called one by one, give actions that are off by {apart:.3g}")
-    found["actions_unnormalized"] = behind(found["actions"])
-    arrays = {name: value.detach().numpy() for name, value in found.items()}
+    recorded["actions_unnormalized"] = behind(recorded["actions"])
+    arrays = {name: value.detach().numpy() for name, value in recorded.items()}
     return arrays | {"in_raw_state": raw, "in_image_image": pictures, "in_tasks": np.array(tasks)}
 
 
@@ -266,21 +274,21 @@ def tower_streams(backbone: Any, inputs: dict[str, Tensor]) -> Tensor:
     )
     pixels = torch.round((crops + 1) * 0.5 * 255).clamp(0, 255) / 255 * 2 - 1
     stream = visual.image_vit.patch_embedding(pixels.flatten(0, 1))
-    stream, found = visual.image_vit.add_pos_emb(stream, visual.image_vit.config.image_num_patch), []
+    stream, streams = visual.image_vit.add_pos_emb(stream, visual.image_vit.config.image_num_patch), []
     for block in visual.image_vit.transformer.resblocks:
-        found.append(stream)
+        streams.append(stream)
         stream = block(stream)
-    return torch.stack(found)
+    return torch.stack(streams)
 
 
 def vision_streams(joint: Any, image: Tensor) -> Tensor:
     """(L + 1, B, N, D): the embeddings, then what each block of the tower puts out."""
     tower = joint.paligemma.model.vision_tower.vision_model
-    stream, found = tower.embeddings(image), []
+    stream, streams = tower.embeddings(image), []
     for block in tower.encoder.layers:
-        found.append(stream)
+        streams.append(stream)
         stream = block(stream, attention_mask=None)
-    return torch.stack([*found, stream])
+    return torch.stack([*streams, stream])
 
 
 def prompts(policy: Any, state: np.ndarray) -> list[str]:
@@ -315,20 +323,20 @@ def main() -> None:
     """Write `reference.npz`, the checkpoint and a README of one paragraph."""
     parser = reference_parser(str(__doc__))
     parser.add_argument("--cameras", nargs="+", default=["base"])
-    chosen = parser.parse_args()
-    config: Any = PreTrainedConfig.from_pretrained(chosen.checkpoint)
+    arguments = parser.parse_args()
+    config: Any = PreTrainedConfig.from_pretrained(arguments.checkpoint)
     if config.type == "molmoact2":
         with torch.inference_mode():
-            write(chosen, config.type, record_layers(chosen.checkpoint, config, chosen.seed))
+            write(arguments, config.type, record_layers(arguments.checkpoint, config, arguments.seed))
         return
-    policy, rng = lerobots_policy(chosen.checkpoint), np.random.default_rng(chosen.seed)
-    low, high = quantiles(chosen.checkpoint, "preprocessor", "observation.state")
+    policy, rng = lerobots_policy(arguments.checkpoint), np.random.default_rng(arguments.seed)
+    low, high = quantiles(arguments.checkpoint, "preprocessor", "observation.state")
     raw = rng.uniform(low, high, (len(TASKS), len(low))).astype(np.float32)
     state = (2 * (raw - low) / (high - low) - 1).astype(np.float32)
-    config, names = policy.config, [f"observation.images.{name}" for name in chosen.cameras]
+    config, names = policy.config, [f"observation.images.{name}" for name in arguments.cameras]
     shapes = [config.input_features[name].shape for name in names]
     pictures = [rng.uniform(0, 1, (len(TASKS), *shape)).astype(np.float32) for shape in shapes]
-    text = AutoTokenizer.from_pretrained(chosen.checkpoint)(
+    text = AutoTokenizer.from_pretrained(arguments.checkpoint)(
         prompts(policy, state), padding="max_length", max_length=config.tokenizer_max_length, return_tensors="pt"
     )
     mask = text["attention_mask"].bool()
@@ -340,27 +348,27 @@ def main() -> None:
     }
     noise = torch.randn(
         (len(TASKS), config.chunk_size, config.max_action_dim),
-        generator=torch.Generator().manual_seed(chosen.seed),
+        generator=torch.Generator().manual_seed(arguments.seed),
     )
     with torch.inference_mode():
-        found = record_tokens(policy, batch) if config.type == "pi0_fast" else record(policy, batch, noise)
-    least, most = quantiles(chosen.checkpoint, "postprocessor", "action")
-    found["actions_unnormalized"] = (found["actions"] + 1) / 2 * (most - least) + least
-    found |= {"in_raw_state": raw, "in_state": state, "in_lang_mask": mask.numpy()}
+        outputs = record_tokens(policy, batch) if config.type == "pi0_fast" else record(policy, batch, noise)
+    least, most = quantiles(arguments.checkpoint, "postprocessor", "action")
+    outputs["actions_unnormalized"] = (outputs["actions"] + 1) / 2 * (most - least) + least
+    outputs |= {"in_raw_state": raw, "in_state": state, "in_lang_mask": mask.numpy()}
     if config.type != "pi0_fast":
-        found["in_noise"] = noise.numpy()
-    found["in_lang_tokens"] = text["input_ids"].numpy()
-    found |= {f"in_image_{name}": picture for name, picture in zip(chosen.cameras, pictures, strict=True)}
-    write(chosen, config.type, found)
+        outputs["in_noise"] = noise.numpy()
+    outputs["in_lang_tokens"] = text["input_ids"].numpy()
+    outputs |= {f"in_image_{name}": picture for name, picture in zip(arguments.cameras, pictures, strict=True)}
+    write(arguments, config.type, outputs)
 
 
-def write(chosen: argparse.Namespace, kind: str, found: dict[str, np.ndarray]) -> None:
+def write(arguments: argparse.Namespace, kind: str, outputs: dict[str, np.ndarray]) -> None:
     """The reference beside a copy of the checkpoint, and where both come from."""
     recorded = (
         f"{kind}\n\nRecorded by `scripts/record_reference.py` with lerobot's own blocks, called one by one; "
         f"{WEIGHTS.get(kind, 'random weights')}"
     )
-    write_reference(chosen.checkpoint, chosen.folder, found, recorded, (torch, transformers, lerobot))
+    write_reference(arguments.checkpoint, arguments.folder, outputs, recorded, (torch, transformers, lerobot))
 
 
 if __name__ == "__main__":

@@ -48,47 +48,53 @@ def record(checkpoint: Path, seed: int) -> dict[str, np.ndarray]:
             "task": TASK,
         }
     )
-    given, model = policy._build_model_inputs(batch), policy.model
-    found: dict[str, Any] = {"input_ids": given["input_ids"], "pixels": given["image_input"]}
+    model_inputs, model = policy._build_model_inputs(batch), policy.model
+    outputs: dict[str, Any] = {"input_ids": model_inputs["input_ids"], "pixels": model_inputs["image_input"]}
     encoder = model.vlm.language_model.encoder
     with torch.no_grad():
-        prompt = model.forward_vlm(given["input_ids"], given["image_input"], given["image_mask"])
-        found["backbone_resid"] = backbone_streams(model, given)
-    apart = float((found["backbone_resid"][-1] - prompt["vlm_features"]).abs().max())
-    if apart > 1e-5 or len(found["backbone_resid"]) != len(encoder.layers) + 1:
+        prompt = model.forward_vlm(
+            model_inputs["input_ids"], model_inputs["image_input"], model_inputs["image_mask"]
+        )
+        outputs["backbone_resid"] = backbone_streams(model, model_inputs)
+    apart = float((outputs["backbone_resid"][-1] - prompt["vlm_features"]).abs().max())
+    if apart > 1e-5 or len(outputs["backbone_resid"]) != len(encoder.layers) + 1:
         raise SystemExit(f"Florence-2's layers, called one by one, are off by {apart:.3g}")
     torch.manual_seed(seed)
     noise = torch.randn(1, policy.config.chunk_size, model.dim_action)
     steps, actions = policy.config.num_denoising_steps, torch.zeros_like(noise)
     columns: dict[str, list[Tensor]] = {"expert_resid": [], "predicted": []}
-    for left in range(steps, 0, -1):
-        time = torch.tensor([left / steps])
-        own, noisy = model.action_space.preprocess(given["proprio"], noise * time + actions * (1 - time))
-        streams, actions = expert_streams(model.transformer, prompt, given["domain_id"], noisy, own, time)
+    for steps_left in range(steps, 0, -1):
+        time = torch.tensor([steps_left / steps])
+        proprioception, noisy = model.action_space.preprocess(
+            model_inputs["proprio"], noise * time + actions * (1 - time)
+        )
+        streams, actions = expert_streams(
+            model.transformer, prompt, model_inputs["domain_id"], noisy, proprioception, time
+        )
         columns["expert_resid"].append(streams)
         columns["predicted"].append(actions)
-    found |= {name: torch.stack(values) for name, values in columns.items()} | {"in_noise": noise}
+    outputs |= {name: torch.stack(values) for name, values in columns.items()} | {"in_noise": noise}
     torch.manual_seed(seed)
-    found["actions"] = policy.predict_action_chunk(batch)
-    apart = float((found["actions"] - model.action_space.postprocess(actions)).abs().max())
+    outputs["actions"] = policy.predict_action_chunk(batch)
+    apart = float((outputs["actions"] - model.action_space.postprocess(actions)).abs().max())
     if apart > 1e-5:
         raise SystemExit(f"lerobot's modules, called one by one, give actions that are off by {apart:.3g}")
-    found["actions_unnormalized"] = behind(found["actions"])
-    arrays = {name: value.detach().numpy() for name, value in found.items()}
+    outputs["actions_unnormalized"] = behind(outputs["actions"])
+    arrays = {name: value.detach().numpy() for name, value in outputs.items()}
     return arrays | {"in_raw_state": state, "in_image": picture, "in_task": np.array(TASK)}
 
 
-def backbone_streams(model: Any, given: dict[str, Tensor]) -> Tensor:
+def backbone_streams(model: Any, model_inputs: dict[str, Tensor]) -> Tensor:
     """(L + 1, 1, T, D) of Florence-2's encoder, whose layers are called one after the other."""
-    encoder, views = model.vlm.language_model.encoder, given["image_input"]
+    encoder, views = model.vlm.language_model.encoder, model_inputs["image_input"]
     picture = model.vlm.get_image_features(views[:, 0]).pooler_output
-    stream = torch.cat([picture, model.vlm.get_input_embeddings()(given["input_ids"])], dim=1)
+    stream = torch.cat([picture, model.vlm.get_input_embeddings()(model_inputs["input_ids"])], dim=1)
     stream = encoder.layernorm_embedding(stream + encoder.embed_positions(stream[..., -1]))
-    found = [stream]
+    streams = [stream]
     for layer in encoder.layers:
         stream = layer(stream, None)
-        found.append(stream)
-    return torch.stack(found)
+        streams.append(stream)
+    return torch.stack(streams)
 
 
 def expert_streams(
@@ -97,7 +103,7 @@ def expert_streams(
     """(L + 1, 1, T, D) of the expert, whose blocks are called one after the other, and what it predicts."""
     length = noisy.shape[1]
     times = timestep_embedding(time, expert.dim_time)
-    tokens = [own[:, None].expand(-1, length, -1) for own in (state, times)]
+    tokens = [vector[:, None].expand(-1, length, -1) for vector in (state, times)]
     stream = torch.cat(
         [
             expert.action_encoder(torch.cat([noisy, *tokens], dim=-1), domain),
@@ -107,25 +113,25 @@ def expert_streams(
         dim=1,
     )
     stream = stream + expert.pos_emb[:, : stream.shape[1]]
-    own = expert.soft_prompt_hub(domain).view(1, expert.len_soft_prompts, expert.hidden_size)
-    stream = torch.cat([stream, own], dim=1)
-    found = [stream]
+    soft_prompt = expert.soft_prompt_hub(domain).view(1, expert.len_soft_prompts, expert.hidden_size)
+    stream = torch.cat([stream, soft_prompt], dim=1)
+    streams = [stream]
     for block in expert.blocks:
         stream = block(stream)
-        found.append(stream)
-    return torch.stack(found), expert.action_decoder(expert.norm(stream[:, :length]), domain)
+        streams.append(stream)
+    return torch.stack(streams), expert.action_decoder(expert.norm(stream[:, :length]), domain)
 
 
 def main() -> None:
     """Write the reference beside a copy of the checkpoint."""
-    chosen = reference_parser(str(__doc__).splitlines()[0]).parse_args()
+    arguments = reference_parser(str(__doc__).splitlines()[0]).parse_args()
     with torch.inference_mode():
-        found = record(chosen.checkpoint, chosen.seed)
+        outputs = record(arguments.checkpoint, arguments.seed)
     recorded = (
         "xvla\n\nRecorded by `scripts/record_xvla.py` with lerobot's own loading, processors and modules; "
         "random weights"
     )
-    write_reference(chosen.checkpoint, chosen.folder, found, recorded, (torch, transformers, lerobot))
+    write_reference(arguments.checkpoint, arguments.folder, outputs, recorded, (torch, transformers, lerobot))
 
 
 if __name__ == "__main__":

@@ -76,14 +76,18 @@ def pi05() -> dict[str, float]:
         config.image_token_index, tower.projection_dim = sizes["vocab_size"], sizes["vlm"]["width"]
         names = {"hidden": "hidden_size", "layers": "num_hidden_layers", "heads": "num_attention_heads",
                  "inter": "intermediate_size", "patch": "patch_size"}  # fmt: skip
-        for own, name in names.items():
-            setattr(tower, name, sizes["vision"][own])
+        for field_name, name in names.items():
+            setattr(tower, name, sizes["vision"][field_name])
         return paligemma(config=config)
 
     class Configurations:
         def __getitem__(self, kind: str) -> Any:
-            made = configurations[kind]
-            return (lambda **own: made(**{**own, "vocab_size": sizes["vocab_size"]})) if kind == "gemma" else made
+            configuration = configurations[kind]
+            return (
+                (lambda **options: configuration(**{**options, "vocab_size": sizes["vocab_size"]}))
+                if kind == "gemma"
+                else configuration
+            )
 
     def gemma(variant: str) -> Any:
         return theirs.GemmaVariantConfig(**sizes["vlm" if variant == "gemma_2b" else "expert"])
@@ -103,16 +107,16 @@ def pi05() -> dict[str, float]:
     lacking = network.load_state_dict(tensors, strict=False)  # a time of its own distillation, which adds zero
     assert not lacking.unexpected_keys
     assert all(name.startswith("target_time_mlp") for name in lacking.missing_keys)
-    found = _reference(folder)
-    inputs = (found["prep_images"], found["prep_image_masks"].bool(), found["in_lang_tokens"],
-              found["in_lang_mask"].bool())  # fmt: skip
-    valid = found["prefix_pad"].bool()
+    reference = _reference(folder)
+    inputs = (reference["prep_images"], reference["prep_image_masks"].bool(), reference["in_lang_tokens"],
+              reference["in_lang_mask"].bool())  # fmt: skip
+    valid = reference["prefix_pad"].bool()
     embedded, padded, _ = network.embed_prefix(*inputs)
     assert torch.equal(padded, valid)
-    actions = network.sample_actions(*inputs, noise=found["in_noise"].clone())
+    actions = network.sample_actions(*inputs, noise=reference["in_noise"].clone())
     return {
-        "prefix_embs": _apart(embedded[valid], found["prefix_embs"][valid]),
-        "actions_padded": _apart(actions, found["actions_padded"]),
+        "prefix_embs": _apart(embedded[valid], reference["prefix_embs"][valid]),
+        "actions_padded": _apart(actions, reference["actions_padded"]),
     }
 
 
@@ -127,7 +131,7 @@ def molmoact2() -> dict[str, float]:
     from probe_kit.hooks.families.molmoact2.adapter import MolmoAct2
 
     folder = GOLDEN / "molmoact2"
-    ours, found = MolmoAct2.load(str(folder / "checkpoint")), _reference(folder)
+    ours, reference = MolmoAct2.load(str(folder / "checkpoint")), _reference(folder)
     lerobots, config = ours.network._backbone(), ours.network.model.config
     fields = {
         **_fields(config.text_config, "", ("hidden_size", "num_attention_heads", "num_key_value_heads", "head_dim",
@@ -146,32 +150,34 @@ def molmoact2() -> dict[str, float]:
     with np.load(folder / "reference.npz") as arrays:
         rows = zip(arrays["in_image_image"], arrays["in_raw_state"], arrays["in_tasks"], strict=True)
         batch = ours.batch([Observation(image, state, str(task)) for image, state, task in rows])
-    given = ours.network._model_inputs(batch)
+    model_inputs = ours.network._model_inputs(batch)
     names = ("input_ids", "pixel_values", "image_token_pooling", "image_grids", "image_num_crops")
-    images, pooling = lerobots.merge_visual_inputs(**{name: given[name] for name in names})
+    images, pooling = lerobots.merge_visual_inputs(**{name: model_inputs[name] for name in names})
     text = {name: batch[name] for name in ("input_ids", "attention_mask", "token_type_ids")}
     inputs = {**text, "images": images, "token_pooling": pooling}
     embedded = network.model.build_input_embeddings(text["input_ids"], images, pooling)
     states = [part.transpose(1, 2).flatten(2) for pair in network.model.encode(**inputs) for part in pair]
     with (
         patch.object(network.model, "_encoder_attention_mask", lerobots._get_encoder_attention_mask),
-        patch.object(torch, "randn", lambda *_, **__: found["in_noise"].clone()),
+        patch.object(torch, "randn", lambda *_, **__: reference["in_noise"].clone()),
     ):
         actions = network.model.generate_actions_from_inputs(
-            **inputs, action_dim_is_pad=batch["action_dim_is_pad"], action_horizon=found["in_noise"].shape[1],
-            num_steps=len(found["velocity"]), sample_noise=True,
+            **inputs, action_dim_is_pad=batch["action_dim_is_pad"], action_horizon=reference["in_noise"].shape[1],
+            num_steps=len(reference["velocity"]), sample_noise=True,
         )  # fmt: skip
     return {
-        "backbone_resid, first": _apart(embedded, found["backbone_resid"][0]),
-        "keys": _apart(torch.stack(states[::2]), found["keys"]),
-        "values": _apart(torch.stack(states[1::2]), found["values"]),
-        "actions": _apart(actions[..., : found["actions"].shape[-1]], found["actions"]),
+        "backbone_resid, first": _apart(embedded, reference["backbone_resid"][0]),
+        "keys": _apart(torch.stack(states[::2]), reference["keys"]),
+        "values": _apart(torch.stack(states[1::2]), reference["values"]),
+        "actions": _apart(actions[..., : reference["actions"].shape[-1]], reference["actions"]),
     }
 
 
 def _fields(config: SimpleNamespace, prefix: str, names: Sequence[str]) -> dict[str, Any]:
     values = {name: getattr(config, name) for name in names}
-    return {f"{prefix}{name}": tuple(own) if isinstance(own, list) else own for name, own in values.items()}
+    return {
+        f"{prefix}{name}": tuple(value) if isinstance(value, list) else value for name, value in values.items()
+    }
 
 
 def _tensors(folder: Path) -> dict[str, torch.Tensor]:

@@ -75,11 +75,11 @@ def _at_once(processes: int, train: Callable[[str, Followed], None], parts: Mapp
     """Train the parts in processes of their own, forked from one that never trained: torch asks for that."""
     for group in batched(parts.items(), processes):
         running = [get_context("fork").Process(target=train, args=part) for part in group]
-        for one in running:
-            one.start()
-        for one in running:
-            one.join()
-        if any(one.exitcode for one in running):
+        for process in running:
+            process.start()
+        for process in running:
+            process.join()
+        if any(process.exitcode for process in running):
             raise typer.Exit(1)
 
 

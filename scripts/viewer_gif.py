@@ -34,8 +34,8 @@ def film_episode(page: Any, address: str, episode: int) -> list[Image.Image]:
     last = int(page.read("document.querySelector('.scrub input').max"))
     pictures = []
     for _ in range(last + 1):
-        whole = Image.open(BytesIO(page.picture(whole=False))).convert("RGB")
-        pictures.append(whole.crop((0, 0, WINDOW[0], round(WINDOW[0] * SIZE[1] / SIZE[0]))))
+        screenshot = Image.open(BytesIO(page.picture(full_page=False))).convert("RGB")
+        pictures.append(screenshot.crop((0, 0, WINDOW[0], round(WINDOW[0] * SIZE[1] / SIZE[0]))))
         page.press("ArrowRight")
     return pictures
 
@@ -43,10 +43,10 @@ def film_episode(page: Any, address: str, episode: int) -> list[Image.Image]:
 def save_film(pictures: list[Image.Image], target: Path) -> None:
     """Write the pictures as one GIF that rests at its ends."""
     small = [
-        one.resize(SIZE, Image.Resampling.LANCZOS).quantize(
+        picture.resize(SIZE, Image.Resampling.LANCZOS).quantize(
             COLORS, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE
         )
-        for one in pictures
+        for picture in pictures
     ]
     pauses = [FIRST_MS, *[STEP_MS] * (len(small) - 2), LAST_MS]
     small[0].save(target, save_all=True, append_images=small[1:], duration=pauses, loop=0, optimize=True)

@@ -100,7 +100,7 @@ def _modules_of_a_test_end_with_it(request: pytest.FixtureRequest) -> Iterator[N
 def _golden(family: str) -> Path:
     """Ours in `golden/`: random weights and what the original implementations put out with them."""
     places = [GOLDEN / family, SHARED / "golden" / family]
-    folder = next((place for place in places if place.is_dir()), None)
+    folder = next((candidate for candidate in places if candidate.is_dir()), None)
     if folder is None:
         pytest.skip(f"no golden reference at {' or '.join(map(str, places))} (set PROBE_KIT_SHARED)")
     return folder
@@ -115,8 +115,10 @@ def pytest_cmdline_main(config: pytest.Config) -> None:
     if hasattr(config, "workerinput"):  # a core of its own already; it must not ask for more
         return
     fence = [config.invocation_params.dir / folder for folder in config.args] == [FENCE]
-    whole = (fence or config.args_source is pytest.Config.ArgsSource.TESTPATHS) and not config.option.collectonly
-    if whole and config.pluginmanager.hasplugin("xdist") and config.option.numprocesses is None:
+    runs_full_suite = (
+        fence or config.args_source is pytest.Config.ArgsSource.TESTPATHS
+    ) and not config.option.collectonly
+    if runs_full_suite and config.pluginmanager.hasplugin("xdist") and config.option.numprocesses is None:
         config.option.numprocesses = len(os.sched_getaffinity(0))
         if config.option.dist == "no":
             config.option.dist = "loadfile"
@@ -245,9 +247,9 @@ def little_runs(small_suite: "Suite", tmp_path_factory: pytest.TempPathFactory) 
 
     def make(folder: Path) -> None:
         for seed, name in enumerate(("run", "other")):
-            made = write_little_run(folder / name, small_suite.select(["color"]), seed)
-            probe_little_run(made)
-            intervene_on_little_run(made)
+            written_run = write_little_run(folder / name, small_suite.select(["color"]), seed)
+            probe_little_run(written_run)
+            intervene_on_little_run(written_run)
 
     return made_once(tmp_path_factory, "little", make)
 

@@ -81,6 +81,6 @@ def test_every_benchmark_is_run_by_a_test_or_says_why_not() -> None:
 def test_a_benchmark_runs_in_its_smallest_form(name: str, tmp_path: Path) -> None:
     arguments = [str(tmp_path / "out") if argument == "OUT" else argument for argument in SMALLEST[name]]
     command = [sys.executable, str(FOLDER / f"{name}.py"), *arguments]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, encoding="utf-8", check=False)
-    assert done.returncode == 0, done.stdout[-1000:] + done.stderr[-3000:]
-    assert done.stdout.strip()
+    completed = subprocess.run(command, cwd=tmp_path, capture_output=True, encoding="utf-8", check=False)
+    assert completed.returncode == 0, completed.stdout[-1000:] + completed.stderr[-3000:]
+    assert completed.stdout.strip()

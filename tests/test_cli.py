@@ -63,17 +63,17 @@ def test_every_model_is_one_line_at_eighty_columns(monkeypatch: pytest.MonkeyPat
 @pytest.mark.slow
 def test_extract_train_retention_end_in_rows_with_the_contracts_keys(small_suite: Suite, tmp_path: Path) -> None:
     run = tmp_path / "run"
-    made = in_process(
+    extracted = in_process(
         "extract", "--model", "pi0-tiny", "--random-weights", "--suite", small_suite.folder,
         "--categories", "color", "--max-steps", 2, "--env-workers", 0, "--batch", 12, "--out", run,
     )  # fmt: skip
-    assert made.returncode == 0, made.stderr
-    assert "RANDOM" in made.stderr
-    assert made.stdout.strip() == str(run)
+    assert extracted.returncode == 0, extracted.stderr
+    assert "RANDOM" in extracted.stderr
+    assert extracted.stdout.strip() == str(run)
     trained = in_process("train", run, "--permutations", 3)
     assert trained.returncode == 0, trained.stderr
-    shown = ("--html", tmp_path / "report.html", "--figures", tmp_path / "figures")
-    printed = in_process("retention", run, "--format", "json", *shown)
+    output_options = ("--html", tmp_path / "report.html", "--figures", tmp_path / "figures")
+    printed = in_process("retention", run, "--format", "json", *output_options)
     assert printed.returncode == 0, printed.stderr
     rows = json.loads(printed.stdout)
     assert {row["category"] for row in rows} == {"color", "mean"}
@@ -92,9 +92,9 @@ def test_extract_train_retention_end_in_rows_with_the_contracts_keys(small_suite
 
 def test_a_dry_run_prints_the_plan_and_writes_nothing(small_suite: Suite, tmp_path: Path) -> None:
     run = tmp_path / "run"
-    shown = in_process("extract", "--model", "expert", "--suite", small_suite.folder, "--out", run, "--dry-run")
-    assert shown.returncode == 0
-    assert "48 (24 items in both layouts)" in shown.stderr
+    result = in_process("extract", "--model", "expert", "--suite", small_suite.folder, "--out", run, "--dry-run")
+    assert result.returncode == 0
+    assert "48 (24 items in both layouts)" in result.stderr
     assert not run.exists()
 
 
@@ -162,12 +162,12 @@ def test_ctrl_c_keeps_what_is_finished_and_the_same_command_continues(small_suit
     _, messages = process.communicate(timeout=60)
     assert process.returncode == 130, messages
     assert "run the same command to resume" in messages
-    kept = {path.name: path.stat().st_mtime_ns for path in run.glob("commits/*.json")}
-    assert 1 <= len(kept) < 8
+    commit_times = {path.name: path.stat().st_mtime_ns for path in run.glob("commits/*.json")}
+    assert 1 <= len(commit_times) < 8
     assert in_process(*command[3:]).returncode == 0
     now = {path.name: path.stat().st_mtime_ns for path in run.glob("commits/*.json")}
     assert len(now) == 8
-    assert all(now[name] == stamp for name, stamp in kept.items())
+    assert all(now[name] == stamp for name, stamp in commit_times.items())
 
 
 def test_help_groups_all_commands_by_what_one_wants_to_do() -> None:
@@ -176,12 +176,14 @@ def test_help_groups_all_commands_by_what_one_wants_to_do() -> None:
     group = typer.main.get_command(app)
     names = [name for panel in PANELS.values() for name in panel]
     assert group.list_commands(None) == names  # type: ignore[attr-defined,arg-type]
-    shown = in_process("--help").stdout
+    help_text = in_process("--help").stdout
     headings = [*(f"─ {panel} ─" for panel in PANELS), *(f"│ {name} " for name in names)]
-    places = {heading: shown.index(heading) for heading in headings}
+    places = {heading: help_text.index(heading) for heading in headings}
     for panel, commands in PANELS.items():
-        further = [places[f"─ {other} ─"] for other in PANELS if places[f"─ {other} ─"] > places[f"─ {panel} ─"]]
-        end = min(further, default=len(shown))
+        later_positions = [
+            places[f"─ {other} ─"] for other in PANELS if places[f"─ {other} ─"] > places[f"─ {panel} ─"]
+        ]
+        end = min(later_positions, default=len(help_text))
         assert all(places[f"─ {panel} ─"] < places[f"│ {name} "] < end for name in commands)
 
 
@@ -204,8 +206,8 @@ def test_a_warning_is_printed_once_also_where_a_library_catches_warnings_in_betw
             with warnings.catch_warnings():
                 pass
             warnings.warn(text, stacklevel=1)
-    said = capsys.readouterr().err
-    assert (said.count("the first one"), said.count("the second one")) == (1, 1)
+    message = capsys.readouterr().err
+    assert (message.count("the first one"), message.count("the second one")) == (1, 1)
 
 
 def test_the_version_is_that_of_the_package() -> None:
@@ -232,11 +234,11 @@ def test_an_option_of_another_command_says_which_one_has_it(arguments: list[str]
 def test_a_folder_of_runs_lists_the_runs_inside_and_a_near_name_is_suggested(
     small_suite: Suite, tmp_path: Path
 ) -> None:
-    made = in_process(
+    extracted = in_process(
         "extract", "--model", "expert", "--suite", small_suite.folder, "--categories", "color", "--items", 2,
         "--max-steps", 1, "--env-workers", 0, "--out", tmp_path / "runs" / "mine",
     )  # fmt: skip
-    assert made.returncode == 0, made.stderr
+    assert extracted.returncode == 0, extracted.stderr
     shutil.copytree(tmp_path / "runs" / "mine", tmp_path / "runs" / "yours")
     for command in ("train", "retention", "run export --format h5", "run verify", "models --run"):
         answer = in_process(*command.split(), "runs", cwd=tmp_path)
@@ -256,8 +258,8 @@ def test_suite_build_list_and_show_go_together(tmp_path: Path) -> None:
     assert built.returncode == 0, built.stderr
     listed = in_process("suite", "show", tmp_path / "suite", "--counts", "--json")
     assert json.loads(listed.stdout)["items"] == {"color": 4}
-    shown = in_process("suite", "show", tmp_path / "suite", "--n", 2, "--json")
-    items = json.loads(shown.stdout)["items"]
+    result = in_process("suite", "show", tmp_path / "suite", "--n", 2, "--json")
+    items = json.loads(result.stdout)["items"]
     suite = load_suite(tmp_path / "suite")
     assert [item["item"] for item in items] == [item.item_id for item in suite.items[:2]]
     for shown_item, item in zip(items, suite.items, strict=False):

@@ -101,8 +101,8 @@ REQUIRED = {
 @cache
 def help_of(command: str) -> str:
     """Help with every line break and frame removed, so that no wrapping hides a text."""
-    shown = CliRunner().invoke(app, [*command.split(), HELP_ALL], env={"COLUMNS": "300"}).stdout
-    return " ".join(re.sub(r"[│╭╮╰╯─]", " ", shown).split())
+    output = CliRunner().invoke(app, [*command.split(), HELP_ALL], env={"COLUMNS": "300"}).stdout
+    return " ".join(re.sub(r"[│╭╮╰╯─]", " ", output).split())
 
 
 @pytest.mark.parametrize(("command", "option"), CLOSED, ids=" ".join)
@@ -116,8 +116,8 @@ def test_a_wrong_choice_exits_2_and_names_the_choices(
     command: str, option: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    given = [option, "wrong-choice"] if option.startswith("--") else ["wrong-choice"]
-    ended = CliRunner().invoke(app, [*command.split(), *REQUIRED[command], *given], env={"COLUMNS": "300"})
+    arguments = [option, "wrong-choice"] if option.startswith("--") else ["wrong-choice"]
+    ended = CliRunner().invoke(app, [*command.split(), *REQUIRED[command], *arguments], env={"COLUMNS": "300"})
     assert ended.exit_code == 2, ended.stderr
     assert "'wrong-choice' is not one of" in ended.stderr
     assert all(repr(str(choice)) in ended.stderr for choice in CLOSED[command, option]), ended.stderr
@@ -126,9 +126,9 @@ def test_a_wrong_choice_exits_2_and_names_the_choices(
 
 @pytest.mark.parametrize("command", sorted({command for command, _ in CLOSED}))
 def test_every_option_that_has_choices_is_one_of_those_above(command: str) -> None:
-    shown = re.findall(r"(--[a-z-]+) <[^>|]+\|[^>]+>", help_of(command))
+    with_choices = re.findall(r"(--[a-z-]+) <[^>|]+\|[^>]+>", help_of(command))
     several = [option for (of, option), names in CLOSED.items() if of == command and len(names) > 1]
-    assert sorted(shown) == sorted(option for option in several if option.startswith("--"))
+    assert sorted(with_choices) == sorted(option for option in several if option.startswith("--"))
 
 
 @pytest.mark.parametrize(
@@ -164,7 +164,7 @@ def test_help_is_short_plain_sentences(command: str) -> None:
     """At most 25 words a sentence, no personified code."""
     texts = [
         LEAVES[command].help.split("\b")[0],
-        *(getattr(one, "help", None) or "" for one in LEAVES[command].params),
+        *(getattr(parameter, "help", None) or "" for parameter in LEAVES[command].params),
     ]
     for text in texts:
         assert not re.search(r"\b(hears?|listens?|whoever|somebody|nobody|twins? of|looks? after)\b", text), text

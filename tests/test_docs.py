@@ -46,10 +46,10 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_architecture_page_names_files_that_exist() -> None:
     page = (DOCS / "architecture.md").read_text(encoding="utf-8")
-    named = re.findall(r"`([a-z0-9_/]+(?:\.py|/))`", page)
-    named = [name for name in named if not name.startswith(("probe_kit", "tests"))]
-    assert len(named) > 40
-    assert [name for name in named if not (ROOT / "probe_kit" / name).exists()] == []
+    file_names = re.findall(r"`([a-z0-9_/]+(?:\.py|/))`", page)
+    file_names = [name for name in file_names if not name.startswith(("probe_kit", "tests"))]
+    assert len(file_names) > 40
+    assert [name for name in file_names if not (ROOT / "probe_kit" / name).exists()] == []
 
 
 @pytest.mark.slow
@@ -108,10 +108,10 @@ def test_every_link_leads_to_a_file_and_to_a_heading_of_it(page: str) -> None:
 
 
 def test_every_command_and_option_stands_on_the_page_of_commands() -> None:
-    shown = runpy.run_path(str(DOCS / "commands_page.py"))["commands_markdown"]()
+    commands_page = runpy.run_path(str(DOCS / "commands_page.py"))["commands_markdown"]()
     options = 0
     for path, command in commands_of(typer.main.get_command(app), None):
-        (section,) = re.findall(rf"^### probe-kit {path}$(.*?)(?=^##|\Z)", shown, re.MULTILINE | re.DOTALL)
+        (section,) = re.findall(rf"^### probe-kit {path}$(.*?)(?=^##|\Z)", commands_page, re.MULTILINE | re.DOTALL)
         for parameter in command.params:
             option = (
                 (*parameter.secondary_opts, *parameter.opts)[-1]
@@ -141,13 +141,13 @@ def test_every_family_that_acts_has_a_row_on_the_page_of_families() -> None:
     from probe_kit.hooks.registry import own_families
 
     page = (DOCS / "families.md").read_text(encoding="utf-8")
-    named = {
+    family_names = {
         name
         for line in re.findall(r"^\| (`[^|]*) \|", page, re.MULTILINE)
         for name in re.findall(r"`([^`]+)`", line)
     }
     acting = {name for name, family in own_families().items() if family.acts}
-    assert acting - {"pi0-tiny-early", "pi0-tiny-state"} - named == set()
+    assert acting - {"pi0-tiny-early", "pi0-tiny-state"} - family_names == set()
 
 
 def test_every_public_name_is_described_in_the_reference() -> None:

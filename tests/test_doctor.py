@@ -36,14 +36,14 @@ def test_the_command_agrees_with_what_it_found() -> None:
 def test_only_what_stops_the_demo_makes_the_command_fail(
     state: State, code: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    found = [Finding("python", "ok", "3.12"), Finding("disk", state, "1 GB [here]", "Clear it")]
-    monkeypatch.setattr(doctor, "examine", lambda: found)
+    findings = [Finding("python", "ok", "3.12"), Finding("disk", state, "1 GB [here]", "Clear it")]
+    monkeypatch.setattr(doctor, "examine", lambda: findings)
     answer = CliRunner().invoke(app, ["doctor"])
     assert answer.exit_code == code
     assert "1 GB [here]" in answer.stdout
     assert "Clear it" in answer.stdout
     printed = CliRunner().invoke(app, ["doctor", "--json"])
-    assert json.loads(printed.stdout)[1] == found[1].to_json()
+    assert json.loads(printed.stdout)[1] == findings[1].to_json()
 
 
 def test_the_scene_that_is_tried_is_one_an_episode_shows() -> None:
@@ -56,17 +56,17 @@ def test_the_scene_that_is_tried_is_one_an_episode_shows() -> None:
 def test_the_policy_that_is_tried_acts(monkeypatch: pytest.MonkeyPatch) -> None:
     from probe_kit.hooks.families.pi0.adapter import Pi0
 
-    act, asked = Pi0.act, []
+    act, shapes = Pi0.act, []
 
-    def spy(policy: Pi0, seen: list[Any], seeds: list[int]) -> Any:
-        chunk = act(policy, seen, seeds)
-        asked.append(chunk.shape)
+    def spy(policy: Pi0, observations: list[Any], seeds: list[int]) -> Any:
+        chunk = act(policy, observations, seeds)
+        shapes.append(chunk.shape)
         return chunk
 
     monkeypatch.setattr(Pi0, "act", spy)
-    found = doctor.let_policy_act()
-    assert asked == [(1, 16, 7)]
-    assert found["torch"] == __import__("torch").__version__
+    facts = doctor.let_policy_act()
+    assert shapes == [(1, 16, 7)]
+    assert facts["torch"] == __import__("torch").__version__
 
 
 def test_a_trial_that_crashes_is_a_finding_with_its_last_words(monkeypatch: pytest.MonkeyPatch) -> None:

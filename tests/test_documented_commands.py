@@ -39,7 +39,10 @@ OURS = [command for command in TYPED if command.ours]
 GROUP = typer.main.get_command(app)
 LEAVES = dict(commands_of(GROUP, None))
 ANYWHERE = {
-    option for leaf in LEAVES.values() for one in leaf.params for option in (*one.opts, *one.secondary_opts)
+    option
+    for leaf in LEAVES.values()
+    for parameter in leaf.params
+    for option in (*parameter.opts, *parameter.secondary_opts)
 }
 
 OTHER_PROGRAMS = {
@@ -79,21 +82,24 @@ def leaf_of(words: list[str]) -> tuple[Any, list[str]]:
 
 
 def options_of(leaf: Any) -> set[str]:
-    return {option for one in leaf.params for option in (*one.opts, *one.secondary_opts)} | {"--help", "-h"}
+    return {option for parameter in leaf.params for option in (*parameter.opts, *parameter.secondary_opts)} | {
+        "--help",
+        "-h",
+    }
 
 
 def test_every_block_is_commands_or_python_or_listed_as_something_else() -> None:
-    found = [block for page in PAGES for block in blocks(page)]
-    assert len(found) > 40
-    strange = [f"{b.page}:{b.line}" for b in found if b.language not in ("", "python", "toml", *SHELLS)]
+    all_blocks = [block for page in PAGES for block in blocks(page)]
+    assert len(all_blocks) > 40
+    strange = [f"{b.page}:{b.line}" for b in all_blocks if b.language not in ("", "python", "toml", *SHELLS)]
     assert strange == []
-    assert {block.listed for block in found if block.listed} == NOT_COMMANDS.keys()
+    assert {block.listed for block in all_blocks if block.listed} == NOT_COMMANDS.keys()
 
 
 def test_every_line_is_one_of_ours_or_of_a_program_that_is_named_with_the_reason() -> None:
     assert len(OURS) > 50
-    others = {command.words[0] for command in TYPED if not command.ours}
-    assert others == OTHER_PROGRAMS.keys()
+    programs = {command.words[0] for command in TYPED if not command.ours}
+    assert programs == OTHER_PROGRAMS.keys()
 
 
 @pytest.mark.parametrize("command", [c for c in TYPED if re.search(r"[*?\[]", c.text)], ids=str)
@@ -108,16 +114,16 @@ def test_what_other_programs_are_given_is_there() -> None:
         r"(?ms)^\[project\.optional-dependencies\]$(.*?)^\[", (ROOT / "pyproject.toml").read_text(encoding="utf-8")
     )
     assert extras is not None
-    known = set(re.findall(r"(?m)^([\w-]+) = \[", extras[1]))
+    known_extras = set(re.findall(r"(?m)^([\w-]+) = \[", extras[1]))
     for command in TYPED:
-        program, *rest = command.words
-        assert set(re.findall(r"--extra ([\w-]+)", command.text)) <= known, command
+        program, *arguments = command.words
+        assert set(re.findall(r"--extra ([\w-]+)", command.text)) <= known_extras, command
         if program == "python":
-            place = ROOT / (rest[1].replace(".", "/") + ".py" if rest[0] == "-m" else rest[0])
-            assert place.is_file(), command
-            options = [word for word in rest[1:] if word.startswith("--")]
+            script = ROOT / (arguments[1].replace(".", "/") + ".py" if arguments[0] == "-m" else arguments[0])
+            assert script.is_file(), command
+            options = [word for word in arguments[1:] if word.startswith("--")]
             assert [
-                option for option in options if f'"{option}"' not in place.read_text(encoding="utf-8")
+                option for option in options if f'"{option}"' not in script.read_text(encoding="utf-8")
             ] == [], command
 
 
@@ -126,23 +132,25 @@ def test_a_command_is_accepted_as_it_is_typed(
     command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Name, arguments, options and their values: it ends only where it looks for a run, a suite or a model."""
-    leaf, rest = leaf_of(command.words[1:])
-    leaf.make_context(leaf.name, list(rest))
+    leaf, arguments = leaf_of(command.words[1:])
+    leaf.make_context(leaf.name, list(arguments))
     if leaf.name in ("demo", "doctor", "models", "words"):
         return
     monkeypatch.setattr("probe_kit.runs.store._QUICK", timedelta(0))  # without keys a store never answers
     monkeypatch.setattr("probe_kit.extract.prepare", _stop_with, raising=False)
     monkeypatch.setattr("probe_kit.serve.server.open_server", _stop_with)
-    monkeypatch.setattr("probe_kit.extract.extraction.prepare_asks", lambda wanted, _, **__: _stop_with(*wanted))
+    monkeypatch.setattr(
+        "probe_kit.extract.extraction.prepare_asks", lambda settings, _, **__: _stop_with(*settings)
+    )
     with contextlib.chdir(tmp_path):
         answer = CliRunner().invoke(app, command.words[1:])
-    said = " ".join(answer.stderr.split())
+    message = " ".join(answer.stderr.split())
     if "--dry-run" in command.words and leaf.name == "run":  # of a study: it needs nothing that is not there
-        assert answer.exit_code == 0, said
+        assert answer.exit_code == 0, message
         assert list(tmp_path.iterdir()) == []
         return
-    assert answer.exit_code in (2, 3), said
-    assert re.search(LOOKED_FOR[leaf.name], said), said
+    assert answer.exit_code in (2, 3), message
+    assert re.search(LOOKED_FOR[leaf.name], message), message
     assert list(tmp_path.iterdir()) == []
 
 
@@ -166,7 +174,7 @@ LOOKED_FOR = {
 """What a command complains of in an empty folder, when nothing is wrong with the command itself."""
 
 
-def _stop_with(*asked: Any, **_: Any) -> Any:
+def _stop_with(*arguments: Any, **_: Any) -> Any:
     """In place of loading a model: what can be wrong with the settings before."""
     from probe_kit.extract.extraction import check_meaningless
     from probe_kit.extract.parts import SCRIPTED
@@ -174,7 +182,7 @@ def _stop_with(*asked: Any, **_: Any) -> Any:
     from probe_kit.hooks.contract.declared import check_options
     from probe_kit.hooks.registry import find_family
 
-    for settings in (one for one in asked if isinstance(one, ExtractSettings | AskSettings)):
+    for settings in (candidate for candidate in arguments if isinstance(candidate, ExtractSettings | AskSettings)):
         check_meaningless(settings)
         followed = settings.followed() if isinstance(settings, ExtractSettings) else settings
         if followed.model.family not in SCRIPTED:
@@ -186,15 +194,15 @@ def _stop_with(*asked: Any, **_: Any) -> Any:
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_commands_and_options_that_the_text_mentions_exist(page: Path) -> None:
-    for found in mentioned(page):
-        if re.match(r"(\./with-uv )?probe-kit [a-z]", found.text):
-            words = [word.partition("|")[0] for word in found.words[1:]]
+    for mention in mentioned(page):
+        if re.match(r"(\./with-uv )?probe-kit [a-z]", mention.text):
+            words = [word.partition("|")[0] for word in mention.words[1:]]
             if words[0] in ("suite", "run") and len(words) == 1:
                 continue
-            leaf, rest = leaf_of(words)
-            assert {word for word in rest if word.startswith("-")} <= options_of(leaf), found
-        for option in re.findall(r"(?<![\w-])--[a-z][a-z-]+", found.text):
-            assert option in ANYWHERE | OF_BENCHMARKS | OF_OTHERS.keys(), found
+            leaf, arguments = leaf_of(words)
+            assert {word for word in arguments if word.startswith("-")} <= options_of(leaf), mention
+        for option in re.findall(r"(?<![\w-])--[a-z][a-z-]+", mention.text):
+            assert option in ANYWHERE | OF_BENCHMARKS | OF_OTHERS.keys(), mention
 
 
 EXAMPLES = [block for page in PAGES for block in blocks(page) if block.language == "python"]
@@ -204,26 +212,32 @@ EXAMPLES = [block for page in PAGES for block in blocks(page) if block.language 
 def test_an_example_in_python_imports_what_exists_and_names_options_that_exist(block: Block) -> None:
     """Of what is imported from probe_kit: the name, and every keyword that it is called with."""
     tree = ast.parse("\n".join(block.lines))
-    known: dict[str, Any] = {"pk": importlib.import_module("probe_kit")}
+    namespace: dict[str, Any] = {"pk": importlib.import_module("probe_kit")}
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and str(node.module).startswith("probe_kit"):
             module = importlib.import_module(str(node.module))
-            known |= {name.asname or name.name: getattr(module, name.name) for name in node.names}
+            namespace |= {name.asname or name.name: getattr(module, name.name) for name in node.names}
     for node in ast.walk(tree):
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "pk":
-            assert hasattr(known["pk"], node.attr), node.attr
-        if isinstance(node, ast.Call) and (called := _called(node.func, known)) is not None:
+            assert hasattr(namespace["pk"], node.attr), node.attr
+        if isinstance(node, ast.Call) and (called := _called(node.func, namespace)) is not None:
             parameters = inspect.signature(called).parameters.values()
-            if all(one.kind is not one.VAR_KEYWORD for one in parameters):
-                assert {one.arg for one in node.keywords} <= {one.name for one in parameters}, ast.unparse(node)
+            if all(parameter.kind is not parameter.VAR_KEYWORD for parameter in parameters):
+                assert {keyword.arg for keyword in node.keywords} <= {
+                    parameter.name for parameter in parameters
+                }, ast.unparse(node)
 
 
-def _called(function: ast.expr, known: dict[str, Any]) -> Any:
+def _called(function: ast.expr, namespace: dict[str, Any]) -> Any:
     """What is called, None if it is nothing of probe_kit's that the example imports."""
     if isinstance(function, ast.Name):
-        return known.get(function.id)
-    if isinstance(function, ast.Attribute) and isinstance(function.value, ast.Name) and function.value.id in known:
-        return getattr(known[function.value.id], function.attr)
+        return namespace.get(function.id)
+    if (
+        isinstance(function, ast.Attribute)
+        and isinstance(function.value, ast.Name)
+        and function.value.id in namespace
+    ):
+        return getattr(namespace[function.value.id], function.attr)
     return None
 
 
@@ -344,7 +358,7 @@ class Terminal:
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int], Path]:
+def make_folder(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int], Path]:
     """By number, runs with their probes, each of other settings, because a table refuses a copy of a run.
 
     Each is made once, when it is first asked for; the cache in which their suite was drawn is not the pages'.
@@ -364,11 +378,11 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int], Path]:
 @pytest.mark.slow
 @pytest.mark.parametrize("page", TO_TYPE)
 def test_the_commands_of_a_page_run_in_their_order_with_an_empty_cache(
-    page: str, made: Callable[[int], Path], tmp_path: Path
+    page: str, make_folder: Callable[[int], Path], tmp_path: Path
 ) -> None:
     terminal = Terminal(tmp_path)
     for number, name in enumerate(RUNS.get(page, ())):
-        shutil.copytree(made(number), tmp_path / name)
+        shutil.copytree(make_folder(number), tmp_path / name)
     if page == "docs/suite.md":
         _write_questions(tmp_path)
     for command in TO_TYPE[page]:

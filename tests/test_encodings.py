@@ -103,23 +103,23 @@ def test_pages_and_tables_are_utf_8_under_a_locale_that_is_not(
     label = "Modèle π — 模型"
     run, other = (str(little_runs / name) for name in ("run", "other"))
     groups = ["--compare", "groups", f"{label}={run}", f"other={other}"]
-    asked = [
+    commands = [
         ["retention", *groups, "--html", str(tmp_path / "report.html"), "--format", "json"],
         ["retention", *groups, "--format", "csv"],
         ["suite", "validate", str(small_suite.folder)],
         ["suite", "build", str(tmp_path / "built"), "--categories", "color", "--n", "2"],
         ["run", "export", other, "--format", "h5", "--out", str(tmp_path / "run.h5")],
     ]
-    done = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", COMMANDS, json.dumps(asked)], env=locale, capture_output=True,
+    completed = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", COMMANDS, json.dumps(commands)], env=locale, capture_output=True,
         encoding="latin-1", check=False,
     )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    answers = json.loads(done.stdout)
-    assert [code for code, *_ in answers] == [0] * len(asked), answers
+    assert completed.returncode == 0, completed.stderr
+    answers = json.loads(completed.stdout)
+    assert [code for code, *_ in answers] == [0] * len(commands), answers
     assert label in str(json.loads(answers[0][1]))
-    shown = answers[1][1]
-    assert "\\u6a21\\u578b" in shown or label in shown.encode("latin-1").decode()
+    output = answers[1][1]
+    assert "\\u6a21\\u578b" in output or label in output.encode("latin-1").decode()
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert label in page
     assert "Ã" not in page

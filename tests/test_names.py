@@ -1,6 +1,7 @@
-"""Names and docstrings of the package use the field's words.
+"""Names and docstrings use the field's words.
 
-A name says what it holds; a docstring begins with a verb or a noun.
+A name says what it holds, in the package as in tests, scripts and benchmarks. A docstring of the package begins
+with a verb or a noun.
 """
 
 import ast
@@ -9,7 +10,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from tests.support.parsed import PACKAGE, nodes, package_trees
+from tests.support.parsed import PACKAGE, nodes, package_trees, parsed
 
 FILLERS = frozenset(
     [
@@ -54,6 +55,11 @@ PRONOUNS = re.compile(
     r"(what|whose|which|as|of|by|with|who|where|how|that|those|these|it|this|so|if|when|from|to|in|for|whether)\b",
     re.IGNORECASE,
 )
+ROOT = PACKAGE.parent
+FOLDERS = ("tests", "scripts", "benchmarks")
+FENCE = ROOT / "tests" / "acceptance"
+TEXTS = re.compile(r'''""".*?"""|"[^"\n]*"|'[^'\n]*'|#[^\n]*''', re.DOTALL)
+WORD = re.compile(rf"\b_*({'|'.join(sorted(FILLERS))})\b")
 FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 
 
@@ -133,6 +139,22 @@ def test_the_package_is_written_in_the_words_of_the_field(check: str) -> None:
         for line, text in CHECKS[check](tree)
     ]
     assert not wrong, f"{RULES[check]}\n" + "\n".join(wrong)
+
+
+def test_names_of_tests_scripts_and_benchmarks_say_what_they_hold() -> None:
+    # The fence stays as it is. Only a file with such a word outside of texts and comments is taken apart.
+    paths = {path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")} - set(FENCE.rglob("*.py"))
+    suspects = [path for path in sorted(paths) if WORD.search(TEXTS.sub("", path.read_text(encoding="utf-8")))]
+    wrong = [
+        f"{path.relative_to(ROOT)}:{line}: {name}" for path in suspects for line, name in fillers(parsed(path))
+    ]
+    assert not wrong, f"{RULES['names']}\n" + "\n".join(wrong)
+
+
+@pytest.mark.parametrize("line", ["found = 1  # one", "f('one', kept := 2)", 'def f(own):\n    """That one."""'])
+def test_a_filler_outside_of_texts_and_comments_is_looked_at(line: str) -> None:
+    assert WORD.search(TEXTS.sub("", line))
+    assert not WORD.search(TEXTS.sub("", '"""One\nfound."""  # one\nsite = "own" + \'kept\''))
 
 
 @pytest.mark.parametrize(

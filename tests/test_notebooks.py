@@ -49,7 +49,7 @@ def shortened(source: str) -> str:
     scope="module",
     params=[pytest.param("short", marks=pytest.mark.slow), pytest.param("whole", marks=pytest.mark.slow)],
 )
-def made(
+def executed_notebooks(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, dict[str, NotebookNode]]:
     """The folder in which all notebooks ran, and the notebooks with fresh outputs."""
@@ -66,9 +66,9 @@ def made(
         nbformat.write(notebook, path)
         return path
 
-    chosen = [name for name in NAMES if (request.param == "whole" or name not in WHOLE_ONLY) and not absent(name)]
+    names = [name for name in NAMES if (request.param == "whole" or name not in WHOLE_ONLY) and not absent(name)]
     with kernel(folder) as manager:
-        return folder, {name: executed(source(name), folder, manager) for name in chosen}
+        return folder, {name: executed(source(name), folder, manager) for name in names}
 
 
 def absent(name: str) -> list[str]:
@@ -106,22 +106,22 @@ def test_these_are_all_notebooks() -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_notebook_runs_and_its_committed_outputs_are_those_of_its_cells(
-    name: str, made: tuple[Path, dict[str, NotebookNode]]
+    name: str, executed_notebooks: tuple[Path, dict[str, NotebookNode]]
 ) -> None:
     if missing := absent(name):
         pytest.skip(f"{', '.join(missing)} of the extra `datasets` is not installed")
-    if name not in made[1]:
+    if name not in executed_notebooks[1]:
         pytest.skip("runs in the slow suite")
     committed = nbformat.read(FOLDER / f"{name}.ipynb", as_version=4)
     assert any(outputs for outputs in kinds(committed))
-    assert kinds(made[1][name]) == kinds(committed)
+    assert kinds(executed_notebooks[1][name]) == kinds(committed)
 
 
-@pytest.mark.parametrize("made", [pytest.param("whole", marks=pytest.mark.slow)], indirect=True)
+@pytest.mark.parametrize("executed_notebooks", [pytest.param("whole", marks=pytest.mark.slow)], indirect=True)
 def test_what_the_first_notebook_says_of_the_embedded_policy_is_so(
-    made: tuple[Path, dict[str, NotebookNode]],
+    executed_notebooks: tuple[Path, dict[str, NotebookNode]],
 ) -> None:
-    run = open_run(made[0] / "work" / "runs" / "pi0-tiny")
+    run = open_run(executed_notebooks[0] / "work" / "runs" / "pi0-tiny")
     assert not run.random_weights
     first = min((run.path / "probes").iterdir(), key=lambda folder: load_results(run, folder.name).created)
     rows = {row.category: row for row in retention_table([run], keys=[first.name]).rows}
@@ -129,63 +129,70 @@ def test_what_the_first_notebook_says_of_the_embedded_policy_is_so(
     assert rows["color"].retention.defined
 
 
-@pytest.mark.parametrize("made", [pytest.param("whole", marks=pytest.mark.slow)], indirect=True)
-def test_the_untrained_network_is_marked_and_shows_no_signal(made: tuple[Path, dict[str, NotebookNode]]) -> None:
-    run = open_run(made[0] / "work" / "runs" / "pi0-tiny-random")
+@pytest.mark.parametrize("executed_notebooks", [pytest.param("whole", marks=pytest.mark.slow)], indirect=True)
+def test_the_untrained_network_is_marked_and_shows_no_signal(
+    executed_notebooks: tuple[Path, dict[str, NotebookNode]],
+) -> None:
+    run = open_run(executed_notebooks[0] / "work" / "runs" / "pi0-tiny-random")
     assert run.random_weights
     assert not any(row.retention.defined for row in retention_table([run]).rows)
 
 
-@pytest.mark.parametrize("made", [pytest.param("whole", marks=pytest.mark.slow)], indirect=True)
+@pytest.mark.parametrize("executed_notebooks", [pytest.param("whole", marks=pytest.mark.slow)], indirect=True)
 def test_the_adapter_of_the_fourth_notebook_passes_its_contract(
-    made: tuple[Path, dict[str, NotebookNode]],
+    executed_notebooks: tuple[Path, dict[str, NotebookNode]],
 ) -> None:
-    shown = printed(made[1]["04-your-own-model"])
-    assert re.search(r"\b[1-9][0-9] passed", shown)
-    assert "failed" not in shown.lower()
-    assert "SiteNeverFiredError" in shown
-    assert open_run(made[0] / "work" / "runs" / "tiny-vla").certificate["hooks_on_equals_hooks_off"]
+    output = printed(executed_notebooks[1]["04-your-own-model"])
+    assert re.search(r"\b[1-9][0-9] passed", output)
+    assert "failed" not in output.lower()
+    assert "SiteNeverFiredError" in output
+    assert open_run(executed_notebooks[0] / "work" / "runs" / "tiny-vla").certificate["hooks_on_equals_hooks_off"]
 
 
-@pytest.mark.parametrize("made", [pytest.param("whole", marks=pytest.mark.slow)], indirect=True)
+@pytest.mark.parametrize("executed_notebooks", [pytest.param("whole", marks=pytest.mark.slow)], indirect=True)
 def test_the_questions_of_the_fifth_notebook_are_valid_and_answered(
-    made: tuple[Path, dict[str, NotebookNode]],
+    executed_notebooks: tuple[Path, dict[str, NotebookNode]],
 ) -> None:
-    shown = printed(made[1]["05-your-own-questions"])
-    assert "0 errors" in shown
-    assert "InstructionError" in shown
-    assert len(open_run(made[0] / "work" / "runs" / "blots").episodes) == 24
+    output = printed(executed_notebooks[1]["05-your-own-questions"])
+    assert "0 errors" in output
+    assert "InstructionError" in output
+    assert len(open_run(executed_notebooks[0] / "work" / "runs" / "blots").episodes) == 24
 
 
-@pytest.mark.parametrize("made", [pytest.param("whole", marks=pytest.mark.slow)], indirect=True)
-def test_the_vlms_of_the_sixth_notebook_are_what_it_says(made: tuple[Path, dict[str, NotebookNode]]) -> None:
-    runs = [open_run(made[0] / "work" / "runs" / name) for name in ("vlm-tiny", "habit", "pi0-tiny-asked")]
-    asked, habit, acted = runs
+@pytest.mark.parametrize("executed_notebooks", [pytest.param("whole", marks=pytest.mark.slow)], indirect=True)
+def test_the_vlms_of_the_sixth_notebook_are_what_it_says(
+    executed_notebooks: tuple[Path, dict[str, NotebookNode]],
+) -> None:
+    runs = [
+        open_run(executed_notebooks[0] / "work" / "runs" / name)
+        for name in ("vlm-tiny", "habit", "pi0-tiny-asked")
+    ]
+    answer_run, habit, acted = runs
     assert (habit.episodes["side_placed"] == "left").all()
     assert retention_table([habit]).rows[0].success.sr == 0.5
-    assert (asked.episodes["outcome"] == "correct").mean() > 0.75
-    assert asked.episodes["first_frame_sha256"].tolist() == acted.episodes["first_frame_sha256"].tolist()
+    assert (answer_run.episodes["outcome"] == "correct").mean() > 0.75
+    assert answer_run.episodes["first_frame_sha256"].tolist() == acted.episodes["first_frame_sha256"].tolist()
 
 
-@pytest.mark.parametrize("made", [pytest.param("whole", marks=pytest.mark.slow)], indirect=True)
+@pytest.mark.parametrize("executed_notebooks", [pytest.param("whole", marks=pytest.mark.slow)], indirect=True)
 def test_the_last_layer_of_the_seventh_notebook_is_read_by_nothing(
-    made: tuple[Path, dict[str, NotebookNode]],
+    executed_notebooks: tuple[Path, dict[str, NotebookNode]],
 ) -> None:
     """Its hooks fired and moved tokens; what can be read there turns nothing."""
-    rows = stored_site_effects(open_run(made[0] / "work" / "runs" / "pi0-tiny"))["color"]
+    rows = stored_site_effects(open_run(executed_notebooks[0] / "work" / "runs" / "pi0-tiny"))["color"]
     (last,) = (row for row in rows if (row.sites, row.role) == ("backbone.03", "all"))
     assert (last.max_action_change, last.no_op_fires) == (0.0, 0)
     assert last.fires == last.n_episodes
     assert last.relative_change > 0
 
 
-@pytest.mark.parametrize("made", [pytest.param("whole", marks=pytest.mark.slow)], indirect=True)
+@pytest.mark.parametrize("executed_notebooks", [pytest.param("whole", marks=pytest.mark.slow)], indirect=True)
 def test_the_recordings_of_the_ninth_notebook_are_shown_and_their_side_is_decoded(
-    made: tuple[Path, dict[str, NotebookNode]],
+    executed_notebooks: tuple[Path, dict[str, NotebookNode]],
 ) -> None:
     if missing := absent("09-your-own-recordings"):
         pytest.skip(f"{', '.join(missing)} of the extra `datasets` is not installed")
-    run = open_run(made[0] / "work" / "runs" / "recorded")
+    run = open_run(executed_notebooks[0] / "work" / "runs" / "recorded")
     assert run.recorded
     assert compare_actions(run).by_number.set_index("number").loc[["x", "y"], "first"].max() < 0.6
     (stored,) = (path.name for path in (run.path / "probes").iterdir())
@@ -203,8 +210,8 @@ def test_every_cell_that_ends_in_a_figure_shows_a_picture(name: str) -> None:
     drawing = [cell for cell in cells if PICTURE.search("".join(cell["source"]).rstrip().splitlines()[-1])]
     assert drawing
     for cell in drawing:
-        shown = [kind for output in cell["outputs"] for kind in output.get("data", {})]
-        assert "image/png" in shown, cell["source"][-1]
+        output_kinds = [kind for output in cell["outputs"] for kind in output.get("data", {})]
+        assert "image/png" in output_kinds, cell["source"][-1]
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -23,10 +23,10 @@ LAZY = [
 
 def ask(code: str) -> str:
     """What a fresh interpreter prints."""
-    found = subprocess.run(
+    completed = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, encoding="utf-8", check=True, cwd=ROOT
     )
-    return found.stdout.strip()
+    return completed.stdout.strip()
 
 
 def test_the_packages_and_those_that_load_late_are_found() -> None:
@@ -64,9 +64,9 @@ def test_help_lists_every_public_name(package: str) -> None:
     module = import_module(package)
     text = pydoc.plain(pydoc.render_doc(module))
     listed = text[re.search(r"\n(CLASSES|FUNCTIONS)\n", text).start() :]
-    own = r"^    (class )?{}[(=: ]"  # a class, a function or a value that stands among the package's own
+    pattern = r"^    (class )?{}[(=: ]"  # a class, a function or a value that stands among the package's own
     names = [name for name in module.__all__ if not ismodule(getattr(module, name))]
-    assert not [name for name in names if not re.search(own.format(name), listed, re.MULTILINE)]
+    assert not [name for name in names if not re.search(pattern.format(name), listed, re.MULTILINE)]
 
 
 @pytest.mark.slow

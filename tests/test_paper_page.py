@@ -26,16 +26,16 @@ def section(title: str) -> str:
 def test_every_table_and_figure_has_a_row() -> None:
     tables = data("paper-tables.json")
     rows = section("Table by table")
-    numbers = {one["source"]["table"] for one in tables["tables"].values()}
+    numbers = {record["source"]["table"] for record in tables["tables"].values()}
     assert numbers == {int(number) for number in re.findall(r"^\| Table (\d)", rows, re.MULTILINE)}
-    figures = {one["figure"] for one in tables["figures"].values()}
+    figures = {record["figure"] for record in tables["figures"].values()}
     assert figures <= {int(number) for line in re.findall(r"^\| Figures? ([^|]*)", rows, re.MULTILINE)
                        for number in re.findall(r"\d", line)}  # fmt: skip
 
 
 def test_every_contradiction_that_was_recomputed_is_on_the_page() -> None:
     rows = section("Where the paper contradicts itself")
-    for one in data("paper-recomputed.json")["disagree"]:
-        for value in (one["printed"], one["recomputed"]):
+    for record in data("paper-recomputed.json")["disagree"]:
+        for value in (record["printed"], record["recomputed"]):
             for number in re.findall(r"\d+\.\d+|\b\d\d\b", str(value)):
-                assert f"{float(number):g}" in rows, (number, one)
+                assert f"{float(number):g}" in rows, (number, record)

@@ -40,8 +40,8 @@ def test_a_planted_answer_is_found_exactly_where_it_lies(planted_run: Run) -> No
     assert best == str(PLANTED)
     assert scores.loc[best, "accuracy"] == 1.0
     assert scores.loc[best, "p_fwe"] < 0.05
-    others = scores.drop(index=best).query("stream == 'backbone'")
-    assert (others["p_fwe"] >= 0.05).all()
+    other_sites = scores.drop(index=best).query("stream == 'backbone'")
+    assert (other_sites["p_fwe"] >= 0.05).all()
     (row,) = (row for row in retention_table([planted_run]).rows if row.category == "shape")
     assert row.retention.defined
     assert (row.backbone.verdict, row.backbone.score, row.backbone.peak) == ("shown", 1.0, 1.0)

@@ -41,19 +41,19 @@ def texts_of(file: Path) -> Iterator[str]:
 
 def test_commands_and_options_that_the_texts_of_the_package_name_exist() -> None:
     files = [file for ending in ("py", "js", "jinja", "html") for file in PACKAGE.rglob(f"*.{ending}")]
-    named = {
+    mentioned_commands = {
         (file.relative_to(PACKAGE).as_posix(), " ".join(match[1].split()))
         for file in files
         for text in texts_of(file)
         for match in A_COMMAND.finditer(text)
     }
-    assert {name.rpartition(".")[2] for name, _ in named} >= {"py", "js"}
-    for file, command in sorted(named):
+    assert {name.rpartition(".")[2] for name, _ in mentioned_commands} >= {"py", "js"}
+    for file, command in sorted(mentioned_commands):
         words = [word for word in command.replace("'", "").split()[1:] if word != "…"]
         if words in (["suite"], ["run"], ["study"], ["dataset"]):
             continue
-        leaf, rest = leaf_of(words)
-        assert {word for word in rest if word.startswith("--")} <= options_of(leaf), f"{file}: {command}"
+        leaf, arguments = leaf_of(words)
+        assert {word for word in arguments if word.startswith("--")} <= options_of(leaf), f"{file}: {command}"
 
 
 # -- as typed ----------------------------------------------------------------------------------------------------
@@ -114,11 +114,11 @@ def run_as_typed(command: str) -> tuple[int, str]:
     """The exit code of a command, and what it printed and what the page that it wrote shows."""
     words = shlex.split(command)[1:]
     if " ".join(words).startswith(NOT_RUN):
-        leaf, rest = leaf_of(words)
-        unknown = {word for word in rest if word.startswith("--")} - options_of(leaf)
+        leaf, arguments = leaf_of(words)
+        unknown = {word for word in arguments if word.startswith("--")} - options_of(leaf)
         return (2, f"no such option: {unknown}") if unknown else (0, "")
     result = CliRunner().invoke(app, words)
-    pages = [Path(words[place + 1]) for place, word in enumerate(words) if word == "--html"]
+    pages = [Path(words[position + 1]) for position, word in enumerate(words) if word == "--html"]
     return result.exit_code, "\n".join([result.output, *(page.read_text(encoding="utf-8") for page in pages)])
 
 
@@ -127,7 +127,10 @@ def write_inputs() -> None:
     draw = np.random.default_rng(0)
     pictures = draw.integers(0, 255, (6, 3, 96, 96, 3), np.uint8)
     state = np.array([0.39, 0.02, 0.08, 0, 0.06, -0.02, 0, 0.64], np.float32)
-    write_recording(Path("a recording"), [[Observation(one, state, TASK) for one in shown] for shown in pictures])
+    write_recording(
+        Path("a recording"),
+        [[Observation(picture, state, TASK) for picture in episode_pictures] for episode_pictures in pictures],
+    )
     lines = ["instruction,correct,wrong,group,category"]
     for number in range(6):
         for name in ("correct", "wrong"):

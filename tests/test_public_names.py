@@ -34,18 +34,20 @@ def code_of(file: Path) -> Iterator[str]:
 
 def private_names(code: str) -> list[str]:
     """What is imported from probe_kit past a public package."""
-    found = []
+    private = []
     for node in ast.walk(ast.parse(code)):
         if isinstance(node, ast.Import):
-            found += [
-                one.name for one in node.names if one.name.startswith("probe_kit.") and one.name not in PUBLIC
+            private += [
+                alias.name
+                for alias in node.names
+                if alias.name.startswith("probe_kit.") and alias.name not in PUBLIC
             ]
         elif isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "probe_kit":
             assert node.module is not None
-            names = [one.name for one in node.names]
+            names = [alias.name for alias in node.names]
             public = public_names(node.module) if node.module in PUBLIC else set()
-            found += [f"{node.module}.{name}" for name in names if name not in public]
-    return found
+            private += [f"{node.module}.{name}" for name in names if name not in public]
+    return private
 
 
 def public_names(package: str) -> set[str]:

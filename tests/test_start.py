@@ -31,8 +31,8 @@ SCRIPT = shutil.which("probe-kit", path=str(Path(sys.executable).parent))
 
 def interrupted(at: str, how: str, number: signal.Signals, *words: str) -> subprocess.CompletedProcess[str]:
     """The command, interrupted when it begins to import the module `at`."""
-    place = SCRIPT if how == "script" else "probe_kit"
-    command = [sys.executable, "-c", INTERRUPTING, at, str(int(number)), how, str(place), *words]
+    target = SCRIPT if how == "script" else "probe_kit"
+    command = [sys.executable, "-c", INTERRUPTING, at, str(int(number)), how, str(target), *words]
     return subprocess.run(command, capture_output=True, encoding="utf-8", check=False, timeout=120)
 
 
@@ -49,9 +49,9 @@ def test_before_a_command_begins_nothing_is_lost_and_nothing_is_traced(
 ) -> None:
     if how == "script" and SCRIPT is None:
         pytest.skip("the console script is not installed")
-    done = interrupted(at, how, number, "models")
-    assert (done.returncode, done.stdout) == (130, "")
-    assert done.stderr == "interrupted before anything was begun\n"
+    completed = interrupted(at, how, number, "models")
+    assert (completed.returncode, completed.stdout) == (130, "")
+    assert completed.stderr == "interrupted before anything was begun\n"
 
 
 @pytest.mark.slow
@@ -60,14 +60,14 @@ def test_while_a_command_imports_its_libraries_it_says_that_what_is_finished_is_
 ) -> None:
     words = ["extract", "--model", "pi0-tiny", "--random-weights", "--items", "2", "--dry-run"]
     words += ["--suite", str(small_suite.folder), "--out", str(tmp_path / "run")]
-    done = interrupted("torch", "module", signal.SIGINT, *words)
-    assert (done.returncode, done.stdout) == (130, "")
-    assert done.stderr == "interrupted. Completed work is saved; run the same command to resume.\n"
+    completed = interrupted("torch", "module", signal.SIGINT, *words)
+    assert (completed.returncode, completed.stdout) == (130, "")
+    assert completed.stderr == "interrupted. Completed work is saved; run the same command to resume.\n"
 
 
 def test_what_a_shell_runs_in_the_background_still_ignores_ctrl_c() -> None:
     code = "import signal, sys; signal.signal(signal.SIGINT, signal.SIG_IGN); sys.argv[1:] = ['--version'];"
     code += "from probe_kit.__main__ import main; import os; os.kill(os.getpid(), signal.SIGINT); main()"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, encoding="utf-8", check=False)
-    assert done.returncode == 0
-    assert done.stdout.startswith("probe-kit ")
+    completed = subprocess.run([sys.executable, "-c", code], capture_output=True, encoding="utf-8", check=False)
+    assert completed.returncode == 0
+    assert completed.stdout.startswith("probe-kit ")

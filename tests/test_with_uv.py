@@ -39,9 +39,9 @@ def executable(path: Path, text: str) -> Path:
 def bare_machine(folder: Path) -> Path:
     """A folder of programs that every machine has, and no others; `sh` is found by its path."""
     for name in ("dirname", "grep", "sort", "head", "paste", "mkdir", "cp", "cat"):
-        found = shutil.which(name)
-        assert found
-        (folder / name).symlink_to(found)
+        program = shutil.which(name)
+        assert program
+        (folder / name).symlink_to(program)
     return folder
 
 
@@ -60,9 +60,9 @@ def programs(tmp_path: Path) -> Path:
 
 def test_a_uv_on_the_path_runs_the_command_in_the_project_from_any_folder(checkout: Path, programs: Path) -> None:
     executable(programs / "uv", RECORDING.format(version="0.9.8", name="theirs"))
-    done = with_uv(checkout, programs, "pytest", "-x", "a b")
-    assert (done.returncode, done.stdout) == (0, f"theirs run --project {checkout} pytest -x a b\n")
-    assert done.stderr == ""
+    completed = with_uv(checkout, programs, "pytest", "-x", "a b")
+    assert (completed.returncode, completed.stdout) == (0, f"theirs run --project {checkout} pytest -x a b\n")
+    assert completed.stderr == ""
 
 
 def test_what_developers_need_is_left_out_of_what_users_run(checkout: Path, programs: Path) -> None:
@@ -87,16 +87,16 @@ def test_where_uv_is_missing_or_too_old_pip_fetches_one_into_the_folder(
     fetched = executable(tmp_path / "fetched", RECORDING.format(version="0.10.0", name="ours"))
     executable(programs / "python3", PIP.format(fetched=fetched))
     for _ in range(2):  # fetched once, found again
-        done = with_uv(checkout, programs, "pytest")
-        assert done.stdout == f"ours run --project {checkout} pytest\n", done.stderr
-    assert "fetching" not in done.stderr
+        completed = with_uv(checkout, programs, "pytest")
+        assert completed.stdout == f"ours run --project {checkout} pytest\n", completed.stderr
+    assert "fetching" not in completed.stderr
     assert (checkout / ".uv" / "bin" / "uv").is_file()
 
 
 def test_a_machine_with_neither_uv_nor_pip_is_told_what_to_install(checkout: Path, programs: Path) -> None:
-    done = with_uv(checkout, programs, "pytest")
-    assert done.returncode == 1
-    assert "install one of them" in done.stderr
+    completed = with_uv(checkout, programs, "pytest")
+    assert completed.returncode == 1
+    assert "install one of them" in completed.stderr
 
 
 def test_a_missing_compiler_is_named_before_anything_is_compiled(checkout: Path, programs: Path) -> None:
@@ -138,6 +138,8 @@ def test_pip_really_fetches_a_uv_that_runs(checkout: Path, programs: Path) -> No
     )
     script.write_text(plain, encoding="utf-8")
     environment = {**{k: v for k, v in os.environ.items() if k.startswith("PIP_")}, "PATH": str(programs)}
-    done = subprocess.run([script, "pytest"], env=environment, capture_output=True, encoding="utf-8", check=False)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith("uv ")
+    completed = subprocess.run(
+        [script, "pytest"], env=environment, capture_output=True, encoding="utf-8", check=False
+    )
+    assert completed.returncode == 0, completed.stderr
+    assert completed.stdout.startswith("uv ")

@@ -57,22 +57,22 @@ def _prose_of(part: str) -> Iterator[Prose]:
 
 def avoided_words(texts: Iterable[Prose]) -> list[str]:
     return [
-        f"{prose.place}: “{found[0]}” in “{sentence}”"
+        f"{prose.location}: “{match[0]}” in “{sentence}”"
         for prose in texts
         for sentence in sentences(without_code(NAMES.sub("code", prose.text)))
-        if (found := PATTERN.search(sentence))
+        if (match := PATTERN.search(sentence))
     ]
 
 
 @pytest.mark.parametrize("part", PARTS)
 def test_no_text_uses_a_word_that_the_project_avoids(part: str) -> None:
-    found = avoided_words(prose_of(part))
-    assert not found, "\n".join(found)
+    violations = avoided_words(prose_of(part))
+    assert not violations, "\n".join(violations)
 
 
 def test_pages_help_texts_and_first_lines_of_modules_have_short_sentences() -> None:
     long = [
-        f"{prose.place}: {words} words in “{sentence}”"
+        f"{prose.location}: {words} words in “{sentence}”"
         for part in PARTS
         for prose in prose_of(part)
         if prose.kind in ("summary", "help", "page")
@@ -85,10 +85,10 @@ def test_pages_help_texts_and_first_lines_of_modules_have_short_sentences() -> N
 def test_no_other_page_of_the_repository_uses_a_word_that_the_project_avoids() -> None:
     names = [*ROOT.glob("*.md"), *(page for folder in FOLDERS for page in (ROOT / folder).rglob("*.md"))]
     assert {"SECURITY.md", "CONTRIBUTING.md", "CHANGELOG.md"} <= {page.name for page in names}
-    found = avoided_words(
+    violations = avoided_words(
         prose for page in names for prose in prose_of_page(page, page.relative_to(ROOT).as_posix())
     )
-    assert not found, "\n".join(found)
+    assert not violations, "\n".join(violations)
 
 
 FOLDERS = ("benchmarks", "scripts", "tests", "probe_kit")
@@ -101,10 +101,10 @@ def test_no_comment_and_no_docstring_uses_a_word_that_the_project_avoids() -> No
         path for path in sorted(paths) if PATTERN.search(" ".join(path.read_text(encoding="utf-8").split()))
     ]
     assert suspects, "this file lists the words"
-    found = avoided_words(
+    violations = avoided_words(
         remark for path in suspects for remark in remarks_of_module(path, path.relative_to(ROOT).as_posix())
     )
-    assert not found, "\n".join(found)
+    assert not violations, "\n".join(violations)
 
 
 @pytest.mark.parametrize(

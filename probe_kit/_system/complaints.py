@@ -46,15 +46,15 @@ def _complaint(mistake: Mapping[str, Any]) -> str:
         expected = f"{message[:1].lower()}{message[1:]}"
     if isinstance(value, Mapping):  # a whole table is no help beside what is expected in its place
         return expected if mistake["type"] == "value_error" else f"is a table; {expected}"
-    return f"is {shortened(repr(value))}; {expected}"
+    return f"is {shorten_text(repr(value))}; {expected}"
 
 
-def shortened(text: str) -> str:
+def shorten_text(text: str) -> str:
     """Return a text, or the beginning of a long one."""
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1]}…"
 
 
-def joined(texts: Sequence[str]) -> str:
+def join_complaints(texts: Sequence[str]) -> str:
     """Return as one complaint what the choices of a union say about one value."""
     first, *alternatives = texts
     return " or ".join([first, *(text.partition("expected ")[2] or text for text in alternatives)])

@@ -58,31 +58,31 @@ def _last(path: str) -> str:
 
 
 _FORMULA = re.compile(r"'*(?:[\t\r\n]|\s*[=+\-@＝＋－＠])")
-"""The beginning of a cell that spreadsheets compute or cut, or of one that `escaped` made."""
+"""The beginning of a cell that spreadsheets compute or cut, or of one that `escape_formula` made."""
 
 
-def escaped(cell: Any) -> Any:
+def escape_formula(cell: Any) -> Any:
     """Return a text that a spreadsheet would compute with a `'` in front, which marks it as text.
 
-    Every other cell is returned as it is. Numbers stay numbers: only `str` is looked at. `unescaped` restores
+    Every other cell is returned as it is. Numbers stay numbers: only `str` is looked at. `unescape` restores
     every text.
     """
     return f"'{cell}" if isinstance(cell, str) and _FORMULA.match(cell) else cell
 
 
-def unescaped(cell: str) -> str:
-    """Return the text that `escaped` was given."""
+def unescape(cell: str) -> str:
+    """Return the text that `escape_formula` was given."""
     return cell[1:] if cell.startswith("'") and _FORMULA.match(cell) else cell
 
 
 def csv_of_frame(frame: "pd.DataFrame") -> str:
-    """Return a frame as comma-separated values with a header, without its index; texts are `escaped`."""
+    """Return a frame as comma-separated values with a header, without its index; see `escape_formula`."""
     import pandas as pd
 
-    safe = frame.rename(columns=escaped)
+    safe = frame.rename(columns=escape_formula)
     for position, (_, column) in enumerate(frame.items()):
         if not (pd.api.types.is_numeric_dtype(column) or pd.api.types.is_datetime64_any_dtype(column)):
-            cells = pd.Series([escaped(cell) for cell in column], index=column.index, dtype=object)
+            cells = pd.Series([escape_formula(cell) for cell in column], index=column.index, dtype=object)
             safe.isetitem(position, cells.array)  # by position: two columns may have one name
     lines = _Lines()
     safe.to_csv(lines, index=False, lineterminator=_Lines.END)
@@ -90,11 +90,11 @@ def csv_of_frame(frame: "pd.DataFrame") -> str:
 
 
 def csv_of_rows(columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:
-    """Return rows as comma-separated values with a header; texts are `escaped`."""
+    """Return rows as comma-separated values with a header; see `escape_formula`."""
     lines = _Lines()
     table = csv.DictWriter(lines, columns, lineterminator=_Lines.END)
-    table.writerow({name: escaped(name) for name in columns})
-    table.writerows({name: escaped(cell) for name, cell in row.items()} for row in rows)
+    table.writerow({name: escape_formula(name) for name in columns})
+    table.writerows({name: escape_formula(cell) for name, cell in row.items()} for row in rows)
     return lines.getvalue()
 
 
@@ -132,10 +132,10 @@ _MARKUP = re.compile(
 
 def markdown_safe(text: str) -> str:
     """Return one line of Markdown that shows `text`; line ends become spaces."""
-    return _MARKUP.sub(_escaped, re.sub(r"\s*[\r\n\u2028\u2029]+\s*", " ", text))
+    return _MARKUP.sub(_escape_text, re.sub(r"\s*[\r\n\u2028\u2029]+\s*", " ", text))
 
 
-def _escaped(match: re.Match[str]) -> str:
+def _escape_text(match: re.Match[str]) -> str:
     sign = match[0].lstrip()
     if sign[0].isdigit():
         return f"{match[0][:-1]}\\{sign[-1]}"

@@ -44,7 +44,7 @@ def while_reading(
         if is_out_of_memory(error):
             raise  # the file may be whole: the machine is too small for it
         check_no_pointers(path)
-        raise raises(f"{_located(path, names)} cannot be read: {reason_of(error)}. {advice}") from error
+        raise raises(f"{_locate(path, names)} cannot be read: {reason_of(error)}. {advice}") from error
 
 
 def check_no_pointers(folder: Path) -> None:
@@ -68,6 +68,6 @@ def _first_line(error: BaseException) -> str:
     return f"{type(error).__name__}: {first[:_LONGEST].rstrip('.')}"
 
 
-def _located(path: Path, names: tuple[str, ...]) -> str:
+def _locate(path: Path, names: tuple[str, ...]) -> str:
     files = sorted(file.name for file in path.glob("*") if file.name.startswith(names)) if names else []
     return f"{', '.join(files)} in {path}" if files else str(path)

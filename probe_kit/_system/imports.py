@@ -43,7 +43,7 @@ def lazy_names(package: str, homes: Mapping[str, str]) -> tuple[Callable[[str], 
 
 def entry_points(group: str) -> tuple[metadata.EntryPoint, ...]:
     """Return the entry points of a group, which are read again if a folder of the import path has changed."""
-    return tuple(_read(tuple((folder, _modified(folder)) for folder in sys.path)).select(group=group))
+    return tuple(_read(tuple((folder, _modification_time(folder)) for folder in sys.path)).select(group=group))
 
 
 @lru_cache(maxsize=1)
@@ -68,7 +68,7 @@ def one_scan_of_packages() -> Iterator[None]:
         metadata.packages_distributions = scan
 
 
-def _modified(folder: str) -> int:
+def _modification_time(folder: str) -> int:
     try:
         return Path(folder).stat().st_mtime_ns
     except OSError:  # the import path may name what is not there

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from probe_kit._system.counting import counted
+from probe_kit._system.counting import plural
 from probe_kit.errors import UsageError
 
 CORES = "PROBE_KIT_CORES"
@@ -89,17 +89,20 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 
 def _devices() -> list[str]:
-    return [f"cpu ({counted(cores_here(), 'core')})", *(_of_torch() if "torch" in sys.modules else _of_system())]
+    return [
+        f"cpu ({plural(cores_here(), 'core')})",
+        *(_torch_devices() if "torch" in sys.modules else _system_devices()),
+    ]
 
 
-def _of_torch() -> list[str]:
+def _torch_devices() -> list[str]:
     torch = sys.modules["torch"]
     if torch.cuda.is_available():
         return [f"cuda:{n} ({torch.cuda.get_device_name(n)})" for n in range(torch.cuda.device_count())]
     return ["mps"] if torch.backends.mps.is_available() else []
 
 
-def _of_system() -> list[str]:
+def _system_devices() -> list[str]:
     """Return the devices that the system shows without torch."""
     if sys.platform == "darwin":
         return ["mps"]
@@ -108,7 +111,7 @@ def _of_system() -> list[str]:
         for card in sorted(_NVIDIA.glob("*/information"))
         if (match := re.search(r"^Model:(.*)$", card.read_text(errors="replace", encoding="utf-8"), re.MULTILINE))
     ]
-    return [f"{counted(len(models), 'GPU')} ({', '.join(dict.fromkeys(models))})"] if models else []
+    return [f"{plural(len(models), 'GPU')} ({', '.join(dict.fromkeys(models))})"] if models else []
 
 
 def _surely_without_gpu() -> bool:

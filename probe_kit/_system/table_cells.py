@@ -138,14 +138,14 @@ def _spelling(cell: str) -> tuple[str, str]:
     """Return the part that two spellings of one value share, and the spelling: of a number its zeros in front."""
     number = number_of(cell)
     if number is None:
-        return _printed(cell), cell
+        return _print_cell(cell), cell
     digits = with_minus(cell).lstrip("+-")
     zeros = re.match(r"0+(?=[0-9])", digits)
     value = f"{number:.17g}" if isinstance(number, float) else str(number)
     return value, f"{zeros[0] if zeros else ''}{value.lstrip('-')}"
 
 
-def _printed(text: str) -> str:
+def _print_cell(text: str) -> str:
     return "".join(sign for sign in text.casefold() if category(sign) != "Cf")
 
 
@@ -154,7 +154,7 @@ def alike(name: str) -> str:
 
     A program that takes names for numbers drops zeros in front, or adds `.0`.
     """
-    text = _printed(name_of(name))
+    text = _print_cell(name_of(name))
     match = _WHOLE.fullmatch(with_minus(text))
     return f"{match[1]}{match[2]}" if match else text
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from probe_kit._system.bounded_files import open_regular
-from probe_kit._system.escaping import unescaped
+from probe_kit._system.escaping import unescape
 from probe_kit._system.table_cells import is_missing, plain_cell
 from probe_kit.errors import ProbeKitError, UsageError
 
@@ -83,7 +83,7 @@ class TextTable:
             )
         positions = {name: self.names.index(name) for name in read}
         width = len(self.names)
-        with _opened(self.path, self.encoding, self.error) as file:
+        with _open_text(self.path, self.encoding, self.error) as file:
             for line, record in _records(file, self.separator, self.path, self.error, self.most_characters):
                 if line <= self.line or not any(map(str.strip, record)):
                     continue
@@ -102,7 +102,7 @@ class TextTable:
 
 def cell_of(text: str) -> str | None:
     """Return a field as the text of its cell; None where it means "no value"."""
-    cell = plain_cell(unescaped(text))
+    cell = plain_cell(unescape(text))
     return None if is_missing(cell) else cell
 
 
@@ -127,18 +127,18 @@ def open_table(
             separators explain. Its class is `error`.
     """
     encoding = _encoding(path, error)
-    with _opened(path, encoding, error) as file:
+    with _open_text(path, encoding, error) as file:
         declared = _DECLARED.fullmatch(file.readline(64).rstrip("\r\n"))
     if declared and declared[1] not in SEPARATORS:
         raise error(f"{path}, line 1 declares the separator {declared[1]!r}; expected one of , ; and tab")
     headings: dict[str, tuple[int, tuple[str, ...]]] = {}
     for separator in SEPARATORS if declared is None else [declared[1]]:
-        with suppress(_BrokenHeadingError), _opened(path, encoding, error) as file:
+        with suppress(_BrokenHeadingError), _open_text(path, encoding, error) as file:
             records = _records(file, separator, path, _BrokenHeadingError, most_characters=_ANY_LENGTH)
             if declared:
                 next(records, None)
             line, record = next(records, (1 + bool(declared), []))
-            headings[separator] = line, tuple(plain_cell(unescaped(name)) for name in record)
+            headings[separator] = line, tuple(plain_cell(unescape(name)) for name in record)
     if not headings:
         raise error(f"{path}, line {1 + bool(declared)} is no CSV: its quotation marks do not close a cell")
     separator = _separator(headings, keys, path, error)
@@ -158,7 +158,7 @@ def read_lines(path: Path, error: type[ProbeKitError] = UsageError, most: int = 
         ProbeKitError: As `open_table` raises it for a file that is no text, and for more lines, as `error`.
     """
     lines: list[str] = []
-    with _opened(path, _encoding(path, error), error) as file:
+    with _open_text(path, _encoding(path, error), error) as file:
         while text := file.readline(MOST_CHARACTERS):
             if len(lines) == most:
                 raise error(f"{path} has more than {most:,} lines; expected a short list. Give another file")
@@ -200,7 +200,7 @@ def _encoding(path: Path, error: type[ProbeKitError]) -> str:
 
 
 @contextmanager
-def _opened(path: Path, encoding: str, error: type[ProbeKitError]) -> Iterator[TextIO]:
+def _open_text(path: Path, encoding: str, error: type[ProbeKitError]) -> Iterator[TextIO]:
     try:
         with path.open(encoding=encoding, newline="") as file:
             yield file

@@ -260,7 +260,7 @@ class Content:
         return self.only([*range(self.names), *columns]) if columns else None
 
 
-def grouped(*groups: tuple[str, Sequence[str]]) -> tuple[Heading, ...]:
+def group_headings(*groups: tuple[str, Sequence[str]]) -> tuple[Heading, ...]:
     """Return headings under names over adjoining columns."""
     return tuple(Heading(text, group=group) for group, texts in groups for text in texts)
 

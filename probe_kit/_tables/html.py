@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from probe_kit._system.escaping import without_folders
+from probe_kit._system.line_breaks import keep_numbers_whole
 from probe_kit._tables.content import Cell, Content, heat_colour
 from probe_kit._tables.numbers import NONE, is_missing
 
@@ -28,6 +29,7 @@ def environment(*folders: Path, paths: tuple[str, ...] = ()) -> "Environment":
     """Return the environment of templates in `folders`, which may import `table.html.jinja`.
 
     No text that it renders holds one of `paths` or another absolute path: pages and notebooks are sent to others.
+    No line breaks between a number and its unit.
     """
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup
@@ -35,13 +37,13 @@ def environment(*folders: Path, paths: tuple[str, ...] = ()) -> "Environment":
     def escaped(value: Any) -> Any:
         if not isinstance(value, str) or isinstance(value, Markup) or value.startswith("data:"):
             return value
-        return without_folders(value, paths)
+        return keep_numbers_whole(without_folders(value, paths))
 
     templates = Environment(
         loader=FileSystemLoader([*folders, _FOLDER]), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
         lstrip_blocks=True, finalize=escaped,
     )  # fmt: skip
-    templates.filters |= {"heat": heat_colour, "sort_key": sort_key, "unbroken": unbroken}
+    templates.filters |= {"heat": heat_colour, "sort_key": sort_key}
     return templates
 
 
@@ -63,8 +65,3 @@ def sort_key(cell: Cell, is_numeric: bool) -> float | str | None:
     if is_numeric and not isinstance(cell.value, str):
         return None if is_missing(cell.value) else cell.value
     return cell.text if cell.text not in ("", NONE) else None
-
-
-def unbroken(heading: str) -> str:
-    """Return a heading that does not break before a unit."""
-    return heading.replace(" %", "\u00a0%").replace("± ", "±\u00a0")

@@ -31,14 +31,14 @@ def number(value: float | None, digits: int = 2) -> str:
     return NONE if value is None or is_missing(value) else f"{value:z.{digits}f}"
 
 
-def signed(value: float | None, digits: int = 2) -> str:
+def with_sign(value: float | None, digits: int = 2) -> str:
     """Return a number with its sign, by default with two decimals; a dash for None and NaN."""
     return NONE if value is None or is_missing(value) else f"{value:+z.{digits}f}"
 
 
 def points(value: float | None) -> str:
     """Return a difference of shares in percentage points, with its sign and one decimal."""
-    return signed(None if value is None else 100 * value, 1)
+    return with_sign(None if value is None else 100 * value, 1)
 
 
 def p_text(value: float | None) -> str:

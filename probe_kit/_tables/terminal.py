@@ -31,7 +31,9 @@ def lines(table: Content, width: int) -> "Iterator[RenderableType]":
         folded = (replace(row, cells=tuple(map(_two_lines, row.cells))) for row in table.rows)
         table = replace(table, rows=tuple(folded))
     yield Text(table.title, style="italic")
-    yield from [_wrapped(table)] if table.overflow == "wrap" and _can_wrap(table, width) else _tables(table, width)
+    yield from (
+        [_wrap_table(table)] if table.overflow == "wrap" and _can_wrap(table, width) else _tables(table, width)
+    )
     notes = list(table.sentences)
     if left_out:
         notes.append(f"With --details or more room: {', '.join(left_out)}.")
@@ -54,7 +56,7 @@ def _can_wrap(table: Content, width: int) -> bool:
     return sum(least) - GAP <= width
 
 
-def _wrapped(table: Content) -> "RichTable":
+def _wrap_table(table: Content) -> "RichTable":
     """Return one table whose texts are broken where they do not fit; names and numbers are not."""
     from rich.text import Text
 

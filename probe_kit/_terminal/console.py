@@ -31,6 +31,7 @@ from rich.text import Text
 
 from probe_kit._system.escaping import UNSAFE, terminal_safe
 from probe_kit._system.json_text import json_text
+from probe_kit._system.line_breaks import keep_numbers_whole
 
 for _stream in ("stdout", "stderr"):
     if getattr(sys, _stream) is None:  # closed by the caller (`>&-`): its number must not go to the next file
@@ -40,7 +41,27 @@ PAGE = 120
 """The columns of a table that is written to a file or a pipe, where no terminal says how many there are."""
 
 
-class SafeConsole(Console):
+_HELD = "\ufdd0"
+"""A blank at which no line is broken, while rich wraps; Unicode has no character of this number."""
+
+
+class WholeNumbersConsole(Console):
+    """A console that breaks no line between a number and its unit. What it writes has plain blanks there."""
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
+        """Draw; texts are wrapped where `keep_numbers_whole` leaves blanks."""
+        if isinstance(renderable, str):
+            renderable = self.render_str(renderable)
+        if isinstance(renderable, Text):
+            held = keep_numbers_whole(renderable.plain, _HELD)
+            if held != renderable.plain:
+                renderable = renderable.copy()
+                renderable.plain = held
+        for segment in super().render(renderable, options):
+            yield segment._replace(text=segment.text.replace(_HELD, " ")) if _HELD in segment.text else segment
+
+
+class SafeConsole(WholeNumbersConsole):
     """A console on which text is text: it reads no markup, and writes no escape sequence but its own."""
 
     def __init__(self, **options: Any) -> None:
@@ -56,7 +77,7 @@ class SafeConsole(Console):
             yield segment if segment.control else segment._replace(text=terminal_safe(segment.text))
 
 
-def marked(template: str, *values: object) -> Text:
+def markup(template: str, *values: object) -> Text:
     """Fill a template of rich's markup, which has a `{}` for each value; a value is shown as text only."""
     text = Text.from_markup(template, emoji=False)
     parts = text.split("{}", allow_blank=True, include_separator=True)
@@ -84,6 +105,19 @@ err = SafeConsole(stderr=True)
 """The console of progress, plans and notes."""
 
 
+@contextmanager
+def whole_numbers_in_help() -> Iterator[None]:
+    """Wrap help that typer prints in the body as all other text; typer takes its console from no caller."""
+    from typer import rich_utils
+
+    names = vars(rich_utils)
+    former, names["Console"] = names["Console"], WholeNumbersConsole
+    try:
+        yield
+    finally:
+        names["Console"] = former
+
+
 def split(text: str | None) -> tuple[str, ...] | None:
     """Return the parts of a comma-separated option, each once; None stays None."""
     return None if text is None else tuple(dict.fromkeys(filter(None, map(str.strip, text.split(",")))))
@@ -105,15 +139,15 @@ def print_json_text(text: str) -> None:
     Characters that a terminal would obey, or that stdout's encoding lacks, are written as JSON's own escapes, so
     nothing is lost.
     """
-    safe = UNSAFE.sub(_escaped, text)
+    safe = UNSAFE.sub(_json_escape, text)
     try:
         safe.encode(sys.stdout.encoding or "utf-8")
     except UnicodeEncodeError:
-        safe = _NOT_ASCII.sub(_escaped, safe)
+        safe = _NOT_ASCII.sub(_json_escape, safe)
     typer.echo(safe)
 
 
-def _escaped(match: re.Match[str]) -> str:
+def _json_escape(match: re.Match[str]) -> str:
     """Return a sign as JSON writes it in ASCII: one escape, or the two of a surrogate pair."""
     return json.dumps(match[0])[1:-1] if ord(match[0]) != 0x7F else "\\u007f"
 
@@ -130,12 +164,12 @@ def say(renderable: RenderableType) -> None:
 
 def say_note(text: str) -> None:
     """Print on stderr a note that a reader of a result has to know."""
-    say(marked("[yellow]note:[/] {}", text))
+    say(markup("[yellow]note:[/] {}", text))
 
 
 def complain(kind: str, message: str, notes: Iterable[str] = ()) -> None:
     """Print an error on stderr: its name, its message, and the notes that belong to it."""
-    say(marked("[bold red]{}[/]: {}", kind, message))
+    say(markup("[bold red]{}[/]: {}", kind, message))
     for note in notes:
         say(f"  {note}")
 
@@ -210,11 +244,11 @@ class Heartbeat:
         before, since = self._first
         rate = (finished - before) / (now - since) if now > since else 0.0
         pace = f", {_per_time(rate)}" if rate > 0 else ""
-        remaining = f", about {spoken((total - finished) / rate)} left" if rate > 0 and finished < total else ""
-        self._say(f"{self._what}: {finished}/{total} after {spoken(now - self._started)}{pace}{remaining}")
+        remaining = f", about {duration((total - finished) / rate)} left" if rate > 0 and finished < total else ""
+        self._say(f"{self._what}: {finished}/{total} after {duration(now - self._started)}{pace}{remaining}")
 
 
-def spoken(seconds: float) -> str:
+def duration(seconds: float) -> str:
     """Return a duration in its two largest units: `3 h 12 min`, `4 min 05 s`, `12 s`."""
     minutes, seconds_left = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)

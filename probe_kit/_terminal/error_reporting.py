@@ -8,7 +8,7 @@ import traceback
 from pathlib import Path
 
 from probe_kit._system.machine import is_out_of_memory
-from probe_kit._terminal.console import complain, marked, say
+from probe_kit._terminal.console import complain, markup, say
 from probe_kit._terminal.interruption import INTERRUPTED
 from probe_kit.errors import FULL_DISK, DiskSpaceError, PolicyFailedError, ProbeKitError, UsageError
 
@@ -32,7 +32,7 @@ def report_error(error: BaseException) -> int:
     used. It is 3 if the command refused, or if the disk is full or read-only.
     """
     if isinstance(error, KeyboardInterrupt):
-        say(marked("[yellow]interrupted[/]. Completed work is saved; run the same command to resume."))
+        say(markup("[yellow]interrupted[/]. Completed work is saved; run the same command to resume."))
         return INTERRUPTED
     if isinstance(error, ProbeKitError):
         return _complain(error)
@@ -93,12 +93,12 @@ def report_unexpected(error: BaseException) -> int:
     complain(
         "InternalError",
         f"{type(error).__name__}: {first}. This is a bug in probe_kit or in a library it calls. "
-        f"Completed work is saved. The traceback is in {_written(error)}; please report it",
+        f"Completed work is saved. The traceback is in {_write_report(error)}; please report it",
     )
     return UNFORESEEN
 
 
-def _written(error: BaseException) -> str:
+def _write_report(error: BaseException) -> str:
     text = "".join(traceback.format_exception(error))
     try:
         handle, name = tempfile.mkstemp(prefix="probe-kit-", suffix="-traceback.txt")

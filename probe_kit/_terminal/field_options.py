@@ -19,6 +19,7 @@ from pydantic.fields import FieldInfo
 from typer.models import OptionInfo
 
 from probe_kit._system.complaints import UNKNOWN, complaints_of, in_words
+from probe_kit._terminal.console import whole_numbers_in_help
 from probe_kit.errors import UsageError
 
 
@@ -39,14 +40,14 @@ class Part(BaseModel):
         try:
             super().__init__(**dict(zip(names, first, strict=False)), **values)
         except ValidationError as error:
-            raise UsageError(_unknown(type(self).__name__, error) or in_words(error)) from None
+            raise UsageError(_complaint_of_unknown(type(self).__name__, error) or in_words(error)) from None
 
     def changed(self, **values: Any) -> Self:
         """Return the group with other values, which are checked."""
         return type(self)(**(dict(self) | values))
 
 
-def _unknown(subject: str, error: ValidationError) -> str:
+def _complaint_of_unknown(subject: str, error: ValidationError) -> str:
     """Return a sentence on a field that the model `subject` lacks; empty if that is not the first mistake."""
     path, text = next(complaints_of(error))
     return f"{subject} has no setting {'.'.join(map(str, path))}; leave it out" if text == UNKNOWN else ""
@@ -114,7 +115,7 @@ def command_with(
             }
             command(typed, **{parameter.name: values[parameter.name] for parameter in parameters})
 
-        required_names = _required(models)
+        required_names = _required_parameters(models)
         required = [parameter for parameter in added.values() if parameter.name in required_names]
         optional = [parameter for parameter in (*parameters, *added.values()) if parameter not in required]
         ordered = [*required, *sorted(optional, key=lambda parameter: _panel(parameter) is not None)]
@@ -130,7 +131,7 @@ def command_with(
     return decorate
 
 
-def _required(models: Iterable[type[BaseModel]]) -> set[str]:
+def _required_parameters(models: Iterable[type[BaseModel]]) -> set[str]:
     """Return the parameters that every command line has: those of required fields of the first model."""
     first = next(iter(models), None)
     return (
@@ -208,7 +209,8 @@ class PanelledHelp(typer.core.TyperCommand):
         panels = self._further_panels()
         ctx.meta[_MAIN_ONLY] = bool(panels)
         try:
-            super().format_help(ctx, formatter)
+            with whole_numbers_in_help():
+                super().format_help(ctx, formatter)
         finally:
             ctx.meta[_MAIN_ONLY] = False
         if panels:
@@ -216,7 +218,8 @@ class PanelledHelp(typer.core.TyperCommand):
 
     def format_whole_help(self, ctx: Any, formatter: Any) -> None:
         """Print all panels."""
-        super().format_help(ctx, formatter)
+        with whole_numbers_in_help():
+            super().format_help(ctx, formatter)
 
     def _further_panels(self) -> list[str]:
         panels = [panel for parameter in self.params if (panel := _panel_of(parameter))]

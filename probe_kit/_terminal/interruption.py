@@ -9,13 +9,13 @@ _ENDING = (signal.SIGINT, signal.SIGTERM)
 
 
 def leave_at_once() -> None:
-    """Make Ctrl-C and SIGTERM end the process in one line until `begun`: there is no work yet to save."""
+    """Make Ctrl-C and SIGTERM end the process in one line until `heed_signals`: there is no work yet to save."""
     for number in _ENDING:
         if signal.getsignal(number) is not signal.SIG_IGN:  # as a shell sets it in the background
             signal.signal(number, _leave)
 
 
-def begun() -> None:
+def heed_signals() -> None:
     """Make both signals a KeyboardInterrupt from here on, because work could be under way that is to be saved."""
     for number in _ENDING:
         if signal.getsignal(number) is _leave:

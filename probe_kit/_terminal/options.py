@@ -65,7 +65,7 @@ def one_of(names: Collection[str]) -> Callable[[str], str]:
     """Return a parser for the names of a registry; others end the command with exit code 2 and the list."""
 
     def parse(text: str) -> str:
-        return _checked(text, names)
+        return _check_choice(text, names)
 
     return parse
 
@@ -84,12 +84,12 @@ def some_of(names: Collection[str], none: str | None = None) -> Callable[[str | 
         parts = Names.parse(text)
         if not parts:
             raise typer.BadParameter(f"it is empty; expected some of {', '.join(names)}")
-        return Names(_checked(part, names) for part in parts)
+        return Names(_check_choice(part, names) for part in parts)
 
     return parse
 
 
-def _checked(name: str, choices: Collection[str]) -> str:
+def _check_choice(name: str, choices: Collection[str]) -> str:
     if name not in choices:
         raise typer.BadParameter(f"{name!r} is not one of {', '.join(map(repr, choices))}.")
     return name

@@ -7,7 +7,7 @@ import typer
 
 from probe_kit._system.escaping import as_argument
 from probe_kit._terminal import options as common
-from probe_kit._terminal.console import err, marked, out, print_json, say
+from probe_kit._terminal.console import err, markup, out, print_json, say
 from probe_kit.errors import UsageError
 from probe_kit.extract.parts import WeightsDtype
 
@@ -72,10 +72,10 @@ def _print_outcome(outcome: "Outcome") -> None:
     """Print one line; below a failed one the value seen, the value expected and the change to make."""
     colours = {"passed": "green", "failed": "bold red", "skipped": "yellow"}
     line = f"{outcome.sentence} ({outcome.reason})" if outcome.reason else outcome.sentence
-    out.print(marked(f"[{colours[outcome.state]}]{{}}[/] {{}}", f"{outcome.state:8}", line), soft_wrap=True)
+    out.print(markup(f"[{colours[outcome.state]}]{{}}[/] {{}}", f"{outcome.state:8}", line), soft_wrap=True)
     if outcome.state == "failed":
         for label, name in (("seen", "actual"), ("expected", "expected"), ("change", "change")):
-            out.print(marked("         [dim]{}[/] {}", f"{label:9}", getattr(outcome, name)), soft_wrap=True)
+            out.print(markup("         [dim]{}[/] {}", f"{label:9}", getattr(outcome, name)), soft_wrap=True)
 
 
 def _print_end(model: str, checkpoint: str | None, outcomes: "list[Outcome]") -> None:
@@ -86,10 +86,10 @@ def _print_end(model: str, checkpoint: str | None, outcomes: "list[Outcome]") ->
     out.print(", ".join(f"{count} {state}" for state, count in counts.items()))
     if counts["failed"]:
         first = next(outcome for outcome in outcomes if outcome.state == "failed")
-        say(marked("next: {}. Then run the same command again.", first.change.rstrip(".")))
+        say(markup("next: {}. Then run the same command again.", first.change.rstrip(".")))
     else:
         play = "extract" if any(outcome.name == "two_episodes_are_extracted" for outcome in outcomes) else "ask"
         subject = f"--model {as_argument(model)}"
         if checkpoint:
             subject += f" --checkpoint {as_argument(checkpoint)}"
-        say(marked("next: [bold]probe-kit {} {}[/] --items 24", play, subject))
+        say(markup("next: [bold]probe-kit {} {}[/] --items 24", play, subject))

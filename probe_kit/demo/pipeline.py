@@ -19,8 +19,8 @@ from rich.text import Text
 
 from probe_kit._system.drafts import write_whole
 from probe_kit._tables.numbers import number, percent
-from probe_kit._tables.table import Cell, Table, grouped
-from probe_kit._terminal.console import marked
+from probe_kit._tables.table import Cell, Table, group_headings
+from probe_kit._terminal.console import markup
 from probe_kit.extract import AskSettings, ExtractSettings, ask_run, extract_run
 from probe_kit.extract.prompts import TEMPLATES
 from probe_kit.intervene import ImageSwap, ReplaySource, run_intervention
@@ -156,7 +156,7 @@ def source_of(organism: Organism, suite: Suite) -> ReplaySource:
     return ReplaySource(suite.folder, weights_seed=organism.weights_seed)
 
 
-def probed(
+def probe_organism(
     organism: Organism,
     suite: Suite,
     folder: Path,
@@ -194,7 +194,7 @@ def probed(
     return run, results
 
 
-def answered(organism: Organism, suite: Suite, folder: Path, stage: NamedProgress) -> Run:
+def ask_vlm(organism: Organism, suite: Suite, folder: Path, stage: NamedProgress) -> Run:
     """Return the run of a VLM on `suite`, in the prompt nearest to an instruction; finished work is reused."""
     settings = AskSettings(organism.model, suite=suite.folder, prompt=TEMPLATES["p2"])
     return ask_run(settings, folder / organism.folder, progress=stage(f"questions, {organism.name}"))
@@ -205,12 +205,14 @@ def findings(runs: Sequence[tuple[Organism, Run]]) -> list[Finding]:
     rows = [(organism, row) for organism, run in runs for row in retention_table([run]).rows]
     trained_acts = any(verdict(row) == "used" for organism, row in rows if organism == TRAINED)
     return [
-        Finding(organism.name, row.category, organism.expected(row.category), measured(row, trained_acts), row)
+        Finding(
+            organism.name, row.category, organism.expected(row.category), measure_truth(row, trained_acts), row
+        )
         for organism, row in rows
     ]
 
 
-def measured(row: RetentionRow, another_acts: bool) -> Truth:
+def measure_truth(row: RetentionRow, another_acts: bool) -> Truth:
     """Return the row's verdict; where only a category that follows is lacking, another organism's counts as one.
 
     Args:
@@ -235,7 +237,7 @@ def organism_table(findings: Sequence[Finding]) -> Table:
         either = " and ".join(f"*{verdict}*" for verdict in COMPATIBLE[DOES_NOT_DECIDE][:2])
         notes.append(f"*{DOES_NOT_DECIDE}*: the action expert was not trained; {either} are both true of it")
     numbers = ("SR %", "± Δ", "follow / reversal %", "backbone", "p", "exceeds", "action", "retention [95 %]")
-    headings = grouped(
+    headings = group_headings(
         ("", ("policy",)),
         ("Verdicts", ("category", "expected", "measured", "agreement")),
         ("What they rest on", numbers),
@@ -307,24 +309,24 @@ class Demo:
     def next_steps(self) -> Text:
         """Return lines that name the files to look at and the commands to try."""
         lines: list[str | Text] = [
-            marked("[bold]Look at[/] {}  everything on one page, in a browser", self.folder / "report.html"),
+            markup("[bold]Look at[/] {}  everything on one page, in a browser", self.folder / "report.html"),
             f"        {self.folder / 'layer_curves.png'}  where the answer can be read, layer by layer",
             f"        {self.folder / 'episode.gif'}  what one episode looks like",
             f"        {self.folder / 'table.md'}  every table",
             f"        {self.run.path}  the run: open_run({str(self.run.path)!r}), plain zarr.open or xarray",
-            marked("[bold]Try[/]     probe-kit suite show            the questions"),
+            markup("[bold]Try[/]     probe-kit suite show            the questions"),
             "        probe-kit extract --model expert --items 4    a policy that knows the answers",
             "        probe-kit models                the models that can be probed",
         ]
         if self.run.random_weights:
             random = "The policy has random weights:"
-            lines.insert(0, marked("[bold yellow]{}[/] expect SR near 0 and no signal.", random))
+            lines.insert(0, markup("[bold yellow]{}[/] expect SR near 0 and no signal.", random))
         return Text("\n").join(line if isinstance(line, Text) else Text(line) for line in lines)
 
     def viewer(self) -> Text:
         """Return one line: the command that shows both runs episode by episode."""
         runs = (shlex.quote(str(run.path)) for run in (self.run, self.vlm_run))
-        return marked("[bold]Open[/]    probe-kit view {} {}", *runs)
+        return markup("[bold]Open[/]    probe-kit view {} {}", *runs)
 
 
 def compare_organisms(folder: Path, stage: NamedProgress) -> list[Finding]:
@@ -336,12 +338,12 @@ def compare_organisms(folder: Path, stage: NamedProgress) -> list[Finding]:
     """
     suite = _questions(folder, FULL, stage)
     # The first untrained network is a control of all others.
-    control, _ = probed(UNTRAINED_NETWORK, suite, folder, FULL.permutations, stage)
-    runs = [(VLM, answered(VLM, suite, folder, stage))]
+    control, _ = probe_organism(UNTRAINED_NETWORK, suite, folder, FULL.permutations, stage)
+    runs = [(VLM, ask_vlm(VLM, suite, folder, stage))]
     for organism in ORGANISMS:
         run = control
         if organism != UNTRAINED_NETWORK:
-            run, _ = probed(organism, suite, folder, FULL.permutations, stage, control)
+            run, _ = probe_organism(organism, suite, folder, FULL.permutations, stage, control)
         runs.append((organism, run))
     return findings(runs)
 
@@ -359,8 +361,8 @@ def run_demo(folder: Path, stage: NamedProgress, size: Size = QUICK) -> Demo:
         size: Items and permutations; by default about 2 minutes of work.
     """
     suite = _questions(folder, size, stage)
-    vlm_run = answered(VLM, suite, folder, stage)
-    run, results = probed(TRAINED, suite, folder, size.permutations, stage)
+    vlm_run = ask_vlm(VLM, suite, folder, stage)
+    run, results = probe_organism(TRAINED, suite, folder, size.permutations, stage)
     table = retention_table([vlm_run, run])
     layer_curve(results).savefig(folder / "layer_curves.png")
     write_whole(folder / "table.md", table.to_markdown())

@@ -12,7 +12,7 @@ from rich.text import Text
 from probe_kit._system.machine import AUTO
 from probe_kit._tables.printing import Format, print_table
 from probe_kit._terminal import options as common
-from probe_kit._terminal.console import counter, err, marked, print_json, progress, say, say_note, spoken
+from probe_kit._terminal.console import counter, duration, err, markup, print_json, progress, say, say_note
 from probe_kit._terminal.field_options import command_with
 from probe_kit._terminal.options import further_option
 from probe_kit.diagnose.results import FRAMES, check_names, diagnosis_table
@@ -166,7 +166,7 @@ def diagnose(
 
         write_page(diagnosis, html)
         say(f"page: {html}")
-    say(marked("run: [bold]{}[/]", run.location))
+    say(markup("run: [bold]{}[/]", run.location))
     raise typer.Exit(diagnosis.exit_code(require or ()))
 
 
@@ -413,7 +413,7 @@ def _captured(extraction: "Extraction", location: "Location", most: int) -> "Run
     # The first one warms the network up; what was captured before took no time now, and workers load meanwhile.
     if len(ended) > FEWEST_PACED and extraction.controller is not None:
         seconds = most * (ended[-1] - ended[0]) / (len(ended) - 1)
-        say(f"about {spoken(seconds)} for at most {most:,} inferences, at the pace of the captured frames")
+        say(f"about {duration(seconds)} for at most {most:,} inferences, at the pace of the captured frames")
     return run
 
 

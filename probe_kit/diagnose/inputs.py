@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from probe_kit._system.counting import counted
+from probe_kit._system.counting import plural
 from probe_kit._system.text_tables import open_table
 from probe_kit.diagnose.results import LEAST_GROUPS, count_groups
 from probe_kit.errors import UsageError
@@ -205,7 +205,7 @@ def check_groups(
 
 def _check_number(groups: int, subject: Callable[[], str], remedy: str) -> None:
     if groups < LEAST_GROUPS:
-        has = f"{subject()} frames of {counted(groups, 'group')}"
+        has = f"{subject()} frames of {plural(groups, 'group')}"
         raise UsageError(f"{has}; a diagnosis needs at least {LEAST_GROUPS}. {remedy}")
 
 

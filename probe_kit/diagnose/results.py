@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BeforeValidator, PlainSerializer
 
-from probe_kit._system.counting import counted
+from probe_kit._system.counting import plural
 from probe_kit._tables.numbers import p_text, whole_percent
 from probe_kit._tables.table import Cell, Heading, Table
 from probe_kit.errors import UsageError
@@ -411,7 +411,7 @@ def describe_origin(diagnosis: "Diagnosis") -> list[str]:
 
 
 def _words_of(instructions: Sequence[str]) -> list[str]:
-    return [f"{counted(len(instructions), 'further instruction')} (sha256 {hash_of_instructions(instructions)})"]
+    return [f"{plural(len(instructions), 'further instruction')} (sha256 {hash_of_instructions(instructions)})"]
 
 
 def _row(diagnosed: "InputDiagnosis", headings: Sequence[Heading]) -> Sequence[Cell]:

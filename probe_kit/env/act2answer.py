@@ -10,7 +10,7 @@ from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
-from probe_kit._system.counting import counted
+from probe_kit._system.counting import plural
 from probe_kit.env.arm import DeltaController, check_action
 from probe_kit.env.rotations import Array
 from probe_kit.env.scene import SIDES, Scene
@@ -46,7 +46,7 @@ class Question:
         """
         from probe_kit.suite.pictures import load_picture
 
-        episode = Episode(item, _checked(layout))
+        episode = Episode(item, _check_layout(layout))
         left, right = (load_picture(episode.picture(side), episode.pixels_sha256(side) or None) for side in SIDES)
         return cls(
             episode.episode_id, item.instruction, {"left": left, "right": right}, episode.side_correct, layout
@@ -55,13 +55,13 @@ class Question:
     @classmethod
     def built_in(cls, layout: Layout = "original") -> Self:
         """Return a question with two plain pictures, without a suite: blue is correct, orange is wrong."""
-        side: Side = "left" if _checked(layout) == "original" else "right"
+        side: Side = "left" if _check_layout(layout) == "original" else "right"
         blue, orange = (Image.new("RGB", (64, 64), color) for color in ("royalblue", "darkorange"))
         pictures = {side: blue, other_side(side): orange}
         return cls(f"built-in:{layout[0]}", "Put the cube on the blue picture", pictures, side, layout)
 
 
-def _checked(layout: Layout) -> Layout:
+def _check_layout(layout: Layout) -> Layout:
     if layout not in LAYOUTS:
         raise SceneError(f"layout {layout!r} does not exist; expected one of {', '.join(LAYOUTS)}.")
     return layout
@@ -278,7 +278,7 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
         trial = self.trial
         if trial.over:
             raise EpisodeOverError(
-                f"the episode ended after {counted(trial.steps, 'step')}; call `reset` to start another."
+                f"the episode ended after {plural(trial.steps, 'step')}; call `reset` to start another."
             )
         trial.advance(check_action(action))
         self._frame = None

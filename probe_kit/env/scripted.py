@@ -198,13 +198,13 @@ def to_openpi(observation: Mapping[str, Any], prompt: str, size: int = 224) -> d
         size: Side of the square picture in pixels.
     """
     return {
-        "observation/image": _padded(Image.fromarray(observation["pixels"]["image"]), size),
+        "observation/image": _pad(Image.fromarray(observation["pixels"]["image"]), size),
         "observation/state": np.asarray(observation["agent_pos"], np.float32),
         "prompt": prompt,
     }
 
 
-def _padded(image: Image.Image, size: int) -> Any:
+def _pad(image: Image.Image, size: int) -> Any:
     scale = size / max(image.size)
     small = image.resize((round(image.width * scale), round(image.height * scale)), Image.Resampling.BILINEAR)
     square = Image.new("RGB", (size, size))

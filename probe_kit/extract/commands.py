@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from probe_kit._system.counting import counted
+from probe_kit._system.counting import plural
 from probe_kit._system.escaping import as_argument, terminal_safe
 from probe_kit._terminal import options as common
-from probe_kit._terminal.console import counter, err, marked, out, print_json, progress, say
+from probe_kit._terminal.console import counter, err, markup, out, print_json, progress, say
 from probe_kit._terminal.field_options import command_with
 from probe_kit._terminal.options import Names, read_size
 from probe_kit.errors import DiskSpaceError, UsageError
@@ -188,7 +188,7 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
     table.add_column(overflow="fold")  # a path that is cut off is no path
     for name, value in rows.items():
         if value:
-            table.add_row(marked("[dim]{}[/]", name), value)
+            table.add_row(markup("[dim]{}[/]", name), value)
     err.print(table)
     for note in extraction.source.content_notes():
         err.print(content_warning(note))
@@ -196,7 +196,7 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
 
 def content_warning(note: str) -> "Text":
     """Return a sentence about an input without content as a line of a terminal."""
-    return marked("[yellow]without content:[/] {}; scores of its probes are no evidence", note)
+    return markup("[yellow]without content:[/] {}; scores of its probes are no evidence", note)
 
 
 def _weights(extraction: "Extraction") -> str:
@@ -249,7 +249,7 @@ def print_sufficiency(extraction: "Extraction") -> None:
         if groups < GROUPS_FOR_PROBES:
             more = source.smaller_groups(plan.episodes) if len(plan.episodes) >= GROUPS_FOR_PROBES else ""
             few = f"{groups} {source.groups}; probes need {GROUPS_FOR_PROBES} or more" + f". {more}" * bool(more)
-            say(marked("[yellow]{}[/]", few))
+            say(markup("[yellow]{}[/]", few))
         return
     scored = not extraction.identity().get("capture_only")
     table = Table(show_header=False, title=f"enough for ({Smallest.of(suite).words})", box=None)
@@ -257,7 +257,7 @@ def print_sufficiency(extraction: "Extraction") -> None:
     table.add_column(overflow="fold")
     for sufficiency in sufficiencies(suite, scored, bool(plan.streams)):
         table.add_row(
-            sufficiency.name, marked("[yellow]{}[/]" if sufficiency.enough is False else "{}", sufficiency.words)
+            sufficiency.name, markup("[yellow]{}[/]" if sufficiency.enough is False else "{}", sufficiency.words)
         )
     err.print(table)
 
@@ -295,7 +295,7 @@ def print_input_notes(run: "Run") -> None:
         say(content_warning(note))
     for note in input_notes(run.certificate):
         say(
-            marked(
+            markup(
                 "[yellow]{}; [bold]probe-kit diagnose {}[/] says where it is lost[/]",
                 note,
                 as_argument(run.location),
@@ -309,11 +309,11 @@ def _print_outcomes(run: "Run") -> None:
     counts = run.episodes["outcome"].value_counts()
     text = ", ".join(f"{name} {count}" for name, count in counts.items())
     text = "captured without acting" if run.capture_only else text
-    say(f"{counted(len(run.episodes), 'episode')}: {text}")
+    say(f"{plural(len(run.episodes), 'episode')}: {text}")
     if (success := EnvironmentSuccess.of(run.episodes)) is not None:
-        say(marked("[yellow]{}[/]" if success.stopped else "{}", success.sentence))
+        say(markup("[yellow]{}[/]" if success.stopped else "{}", success.sentence))
     print_input_notes(run)
-    say(marked("next: [bold]{}[/]", _next_command(run)))
+    say(markup("next: [bold]{}[/]", _next_command(run)))
     out.print(str(run.location), soft_wrap=True)
 
 
@@ -387,7 +387,7 @@ def _print_answers(runs: "Sequence[Run]") -> None:
         out.print(str(run.location), soft_wrap=True)
     if SIDE not in runs[0].episodes:
         step = "targets {}" if runs[0].streams else "labels {}"
-        say(marked(f"next: [bold]probe-kit {step}[/]", as_argument(runs[0].location)))
+        say(markup(f"next: [bold]probe-kit {step}[/]", as_argument(runs[0].location)))
         return
     locations = " ".join(as_argument(run.location) for run in runs)
-    say(marked("next: [bold]probe-kit retention {}[/]  add policy runs of the suite", locations))
+    say(markup("next: [bold]probe-kit retention {}[/]  add policy runs of the suite", locations))

@@ -66,11 +66,11 @@ def read_config(
             gone.
     """
     if path.is_dir() or path.name == RUN_FILE:
-        return _of_run(path if path.is_dir() else path.parent, typed, asks)
+        return _run_settings(path if path.is_dir() else path.parent, typed, asks)
     return read_json_object(path, UsageError, "Write one with `probe-kit extract … --print-config`")
 
 
-def _of_run(folder: Path, typed: Mapping[str, Any], asks: bool) -> Mapping[str, Any]:
+def _run_settings(folder: Path, typed: Mapping[str, Any], asks: bool) -> Mapping[str, Any]:
     """Return the settings of a run, with its checkpoint and its files where the run had them."""
     from probe_kit.runs.run import open_run
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from probe_kit._execution.executor import GivenUp, Pool, TaskQueue, work_off
 from probe_kit._execution.process_pool import ProcessPool, share_of_machine
 from probe_kit._execution.ray_pool import RayPool
-from probe_kit._system.counting import counted
+from probe_kit._system.counting import plural
 from probe_kit._system.imports import install_command
 from probe_kit._terminal.notebook import notebook_progress
 from probe_kit.errors import DiskSpaceError, EpisodesFailedError, MissingExtraError, UsageError
@@ -142,7 +142,7 @@ class Extraction:
             if not force and addition.episodes:
                 check_if_full(space_needed(addition, self.settings), location)
             writer = self.writer(location)
-            with writer.owned():
+            with writer.claim():
                 check_exclusive(location, GROUP_FILE, writer.root.stored_metadata[GROUP_FILE])
                 if self.settings.label is not None:
                     label_run(location, run_label(self.settings))
@@ -503,7 +503,7 @@ def _gpus(settings: Settings, resources: Mapping[str, Any]) -> list[int]:
 
 def _failure(writer: RunWriter, given_up: list[Failed], committed: int) -> EpisodesFailedError:
     error = EpisodesFailedError(
-        f"{counted(len(given_up), 'episode')} failed twice and were given up; {committed} others were finished "
+        f"{plural(len(given_up), 'episode')} failed twice and were given up; {committed} others were finished "
         "and are kept. The same command tries them again; --partial reads the run without them"
     )
     for failed in given_up:

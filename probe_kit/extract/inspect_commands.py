@@ -11,7 +11,7 @@ from rich.text import Text
 
 from probe_kit._system.escaping import terminal_safe
 from probe_kit._terminal import options as common
-from probe_kit._terminal.console import err, marked, out, print_json, print_text, say
+from probe_kit._terminal.console import err, markup, out, print_json, print_text, say
 from probe_kit._terminal.field_options import command_with
 from probe_kit._terminal.options import LISTED, AsJson, Names, Partial, RunFolder, check_no_others
 from probe_kit.errors import UsageError
@@ -55,16 +55,16 @@ def models(
         print_json([_row_json(row) for row in rows])
         return
     if name is None:
-        out.print(_listed(rows))
+        out.print(_list_models(rows))
         return
     for row in rows:
-        out.print(marked("[bold]{}[/]  {}", row["model"], row["description"]))
+        out.print(markup("[bold]{}[/]  {}", row["model"], row["description"]))
         for key in ("checkpoint", "streams", "embodiment", "scene", "does", "ready", "weights", "notes"):
             if row[key]:
-                out.print(marked("  [dim]{}[/] {}", f"{key:10}", row[key]), soft_wrap=True)
+                out.print(markup("  [dim]{}[/] {}", f"{key:10}", row[key]), soft_wrap=True)
         for protocol, settings in row["protocols"].items():
             line = ", ".join(f"{name} {value}" for name, value in settings.items())
-            out.print(marked("  [dim]protocol  [/] {}: {}", protocol, line), soft_wrap=True)
+            out.print(markup("  [dim]protocol  [/] {}: {}", protocol, line), soft_wrap=True)
         if (supported := row["interventions"]) is not None:
             readout = (
                 ""
@@ -74,11 +74,11 @@ def models(
             supported_options = "; ".join(
                 f"{option} {', '.join(values)}" for option, values in supported["asked_as"].items()
             )
-            out.print(marked("  [dim]intervene [/] {}", f"{supported_options}{readout}"), soft_wrap=True)
+            out.print(markup("  [dim]intervene [/] {}", f"{supported_options}{readout}"), soft_wrap=True)
         for option in row["options"]:
             default = f" Default {option['default']}." if option["default"] else ""
             line = f"-M {option['name']}={option['kind'].upper()}  {option['help']}{default}"
-            out.print(marked("  [dim]option    [/] {}", line), soft_wrap=True)
+            out.print(markup("  [dim]option    [/] {}", line), soft_wrap=True)
 
 
 def _print_words(name: str | None, run: str | None, as_json: bool) -> None:
@@ -95,7 +95,7 @@ def _print_words(name: str | None, run: str | None, as_json: bool) -> None:
         print_text("\n".join(listed))
 
 
-def _listed(rows: list[dict[str, Any]]) -> Text:
+def _list_models(rows: list[dict[str, Any]]) -> Text:
     """Return a line per model, its description cut behind a word where the console ends."""
     lines = [(row["model"], row["does"], _in_a_word(row["ready"]), row["description"]) for row in rows]
     lines = [("model", "does", "ready", "what it is"), *lines]
@@ -359,7 +359,7 @@ def show_dataset(
     table.add_column(style="dim", no_wrap=True)
     table.add_column(overflow="fold")
     for name, value in facts.items():
-        table.add_row(name, marked("{}", terminal_safe(value)))
+        table.add_row(name, markup("{}", terminal_safe(value)))
     out.print(table)
     for note in recording.content_notes():
         out.print(content_warning(note), soft_wrap=True)
@@ -409,12 +409,12 @@ def check_environment(
         checks.append(check)
         if not as_json:
             state, colour = ("passed", "green") if check.passed else ("failed", "bold red")
-            out.print(marked(f"[{colour}]{{}}[/] {{}}", f"{state:8}", check.sentence), soft_wrap=True)
+            out.print(markup(f"[{colour}]{{}}[/] {{}}", f"{state:8}", check.sentence), soft_wrap=True)
             if evidence := check.problem or check.facts:
-                out.print(marked("         [dim]seen[/] {}", terminal_safe(evidence)), soft_wrap=True)
+                out.print(markup("         [dim]seen[/] {}", terminal_safe(evidence)), soft_wrap=True)
             for note in check.notes:
                 moved = f", with {STEPS} small actions per episode"
-                out.print(marked("         [yellow]without content[/] {}", note + moved), soft_wrap=True)
+                out.print(markup("         [yellow]without content[/] {}", note + moved), soft_wrap=True)
     failed = sum(not check.passed for check in checks)
     if as_json:
         listed = [{**asdict(check), "passed": check.passed} for check in checks]
@@ -428,5 +428,5 @@ def check_environment(
             *(f"--rotate {quote(turn)}" for turn in rotate or ()),
         ]
         typed = " ".join([quote(environment), *options])
-        say(marked("next: [bold]probe-kit extract --model NAME --env {} --out runs/own[/]", typed))
+        say(markup("next: [bold]probe-kit extract --model NAME --env {} --out runs/own[/]", typed))
     raise typer.Exit(FAILED if failed else 0)

@@ -70,7 +70,7 @@ def protocol_identity(model: ModelSettings, task: ActTask, source: SourceSetting
     """
     if task.protocol is None or "protocol" in source.refuses:
         return {}
-    row, used = protocol_row(model, task.protocol), _used(model, task, source.scene_spec)
+    row, used = protocol_row(model, task.protocol), _used_values(model, task, source.scene_spec)
     protocol = {**({} if row is None else row.settings()), **_scene(protocol_scene(task.protocol))}
     default = {**({} if row is None else _defaults(model.family, row)), **_scene(scene_of(model.family))}
     if task.capture_only:
@@ -116,7 +116,7 @@ def _family(model: str) -> "Family | None":
     return get_family(model)
 
 
-def _used(model: ModelSettings, task: ActTask, scene: "SceneSpec") -> dict[str, str]:
+def _used_values(model: ModelSettings, task: ActTask, scene: "SceneSpec") -> dict[str, str]:
     """Return the values that the run is made with, under the names of `ProtocolRow.settings`."""
     used = {f"-M {name}": _portable_value(as_text(value)) for name, value in model.options.items()}
     plain = {

@@ -213,7 +213,7 @@ class Settings(Part):
             raise UsageError(f"--config: {error}") from error
         kind, fields = cls._typed_source(source_options, None if before is None else before.source)
         if before is not None and values.get("family") in (None, before.model.family):
-            values = _merged(before.model, values)
+            values = _merge_fields(before.model, values)
         if kind is SceneSettings:
             values |= fields
         else:
@@ -221,7 +221,7 @@ class Settings(Part):
                 _refuse(refused, kind)
             former = None if before is None else before.source
             values["source"] = (
-                former.changed(**_merged(former, fields)) if isinstance(former, kind) else kind(**fields)
+                former.changed(**_merge_fields(former, fields)) if isinstance(former, kind) else kind(**fields)
             )
         return cls(values.pop("family", None), **values) if before is None else before.changed(**values)
 
@@ -506,7 +506,7 @@ class AskSettings(Settings):
         ]
 
 
-def _merged(former: Part, fields: Mapping[str, Any]) -> dict[str, Any]:
+def _merge_fields(former: Part, fields: Mapping[str, Any]) -> dict[str, Any]:
     """Return typed fields, in which KEY=VALUE options replace those of equal keys alone."""
     if "options" not in fields:
         return dict(fields)

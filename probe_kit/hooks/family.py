@@ -26,7 +26,7 @@ from probe_kit.hooks.checkpoints.checkpoint import (
     hub_name,
     is_on_hub,
     missing_weights,
-    pinned,
+    pin_revision,
     recorded_commits,
     without_revision,
 )
@@ -228,9 +228,9 @@ class Family:
         merged = model.card.audit.get("adapter")
         model.card = replace(
             model.card,
-            checkpoint=pinned(model.card.checkpoint),
+            checkpoint=pin_revision(model.card.checkpoint),
             settings={**option_texts, **model.card.settings},
-            notes=_notes((*model.card.notes, *([merged] if merged else []), *_unguarded(model))),
+            notes=_notes((*model.card.notes, *([merged] if merged else []), *_note_on_states(model))),
             repositories=_other_commits(commits, location),
             **self._source_of(model.card, location),
         )
@@ -492,7 +492,7 @@ class Family:
 
     def _imported(self, path: str) -> Callable[..., Any]:
         with while_loading(self.name, path), one_scan_of_packages():
-            function: Callable[..., Any] = imported(path)
+            function: Callable[..., Any] = import_object(path)
         return function
 
     def _located(self, checkpoint: str | None, options: Mapping[str, Any]) -> tuple[str | None, dict[str, Any]]:
@@ -502,7 +502,7 @@ class Family:
 
     def renames(self) -> tuple[tuple[str, str], ...]:
         """Return pairs that turn names of tensors in released files into the network's; empty if they agree."""
-        return () if self.stored_names is None else tuple(imported(self.stored_names))
+        return () if self.stored_names is None else tuple(import_object(self.stored_names))
 
     def missing(self) -> str:
         """Return requirements that this machine lacks, the default checkpoint included; empty if it is ready."""
@@ -530,7 +530,7 @@ class Family:
         return [(module, extra) for module, extra in self.packages if find_spec(module) is None]
 
 
-def _unguarded(model: "Model") -> tuple[str, ...]:
+def _note_on_states(model: "Model") -> tuple[str, ...]:
     """A note on states that are read and compared with no statistics; empty where there are none."""
     from probe_kit.hooks.contract.model import Policy
 
@@ -575,7 +575,7 @@ def _check_device(device: str) -> None:
         raise UsageError(f"device {device!r} cannot be used: {reason}. {what_is_here()}") from error
 
 
-def imported(path: str) -> Any:
+def import_object(path: str) -> Any:
     """The object at `module:name` or `module:Class.method`."""
     module, name = path.split(":")
     return attrgetter(name)(import_module(module))

@@ -72,13 +72,15 @@ def outline_of(
     key = (name, location, dtype, repr(sorted(options.items())), complete, file_state(folder))
     if key in _OUTLINES:
         return _OUTLINES[key]
-    outline = _built(load, location, dtype, options, complete)
+    outline = _build_outline(load, location, dtype, options, complete)
     if outline.model is not None:  # what another repository lacks may arrive
         _OUTLINES[key] = outline
     return outline
 
 
-def _built(load: Any, location: str, dtype: str | None, options: Mapping[str, Any], complete: bool) -> Outline:
+def _build_outline(
+    load: Any, location: str, dtype: str | None, options: Mapping[str, Any], complete: bool
+) -> Outline:
     from probe_kit.models.building import sizes_only
 
     try:

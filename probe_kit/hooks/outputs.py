@@ -112,17 +112,17 @@ def stream_outputs(model: Model, activations: ActivationCache) -> dict[str, Prod
         for quantity in (*_COMPARED, *KV):
             if quantity in stream.quantities:
                 key = f"{name}_{_COMPARED[quantity]}" if quantity in _COMPARED else quantity
-                produced[key] = lambda stream=stream, quantity=quantity: _arranged(activations, stream, quantity)  # type: ignore[misc]
+                produced[key] = lambda stream=stream, quantity=quantity: _arrange(activations, stream, quantity)  # type: ignore[misc]
     return produced
 
 
-def _arranged(activations: ActivationCache, stream: Stream, quantity: str) -> NDArray[Any]:
-    values = stacked(activations, stream, quantity)
+def _arrange(activations: ActivationCache, stream: Stream, quantity: str) -> NDArray[Any]:
+    values = stack_layers(activations, stream, quantity)
     values = values[:, 0] if quantity == "final_norm" else values
     return values[0] if stream.iterations is None else values
 
 
-def stacked(activations: ActivationCache, stream: Stream, quantity: str = "residual") -> NDArray[Any]:
+def stack_layers(activations: ActivationCache, stream: Stream, quantity: str = "residual") -> NDArray[Any]:
     """Return (iterations or 1, layers, B, T, D) of one quantity."""
     sites = stream.sites(quantity)
     values = torch.stack([activations[site] for site in sites])
@@ -196,7 +196,7 @@ def outputs_of(module: nn.Module, stack: ExitStack) -> list[Any]:
     outputs: list[Any] = []
 
     def keep(_module: nn.Module, _inputs: object, output: Any) -> None:
-        outputs.append(_copied(output))
+        outputs.append(_copy_array(output))
 
     stack.callback(module.register_forward_hook(keep).remove)
     return outputs
@@ -208,14 +208,14 @@ def _inputs_of(module: nn.Module, stack: ExitStack) -> list[Any]:
 
     def keep(_module: nn.Module, positional: tuple[Any, ...], keywords: dict[str, Any]) -> None:
         inputs.append(
-            (tuple(map(_copied, positional)), {name: _copied(value) for name, value in keywords.items()})
+            (tuple(map(_copy_array, positional)), {name: _copy_array(value) for name, value in keywords.items()})
         )
 
     stack.callback(module.register_forward_pre_hook(keep, with_kwargs=True).remove)
     return inputs
 
 
-def _copied(value: Any) -> Any:
+def _copy_array(value: Any) -> Any:
     return value.detach().clone() if isinstance(value, Tensor) else value
 
 

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from probe_kit._system.bounded_files import UNREADABLE, load_gzipped_json, load_json, open_arrays
 from probe_kit.errors import UsageError
 from probe_kit.hooks.checkpoints.third_party import in_words, while_loading
-from probe_kit.hooks.family import imported
+from probe_kit.hooks.family import import_object
 from probe_kit.hooks.registry import find_family
-from probe_kit.models.checkpoint_files import renamed
+from probe_kit.models.checkpoint_files import rename_tensor
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -61,10 +61,10 @@ def compare(recorded: "Arrays", outputs: "Outputs") -> tuple[Comparison, ...]:
     remade = {name: recorded[entered] for name, entered in outputs.remade.items() if entered in recorded}
     names = {name for name in recorded if not name.startswith("in_")} - set(outputs.inputs)
     theirs = {name: recorded[name] for name in names} | remade
-    return tuple(_compared(name, theirs[name], outputs) for name in sorted(theirs))
+    return tuple(_compare_output(name, theirs[name], outputs) for name in sorted(theirs))
 
 
-def _compared(name: str, theirs: NDArray[Any], outputs: "Outputs") -> Comparison:
+def _compare_output(name: str, theirs: NDArray[Any], outputs: "Outputs") -> Comparison:
     tolerance = outputs.tolerances.get(name, outputs.tolerance)
     if name not in outputs.produced:
         return Comparison(name, "not compared", None, tolerance, "the adapter does not produce it")
@@ -73,11 +73,11 @@ def _compared(name: str, theirs: NDArray[Any], outputs: "Outputs") -> Comparison
         return Comparison(name, "over", None, tolerance, f"shape {ours.shape}, recorded {theirs.shape}")
     error = _largest_error(ours, theirs, outputs.valid.get(name))
     exact = not np.issubdtype(theirs.dtype, np.floating)
-    allowed = tolerance if name in outputs.absolute and not exact else _allowed(theirs, tolerance)
+    allowed = tolerance if name in outputs.absolute and not exact else _tolerance(theirs, tolerance)
     return Comparison(name, "ok" if error <= allowed else "over", error, allowed)
 
 
-def _allowed(theirs: NDArray[Any], tolerance: float) -> float:
+def _tolerance(theirs: NDArray[Any], tolerance: float) -> float:
     """Return the tolerance, absolute plus relative to the largest recorded value.
 
     Ids, masks and counts must be equal.
@@ -121,7 +121,7 @@ def verify_reference(family: str, folder: Path) -> Verification:
     declared.check(str(folder / CHECKPOINT_FOLDER))
     outputs = declared.function("outputs")
     with while_loading(family, str(folder)):
-        produced = outputs(imported(declared.loader), folder, recorded)
+        produced = outputs(import_object(declared.loader), folder, recorded)
         return Verification(family, str(folder), compare(recorded, produced))
 
 
@@ -156,7 +156,9 @@ def verify_keys(family: str, file: Path) -> Verification:
     declared.check_purpose("full_size")
     recorded = _read_key_list(file)
     build, renames = declared.function("full_size"), declared.renames()
-    theirs = {renamed(name, renames): (tuple(entry["shape"]), entry["dtype"]) for name, entry in recorded.items()}
+    theirs = {
+        rename_tensor(name, renames): (tuple(entry["shape"]), entry["dtype"]) for name, entry in recorded.items()
+    }
     sizes: list[str | None] = [name for name, _ in declared.sizes] or [None]
     differences = {
         size: _differences(build(size) if size else build(), theirs, declared.unstored) for size in sizes
@@ -180,7 +182,7 @@ Described = tuple[tuple[int, ...], str]
 def _differences(network: Any, theirs: Mapping[str, Described], unstored: tuple[str, ...]) -> list[str]:
     """The differences between a list of keys and this network's; empty if there are none."""
     state = network.state_dict(keep_vars=True)
-    ours = {name: _described(tensor) for name, tensor in state.items()}
+    ours = {name: _describe(tensor) for name, tensor in state.items()}
     present = {id(state[name]) for name in ours.keys() & theirs.keys()}
     wrong = [
         f"{name}: missing here" for name in sorted(theirs.keys() - ours.keys()) if not _is_declared(name, unstored)
@@ -221,5 +223,5 @@ def _is_declared(name: str, declared: tuple[str, ...]) -> bool:
     return any(name == entry or (entry.endswith(".") and name.startswith(entry)) for entry in declared)
 
 
-def _described(tensor: "Tensor") -> Described:
+def _describe(tensor: "Tensor") -> Described:
     return tuple(tensor.shape), str(tensor.dtype).removeprefix("torch.")

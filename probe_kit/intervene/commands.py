@@ -14,13 +14,13 @@ from rich.console import Console
 from rich.panel import Panel
 from rich.text import Text
 
-from probe_kit._system.counting import counted
+from probe_kit._system.counting import plural
 from probe_kit._system.escaping import as_argument
 from probe_kit._tables.numbers import whole_percent
 from probe_kit._tables.printing import Format, print_table
 from probe_kit._tables.table import Cell, Table
 from probe_kit._terminal import options as common
-from probe_kit._terminal.console import counter, marked, out, print_json, progress, say, say_note, split
+from probe_kit._terminal.console import counter, markup, out, print_json, progress, say, say_note, split
 from probe_kit._terminal.field_options import PanelledHelp, command_with
 from probe_kit._terminal.options import LISTED, AsJson, Names, Partial, RunFolder, choices, further_option, one_of
 from probe_kit.errors import ProbeKitError, UsageError
@@ -294,8 +294,8 @@ def intervene(
         location = as_argument(run)
         following = f"retention {location}" if has_sides else f"run show {location}"
         what = "use beside probes and success" if has_sides else "what the run stores"
-        say(marked("next: [bold]probe-kit {}[/]  {}", following, what))
-    say(marked("stored as {}", result.key))
+        say(markup("next: [bold]probe-kit {}[/]  {}", following, what))
+    say(markup("stored as {}", result.key))
 
 
 def check_options(name: str, options: Mapping[str, Any]) -> None:
@@ -385,7 +385,7 @@ def list_runs(
     print_table(_table(lines, folder), style)
     for line in lines:
         if "error" in line:
-            say(marked("[yellow]{} cannot be read: {}[/]", line["run"], line["error"]))
+            say(markup("[yellow]{} cannot be read: {}[/]", line["run"], line["error"]))
 
 
 def _facts(run: "Run") -> dict[str, Any]:
@@ -481,7 +481,7 @@ def show(
     rows = {"inputs": "; ".join(notes)}
     rows |= {f"intervention {intervention.key}": intervention.words for intervention in interventions}
     rows |= {
-        f"unfinished {key}": f"an intervention, {counted(items, 'item')} so far; "
+        f"unfinished {key}": f"an intervention, {plural(items, 'item')} so far; "
         "the same `probe-kit intervene` continues it"
         for key, items in unfinished.items()
     }

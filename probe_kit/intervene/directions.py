@@ -143,7 +143,7 @@ def fit_directions_in_cells(
         UsageError: If there are too few episodes to fit on.
     """
     if vector is not None:
-        return {cell: _of_file(session, cell, vector, controls, seed) for cell in cells}
+        return {cell: _direction_in_cell(session, cell, vector, controls, seed) for cell in cells}
     items = items_of(session.run, categories, None)
     passed_over = PassedOver(session, patterns)
     fitted: dict[Cell, Directions] = {}
@@ -171,7 +171,9 @@ def fit_directions_in_cells(
     return passed_over.left(fitted)
 
 
-def _of_file(session: ReplaySession, cell: Cell, vector: FileDirection, controls: int, seed: int) -> Directions:
+def _direction_in_cell(
+    session: ReplaySession, cell: Cell, vector: FileDirection, controls: int, seed: int
+) -> Directions:
     """Return a file's direction in a cell.
 
     Raises:

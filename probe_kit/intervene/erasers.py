@@ -153,7 +153,9 @@ def fit_eraser(tokens: PaddedTokens, is_left: NDArray[np.bool_], method: Method)
         removed = read = _inlp(centred, tokens.present, is_left, usable, method.rank)
     else:
         size = float(np.abs(tokens.values[tokens.present]).max())
-        removed = read = _shared(_differences(centred, tokens.present, is_left)[usable], method.rank, size)
+        removed = read = _shared_directions(
+            _differences(centred, tokens.present, is_left)[usable], method.rank, size
+        )
     ranks = (np.linalg.norm(removed, axis=-1) > 0).sum(axis=1)
     if not ranks.any():
         raise NoDirectionError(f"no direction for {method}: {NO_DIRECTION}")
@@ -333,7 +335,7 @@ def half_differences(tokens: PaddedTokens, is_left: NDArray[np.bool_], eraser: E
     return np.where(eraser.fitted[:, None], halves, 0.0)
 
 
-def _shared(differences: Array, rank: int, size: float) -> Array:
+def _shared_directions(differences: Array, rank: int, size: float) -> Array:
     """Return the directions (1, K, D) along which positions' differences (T, D) lie most, the same for all.
 
     Args:

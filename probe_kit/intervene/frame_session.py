@@ -29,7 +29,7 @@ from probe_kit.extract.sources.inputs import (
     with_input,
 )
 from probe_kit.hashing import derive_seed
-from probe_kit.hooks.checkpoints.third_party import copied, while_acting
+from probe_kit.hooks.checkpoints.third_party import copy_observations, while_acting
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.intervene.outcomes import directions_of, spread_of
 from probe_kit.intervene.pairs import Chunk, Given, Pair, PairRow
@@ -289,7 +289,7 @@ class FrameSession(ReplaySession):
         """Return one prediction (chunk, D) in the checkpoint's own units, alone in its batch."""
         assert isinstance(model_input, Observation)
         with while_acting(self.run.model, self.policy.card.checkpoint):
-            return np.asarray(self.policy.predict(copied([model_input]), [seed])[0], np.float32)
+            return np.asarray(self.policy.predict(copy_observations([model_input]), [seed])[0], np.float32)
 
     def displacement(self, chunk: Chunk, pair: Pair) -> float:
         """Return how far a chunk lies toward the source's, in spreads of clean actions; 0 is the clean action."""
@@ -304,7 +304,7 @@ class FrameSession(ReplaySession):
         """
         clean, direction = self._end(pair)
         assert isinstance(pair.clean, Observation)
-        if not np.array_equal(clean, self.policy.act(copied([pair.clean]), [pair.seed])[0]):
+        if not np.array_equal(clean, self.policy.act(copy_observations([pair.clean]), [pair.seed])[0]):
             raise UsageError(
                 f"gradients of {self.policy.card.family} are of an arm's actions, and these frames have "
                 "predictions in other units. Patch exactly: --kind interchange"

@@ -27,7 +27,7 @@ def read_instructions(path: Path) -> tuple[str, ...]:
     is_table = path.suffix.lower() in TABLES
     lines = [] if is_table else read_lines(path)
     is_table |= bool(lines) and any(INSTRUCTION in lines[0].split(sign) for sign in SEPARATORS)
-    numbered = list(_of_table(path) if is_table else _of_lines(path, lines))
+    numbered = list(_pairs_of_table(path) if is_table else _pairs_of_lines(path, lines))
     texts: dict[str, tuple[str, str]] = {}
     for where, text in numbered:
         if not normal_form(text):
@@ -46,13 +46,13 @@ def read_instructions(path: Path) -> tuple[str, ...]:
     return tuple(text for _, text in numbered)
 
 
-def _of_lines(path: Path, lines: list[str]) -> Iterable[tuple[str, str]]:
+def _pairs_of_lines(path: Path, lines: list[str]) -> Iterable[tuple[str, str]]:
     while lines and not lines[-1]:
         lines.pop()
     return [(f"{path}, line {number}", line) for number, line in enumerate(lines, start=1)]
 
 
-def _of_table(path: Path) -> Iterable[tuple[str, str]]:
+def _pairs_of_table(path: Path) -> Iterable[tuple[str, str]]:
     table = open_table(path, (INSTRUCTION,))
     if INSTRUCTION not in table.names:
         raise UsageError(

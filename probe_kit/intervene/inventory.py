@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from probe_kit._system.counting import counted
+from probe_kit._system.counting import plural
 from probe_kit.intervene.kinds import kind_names, kind_of
 from probe_kit.intervene.results import InterventionResult
 from probe_kit.intervene.stored import read_interventions, stored_interventions
@@ -44,7 +44,7 @@ class ListedIntervention:
     def words(self) -> str:
         """A line about the intervention."""
         parts = [f"{self.kind} of {', '.join(self.categories)}"]
-        parts += [] if self.items is None else [f"{counted(self.items, 'item')} each"]
+        parts += [] if self.items is None else [f"{plural(self.items, 'item')} each"]
         parts += [f"wording {self.wording}"] * bool(self.wording)
         for name, value in self.parameters.items():
             if value not in (None, []):

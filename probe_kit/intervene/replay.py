@@ -99,7 +99,7 @@ class Condition:
         return cls(str(cell), play, (cell.site,), cell=cell)
 
 
-def _of_input(name: str, which: str) -> Condition:
+def _condition_of_input(name: str, which: str) -> Condition:
     """Return the inference on one of a pair's inputs, with the same seed and nothing changed in the network."""
 
     def play(context: ConditionContext) -> ConditionResult:
@@ -110,13 +110,13 @@ def _of_input(name: str, which: str) -> Condition:
     return Condition(name, play)
 
 
-CLEAN_RUN = _of_input(CLEAN, "clean")
+CLEAN_RUN = _condition_of_input(CLEAN, "clean")
 """Condition of the inference as the run made it."""
-SOURCE_RUN = _of_input(IMAGE_SWAP, "source")
+SOURCE_RUN = _condition_of_input(IMAGE_SWAP, "source")
 """Condition of the source's inference: in the scene, the two pictures in each other's place."""
-DONOR_RUN = _of_input(DONOR, "donor")
+DONOR_RUN = _condition_of_input(DONOR, "donor")
 """Condition of the donor's inference: all inputs are its own."""
-CONTROL_RUN = _of_input(CONTROL_INPUT, "control")
+CONTROL_RUN = _condition_of_input(CONTROL_INPUT, "control")
 """Condition of the clean inference after a meaningless change of the varied input."""
 
 

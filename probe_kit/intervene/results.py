@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from probe_kit._system.counting import counted
+from probe_kit._system.counting import plural
 from probe_kit._system.escaping import csv_of_frame
 from probe_kit._system.json_text import json_text
 from probe_kit.errors import NoProbesError
@@ -105,7 +105,7 @@ class InterventionResult(Measurement):
     def _few_groups(self) -> list[str]:
         counts = {category: np.unique(part.groups).size for category, part in self.outcomes.by_category()}
         return [
-            f"{category}: with {counted(count, 'group')} of items no p can be below "
+            f"{category}: with {plural(count, 'group')} of items no p can be below "
             f"{smallest_flip_p(count):.2g}, so that nothing is beyond chance. Play more (--items)."
             for category, count in counts.items()
             if smallest_flip_p(count) >= SIGNIFICANCE

@@ -126,7 +126,7 @@ def _evaluate(
         clean = conditions[0].play(context)
         for number, condition in enumerate(conditions):
             played = condition.play(context) if number else clean
-            actions = executed(session, [*past, played.chunk])
+            actions = executed_chunk(session, [*past, played.chunk])
             outcomes.displacement[number, column] += session.displacement(actions, current) - start
             change = float(np.abs(played.chunk - clean.chunk).max())
             outcomes.max_action_change[number, column] = max(outcomes.max_action_change[number, column], change)
@@ -152,7 +152,7 @@ def _step_through(
         seed = derive_seed(planned.policy_seed, "inference", call)
         current = replace(pair, clean=answer, source=other, seed=seed, tiles=stage.tile_masks(), step=call)
         past.append(act(current, past))
-        answer = stage.advance(executed(session, past))
+        answer = stage.advance(executed_chunk(session, past))
         if isinstance(answer, Ending):
             break
     assert isinstance(answer, Ending)
@@ -167,7 +167,7 @@ def _offset(session: SceneSession, observation: object) -> float:
     return session.lateral_offset(observation.state[:2].astype(np.float64))
 
 
-def executed(session: SceneSession, past: Sequence[Chunk]) -> Chunk:
+def executed_chunk(session: SceneSession, past: Sequence[Chunk]) -> Chunk:
     """Return the executed actions: the head of the newest chunk, or one averaged over all chunks."""
     settings, exponent = session.run.settings, session.policy.card.ensemble
     return executed_actions(past, int(settings["execute"]), exponent, settings.get("rotation", PLAIN))

@@ -20,7 +20,7 @@ from probe_kit.errors import (
 )
 from probe_kit.extract.rollout.capturing import FEWEST_FOR_THREADS
 from probe_kit.extract.rollout.worker import torch_threads
-from probe_kit.hooks.checkpoints.third_party import copied, while_acting
+from probe_kit.hooks.checkpoints.third_party import copy_observations, while_acting
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.intervene.pairs import Chunk, Given, Pair
 from probe_kit.runs.run import Run
@@ -141,7 +141,7 @@ class ReplaySession(ABC):
         """
         assert isinstance(model_input, Observation), "pairs of runs are of observations"
         with while_acting(self.run.model, self.policy.card.checkpoint):
-            return np.asarray(self.policy.act(copied([model_input]), [seed])[0], np.float32)
+            return np.asarray(self.policy.act(copy_observations([model_input]), [seed])[0], np.float32)
 
     def replay_error(self, pair: Pair, chunk: Chunk) -> float:
         """Return by how much a clean inference differs from the stored actions; NaN where there are none.

@@ -273,13 +273,17 @@ def classify_behaviour(effect: ImageSwapEffect, control: str | None) -> UseVerdi
         if behaviour is not None:
             side = numbers.only_side if behaviour == "partly used, one-sided" else None
             return UseVerdict(
-                behaviour=behaviour, reason=_measured(effect), reversed=mirrored, side=side, readout=effect.readout
+                behaviour=behaviour,
+                reason=_describe_response(effect),
+                reversed=mirrored,
+                side=side,
+                readout=effect.readout,
             )
     if not is_bounded(effect):
         return UseVerdict(behaviour="undecided", reason=_open(effect), readout=effect.readout)
     bound = (
         f"within {SMALLEST_SHARE_OF_INTEREST} of its reach and {SMALLEST_EFFECT_OF_INTEREST} of the episodes "
-        f"({_measured(effect)})"
+        f"({_describe_response(effect)})"
     )
     if control is None:
         reason = f"{bound}, and no other category of the run is used, so that use is not known to show"
@@ -297,7 +301,7 @@ def is_bounded(effect: ImageSwapEffect) -> bool:
     return -flips < low and high < flips and -share < least and most < share
 
 
-def _measured(effect: ImageSwapEffect) -> str:
+def _describe_response(effect: ImageSwapEffect) -> str:
     """Return displacement and net follow rate with their intervals, in words."""
     return (
         f"moved by {effect.reach_share:z.2f} {_ends(effect.reach_share_ci)} of its reach, net follow rate "
@@ -315,7 +319,7 @@ def _open(effect: ImageSwapEffect) -> str:
             f"{effect.reach_share:z.2f} {_ends(effect.reach_share_ci)}: it depends on something else in the "
             "images, or on the answer in opposite directions, or the items are too few"
         )
-    return f"{_measured(effect)}; {more_groups(effect, effect.n_groups)}, there are {effect.n_groups}"
+    return f"{_describe_response(effect)}; {more_groups(effect, effect.n_groups)}, there are {effect.n_groups}"
 
 
 def more_groups(swap: Any, groups: int) -> str:

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import typer
 
-from probe_kit._system.counting import counted
+from probe_kit._system.counting import plural
 from probe_kit._terminal import options as common
-from probe_kit._terminal.console import counter, err, marked, out, print_json, progress, say, whole_number
+from probe_kit._terminal.console import counter, err, markup, out, print_json, progress, say, whole_number
 from probe_kit.errors import UsageError
 
 if TYPE_CHECKING:
@@ -98,8 +98,8 @@ def words(
     else:
         out.print(_table(value, match, rows))
     if out_file is not None and len(rows):
-        say(marked("wrote {} to {}. Steer along one: --kind steer --sites backbone.{} --roles all --direction {}",
-                   counted(len(rows), "direction"), out_file, f"{value.blocks[rows[0]] + 1:02d}",
+        say(markup("wrote {} to {}. Steer along one: --kind steer --sites backbone.{} --roles all --direction {}",
+                   plural(len(rows), "direction"), out_file, f"{value.blocks[rows[0]] + 1:02d}",
                    f"{out_file}#{value.direction_name(rows[0])}"))  # fmt: skip
 
 
@@ -151,7 +151,7 @@ def _table(value: "ValueWords", match: "WordMatch | None", rows: "NDArray[np.int
         )
         for row in rows
     ]  # fmt: skip
-    read = f"{counted(len(value), 'unit')} of {value.family} were read"
+    read = f"{plural(len(value), 'unit')} of {value.family} were read"
     compared = ""
     if match is not None:
         p = p_text(match.p)

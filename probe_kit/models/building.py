@@ -197,7 +197,7 @@ def fill_rotary(vlm: Any) -> None:
 
 
 @contextmanager
-def replaced(module: ModuleType, values: Mapping[str, Any]) -> Iterator[None]:
+def replace_attributes(module: ModuleType, values: Mapping[str, Any]) -> Iterator[None]:
     """Give `module` these values under their names inside the context, and restore its own ones afterwards.
 
     They are restored also on an exception.

@@ -34,7 +34,7 @@ SIGLIP_TOWER: Renames = (
 """Renames of a SigLIP tower inside a network: newer transformers than the installed one have one level less."""
 
 
-def renamed(name: str, renames: Sequence[tuple[str, str]]) -> str:
+def rename_tensor(name: str, renames: Sequence[tuple[str, str]]) -> str:
     """Return the module's name of a tensor that a file calls `name`."""
     for pattern, replacement in renames:
         name = re.sub(pattern, replacement, name)

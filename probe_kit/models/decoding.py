@@ -54,7 +54,7 @@ def positions(mask: Tensor) -> Tensor:
     return (mask.long().cumsum(dim=1) - 1).clamp(min=0)
 
 
-def needed(mask: Tensor) -> Tensor | None:
+def mask_if_padded(mask: Tensor) -> Tensor | None:
     """Return the mask where there is padding: without one, attention takes its exact causal path."""
     return None if bool(mask.all()) else mask
 
@@ -71,7 +71,7 @@ def last_logits(language_model: Any, embeddings: Tensor, mask: Tensor, cache: Dy
     output = language_model(
         inputs_embeds=embeddings,
         position_ids=positions(mask)[:, -embeddings.shape[1] :],
-        attention_mask=needed(mask),
+        attention_mask=mask_if_padded(mask),
         past_key_values=cache,
         use_cache=True,
         logits_to_keep=1,
@@ -112,7 +112,7 @@ class TokenNetwork(nn.Module):
         return self.language_model(
             inputs_embeds=embeddings,
             position_ids=positions(mask),
-            attention_mask=needed(mask),
+            attention_mask=mask_if_padded(mask),
             output_hidden_states=True,
         )
 
@@ -152,7 +152,7 @@ class TokenNetwork(nn.Module):
 # -- batches --------------------------------------------------------------------------------------------------
 
 
-def packed(rows: Sequence[Tensor], padding: int = 0) -> tuple[Tensor, Tensor]:
+def pack_rows(rows: Sequence[Tensor], padding: int = 0) -> tuple[Tensor, Tensor]:
     """Return rows (T, …) as one batch (B, S, …), and its mask (B, S) bool, False at padding.
 
     Padding stands before the last token of a row: the last tokens line up, and no other token moves, whatever else
@@ -169,7 +169,7 @@ def packed(rows: Sequence[Tensor], padding: int = 0) -> tuple[Tensor, Tensor]:
 
 @dataclass(frozen=True)
 class Packed:
-    """The prompts as one batch: ids (B, T) int64 and mask (B, T) bool, see `packed`."""
+    """The prompts as one batch: ids (B, T) int64 and mask (B, T) bool, see `pack_rows`."""
 
     ids: Tensor
     mask: Tensor
@@ -177,7 +177,7 @@ class Packed:
     @classmethod
     def of(cls, rows: Sequence[Sequence[int]], padding: int) -> "Packed":
         """Pack one prompt per row."""
-        return cls(*packed([torch.tensor(row) for row in rows], padding))
+        return cls(*pack_rows([torch.tensor(row) for row in rows], padding))
 
 
 @dataclass(frozen=True)

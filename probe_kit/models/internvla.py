@@ -481,7 +481,7 @@ class DiffusionTransformer(nn.Module):
         return cast(Tensor, self.final_layer(stream)[:, self.conditions :])
 
 
-def guided(scale: float) -> bool:
+def uses_guidance(scale: float) -> bool:
     """Whether the head runs twice the rows: with the condition and, below them, without."""
     return scale > 1
 
@@ -614,7 +614,7 @@ class InternVLANetwork(nn.Module):
                 those without.
         """
         rows = condition
-        if guided(scale):
+        if uses_guidance(scale):
             without = self.head.z_embedder.uncondition.expand(len(condition), -1, -1)
             rows = torch.cat([condition, without.to(condition.dtype)])
         path = noise.float()
@@ -622,7 +622,7 @@ class InternVLANetwork(nn.Module):
             steps = torch.full((len(rows),), int(schedule.moments[index]), device=path.device)
             noisy = path.repeat(len(rows) // len(path), 1, 1).to(condition.dtype)
             predicted = self.head(noisy, steps, rows).float()
-            if guided(scale):
+            if uses_guidance(scale):
                 with_condition, without_it = predicted.chunk(2)
                 predicted = without_it + scale * (with_condition - without_it)
             path = schedule.back(index, path, predicted)

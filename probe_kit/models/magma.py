@@ -37,7 +37,7 @@ from probe_kit.errors import CheckpointError
 from probe_kit.models.building import build_empty, fill_decoder_rotary
 from probe_kit.models.checkpoint_files import picture_values
 from probe_kit.models.config_file import STORED_TYPE, ConfigFile, Count, Index, part
-from probe_kit.models.decoding import Choose, Decoded, PromptKV, TokenNetwork, greedy, last_logits, packed
+from probe_kit.models.decoding import Choose, Decoded, PromptKV, TokenNetwork, greedy, last_logits, pack_rows
 
 # Older checkpoints append the number of trace tokens; the modules are the same.
 _PROJECTOR = re.compile(r"mlp(?P<layers>[1-9]\d?)x_gelu(_segtokv\d+)?")
@@ -321,7 +321,7 @@ class Projector(nn.Module):
         return torch.cat([projected, separators], dim=1).flatten(0, 1)
 
 
-def stitched(crops: Tensor, grid: Grid) -> Tensor:
+def stitch_crops(crops: Tensor, grid: Grid) -> Tensor:
     """Return the map (rows · a, columns · b, C) of crops (rows · columns, a, b, C) in raster order."""
     high, wide, channels = crops.shape[1:]
     places = crops.reshape(grid.rows, grid.columns, high, wide, channels).transpose(1, 2)
@@ -330,7 +330,7 @@ def stitched(crops: Tensor, grid: Grid) -> Tensor:
 
 def whole_picture(picture: Picture) -> Tensor:
     """Return the picture that the crops were cut from, (1, 3, rows · S, columns · S)."""
-    return stitched(picture.crops.permute(0, 2, 3, 1), picture.grid).permute(2, 0, 1)[None]
+    return stitch_crops(picture.crops.permute(0, 2, 3, 1), picture.grid).permute(2, 0, 1)[None]
 
 
 def map_size(grid: Grid, side: int, reduction: int, strategy: str) -> tuple[int, int]:
@@ -418,7 +418,7 @@ class MagmaNetwork(TokenNetwork):
         else:
             crops = self._projected(torch.cat([picture.crops for picture in pictures]).to(reference))
             parts = torch.split(crops, [len(picture.crops) for picture in pictures])
-            maps = [stitched(part, picture.grid) for part, picture in zip(parts, pictures, strict=True)]
+            maps = [stitch_crops(part, picture.grid) for part, picture in zip(parts, pictures, strict=True)]
         return [self.multi_modal_projector.tokens(projected) for projected in maps]
 
     def _projected(self, pixels: Tensor) -> Tensor:
@@ -437,13 +437,13 @@ class MagmaNetwork(TokenNetwork):
         embedding = self.language_model.get_input_embeddings()
         device = embedding.weight.device
         if pictures is None:
-            return packed([embedding(torch.tensor(ids, device=device)) for ids in prompts])
+            return pack_rows([embedding(torch.tensor(ids, device=device)) for ids in prompts])
         rows = []
         for ids, tokens in zip(prompts, self.look(pictures), strict=True):
             position = placeholder(ids, self.config.image_token)
             before, behind = (torch.tensor(part, device=device) for part in (ids[:position], ids[position + 1 :]))
             rows.append(torch.cat([embedding(before.long()), tokens, embedding(behind.long())]))
-        return packed(rows)
+        return pack_rows(rows)
 
     def forward(self, prompts: Sequence[Sequence[int]], pictures: Sequence[Picture] | None) -> Any:
         """Return the output of transformers for one pass, with logits (B, S, V) and all hidden states."""

@@ -141,14 +141,14 @@ class Attention(nn.Module):
         query, key, value = (
             project(stream).unflatten(-1, (self.heads, -1)) for project in (self.q_proj, self.k_proj, self.v_proj)
         )
-        query, key = _rotated(query, rotation), _rotated(key, rotation)
+        query, key = _rotate(query, rotation), _rotate(key, rotation)
         pictures = zip(*(part.transpose(0, 1).split(lengths, dim=1) for part in (query, key, value)), strict=True)
         read = [functional.scaled_dot_product_attention(q[None], k[None], v[None])[0] for q, k, v in pictures]
         mixed: Tensor = self.out_proj(torch.cat(read, dim=1).transpose(0, 1).flatten(1))
         return mixed
 
 
-def _rotated(heads: Tensor, rotation: tuple[Tensor, Tensor]) -> Tensor:
+def _rotate(heads: Tensor, rotation: tuple[Tensor, Tensor]) -> Tensor:
     cosines, sines = rotation
     wide = heads.float()
     first, second = wide.chunk(2, dim=-1)

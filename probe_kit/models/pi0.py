@@ -24,8 +24,8 @@ from lerobot.policies.pi05.modeling_pi05 import PI05Policy
 from torch import Tensor, nn
 
 from probe_kit._system.bounded_files import load_json
-from probe_kit.models.building import Gate, building_device, replaced
-from probe_kit.models.checkpoint_files import SIGLIP_TOWER, renamed, renamed_tensors
+from probe_kit.models.building import Gate, building_device, replace_attributes
+from probe_kit.models.checkpoint_files import SIGLIP_TOWER, rename_tensor, renamed_tensors
 from probe_kit.models.config_file import ConfigFile, Count
 
 _VLM = "paligemma_with_expert.paligemma"
@@ -59,7 +59,7 @@ current_pi05_keys = partial(current_keys, names=(*_MOVED, *_TIME_OF_PI05))
 
 
 def _current(name: str, names: Sequence[tuple[str, str]]) -> str:
-    bare = renamed(name.removeprefix("model."), SIGLIP_TOWER)
+    bare = rename_tensor(name.removeprefix("model."), SIGLIP_TOWER)
     for old, new in names:
         if bare.startswith(old):
             return f"model.{new}{bare.removeprefix(old)}"
@@ -134,7 +134,7 @@ def build_resized[Policy: nn.Module](
             embedding scale and the rotary frequencies are buffers no checkpoint holds.
     """
     config.device = building_device(device)
-    with resized(sys.modules[policy.__module__], size, config), torch.device(config.device):
+    with resize_network(sys.modules[policy.__module__], size, config), torch.device(config.device):
         return policy(config).eval()
 
 
@@ -149,7 +149,7 @@ def full_size_pi0() -> PI0Policy:
 
 
 @contextmanager
-def resized(module: Any, size: PaliGemmaSize | None, policy_config: Any) -> Iterator[None]:
+def resize_network(module: Any, size: PaliGemmaSize | None, policy_config: Any) -> Iterator[None]:
     """Let lerobot's module of such a policy build networks of this size inside the context.
 
     None stands for the released size.
@@ -184,7 +184,7 @@ def resized(module: Any, size: PaliGemmaSize | None, policy_config: Any) -> Iter
             return gemma(config=config)
 
         replacements["PiGemmaForCausalLM"] = build_expert
-    with replaced(module, replacements):
+    with replace_attributes(module, replacements):
         yield
 
 

@@ -156,7 +156,7 @@ class PrismaticConfig(ConfigFile):
         if (run := values.get("model")) is not None:
             if not isinstance(run, Mapping):
                 raise CheckpointError(f"{source} has no fields under `model`; download the checkpoint again")
-            config = cls.from_json(_of_run(run, source), source)
+            config = cls.from_json(_fields_of_run(run, source), source)
             return config.model_copy(update={"tokenizer_id": _TOKENIZERS[config.text.model_type]})
         return super().from_json(values, source)
 
@@ -195,7 +195,7 @@ class PrismaticConfig(ConfigFile):
         )
 
 
-def _of_run(run: Mapping[str, Any], source: str) -> dict[str, Any]:
+def _fields_of_run(run: Mapping[str, Any], source: str) -> dict[str, Any]:
     """Return the fields of a training run under the names of a checkpoint.
 
     Raises:
@@ -488,7 +488,7 @@ def prepare_picture(picture: NDArray[np.uint8], settings: PictureSettings) -> ND
     if settings.strategy == "letterbox":
         # The original loops over the towers and keeps the last one's colour; the padding is the same for all.
         image = _padded_to_square(image, settings.means[-1])
-    fit = _squeezed if settings.strategy == "resize-naive" else _scaled_and_cropped
+    fit = _squeeze if settings.strategy == "resize-naive" else _scaled_and_cropped
     towers = zip(settings.sides, settings.means, settings.deviations, settings.resampling, strict=True)
     return np.concatenate([_for_tower(image, fit, *tower) for tower in towers])
 
@@ -506,7 +506,7 @@ def _for_tower(
     return np.asarray(normalised.transpose(2, 0, 1), np.float32)
 
 
-def _squeezed(image: Image.Image, side: int, resampling: Image.Resampling) -> Image.Image:
+def _squeeze(image: Image.Image, side: int, resampling: Image.Resampling) -> Image.Image:
     return image.resize((side, side), resampling)
 
 
@@ -540,7 +540,7 @@ def centre_crop(picture: NDArray[np.uint8], side: int, area: float = CROP_AREA) 
     factor = np.float32(np.sqrt(area))
     rows, columns = (_samples(extent, side, factor) for extent in picture.shape[:2])
     pixels = picture.astype(np.float32) / np.float32(255)
-    cropped = _between(_between(pixels, rows, 0), columns, 1)
+    cropped = _interpolate(_interpolate(pixels, rows, 0), columns, 1)
     return (np.clip(cropped, 0, 1) * np.float32(255.5)).astype(np.uint8)
 
 
@@ -551,7 +551,7 @@ def _samples(extent: int, side: int, factor: np.float32) -> NDArray[np.float32]:
     return np.asarray(start + np.arange(side) * step, np.float32)
 
 
-def _between(pixels: NDArray[np.float32], places: NDArray[np.float32], axis: int) -> NDArray[np.float32]:
+def _interpolate(pixels: NDArray[np.float32], places: NDArray[np.float32], axis: int) -> NDArray[np.float32]:
     low = np.floor(places).astype(np.intp)
     high = np.minimum(low + 1, pixels.shape[axis] - 1)
     shape = [1] * pixels.ndim

@@ -66,15 +66,15 @@ _QWEN3_SMALL_VISION: dict[str, Any] = {
 
 def build_qwen2_5_vl(config: Any, dtype: torch.dtype, device: str = "meta") -> Any:
     """Return the network in eval mode; see `build_empty`."""
-    return _built(lambda: Qwen2_5_VLForConditionalGeneration(config), dtype, device)
+    return _build(lambda: Qwen2_5_VLForConditionalGeneration(config), dtype, device)
 
 
 def build_qwen3_vl(config: Any, dtype: torch.dtype, device: str = "meta") -> Any:
     """Return the network in eval mode; see `build_empty`."""
-    return _built(lambda: Qwen3VLForConditionalGeneration(config), dtype, device)
+    return _build(lambda: Qwen3VLForConditionalGeneration(config), dtype, device)
 
 
-def _built(make: Any, dtype: torch.dtype, device: str) -> Any:
+def _build(make: Any, dtype: torch.dtype, device: str) -> Any:
     network = build_empty(make, dtype, device)
     fill_rotary(network)
     return network

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Literal, cast, get_args
 
 import typer
 
-from probe_kit._system.counting import counted
+from probe_kit._system.counting import plural
 from probe_kit._tables.printing import Format, print_table
 from probe_kit._terminal import options as common
 from probe_kit._terminal.console import (
     err,
-    marked,
+    markup,
     out,
     print_json,
     print_text,
@@ -486,7 +486,7 @@ def save_all(figures: "Sequence[ReportFigure]", folder: Path, details: bool = Fa
     for path in save_figures(drawn, folder):
         say(f"figure: {path}")
     if left_out := len(figures) - len(drawn):
-        say(f"{counted(left_out, 'further figure')}: add --details all")
+        say(f"{plural(left_out, 'further figure')}: add --details all")
 
 
 def say_report(written: Path) -> None:
@@ -552,7 +552,7 @@ def show_stages(
         for table in known_used_tables(joined):
             out.print(table)
         for note in joined.notes:
-            out.print(marked("[yellow]{}[/]", note))
+            out.print(markup("[yellow]{}[/]", note))
     if figures is not None:
         from probe_kit.retention.displays.bars import known_used_figure
 

@@ -4,7 +4,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal, Self, get_args
 
-from probe_kit._system.counting import counted
+from probe_kit._system.counting import plural
 from probe_kit._system.escaping import as_argument, csv_of_frame, without_folders
 from probe_kit._tables.formats import render
 from probe_kit._tables.table import Table
@@ -631,4 +631,4 @@ def _in_words(tried: Mapping[str, int]) -> str:
     """Return how many labels a run has probes of; one whose values changed counts again."""
     words = [f"{name} in {of} versions" if of > 1 else name for name, of in tried.items()]
     first = ", ".join([*words[:_NAMED], *["…"] * (len(words) > _NAMED)])
-    return f"{counted(sum(tried.values()), 'label')} ({first})"
+    return f"{plural(sum(tried.values()), 'label')} ({first})"

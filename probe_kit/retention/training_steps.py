@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from probe_kit._system.counting import counted
+from probe_kit._system.counting import plural
 from probe_kit._system.table_cells import is_count
 from probe_kit._tables.numbers import number, percent, points
 from probe_kit._tables.table import Cell, Heading, Table, absent
@@ -77,7 +77,7 @@ def read_steps(text: str | None, runs: Sequence[RunReader]) -> dict[str, int]:
         steps = [int(part) for part in parts]
     if len(steps) != len(runs):
         raise UsageError(
-            f"--compare steps has {counted(len(steps), 'step')} for {counted(len(runs), 'run')}; give one per "
+            f"--compare steps has {plural(len(steps), 'step')} for {plural(len(runs), 'run')}; give one per "
             "run, in order"
         )
     if len(runs) < 2 or len(set(steps)) < len(steps):

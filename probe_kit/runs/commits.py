@@ -82,7 +82,7 @@ def commit_key(number: int) -> str:
     return f"{COMMITS}/{number:08d}.json"
 
 
-def numbered(location: Location, folder: str) -> Iterator[tuple[int, str, bytes]]:
+def numbered_objects(location: Location, folder: str) -> Iterator[tuple[int, str, bytes]]:
     """Yield number, key and content of the objects `<eight digits>.json` in `folder`.
 
     Other names are ignored, such as those that file managers give to copies.
@@ -103,7 +103,7 @@ def read_commits(root: Root, checked: Mapping[int, Commit] | None = None) -> dic
         RunDamagedError: For the first commit that was changed or belongs elsewhere, or the first object that is
             missing or has another size. The message names it.
     """
-    unread = _unread(root.location, checked) if checked else numbered(root.location, COMMITS)
+    unread = _unread(root.location, checked) if checked else numbered_objects(root.location, COMMITS)
     commits = {number: read_commit(root, number, key, raw) for number, key, raw in unread}
     if problem := next(size_problems(root, commits), None):
         raise RunDamagedError(f"{root.location}/{problem}")
@@ -248,7 +248,7 @@ def read_failures(root: Root) -> dict[str, str]:
     """Return the reason by episode id of every episode that was given up. Raises RunDamagedError."""
     advice = "Remove it; the same `probe-kit extract` tries the episode again"
     reasons = {}
-    for number, key, raw in numbered(root.location, FAILED):
+    for number, key, raw in numbered_objects(root.location, FAILED):
         planned = root.planned.get(number, {}).get("episode_id")
         expected = {"run": root.identity, "episode": number, "episode_id": planned}
         failure = Failure.parse(raw, f"{root.location}/{key}", advice, **expected)
@@ -312,7 +312,7 @@ def read_seconds(root: Root, commits: Mapping[int, Commit]) -> dict[int, Seconds
         RunDamagedError: For a record that was changed, or is missing among others.
     """
     stored = {}
-    for number, key, raw in numbered(root.location, TIMES):
+    for number, key, raw in numbered_objects(root.location, TIMES):
         record = SecondsRecord.parse(raw, f"{root.location}/{key}", _ADVICE, run=root.identity, episode=number)
         stored[number] = Seconds(record.inference, record.simulation)
     if stored and (missing := sorted(commits.keys() - stored.keys())):

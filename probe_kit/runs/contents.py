@@ -11,7 +11,7 @@ from pathlib import Path
 from probe_kit._system.drafts import draft_of, full_disk_in_words, move_draft
 from probe_kit.errors import RunDamagedError, UsageError
 from probe_kit.runs.columns import Columns, seal_key
-from probe_kit.runs.commits import Commit, commit_key, numbered, redo, redo_picture, seconds_key, stamp_of
+from probe_kit.runs.commits import Commit, commit_key, numbered_objects, redo, redo_picture, seconds_key, stamp_of
 from probe_kit.runs.folder import Folder
 from probe_kit.runs.layout import (
     DATA,
@@ -68,7 +68,7 @@ def record_keys(root: Root, commits: Mapping[int, Commit], columns: Columns | No
         yield seconds_key(number)
         yield f"{PROVENANCE}/{commit.provenance}.json"
     yield from certificate_keys(root.location)
-    yield from (key for _, key, _ in numbered(root.location, FAILED))
+    yield from (key for _, key, _ in numbered_objects(root.location, FAILED))
     if columns is not None:
         yield seal_key(stamp_of(commits))
     for home in BUNDLES:
@@ -91,10 +91,10 @@ def stored_objects(root: Root, commits: Mapping[int, Commit], columns: Columns |
             yield StoredObject(f"{columns.folder}/{key}", expected, columns.advice)
     for home in BUNDLES:
         for key in bundle_keys(root.location, home):
-            yield from _of_result(root, home, key)
+            yield from _objects_of_result(root, home, key)
 
 
-def _of_result(root: Root, home: str, key: str) -> Iterator[StoredObject]:
+def _objects_of_result(root: Root, home: str, key: str) -> Iterator[StoredObject]:
     try:
         bundle = read_bundle(root.location, home, key)
     except RunDamagedError:  # verification reads every head by itself
@@ -126,10 +126,10 @@ def stray_keys(
     The `objects` are those of `stored_objects`.
     """
     expected = {*record_keys(root, commits, columns), *(stored.key for stored in objects)}
-    return [key for key in root.location.keys("") if key not in expected and not _expected(key)]
+    return [key for key in root.location.keys("") if key not in expected and not _is_expected(key)]
 
 
-def _expected(key: str) -> bool:
+def _is_expected(key: str) -> bool:
     """Whether an object is a picture, or unfinished work: episodes without a commit, sweeps that still run."""
     top, _, below = key.partition("/")
     return (

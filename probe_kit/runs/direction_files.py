@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit._system.bounded_files import UNREADABLE, check_no_pointer, open_arrays, parse_json, read_json_object
-from probe_kit._system.counting import counted
+from probe_kit._system.counting import plural
 from probe_kit._system.table_cells import is_count
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.sites import Site, role_of_view
@@ -73,7 +73,7 @@ class FileDirection:
         if rank == count:
             return ""
         return (
-            f"the {count} rows of {self.name} depend on each other and span {counted(rank, 'direction')}; tokens "
+            f"the {count} rows of {self.name} depend on each other and span {plural(rank, 'direction')}; tokens "
             "are patched within these alone"
         )
 
@@ -103,7 +103,7 @@ def read_direction(text: str) -> FileDirection:
     file, _, name = text.partition("#")
     path = Path(file).expanduser()
     if (path / SAE_WEIGHTS).is_file():
-        return _of_autoencoder(path, name)
+        return _autoencoder_feature(path, name)
     if not path.is_file():
         raise UsageError(f"--direction {text}: there is no file {path}; expected safetensors or npz")
     arrays, entries = _contents(path)
@@ -211,7 +211,7 @@ def _rounding(values: NDArray[Any]) -> float:
     return max(least, float(np.finfo(values.dtype).eps)) if values.dtype.kind == "f" else least
 
 
-def _of_autoencoder(folder: Path, name: str) -> FileDirection:
+def _autoencoder_feature(folder: Path, name: str) -> FileDirection:
     """Return one feature of a sparse autoencoder that SAELens wrote."""
     arrays, _ = _contents(folder / SAE_WEIGHTS)
     decoder = arrays.get(DECODER, np.empty((0, 0)))

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Self
 
-from probe_kit._system.counting import counted, spanned
+from probe_kit._system.counting import describe_range, plural
 from probe_kit.runs.layout import AT_END, LIMIT, ONCE
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ class EnvironmentSuccess:
     @property
     def sentence(self) -> str:
         """Both rates, and that `--max-steps` lowered them where it may have."""
-        episodes = counted(self.n_episodes, "episode")
+        episodes = plural(self.n_episodes, "episode")
         if self.success_once is None:
             return f"success rate {self.sr:.0%} of {episodes}, as their clients said at the end"
         rates = (
@@ -71,7 +71,7 @@ class EnvironmentSuccess:
         )
         if not self.stopped:
             return rates
-        limit = f"limit is {spanned(self.limits)}" if self.limits else "limit is unknown"
+        limit = f"limit is {describe_range(self.limits)}" if self.limits else "limit is unknown"
         return (
             f"{rates}. --max-steps ended {self.stopped} of them after {counted_steps(self.steps)}, and the "
             f"environment's own {limit}: both rates may be too low"
@@ -106,4 +106,4 @@ def bounds_of(episodes: "pd.DataFrame") -> str:
 
 def counted_steps(steps: tuple[int, ...]) -> str:
     """Return numbers of actions in words: `1 action`, `200 actions`, `4 to 7 actions`."""
-    return counted(steps[0], "action") if len(steps) == 1 else f"{spanned(steps)} actions"
+    return plural(steps[0], "action") if len(steps) == 1 else f"{describe_range(steps)} actions"

@@ -244,7 +244,7 @@ class Folder:
                 draft.unlink()
 
     @contextmanager
-    def tended(self, folder: str) -> Iterator[None]:
+    def take_turns(self, folder: str) -> Iterator[None]:
         """Let processes that work on `folder` take turns; drafts of killed ones in it are removed."""
         path = self._path / folder
         path.mkdir(parents=True, exist_ok=True)

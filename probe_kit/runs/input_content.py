@@ -11,7 +11,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit._system.counting import counted, enumerated
+from probe_kit._system.counting import list_names, plural
 from probe_kit._system.escaping import terminal_safe
 
 CODEC_NOISE = 8
@@ -100,7 +100,7 @@ def _notes_of_camera(
     count = sum(episode.count for episode in episodes)
     everything = np.concatenate([episode.pictures[:, camera] for episode in episodes])
     if all(part.all() for part in uniform) and _range(everything) <= CODEC_NOISE:
-        yield f"{name} shows nothing but {_colour(everything)}, in all {counted(count, 'picture')} looked at"
+        yield f"{name} shows nothing but {_colour(everything)}, in all {plural(count, 'picture')} looked at"
         return
     blank = []
     if not all(part.all() for part in uniform):
@@ -111,18 +111,18 @@ def _notes_of_camera(
         if blank:
             pictures = np.concatenate([episode.pictures[:, camera] for episode in blank])
             colour = _colour(pictures) if _range(pictures) <= CODEC_NOISE else "one colour"
-            yield f"{name} shows nothing but {colour} in {_listed(blank, episodes, unit)}"
+            yield f"{name} shows nothing but {colour} in {_list_episodes(blank, episodes, unit)}"
     is_folder = unit == FILE and len(episodes) >= FEWEST
     watched = [episode for episode in episodes if (is_folder or episode.count >= FEWEST) and episode not in blank]
     moving = _moving(watched)
     stuck = [episode for episode in moving if episode.is_still(camera, is_lossy)]
-    if len(watched) > 1 and _joined(watched).is_still(camera, is_lossy):
-        yield f"{name} shows the same picture in all {counted(len(watched), unit)} looked at"
+    if len(watched) > 1 and _join_frames(watched).is_still(camera, is_lossy):
+        yield f"{name} shows the same picture in all {plural(len(watched), unit)} looked at"
     elif stuck and not is_folder:
-        yield f"{name} shows one picture from beginning to end of {_listed(stuck, moving, unit)}"
+        yield f"{name} shows one picture from beginning to end of {_list_episodes(stuck, moving, unit)}"
 
 
-def _joined(episodes: Sequence[EpisodeFrames]) -> EpisodeFrames:
+def _join_frames(episodes: Sequence[EpisodeFrames]) -> EpisodeFrames:
     """Return the frames of several episodes as those of one."""
     hashes = [frame for episode in episodes for frame in episode.hashes]
     return EpisodeFrames("", np.concatenate([episode.pictures for episode in episodes]), None, hashes)
@@ -148,9 +148,9 @@ def _notes_of_state(episodes: Sequence[EpisodeFrames], unit: str) -> Iterator[st
     everything = np.concatenate(states)
     if not np.ptp(everything, axis=0).any():
         zeros = "" if everything.any() else " (all zeros)"
-        yield f"the state is the same at all {counted(len(everything), 'frame')} looked at{zeros}"
+        yield f"the state is the same at all {plural(len(everything), 'frame')} looked at{zeros}"
     elif all(not np.ptp(state, axis=0).any() for state in states):
-        yield f"the state does not change within any of {counted(len(states), unit)} looked at"
+        yield f"the state does not change within any of {plural(len(states), unit)} looked at"
 
 
 def _is_uniform(pictures: NDArray[np.uint8]) -> NDArray[np.bool_]:
@@ -171,10 +171,10 @@ def _colour(pictures: NDArray[np.uint8]) -> str:
     return "white" if min(levels) >= 255 - 2 * CODEC_NOISE else f"one colour (RGB {', '.join(map(str, levels))})"
 
 
-def _listed(some: Sequence[EpisodeFrames], every: Sequence[EpisodeFrames], unit: str) -> str:
+def _list_episodes(some: Sequence[EpisodeFrames], every: Sequence[EpisodeFrames], unit: str) -> str:
     """Return names of episodes as a sentence has them, or their number where they are all."""
     if len(some) == len(every):
-        return f"all {counted(len(some), unit)} looked at" if len(some) > 1 else f"{unit} {some[0].name}"
+        return f"all {plural(len(some), unit)} looked at" if len(some) > 1 else f"{unit} {some[0].name}"
     names = [terminal_safe(episode.name) for episode in some[:_NAMED]]
     more = [f"{len(some) - _NAMED} more"] if len(some) > _NAMED else []
-    return f"{unit}{'s' * (len(some) > 1)} {enumerated(names + more)} ({len(some)} of {len(every)} looked at)"
+    return f"{unit}{'s' * (len(some) > 1)} {list_names(names + more)} ({len(some)} of {len(every)} looked at)"

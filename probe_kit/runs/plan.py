@@ -367,7 +367,7 @@ def further_rows(
     lost = [row for name, row in was.items() if name not in now]
     if added and lost:
         raise SettingsMismatchError(
-            f"{location} has {_counted(stored)}; this command asks for {_counted(requested)}. A run grows and "
+            f"{location} has {_contents(stored)}; this command asks for {_contents(requested)}. A run grows and "
             f"never gets smaller, and {len(lost)} of its episodes are not asked for (the first is "
             f"{lost[0]['episode_id']}). Ask for at least what it has, or choose another --out"
         )
@@ -392,7 +392,7 @@ def _check_equal(was: RowColumns, now: RowColumns, location: Location) -> None:
             )
 
 
-def _counted(rows: Sequence[RowColumns]) -> str:
+def _contents(rows: Sequence[RowColumns]) -> str:
     """Return the number of items by category in words, and the wordings they are asked in."""
     items = {row["item_id"]: row["category"] for row in rows}
     counts = ", ".join(f"{name} {count}" for name, count in sorted(Counter(items.values()).items()))

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit._system.counting import counted
+from probe_kit._system.counting import plural
 from probe_kit._system.escaping import as_argument
 from probe_kit.errors import UsageError
 from probe_kit.runs.run_source import Origin
@@ -64,7 +64,7 @@ def check_call(run: RunReader, call: int) -> None:
     captured = run.captured_calls
     if call and not 0 < call < captured:
         raise UsageError(
-            f"{run.location} has {counted(captured, 'captured inference')} per episode, counted from 0; "
+            f"{run.location} has {plural(captured, 'captured inference')} per episode, counted from 0; "
             f"there is no {call}. Extract with --captured-calls {call + 1} or more"
         )
 

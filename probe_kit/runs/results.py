@@ -177,7 +177,7 @@ def write_bundle(
         files: The contents by name; former files that are not given stay as they are.
         times: The times of events by name (UTC, ISO 8601), which replace the former ones.
     """
-    with location.tended(f"{home}/{key}"):
+    with location.take_turns(f"{home}/{key}"):
         folder, run = f"{home}/{key}", _identity(location)
         before = read_bundle(location, home, key) if is_complete(location, home, key) else None
         former = dict(before.files) if before else {}
@@ -185,7 +185,7 @@ def write_bundle(
         for name, content in files.items():
             content_sum = Checksum.of(content)
             if name not in former or former[name][1] != content_sum:
-                actual = name if before is None else _renamed(name, content_sum)
+                actual = name if before is None else _rename_key(name, content_sum)
                 location.write(f"{folder}/{actual}", content)
                 files_now[name] = actual, content_sum
         # Files, then times, then the head that names them, and only then are former files removed: a crash in
@@ -220,11 +220,11 @@ def is_complete(location: Location, home: str, key: str) -> bool:
 
 def tidy_bundle(location: Location, home: str, key: str) -> None:
     """Remove what killed processes left of a complete bundle: files and folders that never counted."""
-    with location.tended(f"{home}/{key}"):
+    with location.take_turns(f"{home}/{key}"):
         location.remove(f"{home}/.{key}{PARTIAL}")
 
 
-def _renamed(name: str, content_sum: Checksum) -> str:
+def _rename_key(name: str, content_sum: Checksum) -> str:
     path = PurePosixPath(name)
     return f"{path.stem}-{content_sum.digest[:_SHORT]}{path.suffix}"
 

@@ -67,7 +67,7 @@ from probe_kit.runs.records import RESTORE, Checksum
 from probe_kit.runs.root import read_label, read_root
 from probe_kit.runs.run_source import SERVED, Origin, RunSource, select_items
 from probe_kit.runs.store import Location, locate
-from probe_kit.runs.trajectories import Trajectories, judged, watch, with_outcomes
+from probe_kit.runs.trajectories import Trajectories, judge_again, watch, with_outcomes
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -580,10 +580,12 @@ class Run:
         """
         if last_steps == 1:
             return self._watched[0][check_rule(rule)].copy()
-        return judged(self.trajectories, self.episodes["side_correct"], self.settings["scene"], rule, last_steps)
+        return judge_again(
+            self.trajectories, self.episodes["side_correct"], self.settings["scene"], rule, last_steps
+        )
 
     def under(self, rule: str, last_steps: int = 1) -> "Run":
-        """Return the same run with its outcomes by another rule, for tables and figures; see `judged`."""
+        """Return the same run with its outcomes by another rule, for tables and figures; see `judge_again`."""
         if (check_rule(rule), last_steps) == (self.rule, self.last_steps):
             return self
         judged = copy(self)  # shares what was read; of the cache only `episodes` depends on the rule

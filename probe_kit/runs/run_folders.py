@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from difflib import get_close_matches
 from pathlib import Path
 
-from probe_kit._system.counting import counted
+from probe_kit._system.counting import plural
 from probe_kit.errors import DiskSpaceError, UsageError
 from probe_kit.runs.layout import RUN_FILE
 from probe_kit.runs.store import Location
@@ -55,7 +55,7 @@ def what_to_open(address: str) -> str:
     if "://" not in address:
         if inside := runs_in(folder):
             more = f" and {len(inside) - MOST} more" if len(inside) > MOST else ""
-            return f"It holds {counted(len(inside), 'run')}: {', '.join(map(str, inside[:MOST]))}{more}"
+            return f"It holds {plural(len(inside), 'run')}: {', '.join(map(str, inside[:MOST]))}{more}"
         neighbours = {path.name: path for path in runs_in(folder.parent, deep=False)}
         if near := get_close_matches(folder.name, neighbours, n=1):
             return f"Did you mean {neighbours[near[0]]}?"

@@ -40,7 +40,7 @@ def notes_of_content(run: "RunReader") -> list[str]:
         is_folder = "picture" in run.episodes
         with suppress(RunDamagedError):  # `run verify` is the command that reports damage
             return content_notes(
-                _files(run) if is_folder else _stored(run), names, lossy, FILE if is_folder else EPISODE
+                _files(run) if is_folder else _stored_inputs(run), names, lossy, FILE if is_folder else EPISODE
             )
     records: Sequence[Mapping[str, Any]] = run.certificate.get("processes", [run.certificate])
     return list(dict.fromkeys(note for record in records for note in record.get(INPUT_CONTENT, ())))
@@ -53,7 +53,7 @@ def _positions(count: int) -> list[int]:
     return positions
 
 
-def _stored(run: "RunReader") -> list[EpisodeFrames]:
+def _stored_inputs(run: "RunReader") -> list[EpisodeFrames]:
     """Return stored pictures and states of some episodes; the first and last row of a recorded one are joined."""
     rows_of: dict[str, list[int]] = {}
     for row, item in enumerate(run.episodes["item_id"].astype(str)):

@@ -43,7 +43,7 @@ def suite_of(run: RunReader, folder: Path | None = None) -> "Suite":
         except SuiteError as error:
             moved.append(f"The folder {source_folder} of its extraction no longer holds it: {error}")
     try:
-        return _embedded(run)
+        return _embedded_suite(run)
     except SuiteNotFoundError as error:
         if not moved:
             raise
@@ -62,7 +62,7 @@ def _in_folder(run: RunReader, folder: Path) -> "Suite":
     return suite
 
 
-def _embedded(run: RunReader) -> "Suite":
+def _embedded_suite(run: RunReader) -> "Suite":
     from probe_kit.suite.build import default_identity
     from probe_kit.suite.generators import GENERATORS
 
@@ -74,7 +74,7 @@ def _embedded(run: RunReader) -> "Suite":
             f"can be drawn again. {_GIVE}"
         )
     try:
-        drawn = next((suite for suite in _drawn(counts) if _holds(suite, run)), None)
+        drawn = next((suite for suite in _draw_suite(counts) if _holds(suite, run)), None)
     except OSError as error:
         raise SuiteNotFoundError(
             f"{run.location} was extracted from {run.suite}, whose pictures are needed and cannot be drawn again: "
@@ -89,7 +89,7 @@ def _embedded(run: RunReader) -> "Suite":
     return replace(drawn, items=tuple(item for item in drawn.items if item.item_id in planned))
 
 
-def _drawn(counts: Mapping[str, int]) -> Iterator["Suite"]:
+def _draw_suite(counts: Mapping[str, int]) -> Iterator["Suite"]:
     """Yield the embedded suites that a run with so many items per category can come from, the cheapest first."""
     from probe_kit.suite import load_suite
     from probe_kit.suite.build import ITEMS, default_folder, default_suite

@@ -325,7 +325,7 @@ class Bucket:
         yield
 
     @contextmanager
-    def tended(self, folder: str) -> Iterator[None]:  # noqa: ARG002 - an object store holds no drafts
+    def take_turns(self, folder: str) -> Iterator[None]:  # noqa: ARG002 - an object store holds no drafts
         """Run the body without a lock: files of other content have other names, and the last head counts."""
         yield
 

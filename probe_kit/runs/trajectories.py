@@ -75,7 +75,7 @@ class Trajectories:
         return Trajectory.of_frames(row[:frames])
 
 
-def judged(
+def judge_again(
     trajectories: Iterable[Trajectory], sides: Iterable[Side], scene: Mapping[str, Any], rule: str, last_steps: int
 ) -> pd.DataFrame:
     """Return a row per episode with the fields of `Judgement`.

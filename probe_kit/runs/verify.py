@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 from probe_kit._system.escaping import as_argument
 from probe_kit.errors import MissingExtraError, ProbeKitError, RunDamagedError
 from probe_kit.hooks.contract.sites import PADDING
-from probe_kit.hooks.family import imported
+from probe_kit.hooks.family import import_object
 from probe_kit.runs.array_store import ArrayStore
 from probe_kit.runs.arrays import Rows, create_array, open_array
 from probe_kit.runs.columns import Columns, columns_folder, find_columns, seal_key, write_seal
-from probe_kit.runs.commits import Commit, numbered, read_commit, read_failures, read_seconds
+from probe_kit.runs.commits import Commit, numbered_objects, read_commit, read_failures, read_seconds
 from probe_kit.runs.contents import StoredObject, sizes_of, stored_objects, stray_keys
 from probe_kit.runs.layout import COLUMNS, COMMITS, DATA, SEALED, StoredStream, VectorKind
 from probe_kit.runs.plan import count_plans
@@ -53,7 +53,7 @@ def seal(path: Path | str | Location, deep: bool = False) -> bool:
             other records. By default only missing objects are noticed.
     """
     location = Run(locate(path)).location
-    with location.locked(lambda: None), location.tended(DATA):  # a folder that is never exchanged
+    with location.locked(lambda: None), location.take_turns(DATA):  # a folder that is never exchanged
         run = read_run(location)
         if deep and not run.root.left_out:
             run.restore_records()
@@ -254,7 +254,7 @@ def _audit(location: Location, deep: bool) -> Audit:
             return otherwise
 
     commits: dict[int, Commit] = {}
-    for number, key, raw in numbered(location, COMMITS):
+    for number, key, raw in numbered_objects(location, COMMITS):
         if commit := checked(partial(read_commit, root, number, key, raw), None):
             commits[number] = commit
     try:
@@ -350,7 +350,7 @@ def _reading_problems(run: Run) -> Iterator[str]:
         for row in range(len(run.episodes)):
             yield from _complaints(partial(run.trajectory, row))
     for name in _RESULT_READERS:
-        listing: Callable[[Run], Iterator[Callable[[], object]]] = imported(name)
+        listing: Callable[[Run], Iterator[Callable[[], object]]] = import_object(name)
         try:
             readers = list(listing(run))
         except RunDamagedError as error:

@@ -206,7 +206,7 @@ class RunWriter:
         check_other_settings(root.own_settings, self.settings, str(self.location))
         self._check_lengths(root)
         if self._lacks(root):
-            with self.location.locked(lambda: None), self.location.tended(PLANS):
+            with self.location.locked(lambda: None), self.location.take_turns(PLANS):
                 root = self._grown()
         root.check()
         if root.plan:  # an array has no length before its first row arrives
@@ -308,7 +308,7 @@ class RunWriter:
             self.root, self._ids = read_root(self.location), None  # another process was first
 
     @contextmanager
-    def owned(self) -> Iterator[None]:
+    def claim(self) -> Iterator[None]:
         """Work on the run while the body runs; failures of earlier attempts are removed."""
         with self.location.locked(lambda: self.location.remove(FAILED)):
             yield
@@ -383,7 +383,7 @@ class RunWriter:
         rounding: some objects then are ours although the commit is not. All of them become ours, with the commit.
         """
         key = commit_key(episode.planned.index)
-        with self.location.tended(COMMITS):
+        with self.location.take_turns(COMMITS):
             theirs = read_commit(self.root, episode.planned.index, key, self.location.read(key))
             if (theirs.objects, theirs.pictures) != (commit.objects, commit.pictures):
                 self.location.write(key, self._write_objects(episode).to_bytes())

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from probe_kit._system.counting import counted
+from probe_kit._system.counting import plural
 from probe_kit._system.escaping import as_argument, terminal_safe
 from probe_kit._terminal import options as common
-from probe_kit._terminal.console import err, marked, out, say
+from probe_kit._terminal.console import err, markup, out, say
 from probe_kit._terminal.field_options import command_with, options_of
 from probe_kit.errors import UsageError
 from probe_kit.extract.parts import ActMachine, ActTask, Capture, ModelSettings
@@ -108,11 +108,11 @@ def serve(
     def ready() -> None:
         _print_plan(server.plan, server.address)
         if server.token_file is not None:
-            say(marked("token: in [bold]{}[/], which only you can read", server.token_file))
-        say(marked("[green]ready[/]; Ctrl-C commits what was played and ends"))
+            say(markup("token: in [bold]{}[/], which only you can read", server.token_file))
+        say(markup("[green]ready[/]; Ctrl-C commits what was played and ends"))
         out.print(server.address, soft_wrap=True)
 
-    server.serve(stop_after, ready, lambda line: say(marked("[yellow]{}[/]", line)))
+    server.serve(stop_after, ready, lambda line: say(markup("[yellow]{}[/]", line)))
     with err.status("sealing"):
         run = server.close()
     _print_end(run, server.session)
@@ -122,13 +122,13 @@ def serve(
 def _say_line(line: "Line") -> None:
     """Print what became of an episode."""
     number = "" if line.number is None else f"{line.number} "
-    counts = f"{line.captured} of {counted(line.inferences, 'inference')} captured"
+    counts = f"{line.captured} of {plural(line.inferences, 'inference')} captured"
     style = "[red]{}[/]" if line.failure else "[green]{}[/]" if line.outcome == "success" else "{}"
     outcome = "captured" if line.outcome == "capture_only" else line.outcome
     end = f": {line.failure}" if line.failure else ""
     template = f"episode {{}}[bold]{{}}[/] of {{}}: {{}}, {{}} s, {style}{{}}"
     seconds = f"{line.seconds:.1f}"
-    say(marked(template, number, line.episode, line.client, counts, seconds, outcome, end))
+    say(markup(template, number, line.episode, line.client, counts, seconds, outcome, end))
 
 
 def _print_plan(plan: "ServerPlan", address: str) -> None:
@@ -166,7 +166,7 @@ def _print_plan(plan: "ServerPlan", address: str) -> None:
         "mark": f"{KEY}: {{id, group?, step?}}; alone {{end: true, facts: {{success: true}}}}"
         + ("" if served.rule == "said" else f"; without it: --episodes {served.rule}"),
         "comes back": f"actions, float32 ({', '.join(chunk)}): chunk and numbers",
-        "stores": f"the first {counted(capture.calls, 'inference')} of an episode"
+        "stores": f"the first {plural(capture.calls, 'inference')} of an episode"
         + (f", of each {served.every}th" if served.every > 1 else ""),
         "streams": (streams or "unknown before the model is loaded")
         + (f" ({plan.origin})" if plan.origin else ""),
@@ -179,7 +179,7 @@ def _print_plan(plan: "ServerPlan", address: str) -> None:
     table.add_column(overflow="fold")
     for name, value in rows.items():
         if value:
-            table.add_row(marked("[dim]{}[/]", name), terminal_safe(value))
+            table.add_row(markup("[dim]{}[/]", name), terminal_safe(value))
     err.print(table)
 
 
@@ -189,12 +189,12 @@ def _print_end(run: "Run | None", session: "Session") -> None:
     if run is None:
         say("no episode was played; nothing is stored")
         return
-    refused = f", {counted(session.refused, 'observation')} refused" if session.refused else ""
-    say(f"{counted(session.committed, 'episode')} committed{refused}; the run has {len(run.episodes)}")
+    refused = f", {plural(session.refused, 'observation')} refused" if session.refused else ""
+    say(f"{plural(session.committed, 'episode')} committed{refused}; the run has {len(run.episodes)}")
     if len(run.episodes):
         print_input_notes(run)
         partial = " --partial" if len(run.episodes) < run.planned else ""
-        say(marked("next: [bold]probe-kit targets {}{}[/]", as_argument(run.location), partial))
+        say(markup("next: [bold]probe-kit targets {}{}[/]", as_argument(run.location), partial))
     out.print(str(run.location), soft_wrap=True)
 
 

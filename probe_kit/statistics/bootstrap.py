@@ -39,10 +39,10 @@ def group_bootstrap(
 
     Returns:
         Low and high, (S,) each. Where groups agree, or all but a few, resampling claims more certainty than there
-        is; see `widened`.
+        is; see `widen_draws`.
     """
     value, each = values.mean(axis=0), group_means(values, groups)
-    wide = widened(bootstrap_means(values, groups, seed, draws), value, each, seed, bounds)
+    wide = widen_draws(bootstrap_means(values, groups, seed, draws), value, each, seed, bounds)
     return interval(wide, value)
 
 
@@ -80,8 +80,8 @@ def _sums(values: NDArray[np.floating] | NDArray[np.bool_], groups: ArrayLike) -
     return sums, np.bincount(group_of).astype(np.float64)
 
 
-def widened(draws: Matrix, value: Matrix, each: Matrix, seed: int, bounds: Bounds = SHARES) -> Matrix:
-    """Return the (B, S) draws, with no quantile nearer to the (S,) `value` than the same quantile of `unseen`.
+def widen_draws(draws: Matrix, value: Matrix, each: Matrix, seed: int, bounds: Bounds = SHARES) -> Matrix:
+    """Return the (B, S) draws, with no quantile nearer to the (S,) `value` than that of `unseen_quantiles`.
 
     Draws of groups contain nothing that was not observed. Where fifteen of sixteen groups agree, hardly any draw
     has three groups of the other kind. The interval would then be narrower than where all sixteen agree. Here, one
@@ -98,7 +98,7 @@ def widened(draws: Matrix, value: Matrix, each: Matrix, seed: int, bounds: Bound
     """
     mixed = np.random.default_rng(derive_seed("unseen", seed)).permutation(len(draws))
     order = mixed[np.argsort(draws[mixed].round(12), axis=0, kind="stable")]  # equal up to the rounding of sums
-    ordered, least = np.take_along_axis(draws, order, axis=0), unseen(value, each, len(draws), bounds)
+    ordered, least = np.take_along_axis(draws, order, axis=0), unseen_quantiles(value, each, len(draws), bounds)
     half = len(draws) // 2
     ordered[:half] = np.minimum(ordered[:half], least[:half])
     ordered[half:] = np.maximum(ordered[half:], least[half:])
@@ -107,7 +107,7 @@ def widened(draws: Matrix, value: Matrix, each: Matrix, seed: int, bounds: Bound
     return wide
 
 
-def unseen(
+def unseen_quantiles(
     value: NDArray[np.floating], each: Matrix, draws: int = BOOTSTRAP_DRAWS, bounds: Bounds = SHARES
 ) -> Matrix:
     """The quantiles (draws, S), from least to largest, of a mean that unobserved groups could have.

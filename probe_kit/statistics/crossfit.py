@@ -278,7 +278,7 @@ def crossfit(
         UsageError: For NaN, or streams on other groups.
     """
     _check(streams, groups)
-    scored = [_scored(stream) for stream in streams]
+    scored = [_score_stream(stream) for stream in streams]
     return CrossFit(
         np.array([score for score, *_ in scored]) - chance,
         np.array([stream.peak for stream in streams]),
@@ -290,7 +290,7 @@ def crossfit(
     )
 
 
-def _scored(stream: StreamScores) -> tuple[float, Matrix, Matrix]:
+def _score_stream(stream: StreamScores) -> tuple[float, Matrix, Matrix]:
     """Return the score of a stream, (G,) the influence of every group on it, and (R, G) the sums of choices."""
     sums, sizes = stream.scores.sums, stream.scores.sizes
     # One seed for all streams and runs: on equal groups their choices are made in the same resamples.

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from probe_kit._system.counting import counted
+from probe_kit._system.counting import plural
 from probe_kit.errors import TooFewGroupsError, UsageError
 
 if TYPE_CHECKING:
@@ -163,7 +163,7 @@ def assign_folds(labels: ArrayLike, groups: ArrayLike, n_folds: int, seed: int) 
     names, group_of = np.unique(np.asarray(groups), return_inverse=True)
     if names.size < n_folds:
         raise TooFewGroupsError(
-            f"{counted(names.size, 'independent group')} of items cannot fill {n_folds} folds: items that share a "
+            f"{plural(names.size, 'independent group')} of items cannot fill {n_folds} folds: items that share a "
             "picture and both layouts of an item stay together. Extract more items of this category."
         )
     classes, class_of = np.unique(np.asarray(labels), return_inverse=True)

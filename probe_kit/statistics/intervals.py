@@ -90,8 +90,8 @@ def difference_interval(
     if not (first_limits.bounded and second_limits.bounded):
         return NO_LIMITS
     gap = first - second
-    below = _combined(first - first_limits.low, second_limits.high - second, correlation)
-    above = _combined(first_limits.high - first, second - second_limits.low, correlation)
+    below = _combine_limits(first - first_limits.low, second_limits.high - second, correlation)
+    above = _combine_limits(first_limits.high - first, second - second_limits.low, correlation)
     return Interval(gap - below, gap + above)
 
 
@@ -134,7 +134,7 @@ def correlation_of(covariance: float, variances: tuple[float, float]) -> float:
     return max(-1.0, min(1.0, covariance / scale)) if scale > NEGLIGIBLE_VARIANCE else 0.0
 
 
-def _combined(first: float, second: float, correlation: float) -> float:
+def _combine_limits(first: float, second: float, correlation: float) -> float:
     return sqrt(max(0.0, first**2 + second**2 - 2 * correlation * first * second))
 
 

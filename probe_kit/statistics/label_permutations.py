@@ -167,7 +167,7 @@ def exchange_blocks(
     if possible <= max(ENUMERATED, count + 1):
         orders = islice(product(*(permutations(range(len(family))) for family in families)), 1, None)
     else:
-        orders = _drawn([len(family) for family in families], count, np.random.default_rng(seed))
+        orders = _draw_orders([len(family) for family in families], count, np.random.default_rng(seed))
     columns = []
     for order in orders:
         source = np.arange(size)
@@ -191,7 +191,7 @@ def _families(blocks: Mapping[str, Positions], kinds: Mapping[str, Hashable]) ->
     return [np.stack(family) for family in families.values()]
 
 
-def _drawn(
+def _draw_orders(
     sizes: Sequence[int], count: int, generator: np.random.Generator
 ) -> Iterator[tuple[tuple[int, ...], ...]]:
     """Draw `count` different orders of families, none of them the identity; there are more than `count`."""

@@ -96,8 +96,8 @@ def better_than_best(
     stays = (np.random.default_rng(seed).random((sums.shape[1], EXCHANGES)) < 0.5).astype(float)
     # A model that keeps its own groups and takes the other's elsewhere, site by site.
     shared = min(len(sums), len(reference_sums))
-    mixed_here = _mixed(sums, reference_sums[_matching(len(sums), shared)], stays)
-    mixed_there = _mixed(reference_sums, sums[_matching(len(reference_sums), shared)], stays)
+    mixed_here = _mix_sums(sums, reference_sums[_matching(len(sums), shared)], stays)
+    mixed_there = _mix_sums(reference_sums, sums[_matching(len(reference_sums), shared)], stays)
     null = mixed_here.max(axis=0) - mixed_there.max(axis=0)
     best = float(np.asarray(references, np.float64).mean(axis=1).max())
     factor = _widening(best, chance) if widening is None else widening
@@ -129,7 +129,7 @@ def _flipped_p(gains: Matrix, seed: int, factor: float) -> Matrix:
     return p_value(gains.sum(axis=1), factor * (gains @ signs).max(axis=0, keepdims=True))
 
 
-def _mixed(sums: Matrix, other: Matrix, stays: Matrix) -> Matrix:
+def _mix_sums(sums: Matrix, other: Matrix, stays: Matrix) -> Matrix:
     """Return the sums (S, draws) over groups, of `sums` where a group `stays` and of `other` elsewhere."""
     mixed: Matrix = sums @ stays + other @ (1 - stays)
     return mixed
@@ -301,7 +301,7 @@ def holm(p_values: Sequence[float | None]) -> list[float | None]:
     return corrected
 
 
-def corrected[Row](
+def holm_corrected[Row](
     rows: Sequence[Row],
     p: Callable[[Row], float | None],
     summary: Callable[[Row], bool] = lambda _: False,

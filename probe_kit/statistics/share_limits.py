@@ -103,7 +103,7 @@ def korn_graubard_limits(sums: Matrix, sizes: Matrix, tail: float = TAIL) -> tup
     perfect = tail ** (1 / sizes.size)
 
     def lowest(errors: Matrix) -> Matrix:
-        shares, counting = _of_fewer_errors(errors, sizes)
+        shares, counting = _shares_of_fewer_errors(errors, sizes)
         share = 1 - errors.sum(axis=1) / total
         alike = exchangeable_variances(errors, sizes)
         few = np.minimum(_effective(share, alike, total), counting[:, -1])
@@ -135,7 +135,7 @@ def wilson_limits(sums: Matrix, sizes: Matrix, tail: float = TAIL) -> tuple[Matr
     perfect = count / (count + NormalDist().inv_cdf(1 - tail) ** 2)
 
     def lowest(errors: Matrix) -> Matrix:
-        shares, counting = _of_fewer_errors(errors, sizes)
+        shares, counting = _shares_of_fewer_errors(errors, sizes)
         low = wilson_low(shares, np.maximum(counting, count), square)
         share = 1 - errors.sum(axis=1) / sizes.sum()
         return _below(perfect, share, sizes.sum(), np.where(shares < _ALL, low, 1.0).min(axis=1))
@@ -193,7 +193,7 @@ def _effective(shares: Matrix, variances: Matrix, n_episodes: float) -> Matrix:
 # -- some of the errors --------------------------------------------------------------------------------------
 
 
-def _of_fewer_errors(errors: Matrix, sizes: Matrix) -> tuple[Matrix, Matrix]:
+def _shares_of_fewer_errors(errors: Matrix, sizes: Matrix) -> tuple[Matrix, Matrix]:
     """Return the shares right (S, K) of 0, 1, … and all errors, with their fewest effective episodes.
 
     t of the errors x of a pattern may lie in any groups that have them, y ≤ x. With q = t / E, E² v is q² Σ size²
@@ -226,7 +226,7 @@ def _of_fewer_errors(errors: Matrix, sizes: Matrix) -> tuple[Matrix, Matrix]:
 
 
 def _largest_sums(errors: Matrix, numbers: Matrix, q: Matrix, sizes: Matrix) -> Matrix:
-    """Return (K,) the largest sums over groups of y (x − 2 q size) with Σ y = t; see `_of_fewer_errors`."""
+    """Return (K,) the largest sums over groups of y (x − 2 q size) with Σ y = t; see `_shares_of_fewer_errors`."""
     worth = errors - 2 * q[:, None] * sizes
     order = np.argsort(-worth, axis=1)
     worth, most = np.take_along_axis(worth, order, axis=1), errors[order]

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from probe_kit._system.counting import counted
+from probe_kit._system.counting import plural
 from probe_kit._system.escaping import as_argument
 from probe_kit.errors import TooFewGroupsError
 from probe_kit.statistics.bootstrap import GAINS, group_bootstrap
@@ -43,7 +43,7 @@ def at_most(sites: GroupSums) -> float:
     """
     if sites.n_groups < 2:
         raise TooFewGroupsError(
-            f"{counted(sites.n_groups, 'independent group')} of items set no limit; expected two or more"
+            f"{plural(sites.n_groups, 'independent group')} of items set no limit; expected two or more"
         )
     return float(korn_graubard_limits(sites.sums, sites.sizes, SIGNIFICANCE)[1].max())
 

@@ -141,11 +141,11 @@ def open_archive(name: str | Path) -> Path | None:
             return None
         check_sums(path)
         return path
-    return _unpacked(path.resolve()) if path.is_file() and path.suffix == ".zip" else None
+    return _unpack_archive(path.resolve()) if path.is_file() and path.suffix == ".zip" else None
 
 
 @cache
-def _unpacked(file: Path) -> Path:
+def _unpack_archive(file: Path) -> Path:
     folder = Path(tempfile.mkdtemp(prefix="probe-kit-pack-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     check_no_pointer(file)

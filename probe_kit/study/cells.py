@@ -114,7 +114,7 @@ class Selection:
         return {name: count if self.items is None else min(count, self.items) for name, count in every.items()}
 
 
-def joined(selections: Iterable[Selection]) -> Selection:
+def join_selections(selections: Iterable[Selection]) -> Selection:
     """Return the smallest selection that holds all of these."""
     every = list(selections)
     categories = tuple(dict.fromkeys(name for selection in every for name in selection.categories))
@@ -165,12 +165,12 @@ class Cell:
     @cached_property
     def selection(self) -> Selection:
         """The selection that all blocks together need."""
-        return joined(self.selections.values())
+        return join_selections(self.selections.values())
 
     def selected(self, blocks: Collection[str]) -> Selection | None:
         """Return the selection that these blocks need together, None if none of them uses the run."""
         selections = [selection for name, selection in self.selections.items() if name in blocks]
-        return joined(selections) if selections else None
+        return join_selections(selections) if selections else None
 
     @property
     def n_items(self) -> int:
@@ -319,7 +319,7 @@ class Failures:
             DiskSpaceError: For a folder that cannot be written.
             StoreError: For an object store that cannot be written.
         """
-        with self._location.explained_errors(), self._location.tended(FOLDER):
+        with self._location.explained_errors(), self._location.take_turns(FOLDER):
             pass
 
     def of(self, cell: Cell, probes: str = "") -> Failure | None:

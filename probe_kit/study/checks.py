@@ -12,7 +12,7 @@ from probe_kit.runs.store import SCHEMES
 from probe_kit.statistics.label_permutations import permutations_for, smallest_p
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.study.cells import FOLDER, PlannedSuite, slug, slugs
-from probe_kit.study.expansion import Member, acts, answers, categories_of, excludes, members, of_side
+from probe_kit.study.expansion import Member, acts, answers, categories_of, excludes, members, runs_of_side
 from probe_kit.study.schema import (
     BlockTable,
     Mistake,
@@ -22,7 +22,7 @@ from probe_kit.study.schema import (
     Study,
     TableKind,
     TableTable,
-    unknown,
+    complaint_of_unknown,
 )
 from probe_kit.suite.categories import check_slug
 from probe_kit.train.choices import CORRECT
@@ -46,7 +46,7 @@ def unknown_names(study: Study, suite: PlannedSuite) -> list[Mistake]:
         "category": list(suite.items),
     }
     return [
-        Mistake(path, unknown(kind, name, names[kind]))
+        Mistake(path, complaint_of_unknown(kind, name, names[kind]))
         for path, kind, uses in _uses(study)
         if kind != "category" or suite.items  # a suite that cannot be read has none
         for name in uses
@@ -110,7 +110,7 @@ _BY_ROLE = ("mean:", "tokens:")
 def misfits(study: Study, suite: PlannedSuite) -> list[Mistake]:
     """Return the mistakes of tables that do not fit together, in order. Every name of the file is known."""
     checks: tuple[Callable[[Study, PlannedSuite], Iterator[Mistake]], ...] = (
-        _out, _suite, _models, _lineages, _run_blocks, _excludes, _unused, _probes, _comparisons, _drift,
+        _out, _suite, _models, _lineages, _run_blocks, _excludes, _unused_names, _probes, _comparisons, _drift,
         _tables, _figures,
     )  # fmt: skip
     return [mistake for check in checks for mistake in check(study, suite)]
@@ -224,7 +224,7 @@ def _excludes(study: Study, _: PlannedSuite) -> Iterator[Mistake]:
                 yield Mistake(("runs", position, "exclude"), f"{text} excludes no run of block {block.name!r}")
 
 
-def _unused(study: Study, _: PlannedSuite) -> Iterator[Mistake]:
+def _unused_names(study: Study, _: PlannedSuite) -> Iterator[Mistake]:
     used = list(members(study))
     networks = (model.untrained for model in study.models.values())
     in_use: dict[str, set[str | None]] = {
@@ -280,7 +280,7 @@ def _few_items(study: Study, block: BlockTable, suite: PlannedSuite, path: Place
 
 def _views(path: Place, views: list[str], model: ModelTable) -> Iterator[Mistake]:
     """Yield a mistake for views that no stream of a model has, or of unknown form where streams are unknown."""
-    declared = [view for stream in _declared(model) for view in view_names(stream.roles)]
+    declared = [view for stream in _declared_streams(model) for view in view_names(stream.roles)]
     for view in views:
         pooled = view.replace("tokens", "mean", 1)  # every token is there of what has a mean
         has_form = view in _POOLED or (view.startswith(_BY_ROLE) and view.partition(":")[2])
@@ -290,7 +290,7 @@ def _views(path: Place, views: list[str], model: ModelTable) -> Iterator[Mistake
             yield Mistake(path, text)
 
 
-def _declared(model: ModelTable) -> tuple[DeclaredStream, ...]:
+def _declared_streams(model: ModelTable) -> tuple[DeclaredStream, ...]:
     """Return the streams that a family declares; none where it declares none, or the options are wrong."""
     family = get_family(model.family)
     try:
@@ -326,10 +326,10 @@ def _comparisons(study: Study, _: PlannedSuite) -> Iterator[Mistake]:
                     if (model, way) not in planned:
                         yield Mistake((*path, "pairs"), f"no block plays {model!r} in {way!r}")
         yield from _without_common_condition(study, table.chain or [], (*path, "chain"))
-        yield from _grouped(study, table.groups or [], (*path, "groups"))
+        yield from _check_groups(study, table.groups or [], (*path, "groups"))
 
 
-def _grouped(study: Study, names: list[str], path: Place) -> Iterator[Mistake]:
+def _check_groups(study: Study, names: list[str], path: Place) -> Iterator[Mistake]:
     """Yield a mistake for models in several groups of a comparison, and groups without a common condition."""
     groups = {name: [group for group in model.groups if group in names] for name, model in study.models.items()}
     for name, of_model in groups.items():
@@ -360,7 +360,7 @@ def _drift(study: Study, _: PlannedSuite) -> Iterator[Mistake]:
         path = ("drift", name)
         for side in dict.fromkeys(side for pair in table.pairs for side in pair):
             model, _slash, way = side.partition("/")
-            runs = of_side(every, side)
+            runs = runs_of_side(every, side)
             if way and not runs:
                 yield Mistake((*path, "pairs"), f"no block makes the run {side!r}")
             elif not runs:
@@ -393,7 +393,7 @@ def _other_streams(study: Study, side: str, second: str, path: Place) -> Iterato
     widths = [
         {
             (declared.stream.name, declared.stream.width)
-            for declared in _declared(study.models[name.partition("/")[0]])
+            for declared in _declared_streams(study.models[name.partition("/")[0]])
             if declared.stream.part == "backbone"
         }
         for name in (side, second)
@@ -418,7 +418,7 @@ def _tables(study: Study, suite: PlannedSuite) -> Iterator[Mistake]:
         yield from _other_comparison(study, table, path)
         yield from _nothing_to_print(study, table, (*path, "runs"))
         if table.kind in _OF_PROBES:
-            yield from _unprobed(study, table.runs or [], f"a table of kind {table.kind!r}", (*path, "runs"))
+            yield from _check_probes(study, table.runs or [], f"a table of kind {table.kind!r}", (*path, "runs"))
         yield from _absent_categories(study, table.runs or [], table.categories, suite, path)
         if table.elsewhere is None:
             continue
@@ -464,7 +464,7 @@ def _nothing_to_print(study: Study, table: TableTable, path: Place) -> Iterator[
         yield Mistake(path, f"a table of kind {table.kind!r} {text}")
 
 
-def _unprobed(study: Study, runs: list[str], subject: str, path: Place) -> Iterator[Mistake]:
+def _check_probes(study: Study, runs: list[str], subject: str, path: Place) -> Iterator[Mistake]:
     """Yield a mistake for blocks whose probes are to be shown, and no run of which a table of probes names."""
     probed = {name for table in study.shown_probes.values() for name in table.runs}
     # Blocks share runs, so that a block without probes of its own can show those of another one.
@@ -498,7 +498,7 @@ def _figures(study: Study, suite: PlannedSuite) -> Iterator[Mistake]:
         path = ("figures", name)
         yield from _absent_categories(study, figure.runs, figure.categories, suite, path)
         if figure.kind in _OF_PROBES:
-            yield from _unprobed(study, figure.runs, f"a figure of kind {figure.kind!r}", (*path, "runs"))
+            yield from _check_probes(study, figure.runs, f"a figure of kind {figure.kind!r}", (*path, "runs"))
         if figure.view is None:
             continue
         if figure.kind != "curves":

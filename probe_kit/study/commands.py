@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from probe_kit._system.counting import counted
+from probe_kit._system.counting import plural
 from probe_kit._system.escaping import as_argument
 from probe_kit._tables.printing import Format, print_table
-from probe_kit._terminal.console import counter, err, marked, out, print_json, print_text, progress, say
+from probe_kit._terminal.console import counter, err, markup, out, print_json, print_text, progress, say
 from probe_kit._terminal.options import (
     AsJson,
     EnvWorkers,
@@ -117,7 +117,7 @@ def run(
         if changed or (exit_code and not plan.complete):
             raise typer.Exit(UNFINISHED)
         return
-    failed = _played(plan, slots=slots, ray=ray, env_workers=env_workers, retry_failed=retry_failed)
+    failed = _play(plan, slots=slots, ray=ray, env_workers=env_workers, retry_failed=retry_failed)
     if plan.totals()["missing"]:
         plan = plan_study(study, only)
     if plan.totals()["unprobed"] and not no_probes:
@@ -130,11 +130,11 @@ def run(
         plan = plan_study(study, only)
     _print(plan, as_json)
     for failure in failed:
-        say(marked("[red]{}[/]", failure))
+        say(markup("[red]{}[/]", failure))
     if failed or plan.totals()["missing"]:
         raise typer.Exit(UNFINISHED)
     if study.study.tables:
-        say(marked("next: [bold]probe-kit study table {}[/]", as_argument(file)))
+        say(markup("next: [bold]probe-kit study table {}[/]", as_argument(file)))
 
 
 def _print(plan: "StudyPlan", as_json: bool) -> None:
@@ -178,7 +178,7 @@ def _look(plan: "StudyPlan", verify: bool, orphans: bool, as_json: bool) -> bool
     return bool(problems)
 
 
-def _played(plan: "StudyPlan", **options: Any) -> "list[Failure]":
+def _play(plan: "StudyPlan", **options: Any) -> "list[Failure]":
     """Play what is missing, with a bar for the study and one per run in play."""
     from probe_kit.study import EpisodeStored, Failure, conduct_study
 
@@ -189,7 +189,7 @@ def _played(plan: "StudyPlan", **options: Any) -> "list[Failure]":
         def report(event: "Event") -> None:
             nonlocal stored
             if isinstance(event, Failure):
-                say(marked("[red]{}[/]", event))
+                say(markup("[red]{}[/]", event))
             elif isinstance(event, EpisodeStored):
                 count(event.run, event.stored, event.planned)
                 stored += 1
@@ -238,13 +238,13 @@ def table(
     accepts_missing = partial and name is None
     tables, missing = make_each(names, lambda each: make_table(study, each, partial), accepts_missing)
     for table_name, why in missing.items():
-        say(marked("[red]no table {}: {}[/]", table_name, why))
+        say(markup("[red]no table {}: {}[/]", table_name, why))
     _print_tables(tables, style, single=name is not None)
     if not name and style not in ("json", "csv"):
         numbers = [number for printed in tables.values() for number in printed.numbers]
         tests = sum(number.get("p") is not None or number.get("p_over_models") is not None for number in numbers)
         say(
-            f"{counted(len(tables), 'table')} with {counted(tests, 'test')}; "
+            f"{plural(len(tables), 'table')} with {plural(tests, 'test')}; "
             "each is corrected within its own comparison."
         )
     if missing or any(printed.is_partial for printed in tables.values()):
@@ -275,7 +275,7 @@ def _write_report(study: "LoadedStudy", html: Path, partial: bool) -> None:
         report = write_study_report(study, html, partial)
     say_report(html)
     for name, reason in report.missing.items():
-        say(marked("[red]no {}: {}[/]", name, reason))
+        say(markup("[red]no {}: {}[/]", name, reason))
     if report.is_partial:
         raise typer.Exit(UNFINISHED)
 
@@ -386,7 +386,7 @@ def pack(
     with err.status("packing"):
         record = pack_study(load_study(file), out_file, partial, [name for name in EXTRAS if extras[name]])
     out.print(
-        f"{out_file}: {counted(len(record.runs), 'run')}, without {', '.join(record.left_out)}", soft_wrap=True
+        f"{out_file}: {plural(len(record.runs), 'run')}, without {', '.join(record.left_out)}", soft_wrap=True
     )
     for name, reason in record.missing.items():
         _print_plain(f"not packed: {name}: {reason}")

@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit._tables.content import Number, grouped
+from probe_kit._tables.content import Number, group_headings
 from probe_kit._tables.numbers import number, p_text, percent, points
 from probe_kit._tables.table import Cell, Cells, Table
 from probe_kit.errors import UsageError
@@ -106,12 +106,12 @@ def _decisions(
         tested = fold_of == fold
         moved = features[tested]
         if like is not None:
-            moved = _moved(moved, features[~tested], like[~tested])
+            moved = _move_features(moved, features[~tested], like[~tested])
         decisions[tested] = moved @ direction.weights[position].astype(np.float64) + direction.intercepts[position]
     return decisions
 
 
-def _moved(features: Features, origin: Features, like: Features) -> Features:
+def _move_features(features: Features, origin: Features, like: Features) -> Features:
     """Return features with means and deviations of `like` instead of those of `origin`.
 
     Constant features become means.
@@ -307,7 +307,7 @@ def _why_alone_beside_vlm(before: RunReader, after: RunReader, view: str) -> str
         return "other words"
     if ask["picture"] != "frame" or _picture_size(vlm) != _picture_size(policy):
         return "other pictures"
-    of_vlm, of_policy = _delivered(vlm, view), _delivered(policy, view)
+    of_vlm, of_policy = _delivered_tokens(vlm, view), _delivered_tokens(policy, view)
     both = of_vlm.keys() & of_policy.keys()
     return "other tokens" if any(None in of_vlm[name] or of_vlm[name] != of_policy[name] for name in both) else ""
 
@@ -317,7 +317,7 @@ def _picture_size(run: Any) -> list[int]:
     return list(scene.get("picture_size") or (scene["camera"]["width"], scene["camera"]["height"]))
 
 
-def _delivered(run: Any, view: str) -> dict[str, tuple[Any, list[int]]]:
+def _delivered_tokens(run: Any, view: str) -> dict[str, tuple[Any, list[int]]]:
     """Return by episode the instruction's tokens as the model was delivered them, and the positions of a view."""
     role, delivered = view.partition(":")[2], {}
     for commit in run.commits():
@@ -469,7 +469,7 @@ def drift_table(pairs: Mapping[tuple[str, str], Sequence[CategoryDrift]], title:
     heading = f"Drift: {title}" + (f" ({', '.join(dict.fromkeys(alone.values()))})" if alone else "")
     numbers = tuple(number for names, drift in drifts for number in _numbers(names, drift, view))
     groups = (*_COLUMNS, *[_LENS][:has_lens])
-    return Table.of(heading, grouped(*groups), cells, names=2, notes=note, numbers=numbers)
+    return Table.of(heading, group_headings(*groups), cells, names=2, notes=note, numbers=numbers)
 
 
 def _verdict(drift: CategoryDrift) -> str:

@@ -65,7 +65,7 @@ def members(study: Study) -> Iterator[Member]:
                     yield from (Member(block, position, model, way, seed) for seed in block.seeds)
 
 
-def of_side[Run: (Member, Cell)](runs: Sequence[Run], side: str) -> list[Run]:
+def runs_of_side[Run: (Member, Cell)](runs: Sequence[Run], side: str) -> list[Run]:
     """Return the runs of one side of a drift pair: of a model's first condition, or of that after the slash."""
     model, _, way = side.partition("/")
     of_model = [run for run in runs if run.model == model and (run.way == way if way else not run.asks)]
@@ -96,7 +96,7 @@ def expand(study: Study, suite: PlannedSuite) -> tuple[list[Cell], list[Mistake]
         try:
             settings = _settings(study, member)
         except ProbeKitError as error:
-            mistakes.append(Mistake(_blamed(study, member, str(error)), str(error)))
+            mistakes.append(Mistake(_blamed_place(study, member, str(error)), str(error)))
             continue
         try:
             settings.scene.to_json()
@@ -119,7 +119,7 @@ def expand(study: Study, suite: PlannedSuite) -> tuple[list[Cell], list[Mistake]
     return every, list(dict.fromkeys(mistakes))  # every run of a wrong table repeats its mistake
 
 
-def _blamed(study: Study, member: Member, message: str) -> Place:
+def _blamed_place(study: Study, member: Member, message: str) -> Place:
     """Return the table whose values a settings error is about, and the key in it that the message names."""
     home, name = "asks" if member.asks else "conditions", member.way
     # If the model's settings are wrong even in a condition without values, the model is to blame.

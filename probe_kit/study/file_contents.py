@@ -41,7 +41,7 @@ def content_of(path: str | Path) -> str | None:
     try:
         folder = Path(path).expanduser()
         files = list(_files(folder))
-        cached = {file: _cached(file) for file in files}
+        cached = {file: _cached_hash(file) for file in files}
         unread = sum(file.stat().st_size for file in files if cached[file] is None)
         if unread >= LONG_READ:
             say(f"reading {in_units(unread)} of {path}, once: a run is known by the content of its checkpoint")
@@ -93,7 +93,7 @@ def _entry(identity: list[str | int]) -> Path:
     return user_cache() / "file-hashes" / f"{sha256_text(str(identity[0]))[:32]}.json"
 
 
-def _cached(file: Path) -> str | None:
+def _cached_hash(file: Path) -> str | None:
     identity = _identity(file)
     try:
         entry = json.loads(read_regular(_entry(identity), _MOST_BYTES))

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import probe_kit.version
 from probe_kit._system.bounded_files import read_regular, read_regular_text
-from probe_kit._system.counting import counted
+from probe_kit._system.counting import plural
 from probe_kit._system.drafts import draft_of, full_disk_in_words, move_draft
 from probe_kit._system.escaping import markdown_safe
 from probe_kit._system.imports import require
@@ -248,7 +248,7 @@ def _card(study: LoadedStudy, pack: Pack, table: "pd.DataFrame", licence: str | 
 def _words(study: LoadedStudy, pack: Pack, episodes: int) -> Iterator[str]:
     yield f"# {markdown_safe(study.study.name)}"
     yield ""
-    size = f"{counted(len(pack.runs), 'run')}, {counted(episodes, 'episode')}"
+    size = f"{plural(len(pack.runs), 'run')}, {plural(episodes, 'episode')}"
     yield f"A study made with probe_kit {pack.version}: {size}."
     yield markdown_safe(f"Suite: {pack.suite.identity}. Left out: {', '.join(pack.left_out)}.")
     yield ""
@@ -320,10 +320,10 @@ def publish_data_set(
         api.create_tag(repository, tag=version, repo_type="dataset", exist_ok=True)
         return str(commit.commit_url)
 
-    return _tried(upload, repository, pause)
+    return _try_upload(upload, repository, pause)
 
 
-def _tried(upload: Callable[[], str], repository: str, pause: float) -> str:
+def _try_upload(upload: Callable[[], str], repository: str, pause: float) -> str:
     """Return the result of an upload that may need several tries."""
     import httpx
     from huggingface_hub.errors import HfHubHTTPError

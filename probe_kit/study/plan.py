@@ -10,7 +10,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from probe_kit._system.counting import counted
+from probe_kit._system.counting import plural
 from probe_kit.errors import ProbeKitError, RunIncompleteError, RunNotFoundError, UsageError
 from probe_kit.extract.sizes import planned_sizes, space_of
 from probe_kit.hooks.registry import family_names
@@ -22,7 +22,7 @@ from probe_kit.runs.store import locate
 from probe_kit.study.cells import NOT_TRIED_AGAIN, Cell, Failure, Failures, Selection
 from probe_kit.study.expansion import control_of
 from probe_kit.study.reading import LoadedStudy
-from probe_kit.study.schema import ProbesTable, unknown
+from probe_kit.study.schema import ProbesTable, complaint_of_unknown
 from probe_kit.study.stored import open_matching, part_of, probe_key_of
 from probe_kit.study.study_folder import changed_settings
 from probe_kit.train.results.control_scores import Controls
@@ -249,13 +249,13 @@ class StudyPlan:
     def lines(self) -> list[str]:
         """Return totals, hours and bytes with their source, and skipped models, in words."""
         totals, suite = self.totals(), self.study.suite
-        unprobed = f"; probes of {counted(totals['unprobed'], 'run')}" if totals["unprobed"] else ""
+        unprobed = f"; probes of {plural(totals['unprobed'], 'run')}" if totals["unprobed"] else ""
         lines = [
             f"suite: {suite.identity}; items from {suite.source}",
-            f"{counted(totals['runs'], 'run')}, {counted(totals['episodes'], 'episode')} ({totals['acted']:,} "
+            f"{plural(totals['runs'], 'run')}, {plural(totals['episodes'], 'episode')} ({totals['acted']:,} "
             f"acted, {totals['captured']:,} captured without acting, {totals['asked']:,} asked), at most "
-            f"{counted(totals['inferences'], 'inference')} of policies (given by shape: no model was loaded)",
-            f"missing: {counted(totals['missing'], 'episode')}{unprobed}",
+            f"{plural(totals['inferences'], 'inference')} of policies (given by shape: no model was loaded)",
+            f"missing: {plural(totals['missing'], 'episode')}{unprobed}",
         ]
         hours, unmeasured = _known_sums(self.hours())
         if hours:
@@ -313,28 +313,28 @@ def plan_study(study: LoadedStudy, only: str | None = None) -> StudyPlan:
     """
     names = [*study.study.models, *(block.name for block in study.study.runs)]
     if only is not None and only not in names:
-        raise UsageError(f"--only: {unknown('block or model', only, names)}")
+        raise UsageError(f"--only: {complaint_of_unknown('block or model', only, names)}")
     cells = [cell for cell in study.cells if only is None or only == cell.model or only in cell.selections]
     order = {name: position for position, name in enumerate(study.study.models)}
-    planned = [_planned(study, cell) for cell in sorted(cells, key=lambda cell: order[cell.model])]
+    planned = [_plan_cell(study, cell) for cell in sorted(cells, key=lambda cell: order[cell.model])]
     return StudyPlan(study, tuple(_waiting(planned)))
 
 
-def _planned(study: LoadedStudy, cell: Cell) -> PlannedCell:
+def _plan_cell(study: LoadedStudy, cell: Cell) -> PlannedCell:
     location = str(locate(cell.location(study.study.folder)))
     if cell.unavailable:
         return PlannedCell(cell, location, "skipped", 0, f"skipped: {cell.unavailable}")
     try:
         run = open_matching(study, cell, partial=True)
     except (RunNotFoundError, RunIncompleteError):  # the second one was killed before it had a plan
-        return _failed(study, PlannedCell(cell, location, "new", 0, _why_new(study, cell)))
+        return _failed_cell(study, PlannedCell(cell, location, "new", 0, _why_new(study, cell)))
     except ProbeKitError as error:
         return PlannedCell(cell, location, "damaged", 0, f"damaged: {error}")
     stored, streams = _stored_episodes(cell, run), tuple(run.root.streams.values())
     if stored < cell.episodes:
         why = f"{stored} of {cell.episodes} episodes"
         partial = PlannedCell(cell, location, "partial", stored, why, seconds=_mean_seconds(run), streams=streams)
-        return _failed(study, partial)
+        return _failed_cell(study, partial)
     return PlannedCell(
         cell,
         location,
@@ -378,7 +378,7 @@ def _short(value: Any) -> str:
     return text if len(text) <= 40 else f"{text[:37]}…"
 
 
-def _failed(study: LoadedStudy, planned: PlannedCell) -> PlannedCell:
+def _failed_cell(study: LoadedStudy, planned: PlannedCell) -> PlannedCell:
     failure = None if study.archive is not None else Failures(study.study.folder).of(planned.cell)
     if failure is None:
         return planned

@@ -6,7 +6,7 @@ from functools import partial
 from itertools import groupby
 from statistics import fmean
 
-from probe_kit._system.counting import spanned
+from probe_kit._system.counting import describe_range
 from probe_kit._tables.content import Heading, Legend, Number
 from probe_kit._tables.numbers import NONE, number, percent, plain
 from probe_kit._tables.table import Cell, Cells, Table
@@ -242,7 +242,7 @@ def caption(table: RetentionTable, sentences: Sequence[str]) -> str:
 
 def episodes_per_category(table: RetentionTable) -> str:
     """Return how many episodes a category of a table with rows has, in words."""
-    return f"{spanned([row.success.n_episodes for row in table.rows])} episodes per category"
+    return f"{describe_range([row.success.n_episodes for row in table.rows])} episodes per category"
 
 
 # -- columns by category -----------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from typing import Any, get_args
 from pydantic import BaseModel, ValidationError
 
 from probe_kit._system.bounded_files import read_regular
-from probe_kit._system.complaints import MISSING, UNKNOWN, complaints_of, joined
+from probe_kit._system.complaints import MISSING, UNKNOWN, complaints_of, join_complaints
 from probe_kit._system.escaping import as_argument
 from probe_kit.errors import UsageError
 from probe_kit.study import schema
@@ -98,7 +98,7 @@ def load_study(name: str | Path) -> LoadedStudy:
     """
     archive = open_archive(name)
     file = find_study(str(name)) if archive is None else archive / STUDY_FILE
-    content = _parsed(file)
+    content = _parse(file)
     try:
         study = schema.Study.model_validate(content)
     except ValidationError as error:
@@ -125,7 +125,7 @@ def load_study(name: str | Path) -> LoadedStudy:
     return LoadedStudy(file, study.model_copy(update={"out": runs}), suite, packed, pack)
 
 
-def _parsed(file: Path) -> dict[str, Any]:
+def _parse(file: Path) -> dict[str, Any]:
     """Return the content of a file.
 
     Raises:
@@ -159,7 +159,7 @@ def _mistakes(error: ValidationError, content: dict[str, Any]) -> list[Mistake]:
         text = f"unknown key{_near(path)}" if complaint == UNKNOWN else complaint
         words = f"{_NAME_PATTERN} (small letters, digits, dots, hyphens and underscores)"
         texts.setdefault(path, []).append(text.replace(_NAME_PATTERN, words))
-    return [Mistake(path, joined(of_value)) for path, of_value in texts.items()]
+    return [Mistake(path, join_complaints(of_value)) for path, of_value in texts.items()]
 
 
 def _near(path: Place) -> str:

@@ -20,7 +20,7 @@ from probe_kit.study.cells import slugs
 from probe_kit.study.plan import plan_study
 from probe_kit.study.rates import domain_scores, episodes_per_category
 from probe_kit.study.reading import LoadedStudy
-from probe_kit.study.schema import unknown
+from probe_kit.study.schema import complaint_of_unknown
 from probe_kit.study.stored import StoredRuns, stored_runs, study_probes
 from probe_kit.study.tables import make_each, make_table
 from probe_kit.version import __version__
@@ -44,7 +44,7 @@ def make_figures(study: LoadedStudy, name: str, partial_runs: bool = False) -> l
         RunIncompleteError: For runs that are missing.
     """
     if name not in study.study.figures:
-        raise UsageError(unknown("figure", name, list(study.study.figures)))
+        raise UsageError(complaint_of_unknown("figure", name, list(study.study.figures)))
     figure = study.study.figures[name]
     categories = None if figure.categories is None else slugs(figure.categories)
     subject = f"the figure {name!r}"

@@ -14,7 +14,7 @@ from unicodedata import category
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
-from probe_kit._system.complaints import shortened
+from probe_kit._system.complaints import shorten_text
 from probe_kit.errors import UsageError
 from probe_kit.extract.parts import ModelSettings
 from probe_kit.extract.prompts import Picture, Query
@@ -50,7 +50,7 @@ class Mistake:
 
 def _key(name: str) -> str:
     """Return a name on one line, in quotes where it needs them."""
-    return shortened(name if _BARE.fullmatch(name) else json.dumps(name))
+    return shorten_text(name if _BARE.fullmatch(name) else json.dumps(name))
 
 
 class StudyFileError(UsageError):
@@ -80,11 +80,11 @@ def _order(content: Any, path: Place) -> list[int]:
     return positions
 
 
-def unknown(what: str, name: str, names: Collection[str]) -> str:
+def complaint_of_unknown(what: str, name: str, names: Collection[str]) -> str:
     """Return a sentence on a name that is unknown, with the nearest match."""
     near = get_close_matches(name, names, n=1)
     hint = f" Did you mean {near[0]!r}?" if near else ""
-    return f"unknown {what} {shortened(name)!r}; known: {', '.join(names) or 'there are none'}.{hint}"
+    return f"unknown {what} {shorten_text(name)!r}; known: {', '.join(names) or 'there are none'}.{hint}"
 
 
 # -- the tables of a file ----------------------------------------------------------------------------------------

@@ -262,7 +262,7 @@ class StudyFolder:
         newest = self._newest(lambda other: (other.model, other.paths) == (cell.model, cell.paths))
         if model.same(self._models.get(name)) and (newest is None or newest.contents == contents):
             return
-        with self._location.explained_errors(), self._location.tended(RECORDS):
+        with self._location.explained_errors(), self._location.take_turns(RECORDS):
             self._location.write(f"{RECORDS}/{name}", model.to_bytes())
         self._models[name] = model
 
@@ -278,14 +278,14 @@ def _keys_in(runs: Iterable[str], cell: Cell) -> list[str]:
 
 def changed_settings(own_settings: Mapping[str, Any], cell: Cell) -> Iterator[Change]:
     """Yield the settings of a stored run that differ from those of `cell`."""
-    stored, expected = flat_settings(own_settings), flat_settings(_expected(cell))
+    stored, expected = flat_settings(own_settings), flat_settings(_expected_settings(cell))
     for name in sorted(stored | expected):
         is_open = name.partition(".")[0] in _OF_LOADED_MODEL
         if (name in expected or not is_open) and stored.get(name) != expected.get(name):
             yield name, stored.get(name), expected.get(name)
 
 
-def _expected(cell: Cell) -> dict[str, Any]:
+def _expected_settings(cell: Cell) -> dict[str, Any]:
     """Return the settings that a run of the cell has whatever model is loaded, as plain values.
 
     Settings that the file leaves to the model are absent.

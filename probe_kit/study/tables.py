@@ -33,10 +33,10 @@ from probe_kit.study.archive import TABLES, Pack, table_of_record
 from probe_kit.study.cells import Cell as PlannedRun
 from probe_kit.study.cells import Selection, slugs
 from probe_kit.study.drift import CategoryDrift, drift_table, measure_drift
-from probe_kit.study.expansion import of_side
+from probe_kit.study.expansion import runs_of_side
 from probe_kit.study.rates import caption, probing_table, score_table, sides_table, success_table, vlm_table
 from probe_kit.study.reading import LoadedStudy
-from probe_kit.study.schema import ComparisonTable, DriftTable, TableTable, unknown
+from probe_kit.study.schema import ComparisonTable, DriftTable, TableTable, complaint_of_unknown
 from probe_kit.study.stored import StoredRun, StoredRuns, probe_key, stored_runs, study_probes
 from probe_kit.suite.categories import category_of
 
@@ -61,7 +61,7 @@ def difference_table(table: RetentionTable, title: str) -> Table:
 
     The whole comparison is one family of tests.
     """
-    rows = _tested(behaviour_once(table.differences))
+    rows = _test_differences(behaviour_once(table.differences))
     cells = [
         (
             f"{row.group} − {row.minus}",
@@ -82,7 +82,7 @@ def difference_table(table: RetentionTable, title: str) -> Table:
     return Table.of(title, columns, cells, names=2, mean=MEAN, notes=notes, numbers=numbers)
 
 
-def _tested(rows: Sequence[Difference]) -> list[Difference]:
+def _test_differences(rows: Sequence[Difference]) -> list[Difference]:
     """Return the same rows without tests of fewer than FEWEST_GROUPS groups, and Holm's p over the others."""
     return with_holm([row if (row.n_groups or 0) >= FEWEST_GROUPS else replace(row, p=None) for row in rows])
 
@@ -127,7 +127,7 @@ def group_table(table: RetentionTable, title: str) -> Table:
 
 def vlm_vla_table(differences: Sequence[Difference]) -> Table:
     """Return the share right of VLMs minus the success rate of policies, where the file names a policy's VLM."""
-    rows = _tested(differences)
+    rows = _test_differences(differences)
     cells = [
         (
             f"{row.group} − {row.minus}",
@@ -177,7 +177,7 @@ def stages_table(joins: Sequence[KnownUsedTable]) -> Table:
             row.category if row.category == OVERALL else category_of(row.category).title,
             Cell(row.n_items),
             Cell(row.answered_correctly),
-            Cell("not shown" if row.has_signal is False else _encoded(join, row)),
+            Cell("not shown" if row.has_signal is False else _encoded_items(join, row)),
             Cell(row.acted_correctly),
             Cell(row.answered_and_encoded),
             Cell(row.share_not_acted_on, percent, row.share_not_acted_on_ci or (None, None)),
@@ -192,7 +192,7 @@ def stages_table(joins: Sequence[KnownUsedTable]) -> Table:
             "category": row.category,
             "items": row.n_items,
             "answered": row.answered_correctly,
-            "encoded": _encoded(join, row),
+            "encoded": _encoded_items(join, row),
             "acted_on": row.acted_correctly,
             "answered_and_encoded": row.answered_and_encoded,
             "share_not_acted_on": row.share_not_acted_on,
@@ -221,7 +221,7 @@ def stages_table(joins: Sequence[KnownUsedTable]) -> Table:
     return Table.of("Stages", columns, cells, names=2, mean=OVERALL, notes=notes, numbers=tuple(numbers))
 
 
-def _encoded(join: KnownUsedTable, row: CategoryCounts) -> int | None:
+def _encoded_items(join: KnownUsedTable, row: CategoryCounts) -> int | None:
     """Return the encoded items of categories whose probes have signal; the overall row is their sum."""
     if row.encoded is None or row.has_signal is False:
         return None
@@ -279,16 +279,16 @@ def make_table(study: LoadedStudy, name: str, partial: bool = False) -> Table:
         RunIncompleteError: For runs that are missing.
     """
     if name not in study.study.tables:
-        raise UsageError(unknown("table", name, list(study.study.tables)))
+        raise UsageError(complaint_of_unknown("table", name, list(study.study.tables)))
     table = study.study.tables[name]
     if study.pack is not None and table.kind == "drift":
-        return _packed(study.file.parent, study.pack, name)
+        return _packed_table(study.file.parent, study.pack, name)
     subject = f"the table {name!r}"
     stored = stored_runs(study, _selection(study, table), subject, partial, _categories(table))
     provenances = [provenance for run in stored.runs for provenance in run.run.provenances.values()]
     different = ", ".join(differences(provenances))  # what changes numbers, such as the version of torch
     versions = [f"runs were made with different {different}"] if different else []
-    printed = _of_kind(study, table, stored, name, partial)
+    printed = _table_of_kind(study, table, stored, name, partial)
     printed = printed.with_notes([*stored.missing, *stored.unfinished, *versions])
     return replace(printed, is_partial=bool(stored.unfinished), numbers=_numbers(printed.numbers, stored))
 
@@ -317,15 +317,15 @@ def _numbers(numbers: Sequence[Number], stored: StoredRuns) -> tuple[Number, ...
     A value that is not defined is None, because JSON has no NaN.
     """
     names = {run.location: run.cell.name for run in stored.runs}
-    defined = ({name: _defined(value) for name, value in number.items()} for number in numbers)
+    defined = ({name: _defined_value(value) for name, value in number.items()} for number in numbers)
     return tuple(
         {**number, "run": names[number["run"]]} if number.get("run") in names else number for number in defined
     )
 
 
-def _defined(value: Any) -> Any:
+def _defined_value(value: Any) -> Any:
     if isinstance(value, list | tuple):
-        return type(value)(map(_defined, value))
+        return type(value)(map(_defined_value, value))
     return None if isinstance(value, float) and not isfinite(value) else value
 
 
@@ -333,7 +333,7 @@ def _categories(table: TableTable) -> tuple[str, ...] | None:
     return None if table.categories is None else slugs(table.categories)
 
 
-def _packed(archive: Path, pack: Pack, name: str) -> Table:
+def _packed_table(archive: Path, pack: Pack, name: str) -> Table:
     """Return a table as it was packed, because it is made of activations."""
     file = archive / TABLES / f"{name}.json"
     try:
@@ -345,7 +345,7 @@ def _packed(archive: Path, pack: Pack, name: str) -> Table:
         raise RunDamagedError(f"{file} is no record of a table ({error!r}). Fetch the archive again") from error
 
 
-def _of_kind(study: LoadedStudy, table: TableTable, stored: StoredRuns, name: str, partial: bool) -> Table:
+def _table_of_kind(study: LoadedStudy, table: TableTable, stored: StoredRuns, name: str, partial: bool) -> Table:
     def keys(runs: Sequence[StoredRun]) -> list[str]:
         return [probe_key(study, run, run.run, partial) for run in runs]
 
@@ -401,12 +401,12 @@ def _of_kind(study: LoadedStudy, table: TableTable, stored: StoredRuns, name: st
 def _selection(study: LoadedStudy, table: TableTable) -> Callable[[PlannedRun], Selection | None]:
     if table.kind == "drift":
         pairs = study.study.drift[table.drift or ""].pairs
-        names = {cell.name for pair in pairs for side in pair for cell in of_side(study.cells, side)}
+        names = {cell.name for pair in pairs for side in pair for cell in runs_of_side(study.cells, side)}
         return lambda cell: cell.selection if cell.name in names else None
     comparison = study.study.comparisons.get(table.comparison or "")
     if comparison is None:
         return lambda cell: cell.selected(table.runs or ())
-    models, ways = _compared(study, comparison)
+    models, ways = _compared_models(study, comparison)
     asks = comparison.pairs is not None  # a chain and groups are of policies
 
     def select(cell: PlannedRun) -> Selection | None:
@@ -417,7 +417,7 @@ def _selection(study: LoadedStudy, table: TableTable) -> Callable[[PlannedRun], 
     return select
 
 
-def _compared(study: LoadedStudy, comparison: ComparisonTable) -> tuple[list[str], list[str]]:
+def _compared_models(study: LoadedStudy, comparison: ComparisonTable) -> tuple[list[str], list[str]]:
     """Return the models of a comparison, and their conditions: of its pairs, else the first that all have."""
     if comparison.pairs is not None:
         return comparison.pairs.models, comparison.pairs.conditions
@@ -466,7 +466,7 @@ def _sources(study: LoadedStudy, runs: Sequence[StoredRun]) -> list[tuple[str, s
 def _drift(study: LoadedStudy, table: DriftTable, stored: StoredRuns, name: str, partial: bool) -> Table:
     by_name, labels = {run.cell.name: run for run in stored.runs}, stored.labels
     drifts: dict[tuple[str, str], list[CategoryDrift]] = {}
-    for cells in ([of_side(study.cells, side) for side in pair] for pair in table.pairs):
+    for cells in ([runs_of_side(study.cells, side) for side in pair] for pair in table.pairs):
         for pair in product(*cells):
             before, after = (by_name.get(cell.name) for cell in pair)
             if before is None or after is None or before.cell.seed != after.cell.seed:

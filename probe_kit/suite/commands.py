@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from probe_kit._system.bounded_files import load_json, parse_json
-from probe_kit._system.counting import counted
+from probe_kit._system.counting import plural
 from probe_kit._system.escaping import as_argument
-from probe_kit._terminal.console import counter, err, marked, out, print_json, progress
+from probe_kit._terminal.console import counter, err, markup, out, print_json, progress
 from probe_kit._terminal.options import AsJson, Categories, Seed, choices, one_of
 from probe_kit.errors import UsageError
 from probe_kit.suite.converters.conversion import EVERY_SOURCE
@@ -41,8 +41,8 @@ def build(
         drawing = counter(bar, "drawing items")
         suite = build_suite(folder, categories, n, seed, progress=drawing)
     out.print(
-        f"{suite.identity}: {counted(len(suite.items), 'item')}, "
-        f"{counted(2 * len(suite.items), 'episode')} in {folder}"
+        f"{suite.identity}: {plural(len(suite.items), 'item')}, "
+        f"{plural(2 * len(suite.items), 'episode')} in {folder}"
     )
 
 
@@ -87,7 +87,7 @@ def from_csv(
     suite = suite_from_csv(table, out_folder, name=name, category=category, terms=terms)
     count, groups = len(suite.items), len({item.group_id for item in suite.items})
     out.print(
-        f"{suite.identity}: {counted(count, 'item')} in {counted(groups, 'group')} in {out_folder}", soft_wrap=True
+        f"{suite.identity}: {plural(count, 'item')} in {plural(groups, 'group')} in {out_folder}", soft_wrap=True
     )
     err.print(f"next: probe-kit suite validate {as_argument(out_folder)} --baselines", soft_wrap=True)
     err.print(
@@ -129,7 +129,7 @@ def show(
     if as_json:
         print_json({"suite": suite.identity, "items": rows})
         return
-    out.print(marked("[bold]{}[/]", suite.identity), soft_wrap=True)
+    out.print(markup("[bold]{}[/]", suite.identity), soft_wrap=True)
     working_folder = Path.cwd()
     for row in rows:
         # Each path on a line of its own: a column of a table would fold it, so that it could not be copied.
@@ -138,9 +138,9 @@ def show(
             side: str(path.relative_to(working_folder) if path.is_relative_to(working_folder) else path)
             for side, path in paths.items()
         }
-        out.print(marked("\n[bold]{}[/]", row["instruction"]), soft_wrap=True)
+        out.print(markup("\n[bold]{}[/]", row["instruction"]), soft_wrap=True)
         for name, text in {"category": row["category"], "item": row["item"], **pictures}.items():
-            out.print(marked("  {} {}", f"{name:<8}", text), soft_wrap=True)
+            out.print(markup("  {} {}", f"{name:<8}", text), soft_wrap=True)
 
 
 def _list_categories(suite: "Suite", as_json: bool) -> None:
@@ -244,7 +244,7 @@ def convert(
     out.print(f"{suite.identity}: {counts} items in {out_folder}", soft_wrap=True)
     if reasons := load_json(out_folder / "stats.json").get("reasons"):
         left_out = "; ".join(f"{reason} {count}×" for reason, count in reasons.items())
-        err.print(marked("records left out: {}", left_out), soft_wrap=True)
+        err.print(markup("records left out: {}", left_out), soft_wrap=True)
 
 
 def _options(pairs: list[str]) -> dict[str, Any]:

@@ -72,7 +72,7 @@ def encode_png(image: Image.Image) -> bytes:
 def picture_size(encoded: bytes) -> tuple[int, int] | None:
     """Return width and height in pixels from the file's header; None if it is no picture of `FORMATS`."""
     try:
-        with _opened(encoded) as image:
+        with _open_picture(encoded) as image:
             return image.size
     except _DECODING_ERRORS:
         return None
@@ -93,7 +93,7 @@ def load_picture(path: Path, pixels: str | None = None) -> Image.Image:
         raise SuiteError(
             f"{path}: has other pixels than its suite says (expected {pixels[:12]}, found {other[:12]}). {RESTORE}"
         )
-    return letterboxed(picture)
+    return letterbox(picture)
 
 
 def decode_picture(path: Path) -> Image.Image:
@@ -140,11 +140,11 @@ def decode_bytes(
             f"{name} is {refused}; expected one of {', '.join(FORMATS)}. Convert it, or give another file."
         )
     try:
-        with _opened(encoded) as image:
+        with _open_picture(encoded) as image:
             _check_still(image, name, error, largest)
             _check_deep(image, encoded, name, error)
             image.verify()  # decoding alone does not compare the checksums
-        with _opened(encoded) as image:
+        with _open_picture(encoded) as image:
             return on_white(ImageOps.exif_transpose(image) if upright else image)
     except UnidentifiedImageError as problem:  # its own message names an address in memory
         raise error(f"{name} not a picture that Pillow can decode (unknown format). {remedy}") from problem
@@ -178,12 +178,12 @@ def through_jpeg(pixels: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
 
 def stored_picture(path: Path, mode: str) -> Image.Image:
     """Read a picture of this package, whose transparency is part of it, in a `mode` of Pillow such as RGBA."""
-    with _opened(path.read_bytes()) as image:
+    with _open_picture(path.read_bytes()) as image:
         return image.convert(mode)
 
 
 @contextmanager
-def _opened(encoded: bytes) -> Iterator[Image.Image]:
+def _open_picture(encoded: bytes) -> Iterator[Image.Image]:
     """Open a picture of `FORMATS` that is decoded wholly or not at all, whatever other libraries set for Pillow.
 
     Pillow warns of a huge picture when it is opened. Here it is refused instead, and its size is needed for the
@@ -236,7 +236,7 @@ def on_white(image: Image.Image) -> Image.Image:
     return flat
 
 
-def letterboxed(image: Image.Image) -> Image.Image:
+def letterbox(image: Image.Image) -> Image.Image:
     """Return the picture in the middle of a white square as large as its longer side."""
     side = max(image.size)
     if image.size == (side, side):

@@ -7,7 +7,7 @@ A plan states it before any work. The later commands that refuse too few items u
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from probe_kit._system.counting import counted
+from probe_kit._system.counting import plural
 from probe_kit.statistics.label_permutations import ENUMERATED_BELOW
 from probe_kit.statistics.significance import SIGNIFICANCE, chance_margin, items_for_width
 from probe_kit.statistics.sufficiency import (
@@ -79,7 +79,7 @@ class Smallest:
     @property
     def words(self) -> str:
         """The category in a few words."""
-        return f"{self.category}: {counted(self.items, 'item')} in {counted(self.groups, 'independent group')}"
+        return f"{self.category}: {plural(self.items, 'item')} in {plural(self.groups, 'independent group')}"
 
     def items_for(self, groups: int) -> int | None:
         """Return the fewest items that `--items` can select with so many groups; None if the suite lacks them."""

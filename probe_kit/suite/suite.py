@@ -13,12 +13,12 @@ import numpy as np
 import PIL
 from PIL import Image, features
 
-from probe_kit._system.counting import counted
+from probe_kit._system.counting import plural
 from probe_kit.errors import UsageError
 from probe_kit.hashing import canonical_json, sha256_text
 from probe_kit.suite.categories import CATEGORIES, category_of, check_categories, in_order
 from probe_kit.suite.items import LAYOUTS, SCHEMA_VERSION, Episode, Item, Side
-from probe_kit.suite.pictures import encode_png, letterboxed, picture_file_name, pixels_sha256
+from probe_kit.suite.pictures import encode_png, letterbox, picture_file_name, pixels_sha256
 from probe_kit.version import __version__
 
 
@@ -73,7 +73,7 @@ class Suite:
 
     def __repr__(self) -> str:
         counts = ", ".join(f"{category} {count}" for category, count in count_by_category(self.items).items())
-        return f"<Suite {self.identity}: {counted(len(self.items), 'item')} ({counts}) in {self.folder}>"
+        return f"<Suite {self.identity}: {plural(len(self.items), 'item')} ({counts}) in {self.folder}>"
 
     @cached_property
     def content_sha256(self) -> str:
@@ -162,7 +162,7 @@ class Suite:
             return items
         if not 0 < count <= len(items):
             raise UsageError(
-                f"{count} items per category are asked for, and {category!r} has {counted(len(items), 'item')}; "
+                f"{count} items per category are asked for, and {category!r} has {plural(len(items), 'item')}; "
                 f"give a number from 1 to {len(items)}."
             )
         first, dropped = items[:count], items[count:]
@@ -258,7 +258,7 @@ def picture_of(image_id: str, image: Image.Image) -> Picture:
 
 def squared_picture(image_id: str, image: Image.Image, operation: str = "none") -> Picture:
     """Encode the picture on a white square of 224 to 512 pixels; `operation` describes earlier changes to it."""
-    square = letterboxed(image)
+    square = letterbox(image)
     size = min(max(square.width, _SMALLEST), _LARGEST)
     stored = square if square.width == size else square.resize((size, size), Image.Resampling.BICUBIC)
     return Picture(image_id, encode_png(stored), pixels_sha256(stored), pixels_sha256(image), operation)

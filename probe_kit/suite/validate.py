@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from probe_kit._system.counting import counted
+from probe_kit._system.counting import plural
 from probe_kit._system.drafts import write_whole
 from probe_kit.hashing import derive_seed
 from probe_kit.statistics.folds import OUTER_FOLDS, assign_folds
@@ -126,7 +126,7 @@ def enough_items(suite: Suite) -> Iterator[Finding]:
             yield warning("W04", category_of(category).title, f"{count} of {requested} requested")
         elif count < FEWEST_ITEMS:
             yield warning(
-                "W04", category_of(category).title, f"{counted(count, 'item')}; fewer than {FEWEST_ITEMS}"
+                "W04", category_of(category).title, f"{plural(count, 'item')}; fewer than {FEWEST_ITEMS}"
             )
 
 
@@ -137,7 +137,7 @@ def enough_groups(suite: Suite) -> Iterator[Finding]:
         groups[item.category].add(item.group_id)
     for category, members in groups.items():
         if len(members) < OUTER_FOLDS:
-            message = f"{counted(len(members), 'independent group')}; probes need at least {OUTER_FOLDS}"
+            message = f"{plural(len(members), 'independent group')}; probes need at least {OUTER_FOLDS}"
             yield warning("W09", category_of(category).title, message)
 
 
@@ -442,7 +442,7 @@ class Report:
         if 0 < len(self.missing) <= len(CATEGORIES) // 2:
             lines.append(f"Not in this suite: {', '.join(category_of(slug).title for slug in self.missing)}.")
         verdict = "valid" if self.ok else "not valid"
-        counts = f"{counted(len(self.errors), 'error')}, {counted(len(self.warnings), 'warning')}"
+        counts = f"{plural(len(self.errors), 'error')}, {plural(len(self.warnings), 'warning')}"
         lines.append(f"{self.suite}: {verdict}, {counts}")
         return "\n".join(line for line in lines if line)
 

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING, Any
 
 from rich.text import Text
 
-from probe_kit._system.counting import counted
+from probe_kit._system.counting import plural
 from probe_kit._system.escaping import as_argument
 from probe_kit._system.table_cells import is_count
 from probe_kit._terminal import options as common
-from probe_kit._terminal.console import counter, marked, out, progress, say, split
+from probe_kit._terminal.console import counter, markup, out, progress, say, split
 from probe_kit.errors import TooFewGroupsError, UnbalancedEpisodesError, UsageError
 from probe_kit.train import command_options as own
 from probe_kit.train.choices import CORRECT
@@ -113,9 +113,9 @@ def train(
     fitted = _train(opened, target_options, categories, call, options, details)
     if directions is not None:
         count = write_direction_file(fitted[0].directions, directions, opened.weights_sha256)
-        say(marked("{} directions: {}", count, directions))
+        say(markup("{} directions: {}", count, directions))
     of_target = "" if target_options.is_side else f" --target {shlex.quote(target)}"
-    say(marked("next: [bold]probe-kit retention {}{}[/]", as_argument(run), of_target))
+    say(markup("next: [bold]probe-kit retention {}{}[/]", as_argument(run), of_target))
 
 
 def _train(
@@ -156,7 +156,7 @@ def _train(
         fitted.append(results)
     out.print(best_sites_table(fitted, splits=details))
     for number, reason in left_out.items():
-        say(marked("[yellow]left out:[/] call {}: {}", number, reason))
+        say(markup("[yellow]left out:[/] call {}: {}", number, reason))
     if not fitted[0].controls.comparisons:
         say(
             "signal is judged against chance only: add the control random-features, or --untrained RUN, a run "
@@ -186,7 +186,7 @@ def _transfer(
     out.print(transfer_table(results, splits=details))
     for sentence in transfer_sentences(results):
         out.print(sentence, markup=False, highlight=False)
-    say(marked("nothing was stored; [bold]transfer_probes[/] in Python gives every site as a frame"))
+    say(markup("nothing was stored; [bold]transfer_probes[/] in Python gives every site as a frame"))
 
 
 # -- what a run stores ---------------------------------------------------------------------------------------
@@ -221,7 +221,7 @@ def facts_table(inventory: "Inventory", more_lines: Mapping[str, str]) -> "Table
         **inventory.streams,
         **{f"probes {probes.key}": _probes_in_words(probes, inventory) for probes in inventory.probes},
         **{
-            f"unfinished {key}": f"a sweep of {counted(sites, 'site')} so far; "
+            f"unfinished {key}": f"a sweep of {plural(sites, 'site')} so far; "
             "the same `probe-kit train` continues it"
             for key, sites in inventory.unfinished.items()
         },

@@ -9,13 +9,13 @@ from warnings import catch_warnings, simplefilter
 
 import typer
 
-from probe_kit._system.counting import counted
+from probe_kit._system.counting import plural
 from probe_kit._system.escaping import as_argument
 from probe_kit._tables.numbers import NONE
 from probe_kit._tables.printing import Format, print_table
 from probe_kit._tables.table import Table
 from probe_kit._terminal import options as common
-from probe_kit._terminal.console import marked, out, say
+from probe_kit._terminal.console import markup, out, say
 from probe_kit.errors import ProbeKitError, UsageError
 from probe_kit.train.choices import CORRECT, SIDES
 
@@ -45,26 +45,26 @@ def targets(
         Table.of(f"{opened.label}: what can be decoded", columns, rows, numbers=numbers, overflow="wrap"), style
     )
     if constant := [row.target for row in every if row.task == CONSTANT]:
-        say(marked("one value only, so that there is nothing to decode: {}", ", ".join(constant)))
+        say(markup("one value only, so that there is nothing to decode: {}", ", ".join(constant)))
     refusals: dict[str, list[str]] = {}
     for row in listed:
         if row.refused:
             refusals.setdefault(row.refused, []).append(row.target)
     for reason, names in refusals.items():
-        say(marked("[yellow]train refuses {}:[/] {}", ", ".join(names), reason))
+        say(markup("[yellow]train refuses {}:[/] {}", ", ".join(names), reason))
     # Those that need no further option come first, and what is refused is never the next step.
     possible = sorted(
         (row.options for row in listed if row.options is not None), key=lambda options: "--task" in options
     )
     if not possible:
         say(
-            marked(
+            markup(
                 "next: [bold]probe-kit labels {}[/]  writes a table to which you add labels of your own",
                 as_argument(run),
             )
         )
         return
-    say(marked("next: [bold]{}[/]", _command(str(run), possible[0])))
+    say(markup("next: [bold]{}[/]", _command(str(run), possible[0])))
 
 
 def _command(run: str, options: Sequence[str]) -> str:
@@ -212,15 +212,15 @@ def labels(
         draft.write_text(csv_of_frame(frame), encoding="utf-8", newline="\n")
         draft.rename(out_file)
     out.print(
-        f"{out_file}: {counted(len(frame), 'line')}, columns {', '.join(map(str, frame))}",
+        f"{out_file}: {plural(len(frame), 'line')}, columns {', '.join(map(str, frame))}",
         markup=False,
         highlight=False,
         soft_wrap=True,
     )
     if opened.inputs is None and (reason := why_no_sim(opened)):
-        say(marked("[yellow]no sim.* columns:[/] {}", reason))
+        say(markup("[yellow]no sim.* columns:[/] {}", reason))
     say(
-        marked(
+        markup(
             "next: add a column, then [bold]probe-kit train {} --labels {} --target COLUMN[/]",
             as_argument(run),
             as_argument(out_file),

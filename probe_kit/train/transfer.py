@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit._system.counting import counted
+from probe_kit._system.counting import plural
 from probe_kit._system.table_cells import alike
 from probe_kit._tables.numbers import p_text
 from probe_kit._tables.table import Cell, Table
@@ -481,10 +481,10 @@ def transfer_sentences(results: TransferResults) -> list[str]:
     """Return a sentence per reason for leaving samples out, then one per view: where the label transfers."""
     sentences = [f"left out: {count} {reason}" for reason, count in results.left_out.items()]
     groups, samples = results.trained_on["groups"], results.trained_on["samples"]
-    on = f"fitted on {counted(groups, 'group')}, {counted(samples, 'sample')}"
+    on = f"fitted on {plural(groups, 'group')}, {plural(samples, 'sample')}"
     for view in results.curves:
         rows = [row for row in _best(results) if row["view"] == view]
-        of = f"{on}; scored on {counted(rows[0]['groups'], 'group')}, {counted(rows[0]['n'], 'sample')}"
+        of = f"{on}; scored on {plural(rows[0]['groups'], 'group')}, {plural(rows[0]['n'], 'sample')}"
         of += f", view {view}" if len(results.curves) > 1 else ""
         sentences.append(f"{results.target} ({of}) {'; '.join(map(_verdict, rows))}.")
     return sentences

@@ -67,17 +67,17 @@ def view(
     if export is None:
         if categories or without_frames:
             raise UsageError("--only and --without-frames are of an export; give --export FOLDER too")
-        _serve(_opened(runs, True), lender, port, no_browser)
+        _serve(_open_runs(runs, True), lender, port, no_browser)
         return
     from probe_kit.view import write_viewer
 
-    opened = _opened(runs, partial)
+    opened = _open_runs(runs, partial)
     with err.status("exporting"):
         page = write_viewer(opened, export, frames=not without_frames, categories=categories, probes_of=lender)
     out.print(str(page), soft_wrap=True)
 
 
-def _opened(names: list[str], partial: bool) -> "list[Run]":
+def _open_runs(names: list[str], partial: bool) -> "list[Run]":
     """Return the runs of these names: a run, the runs below a folder, or those that `RUNS_BY_NAME` knows."""
     from probe_kit.runs import open_run
     from probe_kit.runs.run_folders import find_runs, is_run

@@ -14,7 +14,7 @@ from probe_kit.retention.behaviour import SCORES
 from probe_kit.runs.layout import FIRST_FRAME, FRAME_COLUMNS
 from probe_kit.runs.thumbnails import EpisodeFrames, episode_frames
 from probe_kit.suite.pictures import picture_size
-from probe_kit.view.run_payloads import Packed, best_sites, code_words, pack_floats, pack_log_odds, rounded
+from probe_kit.view.run_payloads import Packed, best_sites, code_words, pack_floats, pack_log_odds, round_number
 from probe_kit.view.viewed_run import ViewedRun, toward
 
 _STILL = 1e-4
@@ -55,13 +55,13 @@ def episode_payload(viewed: ViewedRun, number: int) -> dict[str, Any]:
         "frames": None if frames is None else _frames(viewed, number, frames),
         "inferences": viewed.inference_steps(position),
         "log_odds": None if log_odds is None else pack_log_odds(log_odds),
-        "refitted": None if log_odds is None else _refitted(viewed, row, calls),
+        "refitted": None if log_odds is None else _refitted_log_odds(viewed, row, calls),
         "held_out": held_out,
         "trajectory": None if trajectory is None else _trajectory(trajectory),
         "events": {} if trajectory is None else _events(trajectory),
         "outcomes": {} if trajectory is None else _outcomes(viewed, trajectory, row),
         # Words at the end of the instruction that did not reach the network.
-        "lost_words": int(rounded(row.get("lost_words"), 0) or 0),
+        "lost_words": int(round_number(row.get("lost_words"), 0) or 0),
         "instruction_tokens": len(run.instruction_ids(position) or ()),
         "words": _answers(viewed, row) | _label_words(viewed, row, position),
         "inputs": _inputs(viewed, position),
@@ -86,7 +86,7 @@ def _label_words(viewed: ViewedRun, row: dict[str, Any], position: int) -> dict[
     return {name: str(row[name]) for name in ("picture",) if name in row} | texts
 
 
-def _refitted(viewed: ViewedRun, row: dict[str, Any], calls: int) -> Any:
+def _refitted_log_odds(viewed: ViewedRun, row: dict[str, Any], calls: int) -> Any:
     """Return the log-odds of the probes of each inference; None where only one inference was probed."""
     category, view = str(row["category"]), viewed.view
     if len(viewed.refitted) < 2:  # one alone is that of `log_odds`
@@ -187,13 +187,13 @@ def _trajectory(trajectory: Trajectory) -> dict[str, Any]:
         "commanded": pack_floats(trajectory.commanded[:, :3]),
         "executed": pack_floats(trajectory.executed[:, :3]),
         "tiles": {
-            "left": pack_floats(_moved(trajectory.tile_left[:, :2])),
-            "right": pack_floats(_moved(trajectory.tile_right[:, :2])),
+            "left": pack_floats(_tile_middles(trajectory.tile_left[:, :2])),
+            "right": pack_floats(_tile_middles(trajectory.tile_right[:, :2])),
         },
     }
 
 
-def _moved(positions: NDArray[np.float32]) -> NDArray[np.float32]:
+def _tile_middles(positions: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the middles of a tile (T + 1, 2), or its first one alone where it stays."""
     return positions if np.abs(positions - positions[0]).max() > _STILL else positions[:1]
 
@@ -251,7 +251,7 @@ def episodes_payload(viewed: ViewedRun) -> dict[str, Any]:
         },
         "outcome": code_words([viewed.outcome_word(_word(value)) for value in episodes["outcome"]]),
         "steps": [None if value is None else int(value) for value in episodes.get("steps", none)],
-        "distance": [rounded(value, 3) for value in episodes.get("distance_correct", none)],
+        "distance": [round_number(value, 3) for value in episodes.get("distance_correct", none)],
         "seeds": [
             sha256_json([int(scene), int(policy)])[:_SHORT]
             for scene, policy in zip(episodes.get("scene_seed", zeros), episodes["policy_seed"], strict=True)

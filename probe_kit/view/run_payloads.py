@@ -64,17 +64,17 @@ class Packed(str):
 
 def pack_floats(values: ArrayLike) -> Packed:
     """Return the values as float32, row by row."""
-    return _packed(values, "<f4")
+    return _pack(values, "<f4")
 
 
 def pack_log_odds(values: ArrayLike) -> Packed:
     """Return log-odds as int16 in steps of 1/256, at most ±127.99; not a number becomes `MISSING`."""
     scaled = np.asarray(values, np.float64) * LOG_ODDS_SCALE
     steps = np.clip(np.round(scaled), MISSING + 1, -MISSING - 1)
-    return _packed(np.where(np.isnan(scaled), MISSING, steps), "<i2")
+    return _pack(np.where(np.isnan(scaled), MISSING, steps), "<i2")
 
 
-def _packed(values: ArrayLike, kind: str) -> Packed:
+def _pack(values: ArrayLike, kind: str) -> Packed:
     return Packed(b64encode(np.ascontiguousarray(values, dtype=kind).tobytes()).decode("ascii"))
 
 
@@ -88,7 +88,7 @@ def code_words(words: Sequence[Any]) -> dict[str, Any]:
     return {"words": distinct, "codes": [code[word] for word in words]}
 
 
-def rounded(value: Any, digits: int = 4) -> float | None:
+def round_number(value: Any, digits: int = 4) -> float | None:
     """Return a JSON number of so many decimals; None for None and for not a number."""
     return None if value is None or value != value else round(float(value), digits)
 
@@ -256,8 +256,8 @@ def _cell(column: Column, row: RetentionRow) -> dict[str, Any]:
     cell = column.cell(row)
     payload: dict[str, Any] = {"text": cell.text}
     if column.key in (SR.key, BACKBONE.key, ACTION.key) and isinstance(cell.value, float):
-        payload["value"] = rounded(cell.value)
-        payload["limits"] = None if cell.interval is None else [rounded(limit) for limit in cell.interval]
+        payload["value"] = round_number(cell.value)
+        payload["limits"] = None if cell.interval is None else [round_number(limit) for limit in cell.interval]
     return payload
 
 
@@ -344,8 +344,8 @@ def target_map_payload(viewed: ViewedRun, number: int) -> dict[str, Any]:
         "sites": _site_entries(results.curves[category, view].sites),
         "headings": (f"{metric} [95 %]", "chance", "p of this site", "p, family-wise", "verdict"),
         "cells": [_target_cells(row) for row in scores.to_dict("records")],
-        "score": [rounded(value) for value in scores["score"]],
-        "chance": [rounded(value) for value in scores["chance"]],
+        "score": [round_number(value) for value in scores["score"]],
+        "chance": [round_number(value) for value in scores["chance"]],
         "signal": [bool(value) for value in scores["signal"]],
     }
 
@@ -382,7 +382,7 @@ def _scores(results: ProbeResults, category: str, view: str | None) -> pd.DataFr
 
 def _shades(scores: pd.DataFrame) -> dict[str, Any]:
     return {
-        "accuracy": [rounded(value) for value in scores["accuracy"]],
+        "accuracy": [round_number(value) for value in scores["accuracy"]],
         "signal": [bool(value) for value in scores["signal"]],
     }
 

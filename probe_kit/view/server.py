@@ -131,7 +131,7 @@ class _Pages:
         if content is None:
             return _missing()
         kind = _KINDS.get(name.rpartition(".")[2], "text/plain")
-        return _tagged(request, content, hashlib.sha256(content).hexdigest(), kind)
+        return _tag_response(request, content, hashlib.sha256(content).hexdigest(), kind)
 
     def data(self, request: Request) -> Response:
         """Return a payload or a picture."""
@@ -144,7 +144,7 @@ class _Pages:
                     picture = self._catalogue.picture(match[1], int(match[2]))
                     if picture is None:
                         return _missing()
-                    return _tagged(request, picture, hashlib.sha256(picture).hexdigest(), "image/webp")
+                    return _tag_response(request, picture, hashlib.sha256(picture).hexdigest(), "image/webp")
                 payload = name.removesuffix(".js")
                 if payload == name:
                     return _missing()
@@ -167,7 +167,7 @@ class _Pages:
         except (ProbeKitError, OSError) as error:
             script = self._catalogue.failure(name, error)
             return Response(script, headers={"cache-control": "no-store"}, media_type=_KINDS["js"])
-        return _tagged(request, script, tag, _KINDS["js"])
+        return _tag_response(request, script, tag, _KINDS["js"])
 
     def prepare(self) -> None:
         """Compute the tables of the runs, while the browser that will ask for them starts."""
@@ -200,7 +200,7 @@ def _missing() -> Response:
     return PlainTextResponse("there is no such page", 404)
 
 
-def _tagged(request: Request, content: bytes, tag: str, kind: str) -> Response:
+def _tag_response(request: Request, content: bytes, tag: str, kind: str) -> Response:
     """Return the content with its tag, or nothing where the browser has it."""
     headers = {"etag": f'"{tag}"', "cache-control": "no-cache"}
     if request.headers.get("if-none-match") == headers["etag"]:
@@ -225,7 +225,7 @@ def _application(pages: _Pages, port: int, token: str) -> Starlette:
     )
 
 
-def _opened(port: int) -> socket.socket:
+def _open_port(port: int) -> socket.socket:
     """Return an open socket at a port of the loopback address."""
     listener = socket.socket()
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -250,7 +250,7 @@ class ViewerServer:
     """
 
     def __init__(self, catalogue: Catalogue, port: int = 0) -> None:
-        self._socket = _opened(port)
+        self._socket = _open_port(port)
         self.port: int = self._socket.getsockname()[1]
         self._token = secrets.token_urlsafe(16)
         self._pages = _Pages(catalogue, TICK_S)

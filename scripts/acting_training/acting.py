@@ -131,9 +131,9 @@ class Actor:
 
 def _without_idle(gradient: Tensor) -> Tensor:
     """Keeps the dimensions deaf that are not decided."""
-    kept = gradient.clone()
-    kept[:, list(IDLE_DIMS)] = 0.0
-    return kept
+    masked = gradient.clone()
+    masked[:, list(IDLE_DIMS)] = 0.0
+    return masked
 
 
 @contextmanager

@@ -36,14 +36,14 @@ class Carrying:
     def action(self, position: NDArray[np.float64], opened: bool) -> NDArray[np.float64]:
         """(7,) for a commanded tool position: on to the tile and down, or up again once the hand is open."""
         if opened:
-            wanted, gripper = np.array([*position[:2], max(TRAVEL_HEIGHT, position[2])]), OPEN
+            target, gripper = np.array([*position[:2], max(TRAVEL_HEIGHT, position[2])]), OPEN
         else:
             away = float(np.hypot(*(self.goal - position)[:2]))
             up = np.clip((away - DESCENT[0]) / (DESCENT[1] - DESCENT[0]), 0, 1)
-            wanted = np.array([*self.goal[:2], self.goal[2] + up * (TRAVEL_HEIGHT - self.goal[2])])
-            there = away < LETS_GO[0] and position[2] - self.goal[2] < LETS_GO[1]
-            gripper = OPEN if there else CLOSED
-        shift = wanted - position
+            target = np.array([*self.goal[:2], self.goal[2] + up * (TRAVEL_HEIGHT - self.goal[2])])
+            at_goal = away < LETS_GO[0] and position[2] - self.goal[2] < LETS_GO[1]
+            gripper = OPEN if at_goal else CLOSED
+        shift = target - position
         shift *= min(1.0, MAX_SHIFT / max(float(np.linalg.norm(shift)), 1e-9))
         return np.array([*shift, 0.0, 0.0, 0.0, gripper])
 

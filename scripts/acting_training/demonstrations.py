@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from vlm_tiny_training.recorded import Recorded
-from vlm_tiny_training.window import seen
+from vlm_tiny_training.window import model_view
 
 from acting_training.carrying import OPENED, Carrying
 from probe_kit.env import Act2AnswerEnv, SceneSpec
@@ -79,21 +79,23 @@ class Recorder:
         env.reset(seed=seed, options={"layout": "original" if side == 0 else "swapped"})
         ways = [Carrying.to(env, name) for name in SIDES]
         detour = rng.normal(0, DETOUR) if rng.random() < DETOUR_SHARE else np.zeros(3)
-        kept, lifted, resting = [], 0, 0
+        recorded, lifted, resting = [], 0, 0
         while lifted < LIFTED and env.trial.steps < LONGEST:
             position, opened = env.trial.controller.target.position, env.scene.arm.opening() > OPENED
             action = ways[side].action(position, opened)
             rests = not opened and float(np.linalg.norm(action[:3])) < RESTING
             resting = resting + 1 if rests else 0
             if resting % RESTING_STRIDE == (1 if rests else 0):
-                kept.append((*self._seen(), np.stack([way.ahead(position, opened, CHUNK) for way in ways])))
+                recorded.append(
+                    (*self._observation(), np.stack([way.ahead(position, opened, CHUNK) for way in ways]))
+                )
             lifted += opened
             env.advance(self._disturbed(action, ways[side], position, opened, detour, rng))
             detour = np.zeros(3)
         if not lifted or env.outcome().zone != "correct" or env.outcome().is_grasped:
             return None
-        columns = [np.array(column) for column in zip(*kept, strict=True)]
-        return Demonstrations(*columns, np.full(len(kept), side, np.int8), np.arange(len(kept)) == 0)
+        columns = [np.array(column) for column in zip(*recorded, strict=True)]
+        return Demonstrations(*columns, np.full(len(recorded), side, np.int8), np.arange(len(recorded)) == 0)
 
     def _disturbed(
         self,
@@ -112,12 +114,12 @@ class Recorder:
         shift[2] = max(shift[2], way.goal[2] - PRESSED - position[2])
         return np.concatenate([shift, action[3:]])
 
-    def _seen(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.float32]]:
+    def _observation(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.float32]]:
         scene = self._env.scene
         frame = scene.frame()
-        tiles = np.stack([seen(255 * np.uint8(frame.bodies == scene.quads[name])) for name in SIDES])
+        tiles = np.stack([model_view(255 * np.uint8(frame.bodies == scene.quads[name])) for name in SIDES])
         state = np.array([*scene.arm.tool_state(), 0.0, scene.arm.opening()], np.float32)
-        return seen(scene.picture(frame)), tiles, state
+        return model_view(scene.picture(frame)), tiles, state
 
 
 def record(path: Path, seeds: range, processes: int, report: Callable[[str], None]) -> Demonstrations:
@@ -126,16 +128,16 @@ def record(path: Path, seeds: range, processes: int, report: Callable[[str], Non
         return Demonstrations.read(path)
     jobs = [(seeds[number::processes], report) for number in range(processes)]
     with get_context("fork").Pool(processes) as pool:
-        made = {seed: twins for part in pool.starmap(_recorded, jobs, 1) for seed, twins in part}
-    demonstrations = Demonstrations.joined([twins for seed in seeds if (twins := made[seed]) is not None])
+        twins_by_seed = {seed: twins for part in pool.starmap(_recorded, jobs, 1) for seed, twins in part}
+    demonstrations = Demonstrations.joined([twins for seed in seeds if (twins := twins_by_seed[seed]) is not None])
     demonstrations.save(path)
     return demonstrations
 
 
 def _recorded(seeds: range, report: Callable[[str], None]) -> list[tuple[int, Demonstrations | None]]:
-    recorder, made = Recorder(), []
+    recorder, recorded = Recorder(), []
     for seed in seeds:
-        made.append((seed, recorder.twins(seed)))
-        report(f"demonstrations of seed {seed}: {'kept' if made[-1][1] else 'not on its tile'}")
+        recorded.append((seed, recorder.twins(seed)))
+        report(f"demonstrations of seed {seed}: {'kept' if recorded[-1][1] else 'not on its tile'}")
     recorder.close()
-    return made
+    return recorded

@@ -17,7 +17,7 @@ class Frames:
     def __init__(self, name: str, surface: Surface, demonstrations: Demonstrations) -> None:
         self.name = name
         self._places = surface.places
-        self._visible = [_visible(demonstrations, place, side) for side, place in enumerate(surface.places)]
+        self._visible = [_visible(demonstrations, area, side) for side, area in enumerate(surface.places)]
         self.rows = _without_pictures(demonstrations, surface, self._visible)
         self._first = np.flatnonzero(self.rows.first)
 
@@ -33,9 +33,9 @@ class Frames:
         """(96, 96, 3) float32 in [0, 255]: the asked picture on `side` (0 left), the other one opposite."""
         picture = self.rows.pictures[frame].astype(np.float32)
         for where, (couple, member) in zip((side, 1 - side), pair.pictures, strict=True):
-            place = self._places[where]
+            area = self._places[where]
             layer = pair.bank.painted[self.name][where][couple, member] * self._visible[where][frame]
-            picture[place.rows, place.columns] += layer
+            picture[area.rows, area.columns] += layer
         return picture.clip(0, 255)
 
 
@@ -45,14 +45,14 @@ def _without_pictures(
     """What the plain pictures they were recorded with added is taken off."""
     pictures = demonstrations.pictures.astype(np.float32)
     plain = [Question.built_in(layout).pictures for layout in ("original", "swapped")]
-    for side, (name, place) in enumerate(zip(("left", "right"), surface.places, strict=True)):
-        paint = np.stack([place.paint(question[name]) for question in plain])[demonstrations.side]
-        pictures[:, place.rows, place.columns] -= paint * visible[side]
+    for side, (name, area) in enumerate(zip(("left", "right"), surface.places, strict=True)):
+        paint = np.stack([area.paint(question[name]) for question in plain])[demonstrations.side]
+        pictures[:, area.rows, area.columns] -= paint * visible[side]
     return replace(demonstrations, pictures=pictures.clip(0, 255).round().astype(np.uint8))
 
 
-def _visible(demonstrations: Demonstrations, place: Place, side: int) -> NDArray[np.float32]:
+def _visible(demonstrations: Demonstrations, area: Place, side: int) -> NDArray[np.float32]:
     """(F, h, w, 1), how much of the tile's own share of each pixel the frame shows."""
-    share = demonstrations.tiles[:, side, place.rows, place.columns] / np.float32(255)
-    shown = (share / np.maximum(place.cover, 1e-3)).clip(0, 1) * (place.cover > 1e-3)
-    return np.asarray(shown[..., None], np.float32)
+    share = demonstrations.tiles[:, side, area.rows, area.columns] / np.float32(255)
+    visible = (share / np.maximum(area.cover, 1e-3)).clip(0, 1) * (area.cover > 1e-3)
+    return np.asarray(visible[..., None], np.float32)

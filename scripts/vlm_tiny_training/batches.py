@@ -40,12 +40,12 @@ class Pairs:
         """One of them."""
         kind = int(rng.choice(len(self._banks), p=self._shares))
         bank, pair = self._banks[kind], self._pairs[kind][rng.integers(len(self._pairs[kind]))]
-        asked = int(rng.integers(2))
-        chosen = []
-        for wanted in (asked, 1 - asked):
+        asked_index = int(rng.integers(2))
+        drawn = []
+        for wanted_index in (asked_index, 1 - asked_index):
             couple, turned = pair[rng.integers(len(pair))]
-            chosen.append((int(couple), int(wanted ^ turned)))
-        target, other = chosen
+            drawn.append((int(couple), int(wanted_index ^ turned)))
+        target, other = drawn
         return Pair(bank, (target, other), (str(bank.phrases[target]), str(bank.phrases[other])))
 
     def phrases(self) -> list[str]:
@@ -64,6 +64,6 @@ def laid_out(name: str, surface: Surface, pair: Pair, side: int) -> Pixels:
     """(96, 96, 3) float32 in [0, 255]: the asked picture of a pair on `side` (0 left), the other one opposite."""
     picture = surface.background.copy()
     for where, (couple, member) in zip((side, 1 - side), pair.pictures, strict=True):
-        place = surface.places[where]
-        picture[place.rows, place.columns] += pair.bank.painted[name][where][couple, member]
+        area = surface.places[where]
+        picture[area.rows, area.columns] += pair.bank.painted[name][where][couple, member]
     return picture.clip(0, 255)

@@ -49,7 +49,7 @@ def brush_of(
     picture: NDArray[np.float64],
     mask: NDArray[np.bool_],
     crop: tuple[int, int, int, int],
-    seen: Callable[[NDArray[np.uint8]], NDArray[np.uint8]],
+    view: Callable[[NDArray[np.uint8]], NDArray[np.uint8]],
 ) -> Brush:
     """The brush of the tile that `mask` shows in a picture of it with `ramp` on it.
 
@@ -57,15 +57,15 @@ def brush_of(
         picture: (H, W, 3) of the scene with `ramp` on the tile.
         mask: (H, W), True where the tile is seen.
         crop: Top, left, height, width of what the model looks at.
-        seen: That crop, resized as the model does.
+        view: That crop, resized as the model does.
     """
     shade = np.median(picture[mask][:, 2]) / 255
-    place = np.clip(np.rint(picture[mask][:, :2] / shade), 0, TEXTURE_PIXELS - 1).astype(int)
-    texel = place[:, 1] * TEXTURE_PIXELS + place[:, 0]
+    texel_position = np.clip(np.rint(picture[mask][:, :2] / shade), 0, TEXTURE_PIXELS - 1).astype(int)
+    texel = texel_position[:, 1] * TEXTURE_PIXELS + texel_position[:, 0]
     y, x = np.nonzero(mask)
     down, across = _resize_weights(*crop[2:])
     top, left = crop[:2]
-    low = seen(255 * np.uint8(mask)).astype(np.float32) / 255
+    low = view(255 * np.uint8(mask)).astype(np.float32) / 255
     rows, columns = (_extent(low.any(axis=axis)) for axis in (1, 0))
     weights = np.einsum("ip,jp->ijp", down[rows][:, y - top], across[columns][:, x - left])
     pixels = sparse.csr_matrix(weights.reshape(-1, len(texel)) * shade)

@@ -67,35 +67,37 @@ class Heads(nn.Module):
         self._number = {phrase: number for number, phrase in enumerate(phrases)}
         self.named = nn.Linear(SIZE.vlm.width, len(phrases))
         self.asked = nn.Linear(SIZE.vlm.width, 1)
-        cover = {name: torch.stack([_cover(place) for place in own.places]) for name, own in surfaces.items()}
-        self._describes = {name: (own >= MOSTLY_PICTURE).float() for name, own in cover.items()}
-        self._belongs = {name: (own >= SEES_PICTURE).float() for name, own in cover.items()}
+        cover = {
+            name: torch.stack([_cover(area) for area in surface.places]) for name, surface in surfaces.items()
+        }
+        self._describes = {name: (mask >= MOSTLY_PICTURE).float() for name, mask in cover.items()}
+        self._belongs = {name: (mask >= SEES_PICTURE).float() for name, mask in cover.items()}
 
     def losses(self, captured: Captured, looked: Looked, names_one: bool) -> dict[str, Tensor]:
         """Both, of one batch. names_one: whether its questions name one of the pictures, the asked one."""
         (projected,), (middle,) = captured.projected, captured.middle
         describes = torch.stack([self._describes[name] for name in looked.surfaces])
         belongs = torch.stack([self._belongs[name] for name in looked.surfaces])
-        shown = torch.einsum("bsp,bpw->bsw", describes / describes.sum(2, keepdim=True), projected)
+        region_features = torch.einsum("bsp,bpw->bsw", describes / describes.sum(2, keepdim=True), projected)
         names = torch.tensor([
-            [self._number[pair.phrases[int(place != side)]] for place in (0, 1)]
+            [self._number[pair.phrases[int(side_index != side)]] for side_index in (0, 1)]
             for pair, side in zip(looked.pairs, looked.sides, strict=True)
         ])  # fmt: skip
-        named = cross_entropy(self.named(shown).flatten(0, 1), names.flatten())
+        naming_loss = cross_entropy(self.named(region_features).flatten(0, 1), names.flatten())
         if not names_one:
-            return {"head named": named}
+            return {"head named": naming_loss}
         patches = belongs.shape[2]
         rows = torch.arange(len(names))
-        wanted = belongs[rows, torch.tensor(looked.sides)]
+        target = belongs[rows, torch.tensor(looked.sides)]
         on_pictures = belongs.sum(1).clamp(max=1)
-        asked = binary_cross_entropy_with_logits(
-            self.asked(middle[:, :patches])[..., 0], wanted, on_pictures, reduction="sum"
+        asking_loss = binary_cross_entropy_with_logits(
+            self.asked(middle[:, :patches])[..., 0], target, on_pictures, reduction="sum"
         )
-        return {"head named": named, "head asked": asked / on_pictures.sum()}
+        return {"head named": naming_loss, "head asked": asking_loss / on_pictures.sum()}
 
 
-def _cover(place: Place) -> Tensor:
+def _cover(area: Place) -> Tensor:
     """(patches,) share of each patch that a picture in this place covers."""
-    whole = torch.zeros(IMAGE_SIDE, IMAGE_SIDE)
-    whole[place.rows, place.columns] = torch.from_numpy(place.cover)
-    return avg_pool2d(whole[None], SIZE.vision.patch)[0].flatten()
+    picture = torch.zeros(IMAGE_SIDE, IMAGE_SIDE)
+    picture[area.rows, area.columns] = torch.from_numpy(area.cover)
+    return avg_pool2d(picture[None], SIZE.vision.patch)[0].flatten()

@@ -12,7 +12,7 @@ from probe_kit.env.scene import SIDES, Scene
 from probe_kit.extract.prompts import GREY, MARGIN
 from probe_kit.models.embedded.tiny import CAMERA_PICTURE, IMAGE_SIDE, LOOKED_AT
 from vlm_tiny_training.brush import brush_of, ramp
-from vlm_tiny_training.window import seen
+from vlm_tiny_training.window import model_view
 
 
 class Place(Protocol):
@@ -61,8 +61,8 @@ def calibrate(spec: SceneSpec) -> Surface:
     views = [_view(env.scene, texture) for texture in (ramp(), Image.new("RGB", ramp().size))]
     env.close()
     (picture, masks), (black, _) = views
-    brushes = [brush_of(picture.astype(np.float64), mask, LOOKED_AT, seen) for mask in masks]
-    return Surface(seen(black).astype(np.float32), (brushes[0], brushes[1]))
+    brushes = [brush_of(picture.astype(np.float64), mask, LOOKED_AT, model_view) for mask in masks]
+    return Surface(model_view(black).astype(np.float32), (brushes[0], brushes[1]))
 
 
 def _view(scene: Scene, texture: Image.Image) -> tuple[NDArray[np.uint8], list[NDArray[np.bool_]]]:
@@ -86,8 +86,8 @@ def sheet(height: int, width: int) -> Surface:
         left = middle - side // 2 - crop_left * width / wide
         places.append(_half(top * down, left * across, side * down, side * across))
     background = np.full((IMAGE_SIDE, IMAGE_SIDE, 3), GREY, np.float32)
-    for place in places:
-        background[place.rows, place.columns] *= 1 - place.cover[..., None]
+    for area in places:
+        background[area.rows, area.columns] *= 1 - area.cover[..., None]
     return Surface(background, (places[0], places[1]))
 
 

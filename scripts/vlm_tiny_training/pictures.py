@@ -59,8 +59,8 @@ class PictureBank:
             if not evaluation.isdisjoint(map(pixels_sha256, pictures)):
                 raise ValueError(f"couple {number} of {category} is in the evaluation split; change the seed")
             for name, surface in surfaces.items():
-                for side, place in enumerate(surface.places):
-                    values = np.stack([place.paint(picture) for picture in pictures])
+                for side, area in enumerate(surface.places):
+                    values = np.stack([area.paint(picture) for picture in pictures])
                     painted[name][side].append(np.rint(values).clip(0, 255).astype(np.uint8))
             phrases.append([couple.left.phrase, couple.right.phrase])
             if number % 500 == 0:

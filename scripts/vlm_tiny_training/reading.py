@@ -94,28 +94,32 @@ class Learner:
     def losses(self, rng: np.random.Generator, setting: Asks, size: int) -> dict[str, Tensor]:
         """Of one batch of questions of one kind."""
         kind = str(rng.choice(list(setting.kinds), p=np.array(list(setting.kinds.values()))))
-        shown = [self._shown(rng) for _ in range(size)]
-        asked = [ask(kind, one.pair, self._pairs, one.side, rng) for one in shown]
-        pictures = blurred(np.stack([one.picture for one in shown]), rng)
+        samples = [self._draw_sample(rng) for _ in range(size)]
+        questions = [ask(kind, sample.pair, self._pairs, sample.side, rng) for sample in samples]
+        pictures = blurred(np.stack([sample.picture for sample in samples]), rng)
         with capturing(self._vlm) as captured:
-            losses = {kind: self.loss(pictures, asked)}
+            losses = {kind: self.loss(pictures, questions)}
         if setting.heads:
-            columns = ([one.pair for one in shown], [one.side for one in shown], [one.surface for one in shown])
+            columns = (
+                [sample.pair for sample in samples],
+                [sample.side for sample in samples],
+                [sample.surface for sample in samples],
+            )
             losses |= self._heads.losses(captured, Looked(*columns), kind != "describe")
         return losses
 
-    def _shown(self, rng: np.random.Generator) -> "Shown":
+    def _draw_sample(self, rng: np.random.Generator) -> "Shown":
         pair, side = self._pairs.draw(rng), int(rng.integers(2))
         name = str(rng.choice(list(self._surfaces)))
         return Shown(pair, side, name, laid_out(name, self._surfaces[name], pair, side))
 
-    def loss(self, pictures: Pixels, asked: list[Asked]) -> Tensor:
+    def loss(self, pictures: Pixels, questions: list[Asked]) -> Tensor:
         """Mean cross-entropy of the answers' tokens, ends included. pictures: (B, 96, 96, 3) in [0, 255]."""
-        prompts = [self._ids(f"<bos>{one.question}\n") for one in asked]
-        answers = [(*self._ids(one.answer), END) for one in asked]
+        prompts = [self._ids(f"<bos>{question.question}\n") for question in questions]
+        answers = [(*self._ids(question.answer), END) for question in questions]
         longest = max(len(p) + len(a) for p, a in zip(prompts, answers, strict=True))
-        ids = torch.zeros(len(asked), longest, dtype=torch.long)
-        next_ids = torch.full((len(asked), longest), -100)
+        ids = torch.zeros(len(questions), longest, dtype=torch.long)
+        next_ids = torch.full((len(questions), longest), -100)
         for row, (prompt, answer) in enumerate(zip(prompts, answers, strict=True)):
             end = len(prompt) + len(answer)
             ids[row, :end] = torch.tensor([*prompt, *answer])
@@ -128,16 +132,16 @@ class Learner:
     def _hidden(self, pictures: Pixels, ids: Tensor, prompts: Tensor) -> Tensor:
         """(B, T, width) at the text's positions: the picture and the prompt attend both ways, the answer back."""
         model = self._vlm.model
-        seen = model.get_image_features(as_tensor(pictures)).pooler_output
-        embedded = torch.cat([seen, model.language_model.embed_tokens(ids)], dim=1)
-        length, patches = embedded.shape[1], seen.shape[1]
-        place = torch.arange(length)
-        of_prompt = place[None] < patches + prompts[:, None]
-        allowed = of_prompt[:, None, :] | (place[None, :] <= place[:, None])[None]
+        picture_features = model.get_image_features(as_tensor(pictures)).pooler_output
+        embedded = torch.cat([picture_features, model.language_model.embed_tokens(ids)], dim=1)
+        length, patches = embedded.shape[1], picture_features.shape[1]
+        position = torch.arange(length)
+        of_prompt = position[None] < patches + prompts[:, None]
+        allowed = of_prompt[:, None, :] | (position[None, :] <= position[:, None])[None]
         mask = torch.zeros(len(ids), 1, length, length).masked_fill(
             ~allowed[:, None], torch.finfo(torch.float32).min
         )
-        positions = (place + 1).expand(len(ids), -1)
+        positions = (position + 1).expand(len(ids), -1)
         output = model.language_model(
             inputs_embeds=embedded, attention_mask=mask, position_ids=positions, use_cache=False
         )
@@ -159,6 +163,6 @@ def blurred(pictures: Pixels, rng: np.random.Generator) -> Pixels:
     """A little, and each otherwise: pictures come to the model by way of several sizes."""
     share = rng.uniform(0, MOST_BLUR, (len(pictures), 1, 1, 1)).astype(np.float32)
     for axis in (1, 2):
-        beside = (np.roll(pictures, 1, axis) + np.roll(pictures, -1, axis)) / 2
-        pictures = (1 - share) * pictures + share * beside
+        neighbours = (np.roll(pictures, 1, axis) + np.roll(pictures, -1, axis)) / 2
+        pictures = (1 - share) * pictures + share * neighbours
     return pictures

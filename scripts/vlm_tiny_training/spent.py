@@ -24,4 +24,4 @@ def timed(out: Path, part: str) -> Iterator[None]:
 def _processor_seconds() -> float:
     """Of this process and of those it waited for."""
     used = [getrusage(whose) for whose in (RUSAGE_SELF, RUSAGE_CHILDREN)]
-    return sum(one.ru_utime + one.ru_stime for one in used)
+    return sum(usage.ru_utime + usage.ru_stime for usage in used)

@@ -33,8 +33,8 @@ class Stage[Setting]:
         """Learning rate of a step of this stage."""
         if step < self.warm_up:
             return self.rate * (step + 1) / self.warm_up
-        done = (step - self.warm_up) / max(1, self.steps - self.warm_up)
-        return self.last_rate + (self.rate - self.last_rate) * (1 + math.cos(math.pi * done)) / 2
+        progress = (step - self.warm_up) / max(1, self.steps - self.warm_up)
+        return self.last_rate + (self.rate - self.last_rate) * (1 + math.cos(math.pi * progress)) / 2
 
 
 class Learning[Setting](Protocol):
@@ -169,7 +169,9 @@ def follow[Setting](
         (milestones or {}).get(trainer.step, lambda: None)()
         if trainer.step % every == 0:
             names = list(dict.fromkeys(name for name, _ in recent))
-            means = {name: float(np.mean([loss for own, loss in recent if own == name])) for name in names}
+            means = {
+                name: float(np.mean([loss for loss_name, loss in recent if loss_name == name])) for name in names
+            }
             recent.clear()
             _append(log, trainer.step, means)
             report(f"{log.stem} {trainer.step} " + " ".join(f"{name} {mean:.3f}" for name, mean in means.items()))

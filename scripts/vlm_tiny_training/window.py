@@ -8,7 +8,7 @@ from torchvision.transforms.v2 import functional
 from probe_kit.models.embedded.tiny import IMAGE_SIDE, LOOKED_AT
 
 
-def seen(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def model_view(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """(480, 640, 3) or (480, 640) uint8 to (96, 96, 3) or (96, 96) uint8."""
     channels = torch.from_numpy(np.ascontiguousarray(np.atleast_3d(picture))).permute(2, 0, 1)
     resized = functional.resize(functional.crop(channels[None].float(), *LOOKED_AT), [IMAGE_SIDE, IMAGE_SIDE])

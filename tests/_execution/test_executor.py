@@ -80,16 +80,16 @@ class Workers:
 
 def done_by(workers: Workers, queue: TaskQueue[int]) -> tuple[list[int], list[GivenUp[int]]]:
     """The tasks that were done, and those that were given up."""
-    done: list[int] = []
+    completed: list[int] = []
     given_up: list[GivenUp[int]] = []
     for slot, event in work_off(workers, queue):
         if isinstance(event, GivenUp):
             given_up.append(event)
         else:
             queue.end(slot, event)
-            done.append(event)
+            completed.append(event)
     assert not workers.opened
-    return done, given_up
+    return completed, given_up
 
 
 def numbers(count: int, tries: int = 2) -> TaskQueue[int]:
@@ -105,17 +105,17 @@ def numbers(count: int, tries: int = 2) -> TaskQueue[int]:
 def test_every_task_is_done_once_unless_it_kills_two_workers(
     size: int, holding: int, count: int, deadly: set[int], accidents: list[int]
 ) -> None:
-    left = list(accidents)
+    pending_accidents = list(accidents)
 
     def dies(_slot: int, task: int) -> Lost | None:
-        accident = task in left and task not in deadly
+        accident = task in pending_accidents and task not in deadly
         if accident:
-            left[:] = [other for other in left if other != task]
+            pending_accidents[:] = [other for other in pending_accidents if other != task]
         return Lost("worker", "died", counts=not accident) if accident or task in deadly else None
 
-    done, given_up = done_by(Workers(size, dies, holding), numbers(count))
+    completed, given_up = done_by(Workers(size, dies, holding), numbers(count))
     tasks = set(range(count))
-    assert sorted(done) == sorted(tasks - deadly)
+    assert sorted(completed) == sorted(tasks - deadly)
     assert {event.task for event in given_up} == tasks & deadly
 
 
@@ -178,8 +178,8 @@ def test_a_lost_worker_is_named_with_what_it_held() -> None:
     def dies(_slot: int, task: int) -> Lost | None:
         return next(losses, None) if task == 2 else None
 
-    said = r"worker 0 ended with code -9; 4 episodes it held \(2, 3, 4, …\) will be tried again"
-    with pytest.warns(WorkerLostWarning, match=said):
+    warning = r"worker 0 ended with code -9; 4 episodes it held \(2, 3, 4, …\) will be tried again"
+    with pytest.warns(WorkerLostWarning, match=warning):
         assert sorted(done_by(Workers(1, dies, holding=4), numbers(6))[0]) == list(range(6))
 
 

@@ -88,7 +88,7 @@ class Cluster:
 
     def _fill(self) -> None:
         for actor in self.actors:
-            if not actor.running and not actor.dead and sum(one.running for one in self.actors) < self.room:
+            if not actor.running and not actor.dead and sum(worker.running for worker in self.actors) < self.room:
                 actor.running = True
 
     def put(self, content: Any) -> Any:
@@ -138,7 +138,7 @@ def done_on(monkeypatch: pytest.MonkeyPatch) -> Callable[[Cluster, int], tuple[l
 
         monkeypatch.setattr(ray_pool, "ray_cluster", connected)
         queue = TaskQueue(((number, number) for number in range(TASKS)), "episode")
-        done: list[int] = []
+        completed: list[int] = []
         given_up: list[GivenUp[int]] = []
         pool = RayPool(lambda *_: None, None, "a cluster", lambda _resources: [0] * workers)
         for slot, event in work_off(pool, queue):
@@ -146,9 +146,9 @@ def done_on(monkeypatch: pytest.MonkeyPatch) -> Callable[[Cluster, int], tuple[l
                 given_up.append(event)
             else:
                 queue.end(slot, event)
-                done.append(event)
+                completed.append(event)
         assert all(actor.dead for actor in cluster.actors), "none outlives the work"
-        return done, given_up
+        return completed, given_up
 
     return play
 
@@ -167,8 +167,8 @@ def test_a_lost_node_whose_worker_finds_no_room_again_holds_nobody_up(done_on: A
     with pytest.warns(
         WorkerLostWarning, match=r"on node first of the Ray cluster is lost: The actor died\.; the episode it held"
     ):
-        done, given_up = done_on(cluster, 2)
-    assert sorted(done) == list(range(TASKS))
+        completed, given_up = done_on(cluster, 2)
+    assert sorted(completed) == list(range(TASKS))
     assert not given_up
     assert len(cluster.actors) == 3
     assert not begun(cluster.actors[2]), "the third never ran, and was given nothing to do"
@@ -186,8 +186,8 @@ def test_workers_that_ray_puts_on_a_lost_node_before_it_knows_are_no_reason_to_e
 
     cluster = Cluster(workers, dies)
     with pytest.warns(WorkerLostWarning):
-        done, _ = done_on(cluster, workers)
-    assert sorted(done) == list(range(TASKS))
+        completed, _ = done_on(cluster, workers)
+    assert sorted(completed) == list(range(TASKS))
     assert len(cluster.actors) == workers + 2 * len(lost)
 
 
@@ -212,13 +212,13 @@ def test_an_error_of_a_worker_is_raised_as_it_is(done_on: Any) -> None:
 
 def test_a_cluster_without_room_is_not_waited_for_in_silence(done_on: Any) -> None:
     with pytest.warns(ClusterFullWarning, match="each needs a core, and the cluster has 0 cores"):
-        done, _ = done_on(Cluster(0), 2)
-    assert sorted(done) == list(range(TASKS))
+        completed, _ = done_on(Cluster(0), 2)
+    assert sorted(completed) == list(range(TASKS))
 
 
 def test_a_task_that_kills_two_workers_is_given_up(done_on: Any) -> None:
     cluster = Cluster(2, lambda _cluster, actor: actor.tasks[-1:] == [7])
     with pytest.warns(WorkerLostWarning):
-        done, given_up = done_on(cluster, 2)
+        completed, given_up = done_on(cluster, 2)
     assert [event.task for event in given_up] == [7]
-    assert sorted(done) == [number for number in range(TASKS) if number != 7]
+    assert sorted(completed) == [number for number in range(TASKS) if number != 7]

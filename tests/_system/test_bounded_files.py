@@ -38,9 +38,9 @@ def endless_device(path: Path) -> None:
 
 
 def listening_socket(path: Path) -> None:
-    made = socket.socket(socket.AF_UNIX)
-    made.bind(str(path))
-    made.close()
+    listener = socket.socket(socket.AF_UNIX)
+    listener.bind(str(path))
+    listener.close()
 
 
 def folder(path: Path) -> None:
@@ -158,8 +158,8 @@ def unbounded_calls() -> dict[str, list[str]]:
 
 
 def test_no_reader_of_foreign_files_lacks_a_bound() -> None:
-    found = [call for name, calls in unbounded_calls().items() if name not in ELSEWHERE for call in calls]
-    assert not found, "read by probe_kit._system.bounded_files, or say here why not"
+    unbounded = [call for name, calls in unbounded_calls().items() if name not in ELSEWHERE for call in calls]
+    assert not unbounded, "read by probe_kit._system.bounded_files, or say here why not"
 
 
 def test_every_module_that_is_left_out_has_such_a_call() -> None:

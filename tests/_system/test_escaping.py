@@ -21,10 +21,10 @@ from probe_kit._system.escaping import (
     as_argument,
     csv_of_frame,
     csv_of_rows,
-    escaped,
+    escape_formula,
     markdown_safe,
     terminal_safe,
-    unescaped,
+    unescape,
     without_folders,
 )
 from probe_kit._system.table_cells import plain_cell
@@ -38,7 +38,7 @@ from probe_kit.retention.report import report_html
 from probe_kit.suite import Suite
 from probe_kit.suite.converters.curation import read_curation
 from probe_kit.suite.manifest import save_suite
-from tests.retention.asked_runs import SaidRun, acted, asked
+from tests.retention.asked_runs import SaidRun, acted, answer_run
 from tests.support.parsed import package_nodes
 
 ROOT = Path(__file__).parents[2]
@@ -61,19 +61,19 @@ texts = st.text(st.sampled_from("=+-@'\t\r\n ,\"aé＝0"), max_size=6)
 
 @pytest.mark.parametrize("text", FORMULAS)
 def test_a_text_that_would_be_computed_gets_a_mark_in_front(text: str) -> None:
-    assert escaped(text) == f"'{text}"
-    assert unescaped(escaped(text)) == text
+    assert escape_formula(text) == f"'{text}"
+    assert unescape(escape_formula(text)) == text
 
 
 @pytest.mark.parametrize("cell", [-0.5, -3, float("nan"), None, True, "", "a=b", "x-1", "'quoted'", "5 − 2"])
 def test_numbers_and_plain_texts_stay_as_they_are(cell: object) -> None:
-    assert escaped(cell) is cell
+    assert escape_formula(cell) is cell
 
 
 @given(texts)
 def test_every_text_comes_back(text: str) -> None:
-    assert unescaped(escaped(text)) == text
-    assert not escaped(text).lstrip().startswith(("=", "+", "-", "@"))
+    assert unescape(escape_formula(text)) == text
+    assert not escape_formula(text).lstrip().startswith(("=", "+", "-", "@"))
 
 
 @given(rows=st.lists(st.tuples(texts, texts), max_size=4))
@@ -122,7 +122,7 @@ def test_a_path_in_a_printed_command_is_one_word_and_no_option(name: str) -> Non
 
 
 def test_every_csv_of_the_package_goes_through_one_function() -> None:
-    others = [
+    other_calls = [
         f"{path.relative_to(ROOT)}:{call.lineno}"
         for path, call in package_nodes(ast.Call)
         if path.name != "escaping.py"
@@ -133,7 +133,7 @@ def test_every_csv_of_the_package_goes_through_one_function() -> None:
             or (call.func.attr == "to_csv" and call.keywords)
         )
     ]
-    assert others == []
+    assert other_calls == []
 
 
 def test_the_attribution_of_a_suite_is_no_formula(small_suite: Suite, tmp_path: Path) -> None:
@@ -143,8 +143,8 @@ def test_the_attribution_of_a_suite_is_no_formula(small_suite: Suite, tmp_path: 
         for item in small_suite.items
         for side in ("left", "right")
     }
-    made = save_suite(replace(small_suite, items=items), pictures, {}, tmp_path / "suite")
-    rows = list(csv.DictReader((made.folder / "ATTRIBUTION.csv").open(encoding="utf-8", newline="")))
+    saved_suite = save_suite(replace(small_suite, items=items), pictures, {}, tmp_path / "suite")
+    rows = list(csv.DictReader((saved_suite.folder / "ATTRIBUTION.csv").open(encoding="utf-8", newline="")))
     assert {row["attribution"] for row in rows} == {"'=HYPERLINK(0)"}
 
 
@@ -171,7 +171,7 @@ HOSTILE = [
 ]  # fmt: skip
 
 
-def shown(markdown: str) -> str:
+def rendered_text(markdown: str) -> str:
     """The text that a reader sees, if the parser makes nothing but one paragraph of text; else its HTML."""
     tokens = PARSER.parse(markdown)
     if [token.type for token in tokens] != ["paragraph_open", "inline", "paragraph_close"]:
@@ -179,12 +179,12 @@ def shown(markdown: str) -> str:
     children = tokens[1].children or []
     if {child.type for child in children} - {"text", "text_special", "code_inline", "softbreak"}:
         return PARSER.render(markdown)
-    return "".join(f"`{one.content}`" if one.type == "code_inline" else one.content for one in children)
+    return "".join(f"`{token.content}`" if token.type == "code_inline" else token.content for token in children)
 
 
 @pytest.mark.parametrize("text", HOSTILE)
 def test_hostile_text_is_shown_as_it_is(text: str) -> None:
-    assert shown(markdown_safe(text)) == re.sub(r"\s*\n+\s*", " ", text)
+    assert rendered_text(markdown_safe(text)) == re.sub(r"\s*\n+\s*", " ", text)
 
 
 @pytest.mark.parametrize(
@@ -197,7 +197,7 @@ def test_names_and_numbers_are_written_without_escapes(text: str) -> None:
 @settings(max_examples=200, deadline=None)
 @given(st.text("abX1 _*~<>[]()!#|\\&;:/.@-+=$'\"", min_size=1, max_size=24).map(str.strip).filter(bool))
 def test_no_text_becomes_markup_and_none_ends_a_cell(text: str) -> None:
-    assert shown(markdown_safe(text)) == text
+    assert rendered_text(markdown_safe(text)) == text
     page = PARSER.render(f"| heading |\n| --- |\n| {markdown_safe(text)} |\n")
     assert page.count("<td>") == 1
     assert not re.search(r"<(?!/?(table|thead|tbody|tr|th|td)>)", page)
@@ -213,7 +213,7 @@ def test_no_tilde_is_left_that_github_strikes_text_out_by(text: str) -> None:
 def test_no_address_becomes_a_link_by_itself(text: str) -> None:
     """GitHub and the hub make links of `scheme://`, `www.` and `name@` that stand in the source."""
     assert not re.search(r"://|www\.|\w@\w", markdown_safe(text))
-    assert shown(markdown_safe(text)) == text
+    assert rendered_text(markdown_safe(text)) == text
 
 
 @pytest.mark.parametrize(
@@ -254,24 +254,31 @@ def runs(folder: Path) -> list[SaidRun]:
         policy, certificate={"policy": MACHINE}, settings={"suite": {"folder": str(folder / "suite")}}
     )
     policy.episodes["first_frame_sha256"] = "other"
-    return [policy, asked(folder / "a VLM", RIGHT, worded=True)]
+    return [policy, answer_run(folder / "a VLM", RIGHT, worded=True)]
 
 
 def leaks(page: str, folder: Path) -> list[str]:
     """Places of this machine in a page; figures are bytes in which any letters may stand together."""
     text = re.sub(r"data:[\w/+-]+;base64,[\w+/=]+", "", page)
     return [
-        place
-        for place in (str(folder), str(Path.home()) + "/", tempfile.gettempdir() + "/", "/home/", "Users", "/opt/")
-        if place in text
+        prefix
+        for prefix in (
+            str(folder),
+            str(Path.home()) + "/",
+            tempfile.gettempdir() + "/",
+            "/home/",
+            "Users",
+            "/opt/",
+        )
+        if prefix in text
     ]
 
 
 def test_no_path_of_this_machine_stands_in_the_report(tmp_path: Path) -> None:
-    own = runs(tmp_path)
-    table = retention_table(own, vlm_vla=True)
+    report_runs = runs(tmp_path)
+    table = retention_table(report_runs, vlm_vla=True)
     assert leaks("\n".join(table.notes), tmp_path), "the notes of this table must name runs by their places"
-    page = report_html(own, table)
+    page = report_html(report_runs, table)
     assert leaks(page, tmp_path) == []
     assert "Success rates only: acted has no activations to probe" in page
     assert "Answers only" not in page, "a model that was only asked lacks nothing"

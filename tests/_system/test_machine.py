@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from probe_kit._system import imports, machine
-from probe_kit._system.counting import counted
+from probe_kit._system.counting import plural
 from probe_kit._system.imports import install_command, install_folder_command
 from probe_kit._system.machine import check_device_name, same_scheduling, what_is_here
 from probe_kit.errors import UsageError
@@ -39,8 +39,8 @@ def test_nothing_of_it_imports_torch() -> None:
         "import sys; from probe_kit._system.machine import check_device_name, what_is_here; "
         "check_device_name('cpu'); print(what_is_here(), 'torch' in sys.modules)"
     )
-    shown = subprocess.run([sys.executable, "-c", code], capture_output=True, encoding="utf-8", check=True).stdout
-    assert re.match(r"This machine has cpu \(\d+ cores?\).* False", shown)
+    output = subprocess.run([sys.executable, "-c", code], capture_output=True, encoding="utf-8", check=True).stdout
+    assert re.match(r"This machine has cpu \(\d+ cores?\).* False", output)
 
 
 def test_with_torch_there_it_names_what_torch_finds() -> None:
@@ -92,7 +92,7 @@ def test_encoding_av1_makes_a_thread_of_root_a_real_time_one_otherwise(tmp_path:
     ],
 )
 def test_a_noun_is_in_the_plural_unless_there_is_one(number: int, noun: str, text: str) -> None:
-    assert counted(number, noun) == text
+    assert plural(number, noun) == text
 
 
 PACKAGE = Path(imports.__file__).parents[1]
@@ -168,12 +168,12 @@ def test_a_package_of_the_users_own_is_installed_by_the_installer_that_the_envir
 
 
 def test_no_message_names_an_installer_of_its_own() -> None:
-    own = Path(imports.__file__)
-    found = [
+    imports_file = Path(imports.__file__)
+    mentions = [
         f"{path.relative_to(PACKAGE)}:{number}"
         for path in sorted(PACKAGE.rglob("*.py"))
-        if path != own
+        if path != imports_file
         for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1)
         if re.search(r"\b(uv|pip3?) (pip |sync|install|add)", line)
     ]
-    assert not found
+    assert not mentions

@@ -92,12 +92,12 @@ def test_cells_are_those_that_pyarrow_reads(tmp_path: Path, rows: int) -> None:
     for columns in (None, ["number", "text"], ["image"], ["decimal.point"], ["list"]):
         for groups in (None, [0]):
             expected = pq.ParquetFile(tmp_path / "x.parquet")
-            whole = list(range(expected.num_row_groups)) if groups is None else groups
+            row_groups = list(range(expected.num_row_groups)) if groups is None else groups
             with open_parquet(tmp_path / "x.parquet", "export") as parquet:
-                found = read_parquet(parquet, columns, groups)
-            due = expected.read_row_groups(whole, columns=columns)
-            assert found.to_pydict() == due.to_pydict()
-            assert found.schema == due.schema
+                read_table = read_parquet(parquet, columns, groups)
+            due = expected.read_row_groups(row_groups, columns=columns)
+            assert read_table.to_pydict() == due.to_pydict()
+            assert read_table.schema == due.schema
 
 
 def test_an_empty_table_has_its_columns(tmp_path: Path) -> None:

@@ -291,7 +291,7 @@ def test_yes_and_no_are_read_in_the_usual_spellings(cell: object, truth: bool | 
 
 
 def test_every_table_of_text_is_read_by_one_function() -> None:
-    others = [
+    other_calls = [
         f"{path.relative_to(ROOT)}:{call.lineno}"
         for path, call in package_nodes(ast.Call)
         if path.name != "text_tables.py"
@@ -301,4 +301,4 @@ def test_every_table_of_text_is_read_by_one_function() -> None:
             or (call.func.attr == "reader" and getattr(call.func.value, "id", "") == "csv")
         )
     ]
-    assert others == []
+    assert other_calls == []

@@ -20,7 +20,7 @@ from probe_kit._tables.formats import names, render
 from probe_kit._tables.formats.latex import _SPECIAL, MOST_COLUMNS
 from probe_kit._tables.html import sort_key
 from probe_kit._tables.numbers import number
-from probe_kit._tables.table import Cell, Heading, Legend, Row, Table, absent, grouped
+from probe_kit._tables.table import Cell, Heading, Legend, Row, Table, absent, group_headings
 
 HOSTILE = [
     "<img src=x onerror=alert(1)>", "</script><b>", "[text](https://evil.example)", "**bold**", "a | b",
@@ -78,8 +78,12 @@ def test_markdown_is_one_table_of_the_same_cells(table: Table) -> None:
     assert all({child.type for child in token.children or []} <= ALLOWED for token in inside)
     count, rows = len(table.headings), len(table.rows)
     cells = plain[1 + count : 1 + count + rows * count]
-    shown = [cell.text if not cell.alarm else f"🔴 {cell.text}" for row in table.rows for cell in row.cells]
-    assert [words(cell).replace("`", "") for cell in cells] == [words(cell).replace("`", "") for cell in shown]
+    expected_cells = [
+        cell.text if not cell.alarm else f"🔴 {cell.text}" for row in table.rows for cell in row.cells
+    ]
+    assert [words(cell).replace("`", "") for cell in cells] == [
+        words(cell).replace("`", "") for cell in expected_cells
+    ]
 
 
 ALLOWED = {"text", "text_special", "strong_open", "strong_close", "softbreak"}
@@ -98,8 +102,8 @@ def test_latex_has_a_line_per_row_whose_cells_read_back(table: Table) -> None:
     for line, row in zip(lines, table.rows, strict=True):
         cells = re.split(r"(?<!\\) ?& ?", line)
         assert len(cells) == len(row.cells)
-        for found, cell in zip(cells, row.cells, strict=True):
-            bare = re.sub(r"\\cellcolor\{\w+\} ?", "", found)
+        for latex_cell, cell in zip(cells, row.cells, strict=True):
+            bare = re.sub(r"\\cellcolor\{\w+\} ?", "", latex_cell)
             if r"\textcolor{red}{" in bare:
                 bare = bare.replace(r"\textcolor{red}{", "", 1).removesuffix("}")
             assert words(pattern.sub(lambda match: back[match[0]], bare)) == words(cell.text)
@@ -157,30 +161,30 @@ def test_a_console_of_any_width_truncates_nothing_and_runs_markup_as_text(table:
     console.print(table)
     text = console.file.getvalue()  # type: ignore[attr-defined]
     assert max(map(len, text.splitlines())) <= width
-    shown = words(text)
+    printed_words = words(text)
     for row in table.rows:
         for cell in row.cells[table.names :]:
-            assert words(cell.text) in shown
+            assert words(cell.text) in printed_words
 
 
 @SETTINGS
 @given(st.lists(st.fixed_dictionaries({"name": CELLS, "ci": st.sampled_from([(0.1, 0.2), None])}), min_size=1))
 def test_json_and_csv_hold_the_numbers_and_no_cell_that_a_spreadsheet_computes(numbers: list[dict]) -> None:
     table = Table.of("t", ("name",), [("x",)], numbers=tuple(numbers))
-    plain = [{"name": one["name"], "ci": one["ci"] and list(one["ci"])} for one in numbers]
+    plain = [{"name": record["name"], "ci": record["ci"] and list(record["ci"])} for record in numbers]
     assert json.loads(table.to_json()) == plain
-    for line, one in zip(csv.DictReader(io.StringIO(table.to_csv())), numbers, strict=True):
-        assert line["name"].lstrip("'") == one["name"].lstrip("'")
+    for line, record in zip(csv.DictReader(io.StringIO(table.to_csv())), numbers, strict=True):
+        assert line["name"].lstrip("'") == record["name"].lstrip("'")
         assert line["name"][0] not in "=+-@"
         if any(other["ci"] for other in numbers):
-            assert (line["ci_low"], line["ci_high"]) == (("0.1", "0.2") if one["ci"] else ("", ""))
+            assert (line["ci_low"], line["ci_high"]) == (("0.1", "0.2") if record["ci"] else ("", ""))
 
 
 # -- what single formats promise ---------------------------------------------------------------------------------
 
 WIDE = Table.of(
     "Rates: a model",
-    (Heading("system"), Heading("category"), *grouped(("first", ("rate %",)), ("second", ("interval",)))),
+    (Heading("system"), Heading("category"), *group_headings(("first", ("rate %",)), ("second", ("interval",)))),
     [
         ("a policy with a long name", "color", "98.1", "[90, 99]"),
         ("a policy with a long name", "mean", "72.5", "[60, 80]"),
@@ -230,7 +234,7 @@ def test_a_column_of_numbers_stands_right_whatever_its_texts_look_like() -> None
     assert table.texts[0] == ("a", "n = 3", "3 of 4", "–", "n/a", "0.5 [0.1, 0.9]")
     assert table.texts[1] == ("b", "–", "[1, 2]", "–", "7 of 9", "–")
     assert "{lrlrrr}" in table.to_latex()
-    assert '<span class="limits">[0.1, 0.9]</span>' in table._repr_html_()
+    assert '<span class="limits">[0.1,\u00a00.9]</span>' in table._repr_html_()
     assert '<span class="limits">[1, 2]</span>' not in table._repr_html_()
     assert [sort_key(cell, True) for cell in (rows[0][1], rows[1][1], rows[1][5])] == [3.0, None, None]
 
@@ -264,7 +268,10 @@ def test_columns_that_do_not_fit_are_left_out_by_name() -> None:
 def test_a_wide_tabular_is_divided_between_groups_and_each_has_its_lines_width() -> None:
     heads = (("a", 6), ("b", 6), ("c", 2), ("", 2))
     names = iter(f"c{at}" for at in range(1, 17))
-    columns = (Heading("c0"), *grouped(*((head, [next(names) for _ in range(count)]) for head, count in heads)))
+    columns = (
+        Heading("c0"),
+        *group_headings(*((head, [next(names) for _ in range(count)]) for head, count in heads)),
+    )
     text = Table.of("wide", columns, [("0", *map(Cell, range(1, 17)))]).to_latex()
     counts = [line.count("&") + 1 for line in text.splitlines() if line.startswith(("c0", "0 "))]
     assert counts == [MOST_COLUMNS, MOST_COLUMNS, 5, 5]
@@ -289,13 +296,13 @@ def test_columns_without_content_and_those_that_need_room_are_left_out() -> None
     table = Table.of("t", ("a", Heading("b", is_detail=True), "c"), [("x", "1", "–"), ("y", "2", "")]).filled()
     assert table.columns == ("a", "b")
     assert table.details(False) is None
-    assert (shown := table.details(True)) is not None
-    assert shown.columns == ("a", "b")
+    assert (detailed_table := table.details(True)) is not None
+    assert detailed_table.columns == ("a", "b")
 
 
 def test_equal_headings_are_told_apart_by_the_name_over_them_where_a_page_has_one_line() -> None:
     table = Table.of(
-        "t", grouped(("", ["n"]), ("left", ["rate"]), ("right", ["rate", "p"])), [("x", "1", "2", "3")]
+        "t", group_headings(("", ["n"]), ("left", ["rate"]), ("right", ["rate", "p"])), [("x", "1", "2", "3")]
     )
     assert table.full_headings == ("n", "left rate", "right rate", "p")
 

@@ -52,10 +52,10 @@ def ended(error: BaseException) -> tuple[int, str]:
     ],
 )
 def test_what_can_be_foreseen_has_its_message_and_code(error: BaseException, code: int, words: str) -> None:
-    ended_with, said = ended(error)
+    ended_with, message = ended(error)
     assert ended_with == code
-    assert words in said
-    assert "Traceback" not in said
+    assert words in message
+    assert "Traceback" not in message
 
 
 @pytest.mark.parametrize(
@@ -64,12 +64,12 @@ def test_what_can_be_foreseen_has_its_message_and_code(error: BaseException, cod
 )
 def test_what_nobody_foresaw_is_one_line_and_a_file(error: Exception, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    code, said = ended(error)
+    code, message = ended(error)
     assert code == 1
-    assert type(error).__name__ in said
-    assert "Traceback" not in said
+    assert type(error).__name__ in message
+    assert "Traceback" not in message
     (file,) = tmp_path.iterdir()
-    assert str(file) in said.replace(" ", "") or file.name in said.replace(" ", "")
+    assert str(file) in message.replace(" ", "") or file.name in message.replace(" ", "")
     assert re.search(r"Traceback.*in fail", file.read_text(encoding="utf-8"), re.DOTALL)
 
 
@@ -85,11 +85,11 @@ def test_what_nobody_foresaw_is_one_line_and_a_file(error: Exception, tmp_path: 
 )
 def test_memory_that_ended_is_no_bug_and_says_what_to_do(error: Exception, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    code, said = ended(error)
+    code, message = ended(error)
     assert code == 1
-    assert (str(error) or "larger than the memory") in " ".join(said.split())
-    assert "fewer --batch" in said
-    assert "bug" not in said
+    assert (str(error) or "larger than the memory") in " ".join(message.split())
+    assert "fewer --batch" in message
+    assert "bug" not in message
     assert not list(tmp_path.iterdir())
 
 
@@ -103,6 +103,6 @@ def test_what_an_error_says_is_not_obeyed(capsys: pytest.CaptureFixture[str]) ->
     error = CheckpointError("[bold]config[/] \x1b[31m")
     error.add_note("in [red]this\u202e")
     assert report_error(error) == 3
-    said = capsys.readouterr().err
-    assert "[bold]config[/] ␛[31m" in said
-    assert "in [red]this\ufffd" in said
+    message = capsys.readouterr().err
+    assert "[bold]config[/] ␛[31m" in message
+    assert "in [red]this\ufffd" in message

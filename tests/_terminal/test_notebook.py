@@ -50,7 +50,7 @@ FITTING = "fitted = pk.train_probes(run, ['shape'], permutations=0, seed=11, con
 
 
 @pytest.fixture(scope="module")
-def shown(
+def executed_cells(
     request: pytest.FixtureRequest, probed: tuple[Run, ProbeResults], tmp_path_factory: pytest.TempPathFactory
 ) -> dict[str, NotebookNode]:
     """The cells of a notebook that shows everything, by what they show; the parameter is matplotlib's backend."""
@@ -66,16 +66,16 @@ def shown(
         cells |= {**{name: name for name in OBJECTS}, "fit": FITTING, "read": FITTING}
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MPLBACKEND", request.param)
-        done = run_cells(list(cells.values()), tmp_path_factory.mktemp("kernel"))
-    return dict(zip(cells, done, strict=True))
+        executed = run_cells(list(cells.values()), tmp_path_factory.mktemp("kernel"))
+    return dict(zip(cells, executed, strict=True))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "shown", [INLINE, pytest.param("agg", marks=pytest.mark.slow)], indirect=True, ids=["inline", "agg"]
+    "executed_cells", [INLINE, pytest.param("agg", marks=pytest.mark.slow)], indirect=True, ids=["inline", "agg"]
 )
-def test_every_figure_is_one_picture_whatever_the_backend(shown: dict[str, NotebookNode]) -> None:
-    pictures = {name: kinds(shown[name]).count("image/png") for name in FIGURES}
+def test_every_figure_is_one_picture_whatever_the_backend(executed_cells: dict[str, NotebookNode]) -> None:
+    pictures = {name: kinds(executed_cells[name]).count("image/png") for name in FIGURES}
     assert pictures == dict.fromkeys(FIGURES, 1)
 
 
@@ -91,30 +91,30 @@ def test_a_policy_and_a_tape_show_short_tables_and_short_lines() -> None:
     policy = load_policy("pi0-tiny")
     with capture(policy, policy.sites()) as activations:
         policy.act(example_observations(["Put the cube on the red shape"]), [0])
-    for name, shown in {"policy": policy, "activations": activations}.items():
-        assert_short(name, DisplayFormatter().format(shown)[0])
+    for name, subject in {"policy": policy, "activations": activations}.items():
+        assert_short(name, DisplayFormatter().format(subject)[0])
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("shown", [INLINE], indirect=True, ids=["inline"])
-def test_objects_show_short_tables_and_short_lines(shown: dict[str, NotebookNode]) -> None:
+@pytest.mark.parametrize("executed_cells", [INLINE], indirect=True, ids=["inline"])
+def test_objects_show_short_tables_and_short_lines(executed_cells: dict[str, NotebookNode]) -> None:
     for name in OBJECTS:
-        (output,) = shown[name].outputs
+        (output,) = executed_cells[name].outputs
         assert_short(name, output.data)
-    table = shown["table"].outputs[0].data["text/html"]
+    table = executed_cells["table"].outputs[0].data["text/html"]
     assert re.search(r"background:#[0-9A-Fa-f]{6}", table)
     assert "random weights" in table
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("shown", [INLINE], indirect=True, ids=["inline"])
+@pytest.mark.parametrize("executed_cells", [INLINE], indirect=True, ids=["inline"])
 def test_a_notebook_draws_one_bar_while_it_works_and_none_for_what_is_read_back(
-    shown: dict[str, NotebookNode],
+    executed_cells: dict[str, NotebookNode],
 ) -> None:
-    (bar,) = [output for output in shown["fit"].outputs if output.output_type == "display_data"]
+    (bar,) = [output for output in executed_cells["fit"].outputs if output.output_type == "display_data"]
     assert PROGRESS_MARK in bar.data["text/html"]
     assert re.fullmatch(r"sites probed: 44 of 44, \d+ s", bar.data["text/plain"])
-    assert shown["read"].outputs == []
+    assert executed_cells["read"].outputs == []
 
 
 def test_nothing_is_drawn_outside_notebooks() -> None:

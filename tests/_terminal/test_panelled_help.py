@@ -17,7 +17,7 @@ LONG = sorted(name for name, command in LEAVES.items() if len(command.params) > 
 SCREEN = 66
 
 
-def shown(command: str, flag: str, width: int = 80) -> str:
+def help_page(command: str, flag: str, width: int = 80) -> str:
     answer = CliRunner().invoke(app, [*command.split(), flag], env={"COLUMNS": str(width)})
     assert answer.exit_code == 0, answer.output
     return answer.stdout
@@ -29,21 +29,27 @@ def options_in(text: str) -> set[str]:
 
 @pytest.mark.parametrize("command", sorted(LEAVES))
 def test_help_fits_a_screen_of_80_columns(command: str) -> None:
-    assert len(shown(command, "--help").splitlines()) <= SCREEN
+    assert len(help_page(command, "--help").splitlines()) <= SCREEN
 
 
 @pytest.mark.parametrize("command", LONG)
 def test_help_names_the_panels_that_only_help_all_shows_and_these_have_every_option(command: str) -> None:
-    short, whole = shown(command, "--help", 300), shown(command, HELP_ALL, 300)
+    short, full = help_page(command, "--help", 300), help_page(command, HELP_ALL, 300)
     declared = {
-        (*one.opts, *one.secondary_opts)[0] for one in LEAVES[command].params if one.param_type_name == "option"
+        (*parameter.opts, *parameter.secondary_opts)[0]
+        for parameter in LEAVES[command].params
+        if parameter.param_type_name == "option"
     }
-    assert {option for option in declared if option.startswith("--")} <= options_in(whole)
-    panels = {one.rich_help_panel for one in LEAVES[command].params if getattr(one, "rich_help_panel", None)}
+    assert {option for option in declared if option.startswith("--")} <= options_in(full)
+    panels = {
+        parameter.rich_help_panel
+        for parameter in LEAVES[command].params
+        if getattr(parameter, "rich_help_panel", None)
+    }
     assert panels
     assert HELP_ALL in short
     for panel in panels:
-        assert f"─ {panel} ─" in whole
+        assert f"─ {panel} ─" in full
         assert f"─ {panel} ─" not in short
         assert panel in short
 
@@ -51,14 +57,16 @@ def test_help_names_the_panels_that_only_help_all_shows_and_these_have_every_opt
 @pytest.mark.parametrize("command", sorted(set(LEAVES) - set(LONG)))
 def test_a_command_with_few_options_shows_all_of_them(command: str) -> None:
     declared = {
-        (*one.opts, *one.secondary_opts)[0] for one in LEAVES[command].params if one.param_type_name == "option"
+        (*parameter.opts, *parameter.secondary_opts)[0]
+        for parameter in LEAVES[command].params
+        if parameter.param_type_name == "option"
     }
-    assert declared <= options_in(shown(command, "--help", 300))
+    assert declared <= options_in(help_page(command, "--help", 300))
 
 
 @pytest.mark.parametrize("command", ["extract", "intervene"])
 def test_help_begins_with_what_is_used_most_and_has_examples(command: str) -> None:
-    text = shown(command, "--help")
+    text = help_page(command, "--help")
     assert f"probe-kit {command} " in text.split("─ Options ─")[0], "an example"
     assert len(options_in(text.split("─ Options ─")[1])) <= MOST_OPTIONS + 2
 

@@ -74,9 +74,9 @@ def chunk(kind: bytes, content: bytes) -> bytes:
     return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
 
 
-def png(side: int, data: bytes, *further: bytes) -> bytes:
+def png(side: int, data: bytes, *chunks: bytes) -> bytes:
     head = chunk(b"IHDR", struct.pack(">IIBBBBB", side, side, 8, 0, 0, 0, 0))
-    return b"\x89PNG\r\n\x1a\n" + head + b"".join(further) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + head + b"".join(chunks) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
 
 
 @pytest.mark.parametrize(
@@ -146,8 +146,8 @@ def packed(header: str, version: bytes = b"\1\0") -> bytes:
     """An `.npz` file of one array of 8 bytes under this header."""
     head = header.encode() + b"\n"
     file = io.BytesIO()
-    with zipfile.ZipFile(file, "w") as made:
-        made.writestr("a.npy", b"\x93NUMPY" + version + struct.pack("<H", len(head)) + head + bytes(8))
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr("a.npy", b"\x93NUMPY" + version + struct.pack("<H", len(head)) + head + bytes(8))
     return file.getvalue()
 
 

@@ -79,21 +79,21 @@ def folder(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Path
     """Checkpoints with something missing, a reference of another model, and a run that is there."""
     folder = tmp_path_factory.mktemp("early")
 
-    def made(name: str, **files: str) -> Path:
+    def make_folder(name: str, **files: str) -> Path:
         (folder / name).mkdir(parents=True)
         for file, content in files.items():
             (folder / name / file.replace("__", ".")).write_text(content, encoding="utf-8")
         return folder / name
 
-    made("empty")
-    made("of-another-model", config__json='{"type": "act"}')
-    made("damaged", config__json="{")
-    made("without-weights", config__json='{"type": "pi0"}')
+    make_folder("empty")
+    make_folder("of-another-model", config__json='{"type": "act"}')
+    make_folder("damaged", config__json="{")
+    make_folder("without-weights", config__json='{"type": "pi0"}')
     shards = {"weight_map": {"one": "a.safetensors", "two": "b.safetensors"}}
-    place = made("with-a-shard-missing", config__json='{"type": "pi0"}', a__safetensors="")
-    (place / "model.safetensors.index.json").write_text(json.dumps(shards), encoding="utf-8")
-    np.savez(made("reference") / "reference.npz", out_actions=np.zeros(2, np.float32))
-    made("reference/checkpoint", config__json='{"type": "smolvla"}')
+    checkpoint = make_folder("with-a-shard-missing", config__json='{"type": "pi0"}', a__safetensors="")
+    (checkpoint / "model.safetensors.index.json").write_text(json.dumps(shards), encoding="utf-8")
+    np.savez(make_folder("reference") / "reference.npz", out_actions=np.zeros(2, np.float32))
+    make_folder("reference/checkpoint", config__json='{"type": "smolvla"}')
     (folder / "file").touch()
     from probe_kit.env import SceneSpec
     from probe_kit.extract import ExtractSettings, extract_run
@@ -110,11 +110,11 @@ def folder(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Path
 def answers(folder: Path, small_suite: Suite) -> dict[str, tuple[int, str, list[str]]]:
     commands = (*CASES, "models")
     arguments = [[word.replace("SUITE", str(small_suite.folder)) for word in line.split()] for line in commands]
-    done = subprocess.run(
+    completed = subprocess.run(
         [sys.executable, "-c", ONE_AFTER_THE_OTHER], input=json.dumps(arguments), cwd=folder, encoding="utf-8",
         capture_output=True, check=True, timeout=300,
     )  # fmt: skip
-    return dict(zip(commands, (tuple(answer) for answer in json.loads(done.stdout)), strict=True))
+    return dict(zip(commands, (tuple(answer) for answer in json.loads(completed.stdout)), strict=True))
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -122,9 +122,9 @@ def test_a_mistake_that_needs_no_weights_is_named_before_anything_heavy_is_loade
     case: str, answers: dict[str, tuple[int, str, list[str]]]
 ) -> None:
     code, message = CASES[case]
-    said = answers[case][1].replace("\n", " ")
-    assert (answers[case][0], answers[case][2]) == (code, []), said
-    assert message in said
+    printed_message = answers[case][1].replace("\n", " ")
+    assert (answers[case][0], answers[case][2]) == (code, []), printed_message
+    assert message in printed_message
 
 
 def test_the_list_of_models_loads_nothing_heavy(answers: dict[str, tuple[int, str, list[str]]]) -> None:
@@ -140,11 +140,11 @@ def test_families_say_what_they_need(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(family, "find_spec", lambda name: None if name == "timm" else name)
     monkeypatch.setattr(huggingface_hub, "try_to_load_from_cache", lambda *_: None)
-    known = known_families()
-    assert known["pi0-tiny"].missing() == ""
-    assert known["pi0"].missing() == "download of juexzz/INTACT-pi0-finetune-bridge, google/paligemma-3b-pt-224"
-    assert known["openvla"].missing() == "extra openvla and download of openvla/openvla-7b"
-    assert known["prismatic"].missing().startswith("extra openvla and download of TRI-ML/prismatic-vlms/prism-")
+    families = known_families()
+    assert families["pi0-tiny"].missing() == ""
+    assert families["pi0"].missing() == "download of juexzz/INTACT-pi0-finetune-bridge, google/paligemma-3b-pt-224"
+    assert families["openvla"].missing() == "extra openvla and download of openvla/openvla-7b"
+    assert families["prismatic"].missing().startswith("extra openvla and download of TRI-ML/prismatic-vlms/prism-")
 
 
 def test_a_cached_config_without_weights_is_no_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -241,10 +241,10 @@ def test_columns_that_do_not_fit_are_named_and_details_prints_them(
         "train": lambda: command("train", str(run), "--permutations", "2", "--views", "mean,last", "--details"),
         "intervene": lambda: print_result(load_effects(open_run(run)), details=True),
     }
-    whole = details[name]() or capsys.readouterr().out
+    output = details[name]() or capsys.readouterr().out
     assert left_out or width > 80, short
     for heading in filter(None, left_out.split(", ")):
-        assert heading in " ".join(whole.split())
+        assert heading in " ".join(output.split())
 
 
 @pytest.mark.slow
@@ -292,14 +292,14 @@ def test_no_command_that_needs_no_model_imports_torch_or_a_third_party(
         ("extract", "--model", "no-such-model", "--dry-run"), ("new-adapter", "heavy-vla"),
     ]  # fmt: skip
     paths = [str(tmp_path / "heavy"), str(tmp_path / "broken"), os.environ.get("PYTHONPATH", "")]
-    done = subprocess.run(
-        [sys.executable, "-c", EACH], input="\n".join("\t".join(one) for one in commands), cwd=tmp_path,
+    completed = subprocess.run(
+        [sys.executable, "-c", EACH], input="\n".join("\t".join(words) for words in commands), cwd=tmp_path,
         capture_output=True, encoding="utf-8", check=True, timeout=300,
         env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths))},
     )  # fmt: skip
-    answers = done.stdout.splitlines()
+    answers = completed.stdout.splitlines()
     expected = [0] * (len(commands) - 2) + [2, 2]
-    assert answers[: len(commands)] == [f"{code} []" for code in expected], done.stdout + done.stderr
+    assert answers[: len(commands)] == [f"{code} []" for code in expected], completed.stdout + completed.stderr
     listed = [line.split()[0] for line in answers[len(commands) :] if line]
     assert {"heavy-vla", "broken-vla", "pi0-tiny"} <= set(listed)
-    assert "BrokenFamilyWarning" not in done.stderr
+    assert "BrokenFamilyWarning" not in completed.stderr

@@ -37,8 +37,8 @@ def accidents(stored: Stored, accident: str) -> Iterator[Change]:
         for path in dict.fromkeys((paths[0], paths[len(paths) // 2], paths[-1])):
             content = path.read_bytes()
             if accident == "a bit":
-                place = Random(str(path.name)).randrange(len(content))
-                yield {path: content[:place] + bytes([content[place] ^ 4]) + content[place + 1 :]}
+                position = Random(str(path.name)).randrange(len(content))
+                yield {path: content[:position] + bytes([content[position] ^ 4]) + content[position + 1 :]}
             elif accident == "cut":
                 yield {path: content[: len(content) // 2]}
             elif accident == "missing":

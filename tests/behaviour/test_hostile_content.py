@@ -22,11 +22,11 @@ pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
 @pytest.fixture(scope="module")
 def run(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run in a folder of that name."""
-    place = tmp_path_factory.mktemp("hostile") / NAME
-    return write_little_run(place, small_suite.select(["color"]), episodes=8).path
+    run_folder = tmp_path_factory.mktemp("hostile") / NAME
+    return write_little_run(run_folder, small_suite.select(["color"]), episodes=8).path
 
 
-def said(*words: object) -> str:
+def printed_text(*words: object) -> str:
     answer = CliRunner().invoke(app, list(map(str, words)))
     assert "InternalError" not in answer.output
     assert "Traceback" not in answer.output
@@ -46,7 +46,7 @@ def said(*words: object) -> str:
     ids=" ".join,
 )  # fmt: skip
 def test_a_run_of_a_hostile_name_is_shown_as_text(run: Path, words: tuple[str, ...]) -> None:
-    said(*words, run)
+    printed_text(*words, run)
 
 
 @pytest.mark.parametrize(
@@ -60,14 +60,14 @@ def test_a_run_of_a_hostile_name_is_shown_as_text(run: Path, words: tuple[str, .
 )  # fmt: skip
 def test_a_path_that_is_not_there_is_named_as_text(words: tuple[str, ...], tmp_path: Path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
-    assert SHOWN in said(*words)
+    assert SHOWN in printed_text(*words)
 
 
 def test_a_suite_in_a_folder_of_a_hostile_name_is_shown_as_text(small_suite: Suite, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(small_suite.folder, tmp_path / NAME))
-    said("suite", "show", "--counts", folder)
+    printed_text("suite", "show", "--counts", folder)
     (folder / "suite.json").write_text(f'{{"schema_version": "{SHOWN}"}}', encoding="utf-8")
-    assert "[bold]x[red] [no-end]" in said("suite", "validate", folder)
+    assert "[bold]x[red] [no-end]" in printed_text("suite", "validate", folder)
 
 
 def test_what_a_third_party_says_of_its_family_is_shown_as_text(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -75,5 +75,5 @@ def test_what_a_third_party_says_of_its_family_is_shown_as_text(monkeypatch: pyt
     package = SimpleNamespace(name="theirs", metadata={"Summary": NAME})
     entry = SimpleNamespace(name="mine", value="x:FAMILY", load=lambda: family, dist=package)
     monkeypatch.setattr(registry, "family_entries", lambda: [entry])
-    assert said("models", "mine").count(SHOWN) == 3
-    assert "[bold]x" in said("models")
+    assert printed_text("models", "mine").count(SHOWN) == 3
+    assert "[bold]x" in printed_text("models")

@@ -61,28 +61,28 @@ def _comparisons(root: Path) -> None:
     write_json(rows, root / "Labeled_data" / "fer2013_label" / "fer2013_0_720_rebalanced.json")
 
 
-def _on_a_copy(of: Path, place: Path) -> None:
-    shutil.copytree(of, place / "run")
+def _on_a_copy(of: Path, folder: Path) -> None:
+    shutil.copytree(of, folder / "run")
 
 
-def _unsealed(of: Path, place: Path) -> None:
-    _on_a_copy(of, place)
+def _unsealed(of: Path, target: Path) -> None:
+    _on_a_copy(of, target)
     for folder in ("columns.zarr", "sealed"):
-        shutil.rmtree(place / "run" / folder)
+        shutil.rmtree(target / "run" / folder)
 
 
 def _of_run(name: str, begin: object, *arguments: str) -> KilledCommand:
     """A command on the run that lies in `run`."""
     first = arguments[: 2 if arguments[0] == "run" else 1]
-    rest = arguments[len(first) :]
+    options = arguments[len(first) :]
     assert callable(begin)
     return KilledCommand(
         name,
         begin,
-        lambda place: [*first, str(place / "run"), *rest],
-        lambda place: run_files(place / "run"),
-        lambda place: committed(place / "run"),
-        lambda place: run_problems(place / "run"),
+        lambda folder: [*first, str(folder / "run"), *options],
+        lambda folder: run_files(folder / "run"),
+        lambda folder: committed(folder / "run"),
+        lambda folder: run_problems(folder / "run"),
     )
 
 
@@ -90,10 +90,10 @@ def _of_extract(name: str, *arguments: str) -> KilledCommand:
     return KilledCommand(
         name,
         lambda _: None,
-        lambda place: [*arguments, "--out", str(place / "run")],
-        lambda place: _without_first_observation(run_files(place / "run")),
-        lambda place: committed(place / "run"),
-        lambda place: run_problems(place / "run"),
+        lambda folder: [*arguments, "--out", str(folder / "run")],
+        lambda folder: _without_first_observation(run_files(folder / "run")),
+        lambda folder: committed(folder / "run"),
+        lambda folder: run_problems(folder / "run"),
     )
 
 
@@ -109,19 +109,21 @@ def _without_first_observation(files: dict[str, bytes]) -> dict[str, bytes]:
 
 
 def _of_ask(suite: Suite) -> KilledCommand:
-    def runs(place: Path) -> list[Path]:
-        return [place / "asked" / "p1-224x224", place / "asked" / "seen-224x224"]
+    def runs(folder: Path) -> list[Path]:
+        return [folder / "asked" / "p1-224x224", folder / "asked" / "seen-224x224"]
 
     return KilledCommand(
         "ask",
         lambda _: None,
-        lambda place: [
+        lambda folder: [
             *("ask", "--model", "vlm-tiny", "--prompt", "p1,seen", "--suite", str(suite.folder)),
-            *("--out", str(place / "asked")),
+            *("--out", str(folder / "asked")),
         ],
-        lambda place: {f"{run.name}/{key}": own for run in runs(place) for key, own in run_files(run).items()},
-        lambda place: committed(*runs(place)),
-        lambda place: run_problems(*runs(place)),
+        lambda folder: {
+            f"{run.name}/{key}": content for run in runs(folder) for key, content in run_files(run).items()
+        },
+        lambda folder: committed(*runs(folder)),
+        lambda folder: run_problems(*runs(folder)),
     )
 
 
@@ -131,9 +133,9 @@ def _of_suite(name: str, begin: object, *arguments: str) -> KilledCommand:
     return KilledCommand(
         name,
         begin,
-        lambda place: [one.format(place=place) for one in arguments],
-        lambda place: files_of(place / "suite"),
-        lambda place: set(files_of(place / "suite")) if (place / "suite").is_dir() else set(),
+        lambda folder: [argument.format(place=folder) for argument in arguments],
+        lambda folder: files_of(folder / "suite"),
+        lambda folder: set(files_of(folder / "suite")) if (folder / "suite").is_dir() else set(),
     )
 
 
@@ -144,14 +146,14 @@ def _command(name: str, request: pytest.FixtureRequest) -> KilledCommand:
         case "suite convert":
             options = ("--root", "{place}/root", "--out", "{place}/suite", "--emit-curation", "{place}/review.csv")
             return _of_suite(
-                name, lambda place: _comparisons(place / "root"), "suite", "convert", "mllm-compbench", *options
+                name, lambda target: _comparisons(target / "root"), "suite", "convert", "mllm-compbench", *options
             )
         case "ask":
             return _of_ask(request.getfixturevalue("six"))
         case "extract":
             suite: Suite = request.getfixturevalue("six")
-            given = ("--model", "pi0-tiny", "--suite", str(suite.folder), "--no-act", "--tokens", "all")
-            return _of_extract(name, "extract", *given, "--workers", "2")
+            extract_options = ("--model", "pi0-tiny", "--suite", str(suite.folder), "--no-act", "--tokens", "all")
+            return _of_extract(name, "extract", *extract_options, "--workers", "2")
         case "run verify --seal":
             return _of_run(
                 name, partial(_unsealed, request.getfixturevalue("little_runs") / "run"), "run", "verify", "--seal"
@@ -194,7 +196,7 @@ def test_the_same_command_twice_at_once_makes_the_same(
     alone, together = begun(command, tmp_path / "alone"), begun(command, tmp_path / "together")
     assert run_together([command.arguments(alone)], alone, lambda: True) == []
     assert run_together([command.arguments(together)] * 2, together, lambda: True) == []
-    assert command.made(together) == command.made(alone)
+    assert command.results(together) == command.results(alone)
     assert command.problems(together) == ()
     assert leftovers(together) == []
 
@@ -209,33 +211,33 @@ def test_sealing_while_another_process_extracts_changes_no_byte(
     seal = ["run", "verify", "--seal", str(together / "run")]
     commands = [command.arguments(together), seal, seal]
     assert run_together(commands, together, lambda: any(together.glob("run/commits/*.json"))) == []
-    assert command.made(together) == command.made(alone)
+    assert command.results(together) == command.results(alone)
     assert command.problems(together) == ()
     assert leftovers(together) == []
 
 
 def mount(*arguments: str) -> None:
-    done = subprocess.run(["mount", *arguments], capture_output=True, encoding="utf-8", check=False)
-    if done.returncode != 0:
-        pytest.skip(f"cannot mount here: {done.stderr.strip()}")
+    completed = subprocess.run(["mount", *arguments], capture_output=True, encoding="utf-8", check=False)
+    if completed.returncode != 0:
+        pytest.skip(f"cannot mount here: {completed.stderr.strip()}")
 
 
 @pytest.fixture(scope="module")
 def disk(little_runs: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """A real file system, mounted read-only, with a whole run and one without columns on it."""
-    place = tmp_path_factory.mktemp("disk")
+    folder = tmp_path_factory.mktemp("disk")
     if shutil.which("mount") is None:
         pytest.skip("there is no mount here")
-    mount("-t", "tmpfs", "-o", "size=50m", "none", str(place))
+    mount("-t", "tmpfs", "-o", "size=50m", "none", str(folder))
     try:
-        shutil.copytree(little_runs / "run", place / "run")
+        shutil.copytree(little_runs / "run", folder / "run")
         shutil.copytree(
-            little_runs / "run", place / "bare", ignore=shutil.ignore_patterns("columns.zarr", "sealed")
+            little_runs / "run", folder / "bare", ignore=shutil.ignore_patterns("columns.zarr", "sealed")
         )
-        mount("-o", "remount,ro", str(place))
-        yield place
+        mount("-o", "remount,ro", str(folder))
+        yield folder
     finally:
-        subprocess.run(["umount", str(place)], check=True)
+        subprocess.run(["umount", str(folder)], check=True)
 
 
 def test_a_run_on_a_read_only_disk_is_read_and_verified(disk: Path, little_runs: Path) -> None:

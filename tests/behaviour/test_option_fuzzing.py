@@ -50,17 +50,17 @@ NEVER = {
 @pytest.fixture(scope="module", autouse=True)
 def places(tmp_path_factory: pytest.TempPathFactory, small_suite: Suite) -> Iterator[Path]:
     """A folder to stand in, with files, folders, a run and a damaged one."""
-    place = tmp_path_factory.mktemp("fuzzed")
-    (place / "a-file").write_bytes(b"\x00\xff[[[")
-    (place / "a-folder").mkdir()
-    write_little_run(place / "runs" / "little", small_suite.select(["color"]), episodes=8)
-    (place / "a-run").symlink_to(place / "runs" / "little")
-    (place / "damaged").mkdir()
-    (place / "damaged" / "run.json").write_bytes(b"[" * 99_999)
-    (place / "SUITE").symlink_to(small_suite.folder)
+    folder = tmp_path_factory.mktemp("fuzzed")
+    (folder / "a-file").write_bytes(b"\x00\xff[[[")
+    (folder / "a-folder").mkdir()
+    write_little_run(folder / "runs" / "little", small_suite.select(["color"]), episodes=8)
+    (folder / "a-run").symlink_to(folder / "runs" / "little")
+    (folder / "damaged").mkdir()
+    (folder / "damaged" / "run.json").write_bytes(b"[" * 99_999)
+    (folder / "SUITE").symlink_to(small_suite.folder)
     before = Path.cwd()
-    os.chdir(place)
-    yield place
+    os.chdir(folder)
+    yield folder
     os.chdir(before)
 
 
@@ -75,34 +75,36 @@ def option(parameter: Any) -> st.SearchStrategy[list[str]]:
 @st.composite
 def command_lines(draw: st.DrawFn) -> list[str]:
     path = draw(st.sampled_from(sorted(COMMANDS)))
-    optional_folder = any(one.name == "folder" and not one.required for one in COMMANDS[path].params)
+    optional_folder = any(
+        parameter.name == "folder" and not parameter.required for parameter in COMMANDS[path].params
+    )
     usable = [
-        one
-        for one in COMMANDS[path].params
-        if not NEVER & set(one.opts) and not (optional_folder and one.name == "folder")
+        parameter
+        for parameter in COMMANDS[path].params
+        if not NEVER & set(parameter.opts) and not (optional_folder and parameter.name == "folder")
     ]
-    required = [one for one in usable if one.required]
-    optional = [one for one in usable if not one.required] or usable
-    others = draw(st.lists(st.sampled_from(optional), max_size=3)) if optional else []
-    given_options = [word for one in [*required, *others] for word in draw(option(one))]
-    if any("--model" in one.opts for one in COMMANDS[path].params):
+    required = [parameter for parameter in usable if parameter.required]
+    optional = [parameter for parameter in usable if not parameter.required] or usable
+    extras = draw(st.lists(st.sampled_from(optional), max_size=3)) if optional else []
+    given_options = [word for parameter in [*required, *extras] for word in draw(option(parameter))]
+    if any("--model" in parameter.opts for parameter in COMMANDS[path].params):
         given_options += ["--model", draw(st.sampled_from(("expert", "pi0-tyni", "\x1b[31m", "[red]", "")))]
-    if any("--suite" in one.opts for one in COMMANDS[path].params):
+    if any("--suite" in parameter.opts for parameter in COMMANDS[path].params):
         given_options += ["--suite", draw(st.sampled_from(("SUITE", "SUITE", "a-file", "a-folder", "\x1b[31m")))]
     if optional_folder:
         given_options += [draw(st.sampled_from(("SUITE", "a-file", "a-folder", "\x1b[31m", "a" * 5000)))]
-    rest = draw(st.lists(st.sampled_from(HOSTILE), max_size=1))
-    return [*path.split(), *ALWAYS.get(path, []), *given_options, *rest]
+    hostile_words = draw(st.lists(st.sampled_from(HOSTILE), max_size=1))
+    return [*path.split(), *ALWAYS.get(path, []), *given_options, *hostile_words]
 
 
 def holds(words: list[str]) -> None:
     answer = CliRunner().invoke(app, words)
-    said = answer.output
+    printed = answer.output
     assert answer.exception is None or isinstance(answer.exception, SystemExit), words
-    assert answer.exit_code in (0, 1, 2, 3), (words, said)
-    assert "Traceback" not in said, (words, said)
-    assert "InternalError" not in said, (words, said)
-    assert not UNSAFE.search(said), (words, said)
+    assert answer.exit_code in (0, 1, 2, 3), (words, printed)
+    assert "Traceback" not in printed, (words, printed)
+    assert "InternalError" not in printed, (words, printed)
+    assert not UNSAFE.search(printed), (words, printed)
 
 
 FUZZED = {"deadline": None, "suppress_health_check": list(HealthCheck), "print_blob": True}

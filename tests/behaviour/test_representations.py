@@ -131,10 +131,10 @@ CHANGES: list[tuple[str, str, Edit]] = [
 @pytest.fixture(scope="module")
 def run(little_runs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A copy with every kind of record, a failure among them; a test puts back what it changes."""
-    place = Path(shutil.copytree(little_runs / "run", tmp_path_factory.mktemp("spelt") / "run"))
-    write_failure(open_run(place).root, 3, "the gripper broke")
-    assert verify_run(place, deep=True).ok
-    return place
+    run_folder = Path(shutil.copytree(little_runs / "run", tmp_path_factory.mktemp("spelt") / "run"))
+    write_failure(open_run(run_folder).root, 3, "the gripper broke")
+    assert verify_run(run_folder, deep=True).ok
+    return run_folder
 
 
 def the_record(run: Path, pattern: str) -> Path:
@@ -180,7 +180,7 @@ def test_bytes_that_are_no_record_are_named(run: Path, pattern: str, way: str) -
 
 
 @pytest.mark.parametrize(
-    "change", [one for one in CHANGES if one[1] != "the same"], ids=lambda change: " ".join(change[:2])
+    "change", [change for change in CHANGES if change[1] != "the same"], ids=lambda change: " ".join(change[:2])
 )
 def test_a_changed_value_under_the_former_hash_is_named(run: Path, change: tuple[str, str, Edit]) -> None:
     path, content = changed(run, *change[::2])
@@ -191,7 +191,7 @@ def test_a_changed_value_under_the_former_hash_is_named(run: Path, change: tuple
 
 
 @pytest.mark.parametrize(
-    "change", [one for one in CHANGES if one[1] != "the same"], ids=lambda change: " ".join(change[:2])
+    "change", [change for change in CHANGES if change[1] != "the same"], ids=lambda change: " ".join(change[:2])
 )
 def test_a_changed_record_with_its_own_hash_computed_anew_is_named(
     run: Path, change: tuple[str, str, Edit]
@@ -242,8 +242,8 @@ def look_at_everything(run: Path) -> None:
     opened.certificate, repr(opened), opened._repr_html_()
     inventory(opened)
     listed_interventions(opened)
-    for one in stored_interventions(opened):
-        _ = one.certificate
+    for intervention in stored_interventions(opened):
+        _ = intervention.certificate
     load_results(opened)
     read_thumbnail(opened.location, 4)
 
@@ -282,20 +282,20 @@ def changed_bytes(stored: Stored, draw: Random) -> Fault | None:
     """One byte replaced, put in or taken out, anywhere in a file of any kind."""
     path = stored.draw(draw)
     content = path.read_bytes()
-    place, byte = draw.randrange(len(content)), bytes([draw.randrange(256)])
+    offset, byte = draw.randrange(len(content)), bytes([draw.randrange(256)])
     how = draw.choice(("replaced", "put in", "taken out"))
-    rest = content[place + (how != "put in") :]
-    after = content[:place] + (byte if how != "taken out" else b"") + rest
-    return None if after == content else Fault(f"byte {place} of {path} {how}", {path: after})
+    tail = content[offset + (how != "put in") :]
+    after = content[:offset] + (byte if how != "taken out" else b"") + tail
+    return None if after == content else Fault(f"byte {offset} of {path} {how}", {path: after})
 
 
 @pytest.fixture(scope="module")
 def real(recorded_run: Run, tmp_path_factory: pytest.TempPathFactory) -> Stored:
     """A copy of a run of pi0-tiny with all tokens, with probes and an intervention."""
-    place = Path(shutil.copytree(recorded_run.path, tmp_path_factory.mktemp("real") / "run"))
-    train_probes(open_run(place), ["color"], permutations=1)
-    intervene_on_little_run(open_run(place))
-    return Stored.of(place, place)
+    run_folder = Path(shutil.copytree(recorded_run.path, tmp_path_factory.mktemp("real") / "run"))
+    train_probes(open_run(run_folder), ["color"], permutations=1)
+    intervene_on_little_run(open_run(run_folder))
+    return Stored.of(run_folder, run_folder)
 
 
 def assert_none_is_silent(stored: Stored, seeds: range) -> None:

@@ -64,11 +64,11 @@ def edit(path: Path, change: Edit) -> None:
     path.write_text(json.dumps(content, indent=1), encoding="utf-8")
 
 
-def swap(one: Path, other: Path) -> None:
-    here, there = one.read_bytes(), other.read_bytes()
-    assert here != there
-    one.write_bytes(there)
-    other.write_bytes(here)
+def swap(first: Path, other: Path) -> None:
+    first_bytes, other_bytes = first.read_bytes(), other.read_bytes()
+    assert first_bytes != other_bytes
+    first.write_bytes(other_bytes)
+    other.write_bytes(first_bytes)
 
 
 def assert_found(run: Path, *names: str, deep: bool = False) -> None:
@@ -83,14 +83,14 @@ def assert_found(run: Path, *names: str, deep: bool = False) -> None:
 # -- the plan ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("left", [0, 20, 23])
-def test_episodes_that_a_sealed_run_lost_are_missed(run: Path, left: int) -> None:
-    for commit in sorted((run / "commits").glob("*.json"))[left:]:
+@pytest.mark.parametrize("remaining", [0, 20, 23])
+def test_episodes_that_a_sealed_run_lost_are_missed(run: Path, remaining: int) -> None:
+    for commit in sorted((run / "commits").glob("*.json"))[remaining:]:
         commit.unlink()
-    if not left:
+    if not remaining:
         (run / "commits").rmdir()
-    assert_found(run, f"commits/{left:08d}.json is missing")
-    with pytest.raises(RunDamagedError, match=f"{24 - left} are gone"):
+    assert_found(run, f"commits/{remaining:08d}.json is missing")
+    with pytest.raises(RunDamagedError, match=f"{24 - remaining} are gone"):
         open_run(run, allow_partial=True)
 
 
@@ -102,8 +102,8 @@ def test_an_older_state_of_a_run_differs_from_a_finished_one(small_suite: Suite,
         writer.write(episode(plan, number))
     older = verify_run(tmp_path / "run", deep=True)
     assert (older.ok, older.finished, older.committed, older.planned) == (True, False, 20, 24)
-    said = CliRunner().invoke(app, ["run", "verify", str(tmp_path / "run")])
-    assert (said.exit_code, "not finished" in said.output) == (0, True)
+    result = CliRunner().invoke(app, ["run", "verify", str(tmp_path / "run")])
+    assert (result.exit_code, "not finished" in result.output) == (0, True)
     with pytest.raises(RunIncompleteError, match="20 of 24"):
         open_run(tmp_path / "run")
 
@@ -112,13 +112,13 @@ def test_a_seal_of_fewer_episodes_is_no_damage_and_is_not_used(small_suite: Suit
     """A run that was sealed, continued and killed before it was sealed again."""
     plan = little_plan(small_suite.select(["color"]))
     writer = little_writer(locate(tmp_path / "run"), plan)
-    first, *rest = writer.remaining()
+    first, *later = writer.remaining()
     writer.write(episode(plan, first))
     seal(tmp_path / "run")
-    for number in rest:
+    for number in later:
         writer.write(episode(plan, number))
-    found = verify_run(tmp_path / "run", deep=True)
-    assert (found.ok, found.finished, found.sealed) == (True, True, False)
+    verification = verify_run(tmp_path / "run", deep=True)
+    assert (verification.ok, verification.finished, verification.sealed) == (True, True, False)
     assert not open_run(tmp_path / "run").sealed
     (tmp_path / "run/commits/00000000.json").unlink()
     with pytest.raises(RunDamagedError, match=r"commits/00000000\.json is missing"):
@@ -179,7 +179,7 @@ def test_seal_makes_no_columns_of_exchanged_rows(equal_sizes: Path) -> None:
 
 
 def test_columns_of_another_run_are_found(run: Path, other: Path) -> None:
-    (ours,), (theirs,) = ([*(place / "columns.zarr").iterdir()] for place in (run, other))
+    (ours,), (theirs,) = ([*(folder / "columns.zarr").iterdir()] for folder in (run, other))
     shutil.rmtree(ours)
     shutil.copytree(theirs, ours)
     assert_found(run, "columns.zarr", deep=True)
@@ -297,12 +297,12 @@ def test_an_interrupted_sweep_is_continued_only_from_what_it_left(run: Path) -> 
     partial = SweepCheckpoint.of(opened.location, settings.key, opened.stamp)
     shutil.rmtree(run / "probes" / settings.key)
     stop_after(opened, settings.permutations, 4)
-    left = sorted((run / partial.folder).iterdir())
-    assert len(left) == 4
-    shutil.copy(left[0], left[1])
-    with pytest.raises(RunDamagedError, match=re.escape(left[1].name)):
+    partial_files = sorted((run / partial.folder).iterdir())
+    assert len(partial_files) == 4
+    shutil.copy(partial_files[0], partial_files[1])
+    with pytest.raises(RunDamagedError, match=re.escape(partial_files[1].name)):
         train_probes(opened, permutations=3)
-    left[1].unlink()
+    partial_files[1].unlink()
     again = train_probes(opened, permutations=3).scores
     np.testing.assert_array_equal(again["accuracy"], expected["accuracy"])
 
@@ -311,8 +311,8 @@ def stop_after(run: Run, permutations: int, sites: int) -> None:
     class EnoughError(Exception):
         pass
 
-    def stop(done: int, _total: int, _site: str) -> None:
-        if done == sites:
+    def stop(finished: int, _total: int, _site: str) -> None:
+        if finished == sites:
             raise EnoughError
 
     with pytest.raises(EnoughError):
@@ -353,8 +353,10 @@ def test_what_a_commit_names_outside_of_its_run_is_not_there(run: Path, tmp_path
     commit = json.loads(path.read_text(encoding="utf-8"))
     commit["objects"][key] = Checksum.of(outside.read_bytes()).to_json()
     write_record(path, commit)
-    found = verify_run(run, deep=True)
-    assert any("outside" in problem and "no object of this episode" in problem for problem in found.problems)
+    verification = verify_run(run, deep=True)
+    assert any(
+        "outside" in problem and "no object of this episode" in problem for problem in verification.problems
+    )
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes in this file system")
@@ -364,8 +366,8 @@ def test_what_a_commit_names_outside_of_its_run_is_not_there(run: Path, tmp_path
 def test_a_pipe_or_a_device_in_the_place_of_a_file_is_not_waited_for(run: Path, key: str) -> None:
     (run / key).unlink()
     os.mkfifo(run / key)
-    found = verify_run(run, deep=True)
-    assert not found.ok or found.committed < found.planned
+    verification = verify_run(run, deep=True)
+    assert not verification.ok or verification.committed < verification.planned
     if key != "certificate.json":  # which other records repeat
         with pytest.raises((RunDamagedError, RunIncompleteError)):
             readings(run)
@@ -389,10 +391,10 @@ def test_copies_that_lie_about_change_nothing_and_are_named(run: Path, little_ru
             shutil.copy(path, path.with_name(name))
     shutil.copytree(probes, probes.with_name(f"{probes.name} copy"))
     assert readings(run) == readings(little_runs / "run")
-    found = verify_run(run, deep=True)
-    assert found.ok
-    assert "commits/00000003 copy.json" in found.strays
-    assert f"probes/{probes.name} copy/settings.json" in found.strays
+    verification = verify_run(run, deep=True)
+    assert verification.ok
+    assert "commits/00000003 copy.json" in verification.strays
+    assert f"probes/{probes.name} copy/settings.json" in verification.strays
 
 
 # -- everything --------------------------------------------------------------------------------------------

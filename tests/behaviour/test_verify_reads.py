@@ -79,10 +79,10 @@ def test_a_result_that_no_reader_takes_is_a_problem(sound: Path, tmp_path: Path,
 
 @pytest.fixture(scope="module")
 def run(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    place = tmp_path_factory.mktemp("empty") / "run"
+    run_folder = tmp_path_factory.mktemp("empty") / "run"
     settings = {**little_settings(), "scene": SceneSpec(max_steps=2).to_json()}
-    RunWriter(locate(place), little_plan(small_suite.select(["color"])), settings)
-    return place
+    RunWriter(locate(run_folder), little_plan(small_suite.select(["color"])), settings)
+    return run_folder
 
 
 def test_it_opens_as_a_table_of_no_episodes(run: Path) -> None:

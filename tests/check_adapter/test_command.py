@@ -39,24 +39,24 @@ def ran(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 def test_a_sound_adapter_passes_every_check_and_plays_two_episodes(tmp_path: Path) -> None:
     install_encoder_vla(tmp_path / "theirs")
     write_checkpoint(tmp_path / "checkpoint")
-    done = ran(tmp_path / "theirs", "encoder-vla", "--checkpoint", str(tmp_path / "checkpoint"))
-    lines = done.stdout.splitlines()
-    assert done.returncode == 0, done.stdout + done.stderr
+    completed = ran(tmp_path / "theirs", "encoder-vla", "--checkpoint", str(tmp_path / "checkpoint"))
+    lines = completed.stdout.splitlines()
+    assert completed.returncode == 0, completed.stdout + completed.stderr
     assert {line.split()[0] for line in lines[:-1]} == {"passed", "skipped"}
     assert lines[0] == "passed   Naming the family imports no torch, so that commands without a model stay fast."
     assert lines[-2] == "passed   Two episodes are extracted, and every stored site is loaded again."
     assert "0 failed" in lines[-1]
-    assert "next: probe-kit extract --model encoder-vla" in done.stderr
+    assert "next: probe-kit extract --model encoder-vla" in completed.stderr
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("model", "play"), [("pi0-tiny", "extract"), ("vlm-tiny", "ask")])
 def test_the_embedded_models_pass(model: str, play: str, tmp_path: Path) -> None:
     """Also those that answer; what needs a checkpoint to copy is skipped with the reason."""
-    done = ran(tmp_path, model)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "skipped  Every option reaches the card. (the family brings its own weights" in done.stdout
-    assert f"next: probe-kit {play} --model {model} --items 24" in done.stderr
+    completed = ran(tmp_path, model)
+    assert completed.returncode == 0, completed.stdout + completed.stderr
+    assert "skipped  Every option reaches the card. (the family brings its own weights" in completed.stdout
+    assert f"next: probe-kit {play} --model {model} --items 24" in completed.stderr
 
 
 @pytest.mark.slow
@@ -67,10 +67,10 @@ def test_a_broken_adapter_is_told_what_to_change(tmp_path: Path) -> None:
     text = source.read_text(encoding="utf-8")
     assert "Tap(block.norm1, fires)" in text
     source.write_text(text.replace("Tap(block.norm1, fires)", "Tap(block.norm1, fires + 1)"), encoding="utf-8")
-    done = ran(folder, "encoder-vla", "--checkpoint", str(tmp_path / "checkpoint"), "--json")
-    assert done.returncode == 1, done.stderr
-    answer = json.loads(done.stdout)
-    failed = {own["name"]: own for own in answer["checks"] if own["state"] == "failed"}
+    completed = ran(folder, "encoder-vla", "--checkpoint", str(tmp_path / "checkpoint"), "--json")
+    assert completed.returncode == 1, completed.stderr
+    answer = json.loads(completed.stdout)
+    failed = {check["name"]: check for check in answer["checks"] if check["state"] == "failed"}
     assert not answer["passed"]
     first = failed["every_site_of_every_quantity_fires_as_often_as_promised"]
     assert first["seen"].startswith("SiteNeverFiredError")
@@ -84,13 +84,13 @@ def test_a_loader_that_fails_and_a_module_that_imports_torch_are_named(tmp_path:
     folder = install(tmp_path / "theirs", "heavy-vla", "heavy_vla:FAMILY")
     (folder / "heavy_vla.py").write_text(HEAVY, encoding="utf-8")
     (tmp_path / "checkpoint").mkdir()
-    done = ran(folder, "heavy-vla", "--checkpoint", str(tmp_path / "checkpoint"))
-    lines = done.stdout.splitlines()
-    assert done.returncode == 1, done.stderr
+    completed = ran(folder, "heavy-vla", "--checkpoint", str(tmp_path / "checkpoint"))
+    lines = completed.stdout.splitlines()
+    assert completed.returncode == 1, completed.stderr
     assert lines[0].startswith("failed   Naming the family imports no torch")
     assert "`import heavy_vla` imports torch" in lines[1]
     assert lines[4].startswith("failed   The model loads")
     assert "FileNotFoundError" in lines[5]
     assert "heavy_vla.py:" in lines[5]
     assert lines[-1] == "0 passed, 2 failed, 0 skipped"
-    assert "next: Keep `FAMILY` in a module" in done.stderr
+    assert "next: Keep `FAMILY` in a module" in completed.stderr

@@ -18,7 +18,7 @@ from probe_kit.demo.pipeline import (
     UNTRAINED_NETWORK,
     VLM,
     Finding,
-    measured,
+    measure_truth,
     organism_table,
     settings_of,
     source_of,
@@ -70,8 +70,8 @@ def test_the_verdict_asks_whether_it_is_in_the_backbone_and_whether_it_is_acted_
 
 
 def test_absent_is_said_only_where_the_best_site_is_below_the_bound() -> None:
-    one = row(0.5, 0.2)
-    assert verdict(replace(one, backbone=replace(one.backbone, verdict="absent"))) == "absent"
+    table_row = row(0.5, 0.2)
+    assert verdict(replace(table_row, backbone=replace(table_row.backbone, verdict="absent"))) == "absent"
 
 
 @pytest.mark.parametrize("control", ["random-features", "untrained"])
@@ -85,15 +85,15 @@ def test_organisms_differ_in_one_truth_at_a_time() -> None:
     assert (TRAINED.expected("color"), TRAINED.expected("state")) == ("used", "not used")
     assert {EARLY.expected(category) for category in ("color", "shape", "state")} == {DOES_NOT_DECIDE}
     assert dict(STATE_USED.truth) == {**dict(TRAINED.truth), "state": "used"}
-    assert {one.expected("counting") for one in ORGANISMS} == {"absent"}
-    untrained = [one for one in ORGANISMS if one.random_weights]
+    assert {organism.expected("counting") for organism in ORGANISMS} == {"absent"}
+    untrained = [organism for organism in ORGANISMS if organism.random_weights]
     assert untrained == [UNTRAINED_NETWORK, *OTHER_TWINS]
-    assert [one.weights_seed for one in untrained] == [0, 1, 2]
-    assert {one.expected(category) for one in untrained for category in ("color", "state")} == {"absent"}
+    assert [organism.weights_seed for organism in untrained] == [0, 1, 2]
+    assert {organism.expected(category) for organism in untrained for category in ("color", "state")} == {"absent"}
 
 
 @pytest.mark.parametrize(
-    ("p", "bounded", "shown", "expected"),
+    ("p", "bounded", "is_shown", "expected"),
     [
         (0.005, True, True, "not used"),
         (0.005, True, False, "undecided"),
@@ -103,13 +103,13 @@ def test_organisms_differ_in_one_truth_at_a_time() -> None:
     ],
 )
 def test_what_the_trained_one_follows_is_the_control_of_those_that_follow_nothing(
-    p: float, bounded: bool, shown: bool, expected: str
+    p: float, bounded: bool, is_shown: bool, expected: str
 ) -> None:
     use = UseVerdict(behaviour="undecided", reason="why", lacks_control=bounded)
     alone = replace(row(0.4, p), image_swap=SwapEffect(use=use))
-    assert measured(alone, shown) == expected
+    assert measure_truth(alone, is_shown) == expected
     follows = UseVerdict(behaviour="used", reason="why")
-    assert measured(replace(alone, image_swap=SwapEffect(use=follows)), shown) == "used"
+    assert measure_truth(replace(alone, image_swap=SwapEffect(use=follows)), is_shown) == "used"
 
 
 @pytest.mark.slow
@@ -125,16 +125,22 @@ def test_a_random_network_of_another_seed_is_found_again(small_suite: Suite, tmp
 
 def test_organisms_have_a_name_and_a_folder_of_their_own() -> None:
     everybody = (VLM, *ORGANISMS)
-    assert len({one.name for one in everybody}) == len({one.folder for one in everybody}) == len(everybody)
+    assert (
+        len({organism.name for organism in everybody})
+        == len({organism.folder for organism in everybody})
+        == len(everybody)
+    )
 
 
 def test_the_table_shows_the_margin_that_decides() -> None:
     """Over 48 episodes Δ is 14.1 points, over their 24 items 20.0, and that is what the verdict rests on."""
-    one = row(0.66, 0.3)
+    table_row = row(0.66, 0.3)
     margins = {"chance_margin_episodes": 0.1414, "chance_margin": 0.2001}
-    shown = replace(one, success=replace(one.success, **margins))
+    changed_row = replace(table_row, success=replace(table_row.success, **margins))
     with out.capture() as printed:
-        out.print(organism_table([Finding("trained", "color", "used", verdict(shown), shown)]), width=160)
+        out.print(
+            organism_table([Finding("trained", "color", "used", verdict(changed_row), changed_row)]), width=160
+        )
     text = printed.get()
     assert "20.0" in text
     assert "14.1" not in text
@@ -151,7 +157,7 @@ def test_the_table_counts_the_true_verdicts() -> None:
     text = " ".join(printed.get().split())
     assert "1 of 3 verdicts are true, 1 undecided, 1 is wrong" in text
     assert "*not used* and *moves with it, does not decide* are both true of it" in text
-    assert [text.count(f" {own} ") for own in ("absent wrong", "undecided undecided")] == [1, 1]
+    assert [text.count(f" {label} ") for label in ("absent wrong", "undecided undecided")] == [1, 1]
 
 
 @pytest.mark.parametrize(
@@ -174,13 +180,13 @@ def test_a_verdict_is_true_undecided_or_wrong(expected: str, verdict: str, agree
 
 
 def test_every_compatible_verdict_is_one_that_the_instrument_gives() -> None:
-    given = {f"{against}{own}" for own in get_args(Behaviour) for against in ("", "against: ")}
-    assert {own for verdicts in COMPATIBLE.values() for own in verdicts} <= given
+    possible = {f"{against}{behaviour}" for behaviour in get_args(Behaviour) for against in ("", "against: ")}
+    assert {compatible for verdicts in COMPATIBLE.values() for compatible in verdicts} <= possible
 
 
 @pytest.mark.parametrize(("sr", "expected"), [(0.9, "known"), (0.6, "not shown"), (0.5, "not shown")])
 def test_a_vlm_knows_what_it_answers_far_from_one_half(sr: float, expected: str) -> None:
-    one = row(sr, None)
-    assert verdict(replace(one, run=replace(one.run, mode="answers"))) == expected
+    table_row = row(sr, None)
+    assert verdict(replace(table_row, run=replace(table_row.run, mode="answers"))) == expected
     assert VLM.expected("state") == "known"
     assert VLM.expected("counting") == "not shown"

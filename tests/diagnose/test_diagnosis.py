@@ -43,14 +43,14 @@ def run_command(*arguments: object) -> Any:
 
 @pytest.fixture(scope="module")
 def folder(two_steps: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    def make(made: Path) -> None:
+    def make(diagnosed: Path) -> None:
         policy = ("--checkpoint", two_steps, "--categories", "color", "--items", 16, "--env-workers", 0)
-        new = (*policy, "--out", made / "run")
+        new = (*policy, "--out", diagnosed / "run")
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr("probe_kit.diagnose.measure.DONORS", 2)
-            answer = run_command("pi0-tiny", *new, *FRAMES, "--html", made / "why.html", "--format", "json")
+            answer = run_command("pi0-tiny", *new, *FRAMES, "--html", diagnosed / "why.html", "--format", "json")
         assert answer.exit_code == 0, answer.output
-        (made / "first.json").write_text(answer.stdout, encoding="utf-8")
+        (diagnosed / "first.json").write_text(answer.stdout, encoding="utf-8")
 
     return made_once(tmp_path_factory, "diagnosed", make)
 
@@ -74,7 +74,7 @@ def diagnosis(folder: Path) -> dict[str, Any]:
 
 
 def test_words_and_pictures_decide_color_and_pass_by_one_block(diagnosis: dict[str, Any]) -> None:
-    inputs = {one["name"]: one for one in diagnosis["inputs"]}
+    inputs = {entry["name"]: entry for entry in diagnosis["inputs"]}
     assert inputs["state"]["verdict"] == "not varied"
     for name in ("instruction", "picture"):
         assert inputs[name]["verdict"] in ("decides", "moves"), "8 frames do not always tell them apart"
@@ -132,7 +132,7 @@ def test_an_input_that_no_model_has_is_refused_before_anything_is_played(tmp_pat
 
 
 @pytest.mark.parametrize(
-    ("options", "named"),
+    ("options", "mention"),
     [
         (("--items", 6), "frames of 3 groups; a diagnosis needs at least 6"),
         (("--target", "sim.tool_y"), "Diagnose a run of `probe-kit extract` that acted"),
@@ -143,11 +143,15 @@ def test_an_input_that_no_model_has_is_refused_before_anything_is_played(tmp_pat
 )
 @pytest.mark.parametrize("plan", [(), ("--dry-run",)], ids=["run", "plan"])
 def test_what_no_weights_can_change_is_refused_before_them_and_by_the_plan(
-    options: tuple[object, ...], named: str, plan: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    options: tuple[object, ...],
+    mention: str,
+    plan: tuple[str, ...],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("probe_kit.hooks.load_policy", never)
     answer = run_command("pi0-tiny", "--categories", "color", "--out", tmp_path / "run", *options, *plan)
-    assert (answer.exit_code, named in " ".join(answer.output.split())) == (2, True), answer.output
+    assert (answer.exit_code, mention in " ".join(answer.output.split())) == (2, True), answer.output
     assert not (tmp_path / "run").exists()
 
 
@@ -415,12 +419,16 @@ def test_an_untrained_policy_uses_nothing(tmp_path: Path) -> None:
     new = ("--categories", "color", "--random-weights", "--no-inside", "--out", tmp_path / "run")
     answer = run_command("pi0-tiny", *new, "--format", "json")
     assert answer.exit_code == 1
-    assert {one["verdict"] for one in json.loads(answer.stdout)["inputs"]} <= {"no effect", "open", "not varied"}
+    assert {entry["verdict"] for entry in json.loads(answer.stdout)["inputs"]} <= {
+        "no effect",
+        "open",
+        "not varied",
+    }
 
 
 @pytest.mark.slow
 def test_neither_words_nor_pictures_decide_what_the_seed_does(tmp_path: Path) -> None:
     new = ("--categories", "state", "--no-inside", "--out", tmp_path / "run")
     answer = run_command("pi0-tiny", *new, "--format", "json")
-    inputs = {one["name"]: one["verdict"] for one in json.loads(answer.stdout)["inputs"]}
+    inputs = {entry["name"]: entry["verdict"] for entry in json.loads(answer.stdout)["inputs"]}
     assert set(inputs.values()) <= {"moves", "no effect", "open", "not varied"}

@@ -13,10 +13,10 @@ from tests.support.reach_env import Reach, ReachEnv
 class Dark(Reach):
     """The camera shows one picture."""
 
-    def _seen(self) -> dict[str, object]:
-        seen = super()._seen()
-        seen["pixels"][:] = 7
-        return seen
+    def _observation(self) -> dict[str, object]:
+        observation = super()._observation()
+        observation["pixels"][:] = 7
+        return observation
 
 
 class DarkEnv(ReachEnv):

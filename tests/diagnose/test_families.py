@@ -25,7 +25,7 @@ def test_every_family_that_acts_is_diagnosed_or_says_what_it_lacks(
     tiny = FAMILIES[family]
     settings = ExtractSettings(
         family,
-        tiny.made(small_suite, tmp_path / "checkpoint"),
+        tiny.prepare_checkpoint(small_suite, tmp_path / "checkpoint"),
         options=tiny.options,
         suite=small_suite.folder,
         capture_only=True,

@@ -47,7 +47,10 @@ def frames(texts: Sequence[str], count: int = 24, groups: int = 12) -> list[Fram
 def obey(observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
     """Actions that follow the words, however they are spelt, and the picture a little."""
     forms = {normal_form(text): value for value, text in enumerate((*ONE_TASK[:1], *OTHERS))}
-    values = [3.0 * forms.get(normal_form(one.instruction), -1.0) + one.image.mean() / 100 for one in observations]
+    values = [
+        3.0 * forms.get(normal_form(observation.instruction), -1.0) + observation.image.mean() / 100
+        for observation in observations
+    ]
     return np.array(values, np.float32)[:, None, None] * np.ones((1, 2, 1), np.float32) + 0 * len(seeds)
 
 
@@ -62,11 +65,11 @@ def test_an_obedient_policy_with_one_task_in_two_spellings_is_not_called_deaf() 
 
 
 def test_words_of_other_tasks_show_that_the_policy_obeys_and_what_is_varied_stays_as_it_is() -> None:
-    given = frames(ONE_TASK)
-    alone, with_words = InputExchange(obey, given), InputExchange(obey, given, words=OTHERS)
+    observed_frames = frames(ONE_TASK)
+    alone, with_words = InputExchange(obey, observed_frames), InputExchange(obey, observed_frames, words=OTHERS)
     words, picture, _ = with_words.measure()
     assert words.verdict == "decides"
-    assert words.n_pairs == DONORS * len(given), "each further task, with several pictures"
+    assert words.n_pairs == DONORS * len(observed_frames), "each further task, with several pictures"
     assert words.control == 0, "another spelling changes nothing"
     assert (picture.share, picture.n_pairs) == (alone.measure(["picture"])[0].share, alone.measure()[1].n_pairs)
     donors = {
@@ -83,14 +86,14 @@ def test_two_tasks_of_which_one_has_two_spellings_are_exchanged_for_each_other_a
 
 
 def test_pictures_that_differ_by_noise_and_states_by_rounding_are_not_varied() -> None:
-    rng, shown = np.random.default_rng(1), frames(OTHERS)
-    for number, frame in enumerate(shown):
+    rng, observed_frames = np.random.default_rng(1), frames(OTHERS)
+    for number, frame in enumerate(observed_frames):
         picture = np.clip(120 + rng.integers(-1, 2, (16, 16, 3)), 0, 255).astype(np.uint8)
         state = np.array([0.5, 0.25], np.float32)
         state[0] = np.nextafter(state[0], np.float32(number % 2))
         observation = Observation(picture, state, frame.instruction)
-        shown[number] = Frame.of(frame.name, observation, frame.group, frame.seed)
-    words, picture_input, state_input = InputExchange(obey, shown).measure()
+        observed_frames[number] = Frame.of(frame.name, observation, frame.group, frame.seed)
+    words, picture_input, state_input = InputExchange(obey, observed_frames).measure()
     assert words.verdict == "decides"
     assert (picture_input.verdict, state_input.verdict) == ("not varied", "not varied")
     assert "what the control" in picture_input.reason
@@ -113,7 +116,7 @@ def test_instructions_are_lines_or_a_column_of_a_table(
 
 
 @pytest.mark.parametrize(
-    ("name", "text", "named"),
+    ("name", "text", "mention"),
     [
         ("words.txt", "", "has 0 instructions"),
         ("words.txt", "Lift it\n\nPush it\n", r"line 2 is '', which names no task"),
@@ -124,10 +127,10 @@ def test_instructions_are_lines_or_a_column_of_a_table(
     ],
 )
 def test_instructions_that_name_no_task_or_one_twice_are_refused_with_their_line(
-    name: str, text: str, named: str, tmp_path: Path
+    name: str, text: str, mention: str, tmp_path: Path
 ) -> None:
     (tmp_path / name).write_text(text, encoding="utf-8")
-    with pytest.raises(UsageError, match=named):
+    with pytest.raises(UsageError, match=mention):
         read_instructions(tmp_path / name)
 
 
@@ -185,10 +188,10 @@ def test_a_diagnosis_captures_the_frames_that_it_uses_and_gives_the_numbers_of_o
     source = LeRobotSource(str(recorded))
     every = extract_run(ExtractSettings("pi0-tiny", source=source), tmp_path / "all")
     assert every.episodes["frames"].sum() == 24
-    whole = diagnose_run(every, frames=9, inside=False, instructions=OTHERS)
-    assert numbers_of(few) == numbers_of(whole.to_json())
-    assert whole.settings["instructions"] == OTHERS
-    assert whole.key != diagnose_run(every, frames=9, inside=False).key
+    full_diagnosis = diagnose_run(every, frames=9, inside=False, instructions=OTHERS)
+    assert numbers_of(few) == numbers_of(full_diagnosis.to_json())
+    assert full_diagnosis.settings["instructions"] == OTHERS
+    assert full_diagnosis.key != diagnose_run(every, frames=9, inside=False).key
 
 
 def pk_run(folder: Path) -> Run:
@@ -198,7 +201,10 @@ def pk_run(folder: Path) -> Run:
 
 
 def numbers_of(diagnosis: dict[str, Any]) -> list[Any]:
-    return [[one["name"], one["share"], one["control"], one["every"], one["p"]] for one in diagnosis["inputs"]]
+    return [
+        [entry["name"], entry["share"], entry["control"], entry["every"], entry["p"]]
+        for entry in diagnosis["inputs"]
+    ]
 
 
 @pytest.mark.slow
@@ -218,7 +224,7 @@ def test_one_task_in_two_spellings_is_said_with_the_remedy_and_no_policy_is_call
 @pytest.mark.slow
 @pytest.mark.parametrize("options", [(), ("--dry-run",)], ids=["run", "plan"])
 @pytest.mark.parametrize(
-    ("texts", "more", "named"),
+    ("texts", "more", "mention"),
     [
         (ONE_TASK[1:], (), "which is the task"),
         (["Rearrange the quuxes"], (), "'quuxes'"),
@@ -231,7 +237,7 @@ def test_one_task_in_two_spellings_is_said_with_the_remedy_and_no_policy_is_call
 def test_what_can_be_refused_without_weights_is_refused_before_them(
     texts: list[str],
     more: tuple[str, ...],
-    named: str,
+    mention: str,
     options: tuple[str, ...],
     recorded: Path,
     tmp_path: Path,
@@ -244,7 +250,7 @@ def test_what_can_be_refused_without_weights_is_refused_before_them(
     new = ("--dataset", recorded, "--instructions", words_file(tmp_path, texts), "--out", tmp_path / "run")
     answer = run_command("pi0-tiny", *new, *more, *options)
     assert answer.exit_code != 0
-    assert named in " ".join(answer.output.split()), answer.output
+    assert mention in " ".join(answer.output.split()), answer.output
     assert not (tmp_path / "run").exists()
 
 
@@ -273,17 +279,17 @@ def test_a_diagnosis_names_its_weights_source_and_settings(tmp_path: Path) -> No
 
     inputs = InputExchange(obey, frames(OTHERS)).measure()
     settings = {"frames": 24, "inputs": [], "inside": False, "seed": 0, "instructions": OTHERS}
-    made = Diagnosis(
+    diagnosis = Diagnosis(
         "abc", "mine", 24, 12, inputs, weights_sha256="0123456789abcdef", checkpoint="tuned/080000",
         source="kitchen#1234", settings=settings,
     )  # fmt: skip
-    told = " ".join(diagnosis_table(made).notes)
+    notes = " ".join(diagnosis_table(diagnosis).notes)
     for part in ("weights 0123456789ab of checkpoint tuned/080000", "kitchen#1234", "seed 0", "3 further", "abc"):
-        assert part in told
-    assert Diagnosis.from_json(json.loads(json.dumps(made.to_json()))) == made
-    write_page(made, tmp_path / "why.html")
+        assert part in notes
+    assert Diagnosis.from_json(json.loads(json.dumps(diagnosis.to_json()))) == diagnosis
+    write_page(diagnosis, tmp_path / "why.html")
     page = (tmp_path / "why.html").read_text(encoding="utf-8")
     assert "weights 0123456789ab of checkpoint tuned/080000" in page
-    assert all(page.count(note.split("(")[0][:40]) == 1 for note in diagnosis_table(made).notes), (
+    assert all(page.count(note.split("(")[0][:40]) == 1 for note in diagnosis_table(diagnosis).notes), (
         "each sentence once"
     )

@@ -82,7 +82,10 @@ def linear_policy(weights: Sequence[float], noise: float = 0.0, wandering: float
 
 
 def verdicts(infer, **settings: object) -> dict[str, str]:  # type: ignore[no-untyped-def]
-    return {one.name: one.verdict for one in InputExchange(infer, frames()).measure(**settings)}
+    return {
+        measured_input.name: measured_input.verdict
+        for measured_input in InputExchange(infer, frames()).measure(**settings)
+    }
 
 
 @pytest.mark.slow
@@ -94,7 +97,7 @@ def test_the_shares_are_the_total_indices_of_sobol_for_a_policy_that_adds_its_in
     # Donors hold another value: words that are exchanged never happen to be the same again.
     parts[0] *= len(WORDS) / (len(WORDS) - 1)
     expected = parts / (weights**2 @ spread + noise**2)
-    shares = {one.name: one.share for one in measured}
+    shares = {measured_input.name: measured_input.share for measured_input in measured}
     assert [shares["instruction"], shares[PICTURE], shares[STATE]] == pytest.approx(expected, abs=0.08)
 
 
@@ -113,8 +116,8 @@ def test_an_effect_below_a_tenth_of_the_spread_is_none() -> None:
 
 
 def test_a_policy_that_its_seed_decides_is_moved_by_its_inputs_at_most() -> None:
-    found = verdicts(linear_policy([0.5, 0.0, 0.0], noise=2.0))
-    assert found["instruction"] in ("moves", "open")
+    input_verdicts = verdicts(linear_policy([0.5, 0.0, 0.0], noise=2.0))
+    assert input_verdicts["instruction"] in ("moves", "open")
 
 
 @pytest.mark.slow
@@ -227,11 +230,14 @@ def test_a_second_camera_that_is_not_read_does_not_arrive() -> None:
         )
         for frame in frames()
     ]
-    found = {one.name: one for one in InputExchange(linear_policy([1.0, 1.0, 0.0]), two).measure()}
-    wrist = found["picture.wrist"]
+    by_name = {
+        measured_input.name: measured_input
+        for measured_input in InputExchange(linear_policy([1.0, 1.0, 0.0]), two).measure()
+    }
+    wrist = by_name["picture.wrist"]
     assert (wrist.verdict, wrist.unchanged) == ("does not arrive", wrist.n_inferences)
-    assert exit_code(list(found.values()), ["instruction", "picture.first"]) == 0
-    assert exit_code(list(found.values())) == 1
+    assert exit_code(list(by_name.values()), ["instruction", "picture.first"]) == 0
+    assert exit_code(list(by_name.values())) == 1
 
 
 def test_a_family_that_refuses_an_empty_instruction_is_diagnosed_without_that_blank() -> None:
@@ -280,19 +286,19 @@ def test_a_base_with_other_effects_by_chance_is_not_a_loss_in_more_than_five_of_
 
 
 def test_the_plan_counts_every_inference() -> None:
-    made = 0
+    inference_count = 0
     policy = linear_policy([1.0, 1.0, 1.0])
 
     def infer(observations: Sequence[Observation], seeds: Sequence[int]) -> Actions:
-        nonlocal made
-        made += len(seeds)
+        nonlocal inference_count
+        inference_count += len(seeds)
         return policy(observations, seeds)  # type: ignore[no-any-return]
 
     exchange = InputExchange(infer, frames())
     inputs = exchange.measure()
-    assert made == count_inferences(len(frames()), len(inputs))
+    assert inference_count == count_inferences(len(frames()), len(inputs))
     exchange.against(infer, inputs)
-    assert made == count_inferences(len(frames()), len(inputs), base=True)
+    assert inference_count == count_inferences(len(frames()), len(inputs), base=True)
 
 
 def test_an_input_that_is_declared_absent_is_none_unless_it_moves_the_action() -> None:
@@ -340,9 +346,9 @@ def test_a_loss_behind_the_last_site_is_not_looked_for_before_it() -> None:
     )
 
 
-@pytest.mark.parametrize(("control", "told"), [(0.08, True), (0.0, False), (None, False)])
+@pytest.mark.parametrize(("control", "is_named"), [(0.08, True), (0.0, False), (None, False)])
 def test_a_text_of_which_the_length_alone_arrives_is_told_from_one_of_which_nothing_does(
-    control: float | None, told: bool
+    control: float | None, is_named: bool
 ) -> None:
     zeros, groups = np.zeros(12), np.array([f"group {index // 2}" for index in range(12)])
     deaf = importance_of(
@@ -359,17 +365,17 @@ def test_a_text_of_which_the_length_alone_arrives_is_told_from_one_of_which_noth
         ),
     )
     assert deaf.verdict == "does not arrive"
-    assert ("its control changes some in 12 of 12" in sentence(deaf)) is told
+    assert ("its control changes some in 12 of 12" in sentence(deaf)) is is_named
 
 
-@pytest.mark.parametrize(("every", "told"), [(0.05, True), (0.5, False)])
-def test_what_the_seed_decides_is_said(every: float, told: bool) -> None:
+@pytest.mark.parametrize(("every", "is_named"), [(0.05, True), (0.5, False)])
+def test_what_the_seed_decides_is_said(every: float, is_named: bool) -> None:
     inputs = (
         InputDiagnosis("instruction", "moves", "", share=every, every=every),
         InputDiagnosis("state", "not varied", ""),
     )
     lines = sentences(Diagnosis("key", "policy", 24, 12, inputs))
-    assert ("the seed decides it" in lines[-1]) is told
+    assert ("the seed decides it" in lines[-1]) is is_named
 
 
 @pytest.mark.parametrize("verdict", ["no effect", "does not arrive"])

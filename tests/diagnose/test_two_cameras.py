@@ -28,7 +28,7 @@ PICTURES = ("picture.top", "picture.wrist")
 
 @pytest.fixture(scope="module")
 def checkpoint(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> str | None:
-    return FAMILIES["smolvla"].made(small_suite, tmp_path_factory.mktemp("two") / "smolvla")
+    return FAMILIES["smolvla"].prepare_checkpoint(small_suite, tmp_path_factory.mktemp("two") / "smolvla")
 
 
 @pytest.fixture(scope="module")

@@ -33,16 +33,16 @@ def arm_env(request: pytest.FixtureRequest) -> Iterator[Act2AnswerEnv]:
 @pytest.fixture
 def make_env() -> Iterator[Callable[..., Act2AnswerEnv]]:
     """Makes environments with fields of the default scene replaced, and closes them after the test."""
-    made: list[Act2AnswerEnv] = []
+    environments: list[Act2AnswerEnv] = []
 
     def make(preset: str = "bridge", **changes: object) -> Act2AnswerEnv:
         if changes.get("arm") == "widowx":
             pytest.importorskip("rtbdata")
-        made.append(Act2AnswerEnv(SceneSpec.preset(preset, **changes)))
-        return made[-1]
+        environments.append(Act2AnswerEnv(SceneSpec.preset(preset, **changes)))
+        return environments[-1]
 
     yield make
-    for env in made:
+    for env in environments:
         env.close()
 
 
@@ -52,7 +52,7 @@ def item(tmp_path: Path) -> Item:
     Image.new("RGB", (40, 40), "red").save(tmp_path / "red.png")
     Image.new("RGB", (40, 40), "cyan").save(tmp_path / "cyan.png")
     blank = {f.name: "" for f in fields(Item)}
-    known = {
+    fields_given = {
         "item_id": "color-0001",
         "instruction": "Put the cube on the red picture",
         "correct_side": "left",
@@ -62,7 +62,7 @@ def item(tmp_path: Path) -> Item:
         "source": {},
         "gen": {},
     }
-    return Item(**(blank | known))  # type: ignore[arg-type]
+    return Item(**(blank | fields_given))  # type: ignore[arg-type]
 
 
 @pytest.fixture

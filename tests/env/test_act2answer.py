@@ -52,8 +52,8 @@ def test_a_truncated_picture_is_refused(item):
 
     noise = np.random.default_rng(0).integers(0, 255, (40, 40, 3), np.uint8)
     Image.fromarray(noise).save(item.folder / "red.png")
-    whole = (item.folder / "red.png").read_bytes()
-    (item.folder / "red.png").write_bytes(whole[: len(whole) // 2])
+    picture_bytes = (item.folder / "red.png").read_bytes()
+    (item.folder / "red.png").write_bytes(picture_bytes[: len(picture_bytes) // 2])
     with pytest.raises(SuiteError, match=r"red\.png"):
         Question.from_item(item, "original")
 
@@ -241,11 +241,11 @@ def test_exchanged_pictures_are_the_other_layouts_bit_for_bit_and_leave_no_trace
         if action is not None:
             for env in (watched, other, alone):
                 env.advance(action)
-        seen, rendered = watched.observe_exchanged()
-        wanted = other.observe()
-        np.testing.assert_array_equal(seen["pixels"]["image"], wanted["pixels"]["image"])
+        observed, rendered = watched.observe_exchanged()
+        expected = other.observe()
+        np.testing.assert_array_equal(observed["pixels"]["image"], expected["pixels"]["image"])
         np.testing.assert_array_equal(rendered, other.render())
-        np.testing.assert_array_equal(seen["agent_pos"], wanted["agent_pos"])
+        np.testing.assert_array_equal(observed["agent_pos"], expected["agent_pos"])
         assert (rendered != watched.render()).any()
         np.testing.assert_array_equal(watched.render(), alone.render())
     assert watched.outcome().to_json() == alone.outcome().to_json()
@@ -442,5 +442,5 @@ def test_the_documented_line_makes_the_environment_without_an_import_of_ours():
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     assert "import probe_kit" not in example
     code = f"{example}\nprint(type(env.unwrapped).__name__, observation.keys() == env.observation_space.keys())"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, encoding="utf-8", check=False)
-    assert (done.returncode, done.stdout) == (0, "Act2AnswerEnv True\n"), done.stderr
+    completed = subprocess.run([sys.executable, "-c", code], capture_output=True, encoding="utf-8", check=False)
+    assert (completed.returncode, completed.stdout) == (0, "Act2AnswerEnv True\n"), completed.stderr

@@ -112,12 +112,12 @@ def test_the_cube_is_in_the_hand_and_stays_there(arm_env):
 
 def test_the_gripper_stays_shut_for_fifteen_actions_whatever_is_asked(env):
     env.reset(seed=0)
-    held, executed = [], []
+    grasped, executed = [], []
     for _ in range(17):
         env.advance(STAY_OPEN)
-        held.append(env.scene.is_grasped())
+        grasped.append(env.scene.is_grasped())
         executed.append(env.trial.executed[6])
-    assert held == [True] * 15 + [False] * 2
+    assert grasped == [True] * 15 + [False] * 2
     assert executed == [0.0] * 15 + [1.0] * 2
     assert env.scene.cube_state().position[2] < 0.03
 

@@ -407,10 +407,10 @@ def test_what_really_moved_is_told_after_limits_and_out_of_reach(controller):
     move = controller.command(action((0.01, 5.0, 0.02), turn=(0.1, 0, 3.0)))
     np.testing.assert_allclose(move.shift, [0.01, 0.10, 0.02])
     np.testing.assert_allclose(move.turn, [0.1, 0, 0.5])
-    held = [controller.command(action((0.1, 0, 0), turn=(0, 0.5, 0))) for _ in range(8)][-1]
-    assert held.ik_error > 0 or held.clipped
-    np.testing.assert_array_equal(held.q_to, held.q_from)
-    np.testing.assert_array_equal([*held.shift, *held.turn], np.zeros(6))
+    report = [controller.command(action((0.1, 0, 0), turn=(0, 0.5, 0))) for _ in range(8)][-1]
+    assert report.ik_error > 0 or report.clipped
+    np.testing.assert_array_equal(report.q_to, report.q_from)
+    np.testing.assert_array_equal([*report.shift, *report.turn], np.zeros(6))
 
 
 def test_without_limits_an_action_is_carried_out_whole_and_nothing_keeps_the_hand_off_the_table(shared_env):

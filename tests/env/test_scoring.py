@@ -46,28 +46,28 @@ def test_a_trajectory_says_where_everything_was_and_who_touched_whom(shared_env)
         action = expert.act()
         shared_env.advance(action)
         recorder.note(action)
-    found, spec = recorder.trajectory(), shared_env.scene_spec
+    motion, spec = recorder.trajectory(), shared_env.scene_spec
     side = shared_env.question.side_correct
-    assert (len(found), found.steps) == (61, 60)
-    np.testing.assert_allclose(found.cube[0, :3], (*spec.cube_xy, spec.cube_side / 2), atol=1e-6)
-    np.testing.assert_allclose(found.cube[-1, :2], shared_env.outcome().cube_xy, atol=1e-6)
-    np.testing.assert_allclose(found.tile(side)[:, :2] - spec.tile_xy(side), 0, atol=1e-6)
-    np.testing.assert_allclose(found.tool[-1, :3], shared_env.scene.arm.tool_state()[:3], atol=1e-6)
-    assert found.held.any()
-    assert not found.held[[0, -1]].any()
-    assert (found.finger_force[found.held] > 1).all()
-    assert found.touches[-1].tolist() == [side == "left", side == "right"]
-    assert found.opening[found.held].max() < 1
-    np.testing.assert_allclose(found.executed, found.commanded, atol=1e-6)
+    assert (len(motion), motion.steps) == (61, 60)
+    np.testing.assert_allclose(motion.cube[0, :3], (*spec.cube_xy, spec.cube_side / 2), atol=1e-6)
+    np.testing.assert_allclose(motion.cube[-1, :2], shared_env.outcome().cube_xy, atol=1e-6)
+    np.testing.assert_allclose(motion.tile(side)[:, :2] - spec.tile_xy(side), 0, atol=1e-6)
+    np.testing.assert_allclose(motion.tool[-1, :3], shared_env.scene.arm.tool_state()[:3], atol=1e-6)
+    assert motion.held.any()
+    assert not motion.held[[0, -1]].any()
+    assert (motion.finger_force[motion.held] > 1).all()
+    assert motion.touches[-1].tolist() == [side == "left", side == "right"]
+    assert motion.opening[motion.held].max() < 1
+    np.testing.assert_allclose(motion.executed, motion.commanded, atol=1e-6)
 
 
 def test_what_was_executed_differs_from_what_was_commanded_where_a_limit_stood_in_the_way(shared_env):
     shared_env.reset(seed=0)
     largest = shared_env.scene_spec.limits.translation
-    found = recorded(shared_env, [np.array([0, 0.5, 0, 0, 0, 0, 0.7]), np.array([0, -0.02, 0, 0, 0, 0.1, 0.2])])
-    assert found.commanded[0, 1] == np.float32(0.5)
-    np.testing.assert_allclose(found.executed[0], [0, largest, 0, 0, 0, 0, 1], atol=1e-6)
-    np.testing.assert_allclose(found.executed[1], [0, -0.02, 0, 0, 0, 0.1, 0], atol=1e-6)
+    motion = recorded(shared_env, [np.array([0, 0.5, 0, 0, 0, 0, 0.7]), np.array([0, -0.02, 0, 0, 0, 0.1, 0.2])])
+    assert motion.commanded[0, 1] == np.float32(0.5)
+    np.testing.assert_allclose(motion.executed[0], [0, largest, 0, 0, 0, 0, 1], atol=1e-6)
+    np.testing.assert_allclose(motion.executed[1], [0, -0.02, 0, 0, 0, 0.1, 0], atol=1e-6)
 
 
 def test_looking_does_not_change_what_happens(shared_env):
@@ -82,16 +82,16 @@ def test_looking_does_not_change_what_happens(shared_env):
 
 def test_frames_and_labels_hold_the_same_numbers(shared_env):
     shared_env.reset(seed=0)
-    found = recorded(shared_env, [np.array([0.01, 0, 0, 0, 0, 0, 1.0])] * 3)
-    frames = found.frames
+    motion = recorded(shared_env, [np.array([0.01, 0, 0, 0, 0, 0, 1.0])] * 3)
+    frames = motion.frames
     assert frames.shape == (4, len(CHANNELS))
     assert np.isnan(frames[0]).sum() == 15
     again = Trajectory.of_frames(frames)
     np.testing.assert_array_equal(again.frames, frames)
-    labelled = found.to_xarray()
+    labelled = motion.to_xarray()
     assert labelled["commanded"].sel(step=1, motion="dx") == np.float32(0.01)
-    assert labelled["cube"].sel(frame=0, pose="z") == found.cube[0, 2]
-    assert frames[0, CHANNELS.index("tile_right.y")] == found.tile_right[0, 1]
+    assert labelled["cube"].sel(frame=0, pose="z") == motion.cube[0, 2]
+    assert frames[0, CHANNELS.index("tile_right.y")] == motion.tile_right[0, 1]
 
 
 ON_TILE = Outcome(
@@ -166,16 +166,16 @@ FRAMES = 12
 LEFT_TILE, RIGHT_TILE = (0.4, 0.155), (0.4, -0.155)
 
 
-def trajectory(tool: np.ndarray, held: list[int]) -> Trajectory:
-    """tool: (T + 1, 3) places. held: frames in which the cube is."""
+def trajectory(tool: np.ndarray, held_frames: list[int]) -> Trajectory:
+    """tool: (T + 1, 3) places. held_frames: frames in which the cube is."""
     frames = len(tool)
     pose = np.zeros((frames, 7), np.float32)
-    tiles = [pose + np.array([*place, 0, 0, 0, 0, 1], np.float32) for place in (LEFT_TILE, RIGHT_TILE)]
+    tiles = [pose + np.array([*tile, 0, 0, 0, 0, 1], np.float32) for tile in (LEFT_TILE, RIGHT_TILE)]
     zero = np.zeros(frames, np.float32)
     return Trajectory(
         tool=np.hstack([tool, np.zeros((frames, 3))]).astype(np.float32), opening=zero, cube=pose, cube_speed=zero,
         tile_left=tiles[0], tile_right=tiles[1], finger_force=np.zeros((frames, 2), np.float32),
-        held=np.isin(np.arange(frames), held), touches=np.zeros((frames, 2), bool),
+        held=np.isin(np.arange(frames), held_frames), touches=np.zeros((frames, 2), bool),
         commanded=np.zeros((frames - 1, 7), np.float32), executed=np.zeros((frames - 1, 7), np.float32),
         ik_error=zero[1:],
     )  # fmt: skip
@@ -192,7 +192,7 @@ def reaching() -> np.ndarray:
 
 
 def test_every_event_has_the_frame_at_which_it_was_first_the_case() -> None:
-    events = Events.of(trajectory(reaching(), held=[4, 5, 7, 8, 9]))
+    events = Events.of(trajectory(reaching(), held_frames=[4, 5, 7, 8, 9]))
     assert events == Events(first_motion=2, grasp=4, first_lateral_move=8, release=10)
     assert [events.frame(name) for name in EVENTS] == [2, 4, 8, 10]
 
@@ -200,16 +200,16 @@ def test_every_event_has_the_frame_at_which_it_was_first_the_case() -> None:
 @pytest.mark.parametrize("side", [-1, 1])
 def test_reaching_sideways_for_the_cube_is_no_choice_of_a_side(side: int) -> None:
     places = reaching() * np.array([1, side, 1])
-    assert Events.of(trajectory(places, held=[4, 5, 6, 7])).first_lateral_move == 8
-    assert Events.of(trajectory(places, held=[])).first_lateral_move is None
+    assert Events.of(trajectory(places, held_frames=[4, 5, 6, 7])).first_lateral_move == 8
+    assert Events.of(trajectory(places, held_frames=[])).first_lateral_move is None
 
 
 def test_what_never_happened_has_no_frame() -> None:
-    assert Events.of(trajectory(np.zeros((FRAMES, 3)), held=[])) == Events(None, None, None, None)
+    assert Events.of(trajectory(np.zeros((FRAMES, 3)), held_frames=[])) == Events(None, None, None, None)
 
 
 def test_a_cube_that_is_still_held_was_not_released() -> None:
-    assert Events.of(trajectory(reaching(), held=list(range(4, FRAMES)))).release is None
+    assert Events.of(trajectory(reaching(), held_frames=list(range(4, FRAMES)))).release is None
 
 
 @pytest.mark.slow
@@ -225,10 +225,10 @@ def test_the_scripted_expert_sets_off_grasps_chooses_a_side_and_lets_go(shared_e
         action = expert.act()
         shared_env.advance(action)
         recorder.note(action)
-    found = [Events.of(recorder.trajectory()).frame(event) for event in EVENTS]
-    assert None not in found
-    assert found == sorted(found)
-    assert len(set(found)) == len(EVENTS)
+    event_frames = [Events.of(recorder.trajectory()).frame(event) for event in EVENTS]
+    assert None not in event_frames
+    assert event_frames == sorted(event_frames)
+    assert len(set(event_frames)) == len(EVENTS)
 
 
 SCENE = SceneSpec.preset("act2answer").to_json()
@@ -247,16 +247,16 @@ def episode(
     """The cube at these places, frame by frame; the rest as it is at the end of all frames."""
     frames = np.zeros((len(cube), len(CHANNELS)), np.float32)
     frames[:, [CHANNELS.index(f"cube.{axis}") for axis in "xyz"]] = cube
-    for name, place in (("tile_left", left), ("tile_right", right)):
-        frames[:, [CHANNELS.index(f"{name}.{axis}") for axis in "xyz"]] = place
+    for name, centre in (("tile_left", left), ("tile_right", right)):
+        frames[:, [CHANNELS.index(f"{name}.{axis}") for axis in "xyz"]] = centre
         frames[:, CHANNELS.index(f"{name}.qw")] = 1
-    seen = Trajectory.of_frames(frames)
+    motion = Trajectory.of_frames(frames)
     ones = np.ones(len(cube), bool)
-    return replace(seen, held=ones & held, touches=ones[:, None] & np.array(touches), cube_speed=ones * speed)
+    return replace(motion, held=ones & held, touches=ones[:, None] & np.array(touches), cube_speed=ones * speed)
 
 
-def outcomes(seen: Trajectory, side="right") -> list[str]:
-    return [judge(seen, rule_of(name, SCENE), side).outcome for name in RULES]
+def outcomes(motion: Trajectory, side="right") -> list[str]:
+    return [judge(motion, rule_of(name, SCENE), side).outcome for name in RULES]
 
 
 def test_the_untouched_cube_of_the_released_scene_answers_right_by_box_alone():
@@ -312,26 +312,26 @@ def test_the_box_ends_where_the_released_one_does(cube, expected):
     ],
 )
 def test_released_on_tile_asks_that_the_cube_was_let_go_lies_still_and_touches_that_tile(changes, expected):
-    place = (0.397 + 0.07, -0.127 + 0.07, 0.021)
-    seen = episode(START, place, **{"touches": (False, True), **changes})
-    assert judge(seen, rule_of("released-on-tile", SCENE), "right").outcome == expected
+    end = (0.397 + 0.07, -0.127 + 0.07, 0.021)
+    motion = episode(START, end, **{"touches": (False, True), **changes})
+    assert judge(motion, rule_of("released-on-tile", SCENE), "right").outcome == expected
     beyond = episode(START, (0.397 + 0.0727, -0.127, 0.021), touches=(False, True))
     assert judge(beyond, rule_of("released-on-tile", SCENE), "right").outcome == "oob"
 
 
 def test_a_tile_that_was_turned_counts_as_it_lies():
-    seen = episode(START, (0.397 + 0.09, -0.127, 0.021), touches=(False, True))
+    motion = episode(START, (0.397 + 0.09, -0.127, 0.021), touches=(False, True))
     rule = rule_of("released-on-tile", SCENE)
-    assert judge(seen, rule, "right").outcome == "oob"
-    turned = np.array(seen.tile_right)
+    assert judge(motion, rule, "right").outcome == "oob"
+    turned = np.array(motion.tile_right)
     turned[:, 3:] = (0, 0, np.sin(np.pi / 8), np.cos(np.pi / 8))  # 45 degrees: its corner points there
-    assert judge(replace(seen, tile_right=turned), rule, "right").outcome == "correct"
+    assert judge(replace(motion, tile_right=turned), rule, "right").outcome == "correct"
 
 
 def test_a_pushed_tile_counts_where_it_is_at_the_end():
     pushed = RIGHT + np.array((0.1, 0, 0))
-    seen = episode(START, (0.5, -0.127, 0.021), right=pushed, touches=(False, True))
-    assert outcomes(seen) == ["correct"] * 3
+    motion = episode(START, (0.5, -0.127, 0.021), right=pushed, touches=(False, True))
+    assert outcomes(motion) == ["correct"] * 3
     stayed = episode(START, (0.5, -0.127, 0.021), touches=(False, False))
     assert outcomes(stayed) == ["oob", "correct", "oob"]
 
@@ -339,27 +339,27 @@ def test_a_pushed_tile_counts_where_it_is_at_the_end():
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_a_cube_in_both_boxes_counts_for_the_correct_one_and_is_flagged(side):
     nearer = np.array((0, 0.03, 0))
-    seen = episode(START, (0.397, 0.028, 0.015), left=LEFT - nearer, right=RIGHT + nearer)
-    verdict = judge(seen, rule_of("box", SCENE), side)
+    motion = episode(START, (0.397, 0.028, 0.015), left=LEFT - nearer, right=RIGHT + nearer)
+    verdict = judge(motion, rule_of("box", SCENE), side)
     assert (verdict.outcome, verdict.both, verdict.correct, verdict.wrong) == ("correct", True, 1.0, 0.0)
     assert not judge(episode(START, START), rule_of("box", SCENE), side).both
 
 
 def test_the_mean_over_the_last_eleven_steps_counts_every_one_alike():
     """Eighty steps: over the correct picture in the last four."""
-    seen = episode(START, *[(0.6, 0, 0.1)] * 76, *[(0.397, -0.127, 0.1)] * 4)
-    verdict = judge(seen, rule_of("box", SCENE), "right", RELEASED_STEPS, 80)
+    motion = episode(START, *[(0.6, 0, 0.1)] * 76, *[(0.397, -0.127, 0.1)] * 4)
+    verdict = judge(motion, rule_of("box", SCENE), "right", RELEASED_STEPS, 80)
     assert (verdict.correct, verdict.wrong, verdict.oob) == (4 / 11, 0, pytest.approx(7 / 11))
     assert verdict.outcome == "correct"
     with pytest.raises(UsageError, match="at least 1"):
-        judge(seen, rule_of("box", SCENE), "right", 0)
+        judge(motion, rule_of("box", SCENE), "right", 0)
 
 
 def test_an_episode_that_ended_early_stays_as_it_was_until_the_last_step():
-    seen = episode(START, *[(0.6, 0, 0.1)] * 6, *[(0.397, -0.127, 0.1)] * 2)
-    assert judge(seen, rule_of("box", SCENE), "right", 11, 80).correct == 1
-    assert judge(seen, rule_of("box", SCENE), "right", 4, 8).correct == 0.5
-    assert judge(seen, rule_of("box", SCENE), "right", 99, 8).correct == 2 / 8
+    motion = episode(START, *[(0.6, 0, 0.1)] * 6, *[(0.397, -0.127, 0.1)] * 2)
+    assert judge(motion, rule_of("box", SCENE), "right", 11, 80).correct == 1
+    assert judge(motion, rule_of("box", SCENE), "right", 4, 8).correct == 0.5
+    assert judge(motion, rule_of("box", SCENE), "right", 99, 8).correct == 2 / 8
 
 
 def test_an_unknown_rule_is_named_with_the_nearest():
@@ -374,16 +374,16 @@ ABOVE_LEFT, ABOVE_RIGHT = (0.397, 0.183, 0.1), (0.397, -0.127, 0.1)
 
 def hand(*places: tuple[float, float, float], held: tuple[int, ...] = ()) -> Trajectory:
     frames = np.zeros((len(places), len(CHANNELS)), np.float32)
-    for name, place in (("tile_left", ABOVE_LEFT), ("tile_right", ABOVE_RIGHT)):
-        frames[:, [CHANNELS.index(f"{name}.{axis}") for axis in "xyz"]] = (*place[:2], 0.003)
+    for name, centre in (("tile_left", ABOVE_LEFT), ("tile_right", ABOVE_RIGHT)):
+        frames[:, [CHANNELS.index(f"{name}.{axis}") for axis in "xyz"]] = (*centre[:2], 0.003)
     frames[:, [CHANNELS.index(f"tool.{axis}") for axis in "xyz"]] = places
     frames[:, [CHANNELS.index(f"cube.{axis}") for axis in "xyz"]] = places
-    seen = Trajectory.of_frames(frames)
-    return replace(seen, held=np.isin(np.arange(len(places)), held))
+    motion = Trajectory.of_frames(frames)
+    return replace(motion, held=np.isin(np.arange(len(places)), held))
 
 
-def of(seen: Trajectory, side="left"):
-    return behaviour_of(seen, side, 0.135, 0.03)
+def of(motion: Trajectory, side="left"):
+    return behaviour_of(motion, side, 0.135, 0.03)
 
 
 @pytest.mark.parametrize(("side", "over"), [("left", "wrong"), ("right", "correct")])
@@ -435,7 +435,7 @@ def test_closer_to_is_what_was_gained_since_the_start():
 
 
 def test_distances_are_of_the_whole_episode_and_a_broken_simulator_hides_none():
-    seen = of(hand(HOME, ABOVE_LEFT, HOME, (np.nan, np.nan, np.nan)), "left")
-    assert seen.min_distance_correct == pytest.approx(0, abs=1e-6)
-    assert seen.furthest == pytest.approx(np.hypot(0.397 - 0.2921, 0.183 + 0.0061), abs=1e-6)
-    assert seen.moved
+    behaviour = of(hand(HOME, ABOVE_LEFT, HOME, (np.nan, np.nan, np.nan)), "left")
+    assert behaviour.min_distance_correct == pytest.approx(0, abs=1e-6)
+    assert behaviour.furthest == pytest.approx(np.hypot(0.397 - 0.2921, 0.183 + 0.0061), abs=1e-6)
+    assert behaviour.moved

@@ -37,17 +37,17 @@ def test_a_pybullet_without_numpy_is_announced_with_its_remedy(monkeypatch):
 
 
 def test_two_clients_do_not_see_each_others_bodies():
-    one, other = BulletClient(), BulletClient()
-    one.createMultiBody(1.0)
-    assert (one.getNumBodies(), other.getNumBodies()) == (1, 0)
-    one.close()
+    first_client, other = BulletClient(), BulletClient()
+    first_client.createMultiBody(1.0)
+    assert (first_client.getNumBodies(), other.getNumBodies()) == (1, 0)
+    first_client.close()
     other.close()
 
 
 def test_closing_twice_is_fine_and_spares_the_others():
-    one, other = BulletClient(), BulletClient()
-    one.close()
-    one.close()
+    first_client, other = BulletClient(), BulletClient()
+    first_client.close()
+    first_client.close()
     assert other.getNumBodies() == 0
     other.close()
 
@@ -76,8 +76,8 @@ SIMULATES = "from probe_kit.env import Act2AnswerEnv; env = Act2AnswerEnv(); env
 
 @pytest.mark.slow
 def test_the_simulator_starts_in_silence_on_both_streams():
-    done = run([sys.executable, "-c", SIMULATES], capture_output=True, check=True)
-    assert (done.stdout, done.stderr) == (b"", b"")
+    completed = run([sys.executable, "-c", SIMULATES], capture_output=True, check=True)
+    assert (completed.stdout, completed.stderr) == (b"", b"")
 
 
 @pytest.mark.slow
@@ -87,8 +87,10 @@ def test_what_others_say_while_it_is_imported_is_passed_on(tmp_path):
         encoding="utf-8",
     )
     code = "from probe_kit.env.simulation import import_pybullet as load; load(); load()"
-    done = run([sys.executable, "-c", code], capture_output=True, check=True, env={"PYTHONPATH": str(tmp_path)})
-    assert done.stderr == b"by C\nby Python\n"
+    completed = run(
+        [sys.executable, "-c", code], capture_output=True, check=True, env={"PYTHONPATH": str(tmp_path)}
+    )
+    assert completed.stderr == b"by C\nby Python\n"
 
 
 @pytest.mark.slow
@@ -322,13 +324,13 @@ def test_other_pictures_sizes_and_pushed_tiles_are_drawn_anew(make_env):
     before = scene.small_picture(HEIGHT)
     assert scene.small_picture(HEIGHT // 2).shape == (HEIGHT // 2, HEIGHT * 2 // 3, 3)
     scene.reset(PICTURES, (*scene.spec.cube_xy, 0.1), 0.0)
-    shown = scene.small_picture(HEIGHT)
-    assert (shown != before).any(-1).sum() > 500
-    np.testing.assert_array_equal(shown, whole_drawing(scene))
+    changed_picture = scene.small_picture(HEIGHT)
+    assert (changed_picture != before).any(-1).sum() > 500
+    np.testing.assert_array_equal(changed_picture, whole_drawing(scene))
     x, y, z = scene.tile_state("left").position
     scene._put(scene.tiles["left"], (x + 0.01, y, z), scene.spec.tile_yaw)
     pushed = scene.small_picture(HEIGHT)
-    assert (pushed != shown).any(-1).sum() > 50
+    assert (pushed != changed_picture).any(-1).sum() > 50
     np.testing.assert_array_equal(pushed, whole_drawing(scene))
 
 

@@ -75,31 +75,31 @@ WORDS = [
 
 
 def read(text: str, template: Template, order: Order = "original") -> tuple[Said, str]:
-    found = read_answer(text, template, order)
-    return found.meaning, found.rule
+    reading = read_answer(text, template, order)
+    return reading.meaning, reading.rule
 
 
-@pytest.mark.parametrize(("text", "said", "rule"), LETTERED)
-def test_answers_by_letter(text: str, said: str, rule: str) -> None:
-    assert read(text, P1) == (said, rule)
+@pytest.mark.parametrize(("text", "meaning", "rule"), LETTERED)
+def test_answers_by_letter(text: str, meaning: str, rule: str) -> None:
+    assert read(text, P1) == (meaning, rule)
 
 
-@pytest.mark.parametrize(("text", "said", "rule"), WORDS)
-def test_answers_in_words(text: str, said: str, rule: str) -> None:
-    assert read(text, SEEN) == (said, rule)
+@pytest.mark.parametrize(("text", "meaning", "rule"), WORDS)
+def test_answers_in_words(text: str, meaning: str, rule: str) -> None:
+    assert read(text, SEEN) == (meaning, rule)
 
 
-@pytest.mark.parametrize(("text", "said", "rule"), LETTERED)
+@pytest.mark.parametrize(("text", "meaning", "rule"), LETTERED)
 def test_with_options_exchanged_letters_change_their_meaning_and_words_do_not(
-    text: str, said: str, rule: str
+    text: str, meaning: str, rule: str
 ) -> None:
-    found = read(text, P1, "swapped")
+    reading = read(text, P1, "swapped")
     if text in ("A right", "A left", "B) right"):
-        assert found == (("right", "letter") if text == "A right" else ("none", "contradicts itself"))
+        assert reading == (("right", "letter") if text == "A right" else ("none", "contradicts itself"))
     elif rule == "letter":
-        assert found == ({"left": "right", "right": "left"}[said], "letter")
+        assert reading == ({"left": "right", "right": "left"}[meaning], "letter")
     else:
-        assert found == (said, rule)
+        assert reading == (meaning, rule)
 
 
 # -- tables of cases -------------------------------------------------------------------------------------------
@@ -128,10 +128,10 @@ UNREAD = {
 def test_what_a_person_reads_is_read_or_left_unreadable_and_never_inverted(name: str) -> None:
     cases, template, order = TABLES[name]
     wrong = {
-        text: found.meaning
-        for said, texts in cases.items()
+        text: reading.meaning
+        for meaning, texts in cases.items()
         for text in texts
-        if (found := read_answer(text, template, order)).meaning != said
+        if (reading := read_answer(text, template, order)).meaning != meaning
     }
     every = {text for texts in cases.values() for text in texts}
     assert wrong == dict.fromkeys(UNREAD.get(name, AUDIT_UNREAD & every), "none")
@@ -140,8 +140,8 @@ def test_what_a_person_reads_is_read_or_left_unreadable_and_never_inverted(name:
 def test_a_side_that_is_read_has_a_tier_and_nothing_else_has() -> None:
     for cases, template, order in TABLES.values():
         for text in (text for texts in cases.values() for text in texts):
-            found = read_answer(text, template, order)
-            assert (found.tier is None) == (found.meaning == "none"), text
+            reading = read_answer(text, template, order)
+            assert (reading.tier is None) == (reading.meaning == "none"), text
 
 
 @pytest.mark.parametrize(
@@ -162,17 +162,22 @@ def test_strict_is_an_option_or_a_side_and_nothing_else(text: str, tier: str) ->
 
 
 def test_outcomes_are_right_wrong_or_unread() -> None:
-    assert [outcome_of(said, "left") for said in ("left", "right", "center", "yes", "no", "none")] == [
+    assert [outcome_of(meaning, "left") for meaning in ("left", "right", "center", "yes", "no", "none")] == [
         "correct", "wrong", "oob", "oob", "oob", "oob",
     ]  # fmt: skip
-    assert [outcome_of(said, None) for said in ("no", "left", "center", "yes", "none")] == [
+    assert [outcome_of(meaning, None) for meaning in ("no", "left", "center", "yes", "none")] == [
         "correct", "wrong", "wrong", "wrong", "oob",
     ]  # fmt: skip
-    assert [side_said(said) for said in ("left", "right", "center", "no")] == ["left", "right", "none", "none"]
+    assert [side_said(meaning) for meaning in ("left", "right", "center", "no")] == [
+        "left",
+        "right",
+        "none",
+        "none",
+    ]
 
 
 def test_where_the_asked_object_lies() -> None:
-    assert [side_expected(asked, "left") for asked in ("target", "distractor", "absent")] == [
+    assert [side_expected(asked_object, "left") for asked_object in ("target", "distractor", "absent")] == [
         "left",
         "right",
         None,

@@ -54,79 +54,79 @@ def settings(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> As
 
 
 @pytest.fixture(scope="module")
-def asked(settings: AskSettings, tmp_path_factory: pytest.TempPathFactory) -> Run:
+def answer_run(settings: AskSettings, tmp_path_factory: pytest.TempPathFactory) -> Run:
     return ask_run(settings.changed(tokens="pooled"), tmp_path_factory.mktemp("asked") / "run")
 
 
 # -- what is stored --------------------------------------------------------------------------------------
 
 
-def test_every_episode_has_its_answer_and_the_run_is_whole(asked: Run) -> None:
-    assert set(asked.episodes) >= COLUMNS
-    assert len(asked.episodes) == 4
-    assert asked.certificate["hooks_on_equals_hooks_off"]
-    assert verify_run(asked.path, deep=True).ok
-    question = asked.episodes["question"][0]
+def test_every_episode_has_its_answer_and_the_run_is_whole(answer_run: Run) -> None:
+    assert set(answer_run.episodes) >= COLUMNS
+    assert len(answer_run.episodes) == 4
+    assert answer_run.certificate["hooks_on_equals_hooks_off"]
+    assert verify_run(answer_run.path, deep=True).ok
+    question = answer_run.episodes["question"][0]
     assert question.startswith('Do you see the gray shape? If yes, specify where: "left" or "right".')
-    ask = asked.settings["ask"]
+    ask = answer_run.settings["ask"]
     assert (ask["prompt"], ask["picture_size"], ask["template_sha256"]) == ("p1", "224x224", P1.sha256)
-    assert asked.label == "prismatic · tiny · p1 · 224×224"
+    assert answer_run.label == "prismatic · tiny · p1 · 224×224"
 
 
-def test_a_question_by_letter_keeps_what_every_layer_would_answer(settings: AskSettings, asked: Run) -> None:
+def test_a_question_by_letter_keeps_what_every_layer_would_answer(settings: AskSettings, answer_run: Run) -> None:
     """By the model's own final norm and head; the last layer is the stored margin."""
     model = task_of(settings).load(settings)
-    margins = asked.lens_margins
+    margins = answer_run.lens_margins
     assert margins is not None
-    assert margins.shape == (4, len(asked.sites("answer")))
-    assert margins[:, -1] == pytest.approx(asked.episodes["margin"].to_numpy(), abs=1e-5)
+    assert margins.shape == (4, len(answer_run.sites("answer")))
+    assert margins[:, -1] == pytest.approx(answer_run.episodes["margin"].to_numpy(), abs=1e-5)
     assert margins[:, :-1].std() > 0
     assert model.unembedding is not None
     letters = [model.tokenizer.encode(model.lead + letter)[-1] for letter in "AB"]  # type: ignore[attr-defined]
-    for layer, site in enumerate(asked.sites("answer")):
-        logits = model.unembedding.logits(torch.from_numpy(np.array(asked.column(site, "last")[:1])))
+    for layer, site in enumerate(answer_run.sites("answer")):
+        logits = model.unembedding.logits(torch.from_numpy(np.array(answer_run.column(site, "last")[:1])))
         assert margins[0, layer] == pytest.approx(float(logits[0, letters[0]] - logits[0, letters[1]]), abs=1e-6)
 
 
-def test_its_streams_are_those_of_the_question_as_it_was_asked(asked: Run) -> None:
-    assert list(asked.streams) == ["backbone", "answer"]
-    assert asked.views("backbone") == ("mean", "last", "mean:image.primary", "mean:language")
-    column = np.asarray(asked.column(Site("backbone", 2), "mean"))
+def test_its_streams_are_those_of_the_question_as_it_was_asked(answer_run: Run) -> None:
+    assert list(answer_run.streams) == ["backbone", "answer"]
+    assert answer_run.views("backbone") == ("mean", "last", "mean:image.primary", "mean:language")
+    column = np.asarray(answer_run.column(Site("backbone", 2), "mean"))
     assert np.isfinite(column).all()
     assert column.std(axis=0).max() > 0
-    assert (asked.episodes["picture_tokens"] == 4).all()
+    assert (answer_run.episodes["picture_tokens"] == 4).all()
 
 
 @pytest.mark.slow
 def test_who_acts_in_the_same_scene_begins_with_the_same_frame(
-    settings: AskSettings, asked: Run, tmp_path: Path
+    settings: AskSettings, answer_run: Run, tmp_path: Path
 ) -> None:
     short = SceneSpec(max_steps=1)  # at full size: pictures are made smaller behind the frame that is hashed
     acting = ExtractSettings("expert", suite=settings.source.suite, categories=("color",), items=2, scene=short)
     acted = extract_run(acting, tmp_path / "run").episodes
     for column in ("episode_id", "scene_seed", "first_frame_sha256", "visible_left"):
-        assert acted[column].tolist() == asked.episodes[column].tolist(), column
+        assert acted[column].tolist() == answer_run.episodes[column].tolist(), column
     assert acted["first_frame_sha256"].nunique() == 2, "items of a pair share their pictures, exchanged"
 
 
 @pytest.mark.parametrize("change", [{"prompt": SEEN}, {"picture": "none"}, {"query": "distractor"}, {"seed": 1}])
-def test_other_questions_are_another_run(settings: AskSettings, asked: Run, change: dict) -> None:
+def test_other_questions_are_another_run(settings: AskSettings, answer_run: Run, change: dict) -> None:
     with pytest.raises(SettingsMismatchError):
-        prepare(settings.changed(tokens="pooled", **change), asked.path)
+        prepare(settings.changed(tokens="pooled", **change), answer_run.path)
 
 
 @pytest.mark.slow
-def test_a_batch_answers_alike(settings: AskSettings, asked: Run, tmp_path: Path) -> None:
+def test_a_batch_answers_alike(settings: AskSettings, answer_run: Run, tmp_path: Path) -> None:
     run = ask_run(settings.changed(batch=3), tmp_path / "run")
-    np.testing.assert_allclose(run.episodes["margin"], asked.episodes["margin"], atol=1e-4)
-    assert run.episodes["answer"].tolist() == asked.episodes["answer"].tolist()
+    np.testing.assert_allclose(run.episodes["margin"], answer_run.episodes["margin"], atol=1e-4)
+    assert run.episodes["answer"].tolist() == answer_run.episodes["answer"].tolist()
     assert run.streams == {}
 
 
 @pytest.mark.slow
-def test_worker_processes_give_the_same_commits(settings: AskSettings, asked: Run, tmp_path: Path) -> None:
+def test_worker_processes_give_the_same_commits(settings: AskSettings, answer_run: Run, tmp_path: Path) -> None:
     run = ask_run(settings.changed(tokens="pooled", workers=2), tmp_path / "run")
-    for path in sorted(asked.path.glob("commits/*.json")):
+    for path in sorted(answer_run.path.glob("commits/*.json")):
         assert (run.path / "commits" / path.name).read_bytes() == path.read_bytes()
 
 
@@ -136,8 +136,8 @@ def test_an_episode_that_cannot_be_asked_is_given_up_and_the_others_stay(
 ) -> None:
     class Choosy(PositionModel):
         def read(self, questions: list[Prompt]) -> Reading:
-            if any("red" in own.text for own in questions) and any(
-                own.observation.image.any() for own in questions
+            if any("red" in question.text for question in questions) and any(
+                question.observation.image.any() for question in questions
             ):
                 raise InstructionError("no red, please")
             return super().read(questions)
@@ -163,7 +163,7 @@ def answers(settings: AskSettings, answer_model: AnswerModel | None = None) -> p
         for row in source.rows(settings.seed)
     ]
     outcomes = [dict(inference.columns) for turn in turns for inference in controller.infer([turn])]
-    return pd.DataFrame([turn.row.to_json() | own for turn, own in zip(turns, outcomes, strict=True)])
+    return pd.DataFrame([turn.row.to_json() | outcome for turn, outcome in zip(turns, outcomes, strict=True)])
 
 
 @pytest.mark.parametrize(("option", "side", "bias"), [("A", "left", 1.0), ("B", "right", -1.0)])
@@ -204,15 +204,15 @@ def test_without_a_picture_exactly_as_many_are_right_as_wrong(settings: AskSetti
 
 
 def test_side_by_side_shows_the_two_pictures_and_no_scene(settings: AskSettings) -> None:
-    seen = []
+    images = []
 
     class Watching(PositionModel):
         def read(self, questions: list[Prompt]) -> Reading:
-            seen.extend(own.observation.image for own in questions)
+            images.extend(question.observation.image for question in questions)
             return super().read(questions)
 
     answers(settings.changed(picture="side-by-side"), Watching(likes("A"), always("A")))
-    original, swapped = seen[1], seen[3]  # behind a blank one, each in two orders
+    original, swapped = images[1], images[3]  # behind a blank one, each in two orders
     assert original.shape == (224, 224, 3)
     assert (original[0] == 128).all()
     half = original.shape[1] // 2
@@ -261,14 +261,14 @@ def test_what_cannot_be_asked_is_refused_before_a_model_is_loaded(
 
 @pytest.mark.slow
 def test_several_runs_of_one_model_are_checked_before_the_first_is_asked(
-    settings: AskSettings, asked: Run, tmp_path: Path
+    settings: AskSettings, answer_run: Run, tmp_path: Path
 ) -> None:
-    wanted = [settings, settings.changed(prompt=P2)]
+    ask_settings = [settings, settings.changed(prompt=P2)]
     with pytest.raises(SettingsMismatchError):
-        next(prepare_asks(wanted, [tmp_path / "p1", asked.path]))
-    prepared = list(prepare_asks(wanted, [tmp_path / "p1", tmp_path / "p2"]))
+        next(prepare_asks(ask_settings, [tmp_path / "p1", answer_run.path]))
+    prepared = list(prepare_asks(ask_settings, [tmp_path / "p1", tmp_path / "p2"]))
     assert prepared[0].controller.model is prepared[1].controller.model
-    names = [one.default_name().rpartition("-")[0] for one in prepared]
+    names = [prepared_ask.default_name().rpartition("-")[0] for prepared_ask in prepared]
     assert names == ["ask-prismatic-p1-224x224", "ask-prismatic-p2-224x224"]
 
 
@@ -301,10 +301,10 @@ def test_it_says_how_answers_came_and_what_to_do_next(small_suite: Suite, folder
     result = ask(small_suite, folder, "--prompt", "p1", "--picture", "none", "--out", str(tmp_path))
     assert result.exit_code == 0, result.output
     assert result.stdout.strip() == str(tmp_path / "p1-224x224-none")
-    said = " ".join(result.stderr.split())
-    assert "p1 · no picture: " in said
-    assert "option mass 0." in said
-    assert "next: probe-kit retention" in said
+    message = " ".join(result.stderr.split())
+    assert "p1 · no picture: " in message
+    assert "option mass 0." in message
+    assert "next: probe-kit retention" in message
 
 
 @pytest.mark.parametrize(

@@ -135,8 +135,8 @@ def test_a_checkpoint_of_another_arm_is_captured(base: Path, small_suite: Suite,
 def test_a_run_that_acts_is_another_run(capture_run: Run, small_suite: Suite) -> None:
     acting = prepare(ACTING.changed(suite=small_suite.folder)).identity()
     assert acting["capture_only"] is False
-    own = capture_run.root.own_settings
-    assert own == json.loads(json.dumps(acting)) | {"capture_only": True}
+    stored_settings = capture_run.root.own_settings
+    assert stored_settings == json.loads(json.dumps(acting)) | {"capture_only": True}
 
 
 @pytest.mark.parametrize(

@@ -131,15 +131,15 @@ def test_an_export_and_a_copy_know_of_later_inferences_that_keep_the_mean(mean_r
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "reason"),
     [
         ({"later_views": "mean"}, "the first alone is captured"),
         ({"later_views": "mean", "captured_calls": 3, "tokens": "all"}, "contradict"),
         ({"later_views": "last", "captured_calls": 3}, "all, mean"),
     ],
 )
-def test_a_view_of_later_inferences_that_cannot_be_kept_is_refused(options: dict[str, Any], said: str) -> None:
-    with pytest.raises(UsageError, match=said):
+def test_a_view_of_later_inferences_that_cannot_be_kept_is_refused(options: dict[str, Any], reason: str) -> None:
+    with pytest.raises(UsageError, match=reason):
         ExtractSettings("pi0-tiny", **options)
 
 
@@ -227,7 +227,7 @@ def test_calls_that_were_fitted_alike_make_a_curve(run: Run) -> None:
     train_probes(run, ("all",), permutations=4, call=1)
     calls = load_results_by_call(run, first)
     assert list(calls) == list(range(CALLS))
-    assert {one.settings.permutations for one in calls.values()} == {5}
+    assert {curve.settings.permutations for curve in calls.values()} == {5}
     line = CallCurves.of(calls, "all", "mean").line("backbone")
     assert line.episodes.tolist() == [int(run.reached(call).sum()) for call in range(CALLS)]
     assert line.accuracy[1] > 0.85 > line.accuracy[0]
@@ -281,13 +281,13 @@ def early(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Run:
     }  # fmt: skip
     plan = make_plan(small_suite, [STREAM], 0, 6, False)
     writer = RunWriter(locate(tmp_path_factory.mktemp("early") / "run"), plan, settings)
-    left: list[int] = [e.index for e in plan.episodes if e.content.item.category == "color"
+    left_episodes: list[int] = [e.index for e in plan.episodes if e.content.item.category == "color"
                        and e.content.side_correct == "left"][:4]  # fmt: skip
     for planned in plan.episodes:
-        fourth = planned.index in left or planned.content.item.category == "shape"
+        fourth = planned.index in left_episodes or planned.content.item.category == "shape"
         draw = np.random.default_rng(planned.index)
         buffers = EpisodeBuffers([STREAM], 6, False, pinned=False)
-        for call in range(3 + fourth + (planned.index == left[0])):
+        for call in range(3 + fourth + (planned.index == left_episodes[0])):
             buffers.pooled["backbone"][call] = draw.normal(size=(2, 3, 8))
             buffers.roles.append({"backbone": [("language", 0, 4), ("padding", 4, 6)]})
         outcome = {"outcome": "oob", "side_placed": "none", "cube_x": 0.0, "cube_y": 0.0}
@@ -298,20 +298,20 @@ def early(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 
 def fit(run: Run, *options: str) -> tuple[int, str]:
-    asked = ["train", str(run.location), "--permutations", "0", "--controls", "none", *options]
-    answer = CliRunner().invoke(app, asked)
+    arguments = ["train", str(run.location), "--permutations", "0", "--controls", "none", *options]
+    answer = CliRunner().invoke(app, arguments)
     return answer.exit_code, " ".join(answer.stderr.split())
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*classes are not balanced")
 def test_all_inferences_are_those_that_enough_episodes_reached_and_the_others_are_named(early: Run) -> None:
-    code, said = fit(early, "--call", "all")
-    assert code == 0, said
-    assert "left out: call 3: category 'color': classes are not balanced, chance is 1.000" in said
-    assert "left out: call 4: category 'color': " in said
-    assert "left out: call 5: category 'color': no episode got as far as captured inference 5" in said
-    assert said.count("left out") == 3
+    code, message = fit(early, "--call", "all")
+    assert code == 0, message
+    assert "left out: call 3: category 'color': classes are not balanced, chance is 1.000" in message
+    assert "left out: call 4: category 'color': " in message
+    assert "left out: call 5: category 'color': no episode got as far as captured inference 5" in message
+    assert message.count("left out") == 3
     assert list(load_results_by_call(early, load_results(early))) == [0, 1, 2]
     assert (
         fit(early, "--call", "all", "--categories", "shape")[1].count("left out") == 2
@@ -324,13 +324,13 @@ def test_all_inferences_are_those_that_enough_episodes_reached_and_the_others_ar
 def test_of_an_inference_that_few_episodes_reached_nothing_is_said_to_be_missing(
     early: Run, call: int, target: str
 ) -> None:
-    code, said = fit(early, "--call", str(call), "--target", target)
+    code, message = fit(early, "--call", str(call), "--target", target)
     assert code in (1, 3)
     number = {3: "only 4 episodes", 4: "only 1 episode", 5: "no episode"}[call]
-    assert f"{number} got as far as captured inference {call}, counted from 0" in said
-    assert "xtract" not in said
-    assert "missing" not in said
-    assert "defect" not in said
+    assert f"{number} got as far as captured inference {call}, counted from 0" in message
+    assert "xtract" not in message
+    assert "missing" not in message
+    assert "defect" not in message
 
 
 @pytest.mark.parametrize("call", [3, 5])

@@ -44,14 +44,16 @@ def nowhere(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path / "empty"))
 
 
-def settings_of(name: str, suite: Suite, **given: Any) -> ExtractSettings | AskSettings:
+def settings_of(name: str, suite: Suite, **options: Any) -> ExtractSettings | AskSettings:
     family = own_families()[name]
     kind = ExtractSettings if family.acts else AskSettings
     if family.needs_checkpoint:
-        given.setdefault("checkpoint", "lab/tuned")  # of the hub, and not here
-    if family.acts and "checkpoint" not in given and family.default_checkpoint in family.not_acting:
-        given["capture_only"] = True
-    return kind(name, suite=suite.folder, categories=("color",), items=2, tokens="pooled", device="cuda", **given)
+        options.setdefault("checkpoint", "lab/tuned")  # of the hub, and not here
+    if family.acts and "checkpoint" not in options and family.default_checkpoint in family.not_acting:
+        options["capture_only"] = True
+    return kind(
+        name, suite=suite.folder, categories=("color",), items=2, tokens="pooled", device="cuda", **options
+    )
 
 
 @pytest.mark.usefixtures("nowhere")
@@ -60,8 +62,18 @@ def test_a_plan_needs_no_weights_no_network_and_no_gpu(name: str, size: str, sma
     options = {"size": size} if size else {}
     planned = prepare(settings_of(name, small_suite, options=options), fetch=False)
     declared = own_families()[name].declared[size]
-    shapes = [(one.stream.name, one.stream.layers, one.stream.width, one.stream.iterations) for one in declared]
-    assert [(own.name, own.layers, own.width, own.iterations) for own in planned.plan.streams] == shapes
+    shapes = [
+        (
+            declaration.stream.name,
+            declaration.stream.layers,
+            declaration.stream.width,
+            declaration.stream.iterations,
+        )
+        for declaration in declared
+    ]
+    assert [
+        (stream.name, stream.layers, stream.width, stream.iterations) for stream in planned.plan.streams
+    ] == shapes
     assert planned.plan.bytes > 0
     assert len(planned.plan.episodes) == 4
     assert planned.identity()["weights_sha256"] is None
@@ -85,7 +97,7 @@ def test_a_checkpoint_in_a_folder_is_nothing_to_download(tmp_path: Path) -> None
     assert words.endswith("nothing to download")
 
 
-NOT_ACTING = [(name, own) for name, family in own_families().items() for own in family.not_acting]
+NOT_ACTING = [(name, checkpoint) for name, family in own_families().items() for checkpoint in family.not_acting]
 
 
 @pytest.mark.usefixtures("nowhere")
@@ -99,19 +111,22 @@ def test_a_checkpoint_that_cannot_act_here_is_planned_with_no_act_alone(
     assert planned.plan.bytes > 0
 
 
-def cached(monkeypatch: pytest.MonkeyPatch, place: Path, repo: str, files: Path, weights: bool = False) -> str:
+def cached(monkeypatch: pytest.MonkeyPatch, cache: Path, repo: str, files: Path, weights: bool = False) -> str:
     """A cache of the hub that holds the files of a folder, but for weights, as one commit of `repo`."""
-    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(place))
-    own = place / f"models--{repo.replace('/', '--')}"
-    (own / "refs").mkdir(parents=True)
-    (own / "refs" / "main").write_text("c" * 40, encoding="utf-8")
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(cache))
+    repository = cache / f"models--{repo.replace('/', '--')}"
+    (repository / "refs").mkdir(parents=True)
+    (repository / "refs" / "main").write_text("c" * 40, encoding="utf-8")
     without = shutil.ignore_patterns(*(() if weights else ("model*.safetensors*", "*.pt")))
-    shutil.copytree(files, own / "snapshots" / ("c" * 40), ignore=without)
+    shutil.copytree(files, repository / "snapshots" / ("c" * 40), ignore=without)
     return repo
 
 
 def sizes(streams: Any) -> dict[str, tuple[Any, ...]]:
-    return {own.name: (own.layers, own.width, own.iterations, own.quantities, own.part) for own in streams}
+    return {
+        stream.name: (stream.layers, stream.width, stream.iterations, stream.quantities, stream.part)
+        for stream in streams
+    }
 
 
 @pytest.mark.slow
@@ -125,15 +140,15 @@ def test_a_checkpoint_whose_configuration_is_in_the_cache_is_planned_with_its_ow
     folder = write(tmp_path / "model")
     model = load_model(name, str(folder), **options)
     repo = cached(monkeypatch, tmp_path / "cache", "lab/tiny", folder)
-    given: dict[str, Any] = {"capture_only": True} if own_families()[name].acts else {}
-    settings = settings_of(name, small_suite, checkpoint=repo, options=options, **given)
+    model_options: dict[str, Any] = {"capture_only": True} if own_families()[name].acts else {}
+    settings = settings_of(name, small_suite, checkpoint=repo, options=options, **model_options)
     planned = prepare(settings, fetch=False)
     assert sizes(planned.plan.streams) == sizes(model.streams.values())
     assert planned.declared.startswith("of the checkpoint's configuration")
     network: Any = model
-    held = sum(own.numel() for own in network.network.parameters()) * 4
+    weight_bytes = sum(parameter.numel() for parameter in network.network.parameters()) * 4
     words = weights_needed(name, repo, options, "float32")
-    assert words.startswith(f"memory {in_units(held)} for weights")
+    assert words.startswith(f"memory {in_units(weight_bytes)} for weights")
     assert "estimated from the parameters" in words
 
 
@@ -178,7 +193,7 @@ def test_a_configuration_whose_backbone_is_not_in_the_cache_is_planned_with_the_
     planned = prepare(settings_of("smolvla", small_suite, checkpoint=repo, capture_only=True), fetch=False)
     assert planned.declared.startswith("of the released size, because its own configuration cannot be read here: ")
     assert "lab/absent" in planned.declared
-    assert [own.layers for own in planned.plan.streams] == [17, 17]
+    assert [stream.layers for stream in planned.plan.streams] == [17, 17]
 
 
 @pytest.mark.slow
@@ -193,12 +208,12 @@ def test_an_adapter_in_the_cache_is_planned_with_the_sizes_of_its_base(
     settings = {"peft_type": "LORA", "r": 2, "lora_alpha": 2, "base_model_name_or_path": "lab/base"}
     (tmp_path / "alone" / "adapter_config.json").write_text(json.dumps(settings), encoding="utf-8")
     tuned = cached(monkeypatch, tmp_path / "cache", "lab/tuned", tmp_path / "alone")
-    wanted = settings_of("pi05", small_suite, checkpoint=tuned, capture_only=True)
-    planned = prepare(wanted, fetch=False)
+    tuned_settings = settings_of("pi05", small_suite, checkpoint=tuned, capture_only=True)
+    planned = prepare(tuned_settings, fetch=False)
     assert planned.declared.startswith("of the released size, because")
     assert "'lab/base'" in planned.declared
     cached(monkeypatch, tmp_path / "cache", "lab/base", base)
-    assert sizes(prepare(wanted, fetch=False).plan.streams) == streams
+    assert sizes(prepare(tuned_settings, fetch=False).plan.streams) == streams
     assert "download about" in weights_needed("pi05", tuned, {}, None)
     folder = tmp_path / "cache" / "models--lab--base" / "snapshots" / ("c" * 40)
     shutil.copy(base / "model.safetensors", folder)
@@ -241,15 +256,19 @@ def test_declared_sizes_are_those_of_the_released_network(name: str, size: str) 
     """Of every stream there is a list of so many blocks whose weights have its width; on the meta device."""
     family = own_families()[name]
     network = family.function("full_size")(*([size] if size else []))
-    assert sum(own.numel() for own in network.parameters()) == family.parameters[size]
+    assert sum(parameter.numel() for parameter in network.parameters()) == family.parameters[size]
     lists = [
         (len(module), {side for parameter in module[0].parameters() for side in parameter.shape})
         for module in network.modules()
         if isinstance(module, nn.ModuleList) and len(module)
     ]
-    for one in family.declared[size]:
-        fits = [blocks for blocks, sides in lists if blocks == one.stream.layers - 1 and one.stream.width in sides]
-        assert fits, one
+    for declaration in family.declared[size]:
+        fits = [
+            blocks
+            for blocks, sides in lists
+            if blocks == declaration.stream.layers - 1 and declaration.stream.width in sides
+        ]
+        assert fits, declaration
 
 
 @pytest.mark.parametrize("name", families(DECLARING))
@@ -257,23 +276,27 @@ def test_declared_streams_have_the_names_and_roles_of_the_loaded_model(name: str
     """Of a tiny checkpoint; only sizes and the camera's name are others."""
     write, options = WRITERS[name]
     model = load_model(name, str(write(tmp_path / "model")), **options)
-    declared = {one.stream.name: one for one in next(iter(own_families()[name].declared.values()))}
+    declared = {
+        declaration.stream.name: declaration for declaration in next(iter(own_families()[name].declared.values()))
+    }
     assert declared.keys() == model.streams.keys()
     for stream in model.streams.values():
-        one = declared[stream.name]
-        assert replace(one.stream, layers=1, width=1, iterations=None) == replace(
+        declaration = declared[stream.name]
+        assert replace(declaration.stream, layers=1, width=1, iterations=None) == replace(
             stream, layers=1, width=1, iterations=None
         )
-        assert (one.stream.iterations is None) == (stream.iterations is None)
+        assert (declaration.stream.iterations is None) == (stream.iterations is None)
         declared_roles, own_roles = ({role.partition(".")[0] for role in roles} for roles in (
-            one.roles, model.role_names[stream.name]))  # fmt: skip
+            declaration.roles, model.role_names[stream.name]))  # fmt: skip
         assert declared_roles == own_roles - {PADDING}
 
 
 @pytest.mark.usefixtures("nowhere")
 def test_questions_are_planned_without_their_model(small_suite: Suite) -> None:
     asks = [settings_of("qwen3-vl", small_suite)] * 2
-    assert [one.declared for one in prepare_asks(asks, [None, None], fetch=False)] == ["of the released size"] * 2  # type: ignore[arg-type]
+    assert [prepared_ask.declared for prepared_ask in prepare_asks(asks, [None, None], fetch=False)] == [
+        "of the released size"
+    ] * 2  # type: ignore[arg-type]
 
 
 @pytest.mark.usefixtures("nowhere")
@@ -294,15 +317,15 @@ def test_a_plan_of_a_few_items_draws_these_and_one_category(
     settings = ExtractSettings("pi05", categories=("color", "shape"), items=4, device="cuda", capture_only=True)
     first = prepare(settings, fetch=False)
     assert isinstance(first.plan, Plan)
-    drawn = [len(load_suite(place).items) for place in (tmp_path / "cache" / "suites").iterdir()]
+    drawn = [len(load_suite(folder).items) for folder in (tmp_path / "cache" / "suites").iterdir()]
     assert sorted(drawn) == [8, 150]
-    whole = default_suite(("color", "shape"))
+    full_suite = default_suite(("color", "shape"))
     again = prepare(settings, fetch=False)
     assert isinstance(again.plan, Plan)
-    assert again.source.suite.complete.content_sha256 == whole.content_sha256
+    assert again.source.suite.complete.content_sha256 == full_suite.content_sha256
     assert first.source.suite.items == again.source.suite.items
     assert first.source.suite.identity == again.source.suite.identity
-    enough = [list(sufficiencies(own.source.suite, True, True)) for own in (first, again)]
+    enough = [list(sufficiencies(prepared.source.suite, True, True)) for prepared in (first, again)]
     assert enough[0] == enough[1]
 
 

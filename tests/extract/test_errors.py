@@ -133,8 +133,8 @@ def test_an_adapter_that_acts_otherwise_under_capture_stops_the_run(
     """It keeps state between calls: every inference adds a little more to its actions."""
     sound, calls = Pi0.act, count(1)
 
-    def drifting(policy: Pi0, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
-        return sound(policy, seen, seeds) + np.float32(1e-6 * next(calls))
+    def drifting(policy: Pi0, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+        return sound(policy, observations, seeds) + np.float32(1e-6 * next(calls))
 
     monkeypatch.setattr(Pi0, "act", drifting)
     settings = ExtractSettings("pi0-tiny", suite=suite.folder, scene=SHORT, env_workers=0)
@@ -218,13 +218,13 @@ def settings(small_suite: Suite) -> ExtractSettings:
 @pytest.fixture
 def unheld(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Keys that were written without a lock on their run; the beginning of a run does not count."""
-    found: list[str] = []
+    keys: list[str] = []
     for name in ("create", "write"):
-        _watch(monkeypatch, name, found)
-    return found
+        _watch(monkeypatch, name, keys)
+    return keys
 
 
-def _watch(monkeypatch: pytest.MonkeyPatch, name: str, found: list[str]) -> None:
+def _watch(monkeypatch: pytest.MonkeyPatch, name: str, keys: list[str]) -> None:
     original = getattr(Folder, name)
 
     def watched(self: Folder, key: str, content: bytes) -> Any:
@@ -234,7 +234,7 @@ def _watch(monkeypatch: pytest.MonkeyPatch, name: str, found: list[str]) -> None
             except BlockingIOError:
                 pass
             else:
-                found.append(key)
+                keys.append(key)
         return original(self, key, content)
 
     monkeypatch.setattr(Folder, name, watched)
@@ -256,27 +256,27 @@ def test_an_extraction_in_one_process_holds_its_run(
 @pytest.mark.slow
 def test_a_worker_holds_the_run_itself(settings: ExtractSettings, tmp_path: Path, unheld: list[str]) -> None:
     address = begun(settings, tmp_path / "run")
-    left, done = list(EPISODES), list[int]()
+    remaining, played = list(EPISODES), list[int]()
 
     def take() -> int | None:
-        if len(done) == len(EPISODES):
+        if len(played) == len(EPISODES):
             raise EOFError  # the executor hung up
-        return left.pop(0) if left else None
+        return remaining.pop(0) if remaining else None
 
     with pytest.raises(EOFError):
-        play_episodes((settings, address, None), take, lambda event: done.append(event.number))
-    assert done == EPISODES
+        play_episodes((settings, address, None), take, lambda event: played.append(event.number))
+    assert played == EPISODES
     assert (tmp_path / "run" / "certificate.json").is_file()
     assert unheld == []
 
 
 def test_a_worker_that_joins_forgets_no_failure(settings: ExtractSettings, tmp_path: Path) -> None:
     writer = prepare(settings).writer(Folder(tmp_path / "run"))
-    with writer.owned():
+    with writer.claim():
         writer.give_up(3, "it fell over")
         with writer.joined():
             pass
     with writer.joined():
         assert list(writer.location.read_all("failed", ".json"))
-    with writer.owned():
+    with writer.claim():
         assert not list(writer.location.read_all("failed", ".json"))

@@ -49,8 +49,8 @@ def _crash(*_: object) -> None:
 
 
 def stop_after(count: int):
-    def progress(done: int, _total: int, _outcome: str) -> None:
-        if done == count:
+    def progress(finished: int, _total: int, _outcome: str) -> None:
+        if finished == count:
             raise CrashError
 
     return progress
@@ -136,9 +136,9 @@ def test_both_layouts_of_an_item_start_from_the_same_scene_with_their_own_noise(
 
 @pytest.mark.slow
 def test_seeds_do_not_depend_on_which_other_episodes_are_run(small_suite: Suite) -> None:
-    whole = prepare(ExtractSettings("expert", suite=small_suite.folder)).plan.episodes
+    full_plan = prepare(ExtractSettings("expert", suite=small_suite.folder)).plan.episodes
     part = prepare(ExtractSettings("expert", suite=small_suite.folder, categories=("shape",))).plan.episodes
-    seeds = {planned.episode_id: planned.policy_seed for planned in whole}
+    seeds = {planned.episode_id: planned.policy_seed for planned in full_plan}
     assert all(seeds[planned.episode_id] == planned.policy_seed for planned in part)
 
 
@@ -247,14 +247,16 @@ def test_a_broken_hook_stops_the_run_at_the_first_episode_with_the_sites_name(
 def test_a_device_changes_nothing_in_a_run_but_roundings(suite: Suite, tmp_path: Path, device: str) -> None:
     """Through pooling on the device, page-locked buffers and the bits of tokens."""
     settings = ExtractSettings("pi0-tiny", suite=suite.folder, scene=SHORT, tokens="all", env_workers=0)
-    here = extract_run(settings, tmp_path / "here")
-    there = extract_run(settings.changed(device=device), tmp_path / "there")
-    for stream in here.streams:
-        for site in here.sites(stream):
-            expected = here.column(site)
-            np.testing.assert_allclose(there.column(site), expected, rtol=0, atol=1e-2 * np.abs(expected).max())
-    site = here.sites("backbone")[-1]
-    for ours, theirs in zip(there.tokens(site), here.tokens(site), strict=True):
+    on_cpu = extract_run(settings, tmp_path / "here")
+    on_device = extract_run(settings.changed(device=device), tmp_path / "there")
+    for stream in on_cpu.streams:
+        for site in on_cpu.sites(stream):
+            expected = on_cpu.column(site)
+            np.testing.assert_allclose(
+                on_device.column(site), expected, rtol=0, atol=1e-2 * np.abs(expected).max()
+            )
+    site = on_cpu.sites("backbone")[-1]
+    for ours, theirs in zip(on_device.tokens(site), on_cpu.tokens(site), strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-2 * np.abs(theirs).max())
 
 
@@ -294,10 +296,14 @@ def acted(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Run:
 def test_a_plan_names_the_content_of_every_item_and_the_suite_it_was_selected_from(
     acted: Run, small_suite: Suite
 ) -> None:
-    own = {item.item_id: item.content_sha256 for item in small_suite.items}
-    assert acted.items["content_sha256"].tolist() == [own[one] for one in acted.items["item_id"]]
+    content_hashes = {item.item_id: item.content_sha256 for item in small_suite.items}
+    assert acted.items["content_sha256"].tolist() == [
+        content_hashes[item_id] for item_id in acted.items["item_id"]
+    ]
     assert len(acted.items) == 2
-    assert acted.episodes["item_content_sha256"].tolist() == [own[one] for one in acted.episodes["item_id"]]
+    assert acted.episodes["item_content_sha256"].tolist() == [
+        content_hashes[item_id] for item_id in acted.episodes["item_id"]
+    ]
     assert acted.suite_parent == small_suite.content_sha256
     assert acted.suite_parent != acted.settings["suite"]["content_sha256"]
 
@@ -331,8 +337,8 @@ def test_an_item_has_one_content_in_all_of_its_wordings(small_suite: Suite) -> N
     plan = make_plan(suite, [], 0, 1, False, ("knowledge", "side"))
     rows = plan.columns
     assert {row["wording"] for row in rows} == {"knowledge", "side"}
-    own = {item.item_id: item.content_sha256 for item in suite.items}
-    assert all(row["item_content_sha256"] == own[row["item_id"]] for row in rows)
+    content_hashes = {item.item_id: item.content_sha256 for item in suite.items}
+    assert all(row["item_content_sha256"] == content_hashes[row["item_id"]] for row in rows)
 
 
 # -- control steps ------------------------------------------------------------------------------------------
@@ -390,15 +396,15 @@ def test_runs_that_took_other_seconds_and_were_resumed_are_equal_in_every_other_
 
 @pytest.mark.slow
 def test_all_seconds_may_be_deleted_and_one_alone_is_damage(acted: Run, tmp_path: Path) -> None:
-    place = Path(shutil.copytree(acted.path, tmp_path / "run"))
-    (place / "times/00000002.json").unlink()
+    run_folder = Path(shutil.copytree(acted.path, tmp_path / "run"))
+    (run_folder / "times/00000002.json").unlink()
     with pytest.raises(RunDamagedError, match=r"times/00000002\.json is missing.*delete the folder times"):
-        open_run(place)
-    assert any("times/00000002.json is missing" in problem for problem in verify_run(place).problems)
-    shutil.rmtree(place / "times")
-    assert verify_run(place, deep=True).ok
-    assert open_run(place).episodes["seconds_inference"].isna().all()
-    assert open_run(place).stamp == acted.stamp
+        open_run(run_folder)
+    assert any("times/00000002.json is missing" in problem for problem in verify_run(run_folder).problems)
+    shutil.rmtree(run_folder / "times")
+    assert verify_run(run_folder, deep=True).ok
+    assert open_run(run_folder).episodes["seconds_inference"].isna().all()
+    assert open_run(run_folder).stamp == acted.stamp
 
 
 # -- label --------------------------------------------------------------------------------------------------
@@ -425,10 +431,14 @@ def test_a_label_is_changed_and_stored_probes_are_found_under_the_new_one(
     probe_little_run(run)
     before, key = files_of(run.path), load_results(run).key
     label_run(run.path, "π0 · mine")
-    named = open_run(run.path)
-    assert (named.label, load_results(named).label, load_results(named).key) == ("π0 · mine", "π0 · mine", key)
-    assert train_probes(named, permutations=2).key == key
-    assert (named.stamp, named.settings_sha256, named.root.identity) == (
+    relabelled = open_run(run.path)
+    assert (relabelled.label, load_results(relabelled).label, load_results(relabelled).key) == (
+        "π0 · mine",
+        "π0 · mine",
+        key,
+    )
+    assert train_probes(relabelled, permutations=2).key == key
+    assert (relabelled.stamp, relabelled.settings_sha256, relabelled.root.identity) == (
         run.stamp, run.settings_sha256, run.root.identity,
     )  # fmt: skip
     assert {name for name, content in files_of(run.path).items() if before.get(name) != content} <= {
@@ -445,21 +455,21 @@ def test_what_no_table_can_print_is_no_label(recorded_run: Run, label: str) -> N
 def test_a_lost_label_and_one_of_another_run_are_damage_that_a_new_label_repairs(
     recorded_run: Run, tmp_path: Path
 ) -> None:
-    place = Path(shutil.copytree(recorded_run.path, tmp_path / "run"))
-    (place / "label.json").unlink()
+    run_folder = Path(shutil.copytree(recorded_run.path, tmp_path / "run"))
+    (run_folder / "label.json").unlink()
     with pytest.raises(RunDamagedError, match=r"label\.json is missing.*probe-kit run show .* --label"):
-        open_run(place)
-    assert any("label.json is missing" in problem for problem in verify_run(place).problems)
-    shown = CliRunner().invoke(app, ["run", "show", str(place), "--label", "again"])
-    assert shown.exit_code == 0, shown.output
-    assert open_run(place).label == "again"
-    refused = CliRunner().invoke(app, ["run", "show", str(place), "--partial"])
+        open_run(run_folder)
+    assert any("label.json is missing" in problem for problem in verify_run(run_folder).problems)
+    result = CliRunner().invoke(app, ["run", "show", str(run_folder), "--label", "again"])
+    assert result.exit_code == 0, result.output
+    assert open_run(run_folder).label == "again"
+    refused = CliRunner().invoke(app, ["run", "show", str(run_folder), "--partial"])
     assert refused.exit_code == 2
     assert "--partial is for --action-errors" in refused.stderr
-    content = json.loads((place / "label.json").read_text(encoding="utf-8"))
-    (place / "label.json").write_text(json.dumps({**content, "label": "forged"}), encoding="utf-8")
+    content = json.loads((run_folder / "label.json").read_text(encoding="utf-8"))
+    (run_folder / "label.json").write_text(json.dumps({**content, "label": "forged"}), encoding="utf-8")
     with pytest.raises(RunDamagedError, match=r"label\.json was changed"):
-        open_run(place)
+        open_run(run_folder)
 
 
 @pytest.mark.slow

@@ -39,8 +39,8 @@ def assert_grew(before: dict[str, bytes], grown: Run, at_once: Run) -> None:
     after = bytes_of(grown.path)
     assert {name: after[name] for name in before} == before
     assert (grown.path / "run.json").read_bytes() == (at_once.path / "run.json").read_bytes()
-    own = ["episode", "seconds_inference", "seconds_simulation"]
-    assert grown.episodes.drop(columns=own).equals(at_once.episodes.drop(columns=own))
+    per_run_columns = ["episode", "seconds_inference", "seconds_simulation"]
+    assert grown.episodes.drop(columns=per_run_columns).equals(at_once.episodes.drop(columns=per_run_columns))
     for stream in at_once.streams:
         for site in at_once.sites(stream):
             for view in at_once.views(stream):
@@ -52,7 +52,9 @@ def test_extract_plays_the_missing_items_only(small_suite: Suite, tmp_path: Path
     played: list[tuple[int, int]] = []
     extract_run(scripted(small_suite, 2), tmp_path / "run")
     before = bytes_of(tmp_path / "run")
-    grown = extract_run(scripted(small_suite, 4), tmp_path / "run", lambda done, of, _: played.append((done, of)))
+    grown = extract_run(
+        scripted(small_suite, 4), tmp_path / "run", lambda finished, of, _: played.append((finished, of))
+    )
     assert played == [(number, 8) for number in (5, 6, 7, 8)]
     assert_grew(before, grown, extract_run(scripted(small_suite, 4), tmp_path / "at_once"))
     again = extract_run(scripted(small_suite, 2), tmp_path / "run", lambda *_: played.append((0, 0)))
@@ -91,9 +93,9 @@ def test_two_workers_let_a_run_grow(small_suite: Suite, tmp_path: Path) -> None:
 
 
 def test_more_items_find_the_run_without_an_out_and_other_categories_do_not(small_suite: Suite) -> None:
-    named = [prepare(scripted(small_suite, items)).default_name() for items in (2, 4)]
+    names = [prepare(scripted(small_suite, items)).default_name() for items in (2, 4)]
     other = prepare(scripted(small_suite, 2).changed(categories=("shape",))).default_name()
-    assert named[0] == named[1] != other
+    assert names[0] == names[1] != other
 
 
 def test_a_label_is_kept_while_a_run_grows_and_is_no_part_of_its_identity(
@@ -113,16 +115,18 @@ def test_the_command_names_what_grows_what_is_stale_and_what_never_shrinks(
     command = ["extract", "--model", "idle", "--suite", str(small_suite.folder), "--categories", "color",
                "--max-steps", "2", "--env-workers", "0", "--out", where]  # fmt: skip
 
-    def said(*more: str) -> str:
+    def dry_run_text(*more: str) -> str:
         answer = CliRunner().invoke(app, [*command, *more])
         assert answer.exit_code == 0, answer.output
         return " ".join(answer.output.split())
 
-    assert "grows" not in said("--items", "2")
-    assert "grows from 4 to 8 episodes; stored ones stay as they are" in said("--items", "4", "--dry-run")
+    assert "grows" not in dry_run_text("--items", "2")
+    assert "grows from 4 to 8 episodes; stored ones stay as they are" in dry_run_text("--items", "4", "--dry-run")
     assert len(open_run(where).episodes) == 4
-    assert "8 episodes: " in said("--items", "4")
-    assert "grows no: the run has 8 episodes, these 4 among them, and never shrinks" in said("--items", "2")
+    assert "8 episodes: " in dry_run_text("--items", "4")
+    assert "grows no: the run has 8 episodes, these 4 among them, and never shrinks" in dry_run_text(
+        "--items", "2"
+    )
     refused = CliRunner().invoke(app, [*command, "--items", "2", "--categories", "shape"])
     assert refused.exit_code == 3
     assert "never gets smaller" in " ".join(refused.output.split())

@@ -13,7 +13,7 @@ from probe_kit.cli import app
 from probe_kit.env import SceneSpec
 from probe_kit.errors import IgnoredInputsError, InstructionError
 from probe_kit.extract import AskSettings, ExtractSettings, LeRobotSource, ask_run, prepare
-from probe_kit.extract.rollout.controllers import varied
+from probe_kit.extract.rollout.controllers import vary_observation
 from probe_kit.extract.sources.inputs import NEAREST, PICTURE, Frame, draw_donors, same_input
 from probe_kit.hooks import Edit, Observation, Policy, Site, Tap
 from probe_kit.hooks.families.pi0.adapter import load_pi0_tiny
@@ -169,14 +169,14 @@ def letters(text: str) -> tuple[int, ...]:
 
 
 def test_other_words_of_as_many_tokens_are_tried_first_and_then_all_others() -> None:
-    variants = varied(observation("lift it"), ["drop it now", "lift it", "push it", "what?"], letters)
+    variants = vary_observation(observation("lift it"), ["drop it now", "lift it", "push it", "what?"], letters)
     texts = [variant.instruction for variant in variants["instruction"]]
     assert texts == ["push it", "it lift", "drop it now", "what?"]
 
 
 def test_a_single_word_without_alternatives_and_a_picture_of_one_colour_are_not_varied() -> None:
     plain = np.full((4, 4, 3), 7, np.uint8)
-    variants = varied(observation("push", plain), ["push"], letters)
+    variants = vary_observation(observation("push", plain), ["push"], letters)
     assert {name: list(observations) for name, observations in variants.items()} == {
         "picture": [],
         "instruction": [],
@@ -185,14 +185,16 @@ def test_a_single_word_without_alternatives_and_a_picture_of_one_colour_are_not_
 
 def test_a_blank_picture_changes_nothing_but_the_picture() -> None:
     clean = observation("lift it")
-    (blank,) = varied(clean, [], letters)["picture"]
+    (blank,) = vary_observation(clean, [], letters)["picture"]
     assert not same_input(clean, blank, PICTURE)
     assert len(np.unique(blank.image.reshape(-1, 3), axis=0)) == 1
     assert (blank.instruction, blank.state.tolist()) == (clean.instruction, clean.state.tolist())
 
 
 def test_another_spelling_of_an_instruction_is_no_other_instruction() -> None:
-    (words, *_) = varied(observation("lift it"), ["Lift it.", "LIFT  IT", "push it"], letters)["instruction"]
+    (words, *_) = vary_observation(observation("lift it"), ["Lift it.", "LIFT  IT", "push it"], letters)[
+        "instruction"
+    ]
     assert words.instruction == "push it"
 
 
@@ -230,31 +232,32 @@ def plain(colour: int) -> Observation:
 
 @pytest.mark.parametrize("vary", ["instruction", "picture", "state"])
 def test_a_donor_is_of_another_group_and_holds_another_value(vary: str) -> None:
-    given = frames()
-    pairs = draw_donors(given, vary, np.random.default_rng(0), 3)
-    assert {frame for frame, _ in pairs} == set(range(len(given)))
-    assert len(pairs) == len(set(pairs)) == 3 * len(given)
+    episode_frames = frames()
+    pairs = draw_donors(episode_frames, vary, np.random.default_rng(0), 3)
+    assert {frame for frame, _ in pairs} == set(range(len(episode_frames)))
+    assert len(pairs) == len(set(pairs)) == 3 * len(episode_frames)
     for frame, donor in pairs:
-        assert given[frame].group != given[donor].group
-        assert not same_input(given[frame].observation, given[donor].observation, vary)
+        assert episode_frames[frame].group != episode_frames[donor].group
+        assert not same_input(episode_frames[frame].observation, episode_frames[donor].observation, vary)
 
 
 def test_the_donor_of_a_picture_is_one_of_the_nearest_in_spreads_of_every_number_of_the_state() -> None:
-    given = frames(60)
-    states = np.stack([frame.state for frame in given])
+    episode_frames = frames(60)
+    states = np.stack([frame.state for frame in episode_frames])
     scaled = states / states.std(axis=0)
-    others = [
+    candidates = [
         number
-        for number, frame in enumerate(given)
-        if frame.group != given[0].group and not same_input(frame.observation, given[0].observation, "picture")
+        for number, frame in enumerate(episode_frames)
+        if frame.group != episode_frames[0].group
+        and not same_input(frame.observation, episode_frames[0].observation, "picture")
     ]
-    nearest = sorted(others, key=lambda number: float(np.linalg.norm(scaled[number] - scaled[0])))[:NEAREST]
-    assert drawn(given, 40) == set(nearest)
+    nearest = sorted(candidates, key=lambda number: float(np.linalg.norm(scaled[number] - scaled[0])))[:NEAREST]
+    assert drawn(episode_frames, 40) == set(nearest)
 
 
 def test_frames_that_are_equally_near_are_all_drawn() -> None:
-    given = [Frame.of(str(number), plain(number), str(number), 0) for number in range(3 * NEAREST)]
-    assert drawn(given, 300) == set(range(1, 3 * NEAREST))
+    episode_frames = [Frame.of(str(number), plain(number), str(number), 0) for number in range(3 * NEAREST)]
+    assert drawn(episode_frames, 300) == set(range(1, 3 * NEAREST))
 
 
 def test_a_picture_beyond_the_nearest_is_never_read() -> None:
@@ -265,13 +268,15 @@ def test_a_picture_beyond_the_nearest_is_never_read() -> None:
         read.append(frame.number)
         return plain(frame.number)
 
-    given = [Frame(f"{at}", f"{at}", 0, "go", np.array([float(at)]), observe, number=at) for at in range(100)]
-    ((_, donor),) = draw_donors(given, "picture", np.random.default_rng(0), of=[0])
+    episode_frames = [
+        Frame(f"{at}", f"{at}", 0, "go", np.array([float(at)]), observe, number=at) for at in range(100)
+    ]
+    ((_, donor),) = draw_donors(episode_frames, "picture", np.random.default_rng(0), of=[0])
     assert donor in range(1, NEAREST + 1)
     assert set(read) == set(range(NEAREST + 1))
 
 
 def test_a_frame_without_a_donor_is_left_out() -> None:
-    given = [Frame.of(str(number), plain(0), str(number), 0) for number in range(3)]
+    episode_frames = [Frame.of(str(number), plain(0), str(number), 0) for number in range(3)]
     for vary in ("instruction", "picture", "state"):
-        assert draw_donors(given, vary, np.random.default_rng(0)) == []
+        assert draw_donors(episode_frames, vary, np.random.default_rng(0)) == []

@@ -22,12 +22,20 @@ RED = "Put the cube on the red shape"
 
 
 def frames(observations: Sequence[Observation], other_words: str = "") -> list[Frame]:
-    made = [Frame.of(f"{at}", observation, f"group {at}", at) for at, observation in enumerate(observations)]
+    built_frames = [
+        Frame.of(f"{at}", observation, f"group {at}", at) for at, observation in enumerate(observations)
+    ]
     if other_words:
-        made[0] = Frame(
-            "0", "group 0", 0, made[0].instruction, made[0].state, made[0].observe, other_words=other_words
+        built_frames[0] = Frame(
+            "0",
+            "group 0",
+            0,
+            built_frames[0].instruction,
+            built_frames[0].state,
+            built_frames[0].observe,
+            other_words=other_words,
         )
-    return made
+    return built_frames
 
 
 def observed(picture: np.ndarray | None = None, state: float = 0.0, words: str = RED) -> Observation:
@@ -74,7 +82,7 @@ def test_texts_that_differ_in_case_space_punctuation_or_form_are_one_instruction
 
 
 @pytest.mark.parametrize(
-    ("one", "other"),
+    ("text", "other"),
     [
         ("red", "blue"),
         ("1.5 cm", "15 cm"),
@@ -84,9 +92,9 @@ def test_texts_that_differ_in_case_space_punctuation_or_form_are_one_instruction
         ("की", "क"),
     ],
 )
-def test_texts_that_differ_in_a_word_a_number_or_a_letter_are_two_instructions(one: str, other: str) -> None:
-    assert normal_form(one) != normal_form(other)
-    assert describe_spellings([one, other]) == []
+def test_texts_that_differ_in_a_word_a_number_or_a_letter_are_two_instructions(text: str, other: str) -> None:
+    assert normal_form(text) != normal_form(other)
+    assert describe_spellings([text, other]) == []
 
 
 def test_forms_of_unicode_and_letters_with_marks_are_equal() -> None:
@@ -100,8 +108,10 @@ def test_forms_of_unicode_and_letters_with_marks_are_equal() -> None:
 def test_other_words_of_one_meaning_are_one_value_with_the_task_that_they_stand_for() -> None:
     texts = [RED, "Set the block on the red tile", "Put the cube on the blue shape"]
     assert values_of_texts(texts, [(RED, texts[1])]).tolist() == [0, 0, 1]
-    given = frames([observed(words=text) for text in texts], other_words=texts[1])
-    assert {donor for _, donor in draw_donors(given, "instruction", np.random.default_rng(0), 3, [0])} == {2}
+    episode_frames = frames([observed(words=text) for text in texts], other_words=texts[1])
+    assert {
+        donor for _, donor in draw_donors(episode_frames, "instruction", np.random.default_rng(0), 3, [0])
+    } == {2}
 
 
 @pytest.mark.parametrize("quality", [95, 90, 75])
@@ -125,18 +135,22 @@ def test_noise_of_a_sensor_is_no_other_picture_and_pictures_of_noise_are() -> No
 def test_states_one_step_of_the_control_apart_are_one_value() -> None:
     """The control moves a state by a hundredth of its spread."""
     states = [0.0, 0.01, 1.0, 1.01, 2.0]
-    given = frames([observed(state=state * 100) for state in states])
-    compared = InputComparison.of(given, "state")
+    episode_frames = frames([observed(state=state * 100) for state in states])
+    compared = InputComparison.of(episode_frames, "state")
     assert compared.values(5).tolist() == [0, 0, 1, 1, 2]
-    assert {donor for _, donor in draw_donors(given, "state", np.random.default_rng(0), 5, [0])} == {2, 3, 4}
+    assert {donor for _, donor in draw_donors(episode_frames, "state", np.random.default_rng(0), 5, [0])} == {
+        2,
+        3,
+        4,
+    }
     near = np.nextafter(np.float32(0.4), np.float32(1))
     assert not differ(observed(state=0.4), observed(state=float(near)), "state")
     assert differ(observed(state=0.4), observed(state=0.401), "state")
 
 
 def test_frames_with_further_words_are_donors_with_their_own_pictures_and_states() -> None:
-    given = frames([observed(state=float(at)) for at in range(3)])
-    donor = given[1].with_instruction("Lift it")
-    assert (donor.group, donor.observation.instruction) == (given[1].group, "Lift it")
-    assert donor.observation.image is given[1].observation.image
-    assert draw_donors([*given, donor], "instruction", np.random.default_rng(0), 1, [0]) == [(0, 3)]
+    episode_frames = frames([observed(state=float(at)) for at in range(3)])
+    donor = episode_frames[1].with_instruction("Lift it")
+    assert (donor.group, donor.observation.instruction) == (episode_frames[1].group, "Lift it")
+    assert donor.observation.image is episode_frames[1].observation.image
+    assert draw_donors([*episode_frames, donor], "instruction", np.random.default_rng(0), 1, [0]) == [(0, 3)]

@@ -62,10 +62,10 @@ def test_the_policy_of_a_run_sees_in_the_export_what_it_saw_at_every_inference(
     played = extract_run(ExtractSettings("pi0-tiny", **scene, execute=2, captured_calls=3), tmp_path / "played")
     data = export_run(played.path, "lerobot", tmp_path / "data")
     source = LeRobotSource(str(data), every=2)
-    shown = extract_run(ExtractSettings("pi0-tiny", source=source), tmp_path / "shown")
-    for row, number in enumerate(shown.episodes["source_episode"]):
+    replayed = extract_run(ExtractSettings("pi0-tiny", source=source), tmp_path / "shown")
+    for row, number in enumerate(replayed.episodes["source_episode"]):
         for call in range(3):
-            np.testing.assert_array_equal(backbone_of(shown, row, call), backbone_of(played, number, call))
+            np.testing.assert_array_equal(backbone_of(replayed, row, call), backbone_of(played, number, call))
 
 
 @pytest.mark.slow
@@ -75,7 +75,11 @@ def test_every_policy_sees_in_the_export_what_it_sees_in_the_scene(
 ) -> None:
     category = {"categories": ("color",), "items": 6}
     tiny, few = FAMILIES[family], small_suite.select(category["categories"], category["items"])
-    common = {"model": family, "checkpoint": tiny.made(few, tmp_path / "tiny"), "options": tiny.options}
+    common = {
+        "model": family,
+        "checkpoint": tiny.prepare_checkpoint(few, tmp_path / "tiny"),
+        "options": tiny.options,
+    }
     in_scene = ExtractSettings(
         **common,
         **category,
@@ -88,11 +92,11 @@ def test_every_policy_sees_in_the_export_what_it_sees_in_the_scene(
     camera = scene.certificate["policy"]["cameras"][0]
     cameras = [f"{camera}=observation.images.scene"]
     source = LeRobotSource(str(exported), every=100, episodes=f"0:{len(scene.episodes)}", cameras=cameras)
-    shown = extract_run(ExtractSettings(**common, source=source, accept_units=True), tmp_path / "shown")
+    replayed = extract_run(ExtractSettings(**common, source=source, accept_units=True), tmp_path / "shown")
     items = recorded_run.episodes["item_id"].tolist()
     assert scene.episodes["item_id"].tolist() == items[: len(scene.episodes)]
-    for row, number in enumerate(shown.episodes["source_episode"]):
-        np.testing.assert_array_equal(backbone_of(shown, row), backbone_of(scene, number))
+    for row, number in enumerate(replayed.episodes["source_episode"]):
+        np.testing.assert_array_equal(backbone_of(replayed, row), backbone_of(scene, number))
 
 
 @pytest.mark.slow

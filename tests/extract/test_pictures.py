@@ -141,12 +141,12 @@ def test_a_line_that_cannot_be_shown_is_named(folder: Path, tmp_path: Path, tabl
 
 
 def test_a_link_in_the_folder_is_followed_within_it_alone(folder: Path, tmp_path: Path) -> None:
-    home, beside = tmp_path / "home", tmp_path / "home-beside"
+    home, sibling = tmp_path / "home", tmp_path / "home-beside"
     shutil.copytree(folder, home)
-    shutil.copytree(folder, beside)
+    shutil.copytree(folder, sibling)
     (home / "inside.png").symlink_to("0.png")
-    (home / "outside.png").symlink_to(beside / "0.png")
-    (home / "elsewhere").symlink_to(beside)
+    (home / "outside.png").symlink_to(sibling / "0.png")
+    (home / "elsewhere").symlink_to(sibling)
     (tmp_path / "another").symlink_to(home)
     for name in ("inside.png", "outside.png", "elsewhere/0.png"):
         (home / "table.csv").write_text(f"picture,instruction\n{name},go\n", encoding="utf-8")
@@ -370,6 +370,6 @@ def test_a_source_that_cannot_be_used_is_left_out_by_name(
 ) -> None:
     entry = EntryPoint("noise", value, kinds.ENTRY_POINTS)
     monkeypatch.setattr(kinds, "entry_points", lambda **_: [entry])
-    with pytest.warns(kinds.BrokenSourceWarning, match="noise") as said:
+    with pytest.warns(kinds.BrokenSourceWarning, match="noise") as warned:
         assert list(kinds._third_party()) == []
-    assert problem in str(said[0].message)
+    assert problem in str(warned[0].message)

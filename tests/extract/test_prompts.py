@@ -28,18 +28,19 @@ def suite(tmp_path_factory: pytest.TempPathFactory) -> Suite:
 
 
 def test_every_item_has_its_phrase_with_the(suite: Suite) -> None:
-    found = phrases(suite, "target")
-    assert found.keys() == {item.item_id for item in suite.items}
+    phrase_by_item = phrases(suite, "target")
+    assert phrase_by_item.keys() == {item.item_id for item in suite.items}
     assert all(
-        phrase.with_article in item.instruction for item, phrase in zip(suite.items, found.values(), strict=True)
+        phrase.with_article in item.instruction
+        for item, phrase in zip(suite.items, phrase_by_item.values(), strict=True)
     )
 
 
 def test_the_distractors_phrase_is_what_the_twin_asks_for(suite: Suite) -> None:
-    found = phrases(suite, "distractor")
+    phrase_by_item = phrases(suite, "distractor")
     twins = {(item.pair_id, item.target_concept): item for item in suite.items}
     for item in suite.items:
-        assert found[item.item_id] == Phrase.of(twins[item.pair_id, item.distractor_concept])
+        assert phrase_by_item[item.item_id] == Phrase.of(twins[item.pair_id, item.distractor_concept])
 
 
 def test_without_a_twin_the_concept_is_exchanged_in_the_items_own_phrase(suite: Suite) -> None:
@@ -54,20 +55,20 @@ def test_without_a_twin_the_concept_is_exchanged_in_the_items_own_phrase(suite: 
 def test_an_absent_object_is_named_by_neither_picture_and_repeats_with_the_seed(suite: Suite) -> None:
     some = suite.select(("color", "counting"))
     concept = {(item.category, item.object_phrase): item.target_concept for item in some.items}
-    found = phrases(some, "absent")
+    phrase_by_item = phrases(some, "absent")
     for item in some.items:
-        named = concept[item.category, found[item.item_id].text]
-        assert named not in (item.target_concept, item.distractor_concept)
-    assert found == phrases(some, "absent")
-    assert found != phrases(some, "absent", seed=1)
+        absent_concept = concept[item.category, phrase_by_item[item.item_id].text]
+        assert absent_concept not in (item.target_concept, item.distractor_concept)
+    assert phrase_by_item == phrases(some, "absent")
+    assert phrase_by_item != phrases(some, "absent", seed=1)
 
 
 def test_a_comparison_is_asked_for_only_among_comparisons(suite: Suite) -> None:
     emotion = suite.select(("emotion",))
     compares = {item.object_phrase: item.polarity != "none" for item in emotion.items}
     assert len(set(compares.values())) == 2
-    found = phrases(emotion, "absent")
-    assert all(compares[found[item.item_id].text] == (item.polarity != "none") for item in emotion.items)
+    phrase_by_item = phrases(emotion, "absent")
+    assert all(compares[phrase_by_item[item.item_id].text] == (item.polarity != "none") for item in emotion.items)
 
 
 def test_a_category_of_two_concepts_has_nothing_absent(suite: Suite) -> None:
@@ -111,7 +112,7 @@ def test_the_swapped_order_exchanges_the_sides_and_nothing_else(template: Templa
 
 
 def test_which_prompts_take_letters_and_which_take_no() -> None:
-    assert [(one.lettered, one.yes_or_no, one.tokens) for one in (SEEN, P1, P2)] == [
+    assert [(prompt.lettered, prompt.yes_or_no, prompt.tokens) for prompt in (SEEN, P1, P2)] == [
         (False, True, 24),
         (True, False, 8),
         (True, False, 8),

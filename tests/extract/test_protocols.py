@@ -95,8 +95,8 @@ def test_the_options_of_a_row_are_the_familys_own(name: str) -> None:
     """What a loader would refuse is refused here, without one."""
     family = own_families()[name]
     for row in (row for first in family.protocols.values() for row in first.rows):
-        given = row.options_for(None)
-        assert check_options(name, family.options, given) == given
+        options = row.options_for(None)
+        assert check_options(name, family.options, options) == options
 
 
 @pytest.mark.parametrize("name", RELEASED)
@@ -118,11 +118,11 @@ def test_what_is_not_given_is_as_released(name: str) -> None:
 
 
 def test_what_is_given_wins_and_is_recorded_as_a_deviation() -> None:
-    given = ExtractSettings(
+    magma_settings = ExtractSettings(
         "magma", options={"temperature": "0", "tokenizer": "words"}, execute=1, dtype="float32",
         protocol="act2answer", scene=protocol_scene("act2answer", tile_side=0.2033),
     )  # fmt: skip
-    settings = given.followed()
+    settings = magma_settings.followed()
     assert settings.model.options["temperature"] == "0"
     assert settings.model.options["prompt"] == "act2answer"
     assert deviations(settings) == {
@@ -135,9 +135,11 @@ def test_what_is_given_wins_and_is_recorded_as_a_deviation() -> None:
 
 
 def test_what_cannot_be_matched_of_pi0_is_its_picture_path_and_not_its_statistics() -> None:
-    said = protocol_identity(ExtractSettings("pi0", protocol="act2answer").followed())["protocol"]["unmatched"]
-    assert any("Lanczos" in line and "bilinearly" in line for line in said)
-    assert not any("statistics" in line for line in said)
+    unmatched = protocol_identity(ExtractSettings("pi0", protocol="act2answer").followed())["protocol"][
+        "unmatched"
+    ]
+    assert any("Lanczos" in line and "bilinearly" in line for line in unmatched)
+    assert not any("statistics" in line for line in unmatched)
 
 
 def test_another_scene_that_is_asked_for_is_kept_and_reported() -> None:
@@ -150,10 +152,10 @@ def test_another_scene_that_is_asked_for_is_kept_and_reported() -> None:
 
 def test_a_vlm_is_asked_in_the_scene_of_the_protocol_or_the_one_that_is_named() -> None:
     size = {"picture_size": (224, 224)}
-    asked = AskSettings("vlm-tiny", protocol="act2answer", **size)
-    named = AskSettings("vlm-tiny", scene="act2answer", **size)
-    assert asked.scene == named.scene == protocol_scene("act2answer", **size)
-    assert asked.identity() == named.identity()
+    by_protocol = AskSettings("vlm-tiny", protocol="act2answer", **size)
+    by_scene = AskSettings("vlm-tiny", scene="act2answer", **size)
+    assert by_protocol.scene == by_scene.scene == protocol_scene("act2answer", **size)
+    assert by_protocol.identity() == by_scene.identity()
     both = AskSettings("vlm-tiny", protocol="act2answer", scene="frontal", **size)
     assert both.scene == protocol_scene(None, "frontal", **size)
     assert AskSettings("vlm-tiny", protocol="act2answer").scene == protocol_scene("act2answer")
@@ -162,21 +164,21 @@ def test_a_vlm_is_asked_in_the_scene_of_the_protocol_or_the_one_that_is_named() 
 
 
 def test_how_a_protocol_differs_from_the_default_is_in_the_run() -> None:
-    said = protocol_identity(ExtractSettings("magma", protocol="act2answer").followed())["protocol"]
-    assert said["name"] == "act2answer"
-    assert said["differs_from_default"]["-M temperature"] == ["0.7", "0"]
-    assert not [name for name in said["differs_from_default"] if name.startswith("scene")]
-    assert "-M unnorm_key" not in said["differs_from_default"]
-    assert said["unmatched"]
+    protocol = protocol_identity(ExtractSettings("magma", protocol="act2answer").followed())["protocol"]
+    assert protocol["name"] == "act2answer"
+    assert protocol["differs_from_default"]["-M temperature"] == ["0.7", "0"]
+    assert not [name for name in protocol["differs_from_default"] if name.startswith("scene")]
+    assert "-M unnorm_key" not in protocol["differs_from_default"]
+    assert protocol["unmatched"]
     assert protocol_identity(ExtractSettings("magma")) == {}
 
 
 def test_options_of_the_protocols_checkpoint_do_not_follow_another_one() -> None:
-    own = ExtractSettings("openvla", "my/fine-tune", protocol="act2answer").followed()
-    assert "unnorm_key" not in own.model.options
-    assert own.model.options["temperature"] == 0.6
-    assert set(deviations(own)) == {"checkpoint", "-M unnorm_key"}
-    assert "SFT" not in run_label(own)
+    fine_tuned = ExtractSettings("openvla", "my/fine-tune", protocol="act2answer").followed()
+    assert "unnorm_key" not in fine_tuned.model.options
+    assert fine_tuned.model.options["temperature"] == 0.6
+    assert set(deviations(fine_tuned)) == {"checkpoint", "-M unnorm_key"}
+    assert "SFT" not in run_label(fine_tuned)
 
 
 def test_the_conversion_of_rotations_is_the_protocols_unless_another_is_asked_for() -> None:
@@ -214,8 +216,8 @@ def test_a_run_names_its_protocol_and_the_report_lists_what_differs(small_suite:
         scene=protocol_scene("act2answer", max_steps=2), env_workers=0,
     )  # fmt: skip
     run = extract_run(settings, tmp_path / "run")
-    said = run.settings["protocol"]
-    assert set(said["deviations"]) == {"checkpoint", "dtype", "scene max_steps"}
+    protocol = run.settings["protocol"]
+    assert set(protocol["deviations"]) == {"checkpoint", "dtype", "scene max_steps"}
     assert run.settings["execute"] == 1
     assert run.settings["policy"]["openness"] == "release"
     assert run.settings["rotation"] == run.certificate["rotation"] == "axis-angle"

@@ -76,20 +76,20 @@ def test_a_node_lost_in_mid_run_changes_nothing_in_the_bucket(tmp_path: Path, bu
         return len(locate(url).keys(COMMITS))
 
     with two_nodes() as nodes, ThreadPoolExecutor(1) as thread:
-        kept = thread.submit(lose, nodes)
+        committed = thread.submit(lose, nodes)
         with pytest.warns(WorkerLostWarning) as warned:
             extract_run(settings.changed(ray=nodes.address, workers=2), url)
-    assert 0 < kept.result() < len(plain.episodes)
+    assert 0 < committed.result() < len(plain.episodes)
     messages = [str(warning.message) for warning in warned]
     assert nodes.second_id in messages[0]
     assert "it held (" in messages[0]
-    there = open_run(url)
-    assert there.certificate["hooks_on_equals_hooks_off"]
+    stored_run = open_run(url)
+    assert stored_run.certificate["hooks_on_equals_hooks_off"]
     assert verify_run(url, deep=True).ok
-    assert contents(there) == contents(plain)
+    assert contents(stored_run) == contents(plain)
 
 
 def contents(run: Run) -> dict[str, bytes]:
     """All but seconds, and certificates: each process writes one, with the hash of what it played first."""
-    own = ("certificate", "times/")
-    return {key: content for key, content in objects(run.location).items() if not key.startswith(own)}
+    varying_keys = ("certificate", "times/")
+    return {key: content for key, content in objects(run.location).items() if not key.startswith(varying_keys)}

@@ -56,23 +56,23 @@ def value_of(name: str) -> Any:
 
 def with_one(name: str) -> ExtractSettings:
     """Settings of which one field differs; what it needs beside itself has its other value too."""
-    beside = {"inference_limit": {"workers": 1}, "later_views": {"captured_calls": 2}}.get(name, {})
-    return ExtractSettings("pi0", **{name: value_of(name)} | beside)
+    companions = {"inference_limit": {"workers": 1}, "later_views": {"captured_calls": 2}}.get(name, {})
+    return ExtractSettings("pi0", **{name: value_of(name)} | companions)
 
 
 def typed(*words: str) -> ExtractSettings:
     """Settings that a command line makes."""
-    made: list[ExtractSettings] = []
+    parsed: list[ExtractSettings] = []
 
     @command_with(*ExtractSettings.option_models())
     def command(values: Any) -> None:
-        made.append(ExtractSettings.of_command(values))
+        parsed.append(ExtractSettings.of_command(values))
 
     program = typer.Typer()
     program.command()(command)
     ended = CliRunner().invoke(program, words, catch_exceptions=False)
     assert ended.exit_code == 0, ended.output
-    return made[0]
+    return parsed[0]
 
 
 @pytest.mark.parametrize("name", sorted({*EVERY, "later_views"}))
@@ -235,7 +235,11 @@ def test_what_is_not_chosen_is_that_of_the_protocol_the_model_or_the_class() -> 
 
 
 def test_sources_share_the_options_that_mean_the_same() -> None:
-    declared = [(one.parameter, one.option.metavar) for kind in SOURCES for one in options_of(kind)]
+    declared = [
+        (declared_option.parameter, declared_option.option.metavar)
+        for kind in SOURCES
+        for declared_option in options_of(kind)
+    ]
     shared = {name for name, _ in declared if [name for name, _ in declared].count(name) > 1}
     assert shared == {"episodes", "camera", "no_pixels", "rotate"}
     assert len(set(declared)) == len({name for name, _ in declared})
@@ -279,15 +283,15 @@ def test_a_policy_on_a_gpu_chooses_its_batch_unless_one_is_chosen() -> None:
 
 
 def test_the_settings_of_a_run_repeat_it_wherever_it_lies(small_suite: Suite, tmp_path: Path) -> None:
-    asked = ExtractSettings(
+    settings = ExtractSettings(
         "expert", suite=small_suite.folder, categories=("color",), items=2, max_steps=2, env_workers=0
     )
-    run = extract_run(asked, tmp_path / "run")
+    run = extract_run(settings, tmp_path / "run")
     for where in (tmp_path / "run", tmp_path / "run" / "run.json"):
         again = ExtractSettings.of_command({"env_workers": 0}, read_config(where))
-        assert again == asked
+        assert again == settings
     assert str(tmp_path) not in json.dumps(run.settings)
-    assert prepare(again).identity() == prepare(asked).identity()
+    assert prepare(again).identity() == prepare(settings).identity()
 
 
 def test_a_run_whose_edits_need_vectors_is_not_repeated_without_them(
@@ -336,15 +340,15 @@ def test_a_scene_run_has_the_identity_and_the_plan_that_it_had(suite: Suite) -> 
 
 def elsewhere(monkeypatch: pytest.MonkeyPatch, **changes: object) -> None:
     """Pretend that this process computes somewhere else; versions are changed one by one."""
-    here = provenance.provenance_here
+    actual = provenance.provenance_here
 
-    def there(*where: str) -> dict[str, object]:
-        record = here(*where)
+    def other_machine(*where: str) -> dict[str, object]:
+        record = actual(*where)
         versions = {name: value for name, value in changes.items() if name in record["versions"]}
-        rest = {name: value for name, value in changes.items() if name not in versions}
-        return {**record, **rest, "versions": {**record["versions"], **versions}}
+        other_changes = {name: value for name, value in changes.items() if name not in versions}
+        return {**record, **other_changes, "versions": {**record["versions"], **versions}}
 
-    monkeypatch.setattr("probe_kit.extract.extraction.provenance_here", there)
+    monkeypatch.setattr("probe_kit.extract.extraction.provenance_here", other_machine)
 
 
 @pytest.mark.slow

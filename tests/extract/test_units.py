@@ -48,10 +48,10 @@ def played(seed: int, count: int, frames: int, ratio: float, still: float = -1.5
     spread, centers = np.array([0.5, 0.3, 0.8, 0.1, 0.2, 0.05]), np.array([0.2, -0.8, 1.5, 0.4, 0.1, 0.2])
     episodes = []
     for _ in range(count):
-        place = centers + spread * random.standard_normal(6)
+        base = centers + spread * random.standard_normal(6)
         bent = random.gamma(2, 1, (frames, 6)) - 2
         gripper = (np.arange(frames) > 0.8 * frames).astype(float)
-        values = np.column_stack([place + spread * ratio * bent, gripper, np.full(frames, still)])
+        values = np.column_stack([base + spread * ratio * bent, gripper, np.full(frames, still)])
         episodes.append(values.astype(np.float32))
     return episodes
 
@@ -106,8 +106,8 @@ def test_a_number_that_never_moves_or_hardly_moves_beside_its_mean_fits(value: f
 
 def test_the_same_data_set_gives_no_warning_even_of_few_chosen_frames() -> None:
     episodes = played(0, 12, 40, 0.1)
-    chosen = [episodes[0][:1]]
-    assert not compare_units(checkpoint(episodes), chosen, NAMES, recorded(episodes)).misfits
+    chosen_frames = [episodes[0][:1]]
+    assert not compare_units(checkpoint(episodes), chosen_frames, NAMES, recorded(episodes)).misfits
 
 
 def test_one_small_region_of_the_workspace_is_said_and_not_refused() -> None:

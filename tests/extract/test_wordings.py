@@ -42,8 +42,11 @@ def test_every_item_is_planned_in_every_wording_that_it_has_on_the_same_seeds(su
     assert len({row["episode_id"] for row in rows}) == len(rows)
     plain = {planned.content.episode_id: planned for planned in scene_rows(suite, 0)}
     for row in rows:
-        own = plain[":".join(row["episode_id"].split(":")[:2])]
-        assert (row["scene_seed"], row["policy_seed"]) == (own.columns["scene_seed"], own.policy_seed)
+        plain_episode = plain[":".join(row["episode_id"].split(":")[:2])]
+        assert (row["scene_seed"], row["policy_seed"]) == (
+            plain_episode.columns["scene_seed"],
+            plain_episode.policy_seed,
+        )
 
 
 @pytest.mark.slow
@@ -51,10 +54,10 @@ def test_a_run_without_the_option_is_what_it_was(suite):
     plain = prepare(ExtractSettings("expert", suite=suite.folder, scene=SHORT))
     assert "wordings" not in plain.plan.selection
     assert not [row for row in (e.to_json() for e in plain.plan.episodes) if "wording" in row]
-    asked = prepare(ExtractSettings("expert", suite=suite.folder, scene=SHORT, wordings=("knowledge",)))
-    assert asked.plan.selection["wordings"]["names"] == ["knowledge"]
-    assert asked.identity() == plain.identity()
-    assert asked.default_name() != plain.default_name()
+    prepared = prepare(ExtractSettings("expert", suite=suite.folder, scene=SHORT, wordings=("knowledge",)))
+    assert prepared.plan.selection["wordings"]["names"] == ["knowledge"]
+    assert prepared.identity() == plain.identity()
+    assert prepared.default_name() != plain.default_name()
 
 
 def test_a_wording_that_no_item_has_is_refused_before_anything_is_played(suite):
@@ -77,16 +80,16 @@ def test_one_wording_of_a_run_is_read_like_a_run(ladder):
     assert ladder.wordings == ("knowledge", "named")
     assert ladder.episodes["wording"].value_counts().to_dict() == {"knowledge": 4, "named": 4}
     site = Site("backbone", 1)
-    whole = ladder.column(site)
+    full_column = ladder.column(site)
     assert ladder.sealed
     for name in ladder.wordings:
-        one = ladder.in_wording(name)
+        one_wording = ladder.in_wording(name)
         mine = (ladder.episodes["wording"] == name).to_numpy()
-        assert (one.episodes["wording"] == name).all()
-        assert one.planned == 4
-        np.testing.assert_array_equal(one.column(site), whole[mine])
-        assert one.xarray()["backbone_pooled"].sizes["episode"] == 4
-        assert one.all_wordings.episodes.equals(ladder.episodes)
+        assert (one_wording.episodes["wording"] == name).all()
+        assert one_wording.planned == 4
+        np.testing.assert_array_equal(one_wording.column(site), full_column[mine])
+        assert one_wording.xarray()["backbone_pooled"].sizes["episode"] == 4
+        assert one_wording.all_wordings.episodes.equals(ladder.episodes)
     assert ladder.in_wording().wording == "knowledge"
     assert (ladder.in_wording("named").column(site) != ladder.in_wording("knowledge").column(site)).any()
 

@@ -61,12 +61,12 @@ def test_environment_processes_give_the_same_bytes(suite: Suite, plain: Path, tm
 
 @pytest.mark.slow
 def test_a_batch_gives_the_same_numbers_up_to_float_rounding(suite: Suite, plain: Path, tmp_path: Path) -> None:
-    run, one = extract_run(settings(suite, batch=3, env_workers=0), tmp_path / "run"), open_run(plain)
+    run, unbatched = extract_run(settings(suite, batch=3, env_workers=0), tmp_path / "run"), open_run(plain)
     for stream in run.streams:
         for site in run.sites(stream):
-            np.testing.assert_allclose(run.column(site), one.column(site), rtol=1e-4, atol=1e-4)
-    assert run.settings_sha256 == one.settings_sha256
-    assert run.episodes["outcome"].tolist() == one.episodes["outcome"].tolist()
+            np.testing.assert_allclose(run.column(site), unbatched.column(site), rtol=1e-4, atol=1e-4)
+    assert run.settings_sha256 == unbatched.settings_sha256
+    assert run.episodes["outcome"].tolist() == unbatched.episodes["outcome"].tolist()
 
 
 def test_a_simulating_process_starts_without_the_array_store_and_torch() -> None:
@@ -105,7 +105,9 @@ def test_an_episode_that_fails_twice_is_named_and_all_others_are_kept(
     def infer_badly(self, turns):
         bad = [np.float32(np.nan if turn.row.policy_seed == poison.policy_seed else 1) for turn in turns]
         inferences = infer(self, turns)
-        return [replace(one, actions=one.actions * bad[row]) for row, one in enumerate(inferences)]
+        return [
+            replace(inference, actions=inference.actions * bad[row]) for row, inference in enumerate(inferences)
+        ]
 
     monkeypatch.setattr(PolicyController, "infer", infer_badly)
     with pytest.raises(EpisodesFailedError, match="1 episode failed twice") as caught:
@@ -172,11 +174,11 @@ BRIEF = SceneSpec(max_steps=2)
 def test_the_smallest_batch_near_the_best_rate_is_chosen(
     inference: dict[int, float], turn: float, cores: int, batch: int, waits: float
 ) -> None:
-    found = choose(inference, turn, cores)
-    assert found.batch == batch
-    assert found.waits == pytest.approx(waits)
-    assert found.env_workers == (2 * batch if cores > 1 else 0)
-    assert f"batch {batch}" in found.words
+    choice = choose(inference, turn, cores)
+    assert choice.batch == batch
+    assert choice.waits == pytest.approx(waits)
+    assert choice.env_workers == (2 * batch if cores > 1 else 0)
+    assert f"batch {batch}" in choice.words
 
 
 def test_batches_are_tried_up_to_the_bound_and_no_further_than_memory() -> None:
@@ -223,7 +225,7 @@ def test_a_policy_that_takes_one_observation_is_calibrated_to_the_same_bytes(
     monkeypatch.setattr(calibration, "cores_here", lambda: 1)  # no processes: their start takes longer than this
     settings = ExtractSettings("pi0-tiny", suite=small_suite.folder, scene=BRIEF, items=2, env_workers=0)
     plain = extract_run(settings, tmp_path / "plain")
-    asked = settings.changed(env_workers=None, batch="auto")
+    calibrated = settings.changed(env_workers=None, batch="auto")
     run_preflight, tried = PolicyController.run_preflight, set[int]()
 
     def counted(controller: PolicyController, observations: list, seeds: list) -> None:  # type: ignore[type-arg]
@@ -232,7 +234,7 @@ def test_a_policy_that_takes_one_observation_is_calibrated_to_the_same_bytes(
 
     monkeypatch.setattr(PolicyController, "run_preflight", counted)
     monkeypatch.setattr(calibration, "largest_batch", lambda _of_card, episodes: largest_batch(1, episodes))
-    extraction = prepare(asked, tmp_path / "run")
+    extraction = prepare(calibrated, tmp_path / "run")
     assert tried == {1}
     assert extraction.calibration is not None
     assert (extraction.settings.machine.batch, extraction.settings.machine.env_workers) == (1, 0)
@@ -243,9 +245,18 @@ def test_a_policy_that_takes_one_observation_is_calibrated_to_the_same_bytes(
 
 @pytest.mark.slow
 def test_what_it_chooses_is_refused_beside_it(small_suite: Suite) -> None:
-    asked = ["extract", "--model", "pi0-tiny", "--suite", str(small_suite.folder), "--batch", "auto", "--dry-run"]
-    result = CliRunner().invoke(app, [*asked, "--env-workers", "2"])
+    command = [
+        "extract",
+        "--model",
+        "pi0-tiny",
+        "--suite",
+        str(small_suite.folder),
+        "--batch",
+        "auto",
+        "--dry-run",
+    ]
+    result = CliRunner().invoke(app, [*command, "--env-workers", "2"])
     assert (result.exit_code, "leave out --env-workers" in " ".join(result.output.split())) == (2, True)
-    assert CliRunner().invoke(app, [*asked[:-2], "many"]).exit_code == 2
+    assert CliRunner().invoke(app, [*command[:-2], "many"]).exit_code == 2
     with pytest.raises(UsageError, match="scripted"):
         prepare(ExtractSettings("expert", suite=small_suite.folder, batch="auto"))

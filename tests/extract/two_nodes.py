@@ -48,12 +48,12 @@ def two_nodes() -> Iterator[TwoNodes]:
     ray = pytest.importorskip("ray", reason="Ray is not installed (extra `ray`)")
     from ray.cluster_utils import Cluster
 
-    one: dict[str, Any] = {"num_cpus": 1, "object_store_memory": SHARED_MEMORY}
+    node: dict[str, Any] = {"num_cpus": 1, "object_store_memory": SHARED_MEMORY}
     try:
         with pytest.MonkeyPatch.context() as patch:
             patch.setenv("RAY_worker_niceness", "0")
-            cluster = Cluster(initialize_head=True, head_node_args={**one, "include_dashboard": False})
-            second = cluster.add_node(**one)
+            cluster = Cluster(initialize_head=True, head_node_args={**node, "include_dashboard": False})
+            second = cluster.add_node(**node)
         cluster.wait_for_nodes(timeout=180)
     except Exception as error:  # noqa: BLE001 - Ray raises a plain one where its own processes are too slow
         pytest.skip(f"Ray does not start two nodes here: {error}")

@@ -26,16 +26,18 @@ from probe_kit.hooks.families.pi0.adapter import Pi0
 def activations(pi0_tiny: Pi0) -> ActivationCache:
     import numpy as np
 
-    seen = Observation(np.zeros((48, 64, 3), np.uint8), np.zeros(8, np.float32), "Put the cube on the red shape")
+    observation = Observation(
+        np.zeros((48, 64, 3), np.uint8), np.zeros(8, np.float32), "Put the cube on the red shape"
+    )
     with capture(pi0_tiny, pi0_tiny.sites()) as activations:
-        pi0_tiny.act([seen, seen], [0, 1])
+        pi0_tiny.act([observation, observation], [0, 1])
     return activations
 
 
 def test_a_cache_is_a_mapping_from_sites(activations: ActivationCache, pi0_tiny: Pi0) -> None:
     assert set(activations) == set(activations.keys()) == set(pi0_tiny.sites())
     assert len(list(activations)) == len(activations) == 44
-    assert all(torch.equal(activations[site], kept) for site, kept in activations.items())
+    assert all(torch.equal(activations[site], tensor) for site, tensor in activations.items())
     assert {activations: 1}[activations] == 1  # compared by identity, as tensors are
 
 
@@ -66,11 +68,11 @@ def test_layers_and_iterations_stack_into_one_tensor(activations: ActivationCach
 
 
 def test_what_has_no_rectangular_shape_is_not_stacked(pi0_tiny: Pi0, observation: Observation) -> None:
-    with capture(pi0_tiny, [Site("expert", 0, iteration=0), *pi0_tiny.streams["expert"].sites()[1:]]) as whole:
+    with capture(pi0_tiny, [Site("expert", 0, iteration=0), *pi0_tiny.streams["expert"].sites()[1:]]) as tape:
         pi0_tiny.act([observation], [0])
-    del whole._kept[Site("expert", 1, iteration=4)]
+    del tape._kept[Site("expert", 1, iteration=4)]
     with pytest.raises(UnknownSiteError, match=r"layers \[1\] of expert lack iterations"):
-        whole.stack("expert")
+        tape.stack("expert")
 
 
 def test_it_says_what_it_holds(activations: ActivationCache) -> None:
@@ -108,17 +110,17 @@ def test_copies_do_not_alias_what_the_model_works_on(pi0_tiny: Pi0, observation:
     """An in-place change behind the hook must not reach the cache."""
     site = Site("backbone", 1)
     norm = pi0_tiny.tap(site).module
-    seen: list[torch.Tensor] = []
+    cloned_inputs: list[torch.Tensor] = []
 
     def vandalise(_module: object, inputs: tuple[torch.Tensor, ...]) -> None:
-        seen.append(inputs[0].clone())
+        cloned_inputs.append(inputs[0].clone())
         inputs[0].zero_()
 
     with capture(pi0_tiny, [site]) as activations:
         handle = norm.register_forward_pre_hook(vandalise)
         pi0_tiny.act([observation], [0])
     handle.remove()
-    assert torch.equal(activations[site], seen[0])
+    assert torch.equal(activations[site], cloned_inputs[0])
 
 
 @pytest.mark.parametrize("most_bytes", [None, 1, 100_000])
@@ -145,9 +147,9 @@ def test_a_network_that_writes_its_stream_in_place_is_captured_as_it_passed(
         with capture(pi0_tiny, sites, reduce=lambda _, activation: activation.clone()) as fired:
             pi0_tiny.act([observation, observation], [0, 1])
         for _ in range(2):
-            with capture(pi0_tiny, sites, most_bytes=most_bytes) as kept:
+            with capture(pi0_tiny, sites, most_bytes=most_bytes) as tape:
                 pi0_tiny.act([observation, observation], [0, 1])
-            assert [site for site in sites if not torch.equal(kept[site], fired[site])] == []
+            assert [site for site in sites if not torch.equal(tape[site], fired[site])] == []
     finally:
         for handle in handles:
             handle.remove()
@@ -158,16 +160,16 @@ def test_a_network_that_writes_its_stream_in_place_is_captured_as_it_passed(
 def test_what_passed_can_be_read_while_the_model_runs_and_shares_no_memory(
     pi0_tiny: Pi0, observation: Observation
 ) -> None:
-    first, seen = Site("backbone", 0), list[torch.Tensor]()
+    first, clones = Site("backbone", 0), list[torch.Tensor]()
     with capture(pi0_tiny, pi0_tiny.sites()) as activations:
         module = pi0_tiny.tap(Site("backbone", 1)).module
-        handle = module.register_forward_hook(lambda *_: seen.append(activations[first].clone()))
+        handle = module.register_forward_hook(lambda *_: clones.append(activations[first].clone()))
         pi0_tiny.act([observation], [0])
     handle.remove()
-    kept = activations[first]
-    assert torch.equal(kept, seen[0])
-    assert kept.untyped_storage().nbytes() == kept.numel() * kept.element_size()
-    assert not kept.is_inference()
+    captured = activations[first]
+    assert torch.equal(captured, clones[0])
+    assert captured.untyped_storage().nbytes() == captured.numel() * captured.element_size()
+    assert not captured.is_inference()
 
 
 def test_an_edit_that_is_entered_inside_a_capture_does_not_reach_what_passed_before_it(
@@ -229,7 +231,7 @@ def test_a_probe_trains_on_any_part_of_what_was_captured(
 ) -> None:
     with capture(pi0_tiny, pi0_tiny.sites(), reduce) as activations:
         pi0_tiny.act([observation, observation], [0, 1])
-    assert not any(kept.is_inference() or kept.requires_grad for kept in activations.values())
+    assert not any(tensor.is_inference() or tensor.requires_grad for tensor in activations.values())
     tokens = activations["backbone.02.residual"].float()
     probe = torch.nn.Linear(tokens.shape[-1], 2)
     torch.nn.functional.cross_entropy(probe(tokens[:, -1]), torch.tensor([0, 1])).backward()
@@ -243,9 +245,9 @@ def test_a_site_that_a_compiled_function_passes_over_names_that_function(observa
     inner = policy.network.model
     inner.denoise_step = torch.compile(inner.denoise_step, backend="eager")
     policy.act([observation], [0])  # compiled code calls no hook that is attached after this
-    named = r"fired 0 times .*torch\.compile or torch\.jit: model\.denoise_step"
+    reason = r"fired 0 times .*torch\.compile or torch\.jit: model\.denoise_step"
     try:
-        with pytest.raises(SiteNeverFiredError, match=named), capture(policy, [Site("expert", 0, iteration=0)]):
+        with pytest.raises(SiteNeverFiredError, match=reason), capture(policy, [Site("expert", 0, iteration=0)]):
             policy.act([observation], [0])
     finally:
         torch.compiler.reset()
@@ -288,12 +290,12 @@ def test_a_reduction_runs_at_the_moment_of_firing_and_replaces_the_copy(
     pi0_tiny: Pi0, observation: Observation
 ) -> None:
     sites = [Site("backbone", 2), Site("expert", 1, iteration=3)]
-    with capture(pi0_tiny, sites) as whole:
+    with capture(pi0_tiny, sites) as unreduced:
         pi0_tiny.act([observation], [0])
     with capture(pi0_tiny, sites, reduce=lambda _site, activation: activation.mean(1)) as reduced:
         pi0_tiny.act([observation], [0])
     for site in sites:
-        assert torch.equal(reduced[site], whole[site].mean(1))
+        assert torch.equal(reduced[site], unreduced[site].mean(1))
 
 
 def test_an_edit_of_one_iteration_leaves_the_others_before_it_alone(
@@ -321,15 +323,15 @@ def test_a_module_that_may_be_called_more_often_is_captured_at_its_first_calls(
     pi0_tiny: Pi0, observation: Observation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Where the model itself decides how many tokens it puts out; fewer calls than are captured stay an error."""
-    sites, whole = pi0_tiny.streams["expert"].sites()[:1], pi0_tiny.tap(Site("expert", 0, iteration=0))
+    sites, tap = pi0_tiny.streams["expert"].sites()[:1], pi0_tiny.tap(Site("expert", 0, iteration=0))
     with capture(pi0_tiny, sites) as plain:
         pi0_tiny.act([observation], [0])
-    monkeypatch.setattr(pi0_tiny, "tap", lambda _: replace(whole, fires=3, more=True))
+    monkeypatch.setattr(pi0_tiny, "tap", lambda _: replace(tap, fires=3, more=True))
     with capture(pi0_tiny, sites) as cache:
         pi0_tiny.act([observation], [0])
     assert torch.equal(cache[sites[0]], plain[sites[0]])
     assert cache.fires == {"expert.00.residual": 3}
-    monkeypatch.setattr(pi0_tiny, "tap", lambda _: replace(whole, fires=11, more=True))
+    monkeypatch.setattr(pi0_tiny, "tap", lambda _: replace(tap, fires=11, more=True))
     with pytest.raises(SiteNeverFiredError, match="expected at least 11"), capture(pi0_tiny, sites):
         pi0_tiny.act([observation], [0])
 
@@ -337,9 +339,9 @@ def test_a_module_that_may_be_called_more_often_is_captured_at_its_first_calls(
 SITE = Site("backbone", 2)
 
 
-def _tape(policy: Pi0, seen: list[Observation], edits: list[Edit], vectors: dict) -> tuple:
-    with apply_edits(policy, edits, seen, vectors) as edit_log, capture(policy, [SITE]) as activations:
-        actions = policy.act(seen, [0])
+def _tape(policy: Pi0, observations: list[Observation], edits: list[Edit], vectors: dict) -> tuple:
+    with apply_edits(policy, edits, observations, vectors) as edit_log, capture(policy, [SITE]) as activations:
+        actions = policy.act(observations, [0])
     return activations[SITE][0].numpy(), actions, edit_log
 
 
@@ -353,10 +355,10 @@ def _direction(policy: Pi0, seed: int = 0) -> np.ndarray:
 
 
 def test_an_edit_is_data_that_can_be_hashed_and_sent_between_processes() -> None:
-    one = Edit("zero", (SITE,), roles=("language",))
-    assert pickle.loads(pickle.dumps(one)) == one
-    assert len({one, Edit("zero", (SITE,), roles=("language",)), Edit("zero", (SITE,))}) == 2
-    assert one.to_json()["sites"] == ["backbone.02.residual"]
+    zero_edit = Edit("zero", (SITE,), roles=("language",))
+    assert pickle.loads(pickle.dumps(zero_edit)) == zero_edit
+    assert len({zero_edit, Edit("zero", (SITE,), roles=("language",)), Edit("zero", (SITE,))}) == 2
+    assert zero_edit.to_json()["sites"] == ["backbone.02.residual"]
 
 
 def test_only_tokens_of_the_named_roles_change(pi0_tiny: Pi0, observation: Observation, plain: np.ndarray) -> None:
@@ -381,10 +383,10 @@ def test_adding_and_removing_a_direction_follow_their_formulas(
         _tape(pi0_tiny, [observation], [add], vectors)[0][valid], plain[valid] + 2 * direction, atol=1e-5
     )
     remove = Edit("remove", (SITE,), vector=vector_hash(direction))
-    left = _tape(pi0_tiny, [observation], [remove], vectors)[0]
-    np.testing.assert_allclose(left[valid] @ direction, 0, atol=1e-3)
+    without_direction = _tape(pi0_tiny, [observation], [remove], vectors)[0]
+    np.testing.assert_allclose(without_direction[valid] @ direction, 0, atol=1e-3)
     both = _tape(pi0_tiny, [observation], [add, remove], vectors)[0]
-    np.testing.assert_allclose(both[valid], left[valid], atol=1e-4)
+    np.testing.assert_allclose(both[valid], without_direction[valid], atol=1e-4)
 
 
 def test_dose_zero_changes_no_action_bit_for_bit(pi0_tiny: Pi0, observation: Observation) -> None:
@@ -396,9 +398,9 @@ def test_dose_zero_changes_no_action_bit_for_bit(pi0_tiny: Pi0, observation: Obs
 
 def test_a_donor_replaces_token_by_token(pi0_tiny: Pi0, observation: Observation, plain: np.ndarray) -> None:
     donor = np.random.default_rng(1).normal(size=plain.shape).astype(np.float32)
-    whole = Edit("replace", (SITE,), vector=vector_hash(donor))
+    replacement = Edit("replace", (SITE,), vector=vector_hash(donor))
     valid = pi0_tiny.roles([observation])["backbone"][0].valid
-    changed, actions, _ = _tape(pi0_tiny, [observation], [whole], {vector_hash(donor): donor})
+    changed, actions, _ = _tape(pi0_tiny, [observation], [replacement], {vector_hash(donor): donor})
     np.testing.assert_allclose(changed[valid], donor[valid], atol=1e-5)
     assert np.abs(actions - pi0_tiny.act([observation], [0])).max() > 0
 
@@ -438,28 +440,28 @@ def test_a_vector_of_another_hash_or_shape_is_refused(pi0_tiny: Pi0, observation
 
 def test_rows_of_a_batch_are_edited_each_by_its_own_roles(pi0_tiny: Pi0, observation: Observation) -> None:
     """Zero and source, one after the other at the same site; instructions differ in their length."""
-    seen = [observation, replace(observation, instruction="Put the cube on the shape")]
-    masks = [roles.mask("language") for roles in pi0_tiny.roles(seen)["backbone"]]
+    observations = [observation, replace(observation, instruction="Put the cube on the shape")]
+    masks = [roles.mask("language") for roles in pi0_tiny.roles(observations)["backbone"]]
     assert masks[0].sum() != masks[1].sum()
     with capture(pi0_tiny, [SITE]) as activations:
-        pi0_tiny.act(seen, [0, 1])
+        pi0_tiny.act(observations, [0, 1])
     plain = activations[SITE].numpy()
     source = np.random.default_rng(1).normal(size=plain.shape[1:]).astype(np.float32)
     image = Edit("replace", (SITE,), roles=("image",), vector=vector_hash(source), strength=0.5)
     edits = [Edit("zero", (SITE,), roles=("language",)), image]
     with (
-        apply_edits(pi0_tiny, edits, seen, {image.vector: source}) as edit_log,
+        apply_edits(pi0_tiny, edits, observations, {image.vector: source}) as edit_log,
         capture(pi0_tiny, [SITE]) as activations,
     ):
-        pi0_tiny.act(seen, [0, 1])
+        pi0_tiny.act(observations, [0, 1])
     changed = activations[SITE].numpy()
-    for row, roles in enumerate(pi0_tiny.roles(seen)["backbone"]):
+    for row, roles in enumerate(pi0_tiny.roles(observations)["backbone"]):
         language, pictures = roles.mask("language"), roles.mask("image")
         assert (changed[row][language] == 0).all()
         half = (plain[row] + source)[pictures] / 2
         np.testing.assert_allclose(changed[row][pictures], half, atol=1e-5)
-        rest = ~language & ~pictures
-        np.testing.assert_array_equal(changed[row][rest], plain[row][rest])
+        other_tokens = ~language & ~pictures
+        np.testing.assert_array_equal(changed[row][other_tokens], plain[row][other_tokens])
     assert [entry.tokens for entry in edit_log.entries] == [sum(mask.sum() for mask in masks), 2 * pictures.sum()]
     first = edit_log.entries[0]
     lengths = np.concatenate([np.linalg.norm(plain[row][mask], axis=1) for row, mask in enumerate(masks)])

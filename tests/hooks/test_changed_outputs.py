@@ -48,9 +48,9 @@ def test_torchs_fused_encoder_rounds_differently_under_hooks_and_is_named(checkp
     policy = load(checkpoint)
     change = np.abs(plain(policy) - captured(policy)).max()
     assert 0 < change < 1e-5, "torch no longer fuses: remove what switches it off"
-    said = reason(policy)
-    assert "torch's fused encoder" in said
-    assert "set_fastpath_enabled(False)" in said
+    cause = reason(policy)
+    assert "torch's fused encoder" in cause
+    assert "set_fastpath_enabled(False)" in cause
     assert torch.backends.mha.get_fastpath_enabled(), "the diagnosis left it as it was"
 
 
@@ -65,24 +65,24 @@ def test_state_that_is_kept_between_calls_is_told_from_a_path_that_hooks_change(
     calls = count(1)
 
     class Drifting(EncoderPolicy):
-        def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
-            return super().act(seen, seeds) + np.float32(1e-3 * next(calls))
+        def act(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+            return super().act(observations, seeds) + np.float32(1e-3 * next(calls))
 
     sound = load(checkpoint)
     drifting = Drifting(sound.network, sound.card)
-    said = reason(drifting)
-    assert "keeps state between calls" in said
-    assert "fused" not in said
+    cause = reason(drifting)
+    assert "keeps state between calls" in cause
+    assert "fused" not in cause
 
 
 def test_another_module_that_looks_for_hooks_is_described(checkpoint: str) -> None:
     class Looking(EncoderPolicy):
-        def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+        def act(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
             hooked = any(module._forward_pre_hooks for module in self.network.modules())
-            return super().act(seen, seeds) + np.float32(hooked)
+            return super().act(observations, seeds) + np.float32(hooked)
 
     sound = load(checkpoint)
     looking = Looking(sound.network, sound.card)
-    said = reason(looking)
-    assert "while it has hooks" in said
-    assert "keeps state" not in said
+    cause = reason(looking)
+    assert "while it has hooks" in cause
+    assert "keeps state" not in cause

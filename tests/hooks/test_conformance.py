@@ -28,11 +28,11 @@ from probe_kit.hooks.conformance.check import (
     Outcome,
     SkipTest,
     check,
+    expect_refusal,
     package_of,
     place_of,
-    refused,
     require_bits,
-    tried,
+    try_check,
 )
 from probe_kit.hooks.conformance.subject import AnswerSubject, PolicySubject, Subject
 from probe_kit.hooks.families.pi0.adapter import Pi0
@@ -48,7 +48,7 @@ def of(error: BaseException | None) -> Outcome:
         if error is not None:
             raise error
 
-    return tried("name", "A promise.", "Do it.", body, "tests.hooks")
+    return try_check("name", "A promise.", "Do it.", body, "tests.hooks")
 
 
 def test_no_error_is_passed_and_a_skip_has_its_reason() -> None:
@@ -65,10 +65,10 @@ def test_a_failure_has_what_was_seen_expected_and_to_be_changed() -> None:
 
 @pytest.mark.parametrize("error", [ValueError("odd"), SystemExit(3), KeyboardInterrupt("mine"), MemoryError()])
 def test_whatever_an_adapter_raises_is_a_failure_that_names_its_line(error: BaseException) -> None:
-    found = of(error)
-    assert (found.state, found.change) == ("failed", "Do it.")
-    assert "sys.exit(3)" in found.actual or type(error).__name__ in found.actual
-    assert f"{Path(__file__).name}:" in found.actual
+    outcome = of(error)
+    assert (outcome.state, outcome.change) == ("failed", "Do it.")
+    assert "sys.exit(3)" in outcome.actual or type(error).__name__ in outcome.actual
+    assert f"{Path(__file__).name}:" in outcome.actual
 
 
 def test_an_error_of_ours_is_told_whole_with_its_notes() -> None:
@@ -90,14 +90,14 @@ def test_ctrl_c_ends_the_command() -> None:
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background ignores it
     try:
         with pytest.raises(KeyboardInterrupt):
-            tried("name", "A promise.", "Do it.", lambda: os.kill(os.getpid(), signal.SIGINT), "tests")
+            try_check("name", "A promise.", "Do it.", lambda: os.kill(os.getpid(), signal.SIGINT), "tests")
     finally:
         signal.signal(signal.SIGINT, before)
 
 
 def test_what_an_adapter_changed_in_the_process_is_put_back() -> None:
     folder = Path.cwd()
-    tried("name", "A promise.", "Do it.", lambda: os.chdir("/"), "tests")
+    try_check("name", "A promise.", "Do it.", lambda: os.chdir("/"), "tests")
     assert Path.cwd() == folder
 
 
@@ -111,7 +111,7 @@ def test_the_place_is_that_of_the_adapters_own_code() -> None:
     assert f"{Path(__file__).name}:" in place_of(raised.value, __name__)
 
 
-CHECKS = {own.name: own for own in (*POLICY_CHECKS, *ANSWER_CHECKS)}
+CHECKS = {each_check.name: each_check for each_check in (*POLICY_CHECKS, *ANSWER_CHECKS)}
 
 
 @pytest.fixture(autouse=True)
@@ -154,11 +154,11 @@ class Nameless(EncoderPolicy):
 class Turned(EncoderPolicy):
     """Calls the picture words, and the words picture."""
 
-    def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
-        found, other = super().roles(seen), {"image.primary": "language", "language": "image.primary"}
+    def roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
+        roles, other = super().roles(observations), {"image.primary": "language", "language": "image.primary"}
         turned = [Roles(tuple(span._replace(role=other.get(span.role, span.role)) for span in row.spans))
-                  for row in found["backbone"]]  # fmt: skip
-        return {**found, "backbone": turned}
+                  for row in roles["backbone"]]  # fmt: skip
+        return {**roles, "backbone": turned}
 
 
 class Misnamed(EncoderPolicy):
@@ -181,8 +181,8 @@ class Unchecked(EncoderPolicy):
         del site
         return Tap(self.network.velocity, 1)
 
-    def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
-        return super().act(seen, [*seeds, *range(len(seen))][: len(seen)])
+    def act(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+        return super().act(observations, [*seeds, *range(len(observations))][: len(observations)])
 
 
 class Copying(EncoderPolicy):
@@ -195,22 +195,22 @@ class Copying(EncoderPolicy):
 class Drifting(EncoderPolicy):
     calls = count(1)
 
-    def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
-        return super().act(seen, seeds) + np.float32(1e-3 * next(self.calls))
+    def act(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+        return super().act(observations, seeds) + np.float32(1e-3 * next(self.calls))
 
 
 class Drawing(EncoderPolicy):
     """Noise from the global generator."""
 
-    def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
-        return super().act(seen, torch.randint(2**31, (len(seeds),)).tolist())
+    def act(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+        return super().act(observations, torch.randint(2**31, (len(seeds),)).tolist())
 
 
 class Constant(EncoderPolicy):
     """One noise for every seed."""
 
-    def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
-        return super().act(seen, [0] * len(seeds))
+    def act(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+        return super().act(observations, [0] * len(seeds))
 
 
 class Seedless(EncoderPolicy):
@@ -220,15 +220,15 @@ class Seedless(EncoderPolicy):
 
 
 class Doubling(EncoderPolicy):
-    def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
-        return super().act(seen, seeds).astype(np.float64)  # type: ignore[return-value]
+    def act(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+        return super().act(observations, seeds).astype(np.float64)  # type: ignore[return-value]
 
 
 class Mixing(EncoderPolicy):
     """Rows that know of each other."""
 
-    def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
-        actions = super().act(seen, seeds)
+    def act(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+        actions = super().act(observations, seeds)
         return np.asarray(actions + actions.mean(axis=0), np.float32)
 
 
@@ -243,12 +243,14 @@ class Passive(EncoderPolicy):
 
 
 class Otherwise(EncoderPolicy):
-    def infer_without_acting(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
-        return self.act(seen, [seed + 1 for seed in seeds])
+    def infer_without_acting(
+        self, observations: Sequence[Observation], seeds: Sequence[int]
+    ) -> NDArray[np.float32]:
+        return self.act(observations, [seed + 1 for seed in seeds])
 
 
 @pytest.mark.parametrize(
-    ("broken", "name", "said"),
+    ("broken", "name", "reason"),
     [
         (Longer, "every_site_of_every_quantity_fires_as_often_as_promised", "expert"),
         (Narrower, "activations_have_the_shape_of_their_stream", "has the shape"),
@@ -279,12 +281,12 @@ class Otherwise(EncoderPolicy):
     ],
 )
 def test_a_policy_that_breaks_a_promise_fails_its_check(
-    broken: type[EncoderPolicy], name: str, said: str, sound: EncoderPolicy, checkpoint: Path
+    broken: type[EncoderPolicy], name: str, reason: str, sound: EncoderPolicy, checkpoint: Path
 ) -> None:
     good = policy_subject(sound, checkpoint)
     CHECKS[name](good)
     bad = policy_subject(broken(sound.network, sound.card), checkpoint)
-    with pytest.raises((CheckFailedError, probe_kit.ProbeKitError), match=re.escape(said)) as failed:
+    with pytest.raises((CheckFailedError, probe_kit.ProbeKitError), match=re.escape(reason)) as failed:
         CHECKS[name](bad)
     assert isinstance(failed.value, probe_kit.ProbeKitError) or "; change: " in str(failed.value)
 
@@ -307,42 +309,42 @@ class Taking(EncoderPolicy):
 
 
 @pytest.mark.parametrize(
-    ("name", "said"),
+    ("name", "reason"),
     [
         ("heads_make_what_the_output_projection_adds", "are off by"),
         ("attention_patterns_are_the_models_own", "does not give what its heads read"),
     ],
 )
 def test_a_policy_that_taps_other_heads_fails_its_checks(
-    name: str, said: str, pi0_tiny: Pi0, monkeypatch: pytest.MonkeyPatch
+    name: str, reason: str, pi0_tiny: Pi0, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     subject = policy_subject(pi0_tiny)
     CHECKS[name](subject)
     monkeypatch.setattr(pi0_tiny, "__class__", Tapping)
-    with pytest.raises((CheckFailedError, probe_kit.ProbeKitError), match=said):
+    with pytest.raises((CheckFailedError, probe_kit.ProbeKitError), match=reason):
         CHECKS[name](subject)
 
 
 def test_heads_that_are_not_declared_and_not_refused_fail_their_check(
     sound: EncoderPolicy, checkpoint: Path
 ) -> None:
-    own = CHECKS["heads_that_are_not_declared_are_refused_by_name"]
-    own(policy_subject(sound, checkpoint))
+    head_check = CHECKS["heads_that_are_not_declared_are_refused_by_name"]
+    head_check(policy_subject(sound, checkpoint))
     bad = policy_subject(Taking(sound.network, sound.card), checkpoint)
     with pytest.raises(CheckFailedError, match=r"tap\(backbone\.00\.heads\): no error"):
-        own(bad)
+        head_check(bad)
 
 
 def test_a_model_whose_lens_leaves_the_norm_out_fails_its_check(monkeypatch: pytest.MonkeyPatch) -> None:
-    own, vlm = CHECKS["the_last_row_of_the_logit_lens_is_the_output"], registry.load_model("vlm-tiny")
+    lens_check, vlm = CHECKS["the_last_row_of_the_logit_lens_is_the_output"], registry.load_model("vlm-tiny")
     subject = AnswerSubject(model=vlm)
-    own(subject)
+    lens_check(subject)
     right = vlm.unembedding
     assert right is not None
     broken = dataclasses.replace(right, norm=torch.nn.Identity())
     monkeypatch.setattr(type(vlm), "unembedding", property(lambda _: broken))
     with pytest.raises(CheckFailedError, match=r"logits of the last layer of answer differ .*; change: Correct"):
-        own(subject)
+        lens_check(subject)
 
 
 # -- gradients -------------------------------------------------------------------------------------------------
@@ -354,11 +356,13 @@ class Sloped(EncoderPolicy):
     interventions = dataclasses.replace(EncoderPolicy.interventions, gradients=True)
     shift, doubled = 0.0, False
 
-    def differentiable(self, seen: Sequence[Observation], seeds: Sequence[int]) -> Tensor:
-        image = torch.stack([torch.from_numpy(one.image).permute(2, 0, 1) / 255 for one in seen])
-        state = torch.from_numpy(np.stack([one.state for one in seen]))
+    def differentiable(self, observations: Sequence[Observation], seeds: Sequence[int]) -> Tensor:
+        image = torch.stack(
+            [torch.from_numpy(observation.image).permute(2, 0, 1) / 255 for observation in observations]
+        )
+        state = torch.from_numpy(np.stack([observation.state for observation in observations]))
         noise = [torch.randn(CHUNK, 7, generator=torch.Generator().manual_seed(seed)) for seed in seeds]
-        raw = self.network(image, self._letters(seen), state, torch.stack(noise))
+        raw = self.network(image, self._letters(observations), state, torch.stack(noise))
         actions = torch.cat([0.02 * raw[..., :6], raw[..., 6:].sigmoid()], -1) + self.shift
         return 2 * actions - actions.detach() if self.doubled else actions
 
@@ -378,18 +382,18 @@ class Promising(EncoderPolicy):
 
 
 @pytest.mark.parametrize(
-    ("broken", "name", "said"),
+    ("broken", "name", "reason"),
     [
         (Shifted, "actions_with_a_graph_are_the_actions", "actions with a graph are off by 0.001"),
         (Doubled, "gradients_at_sites_are_central_differences", "a gradient of"),
     ],
 )
 def test_gradients_that_are_not_those_of_the_actions_fail_their_check(
-    broken: type[EncoderPolicy], name: str, said: str, sound: EncoderPolicy, checkpoint: Path
+    broken: type[EncoderPolicy], name: str, reason: str, sound: EncoderPolicy, checkpoint: Path
 ) -> None:
     CHECKS[name](policy_subject(Sloped(sound.network, sound.card), checkpoint))
     bad = policy_subject(broken(sound.network, sound.card), checkpoint)
-    with pytest.raises(CheckFailedError, match=re.escape(said)):
+    with pytest.raises(CheckFailedError, match=re.escape(reason)):
         CHECKS[name](bad)
 
 
@@ -421,19 +425,19 @@ def subject_of(loader: str, checkpoint: Path, monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.mark.parametrize(
-    ("name", "said"),
+    ("name", "reason"),
     [
         ("every_file_that_is_read_reaches_the_card", "the same settings after a change of config.json"),
         ("random_twins_differ_by_their_seed_and_repeat_by_it", "one untrained network only"),
     ],
 )
 def test_a_loader_that_breaks_a_promise_fails_its_check(
-    name: str, said: str, checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+    name: str, reason: str, checkpoint: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with subject_of("tests.support.encoder_vla.policy:load", checkpoint, monkeypatch) as good:
         CHECKS[name](good)
     sloppy = subject_of("tests.hooks.test_conformance:load_sloppily", checkpoint, monkeypatch)
-    with sloppy as bad, pytest.raises((CheckFailedError, UsageError), match=said):
+    with sloppy as bad, pytest.raises((CheckFailedError, UsageError), match=reason):
         CHECKS[name](bad)
 
 
@@ -442,29 +446,29 @@ def test_weights_that_are_nearly_the_networks_are_found(
 ) -> None:
     """The loader compares nothing, so that a missing tensor stays as it was drawn."""
 
-    def load_nearly(_: Subject, place: Path) -> EncoderPolicy:
+    def load_nearly(_: Subject, folder: Path) -> EncoderPolicy:
         network = EncoderVLA()
-        network.load_state_dict(load_file(place / "model.safetensors"), strict=False)
+        network.load_state_dict(load_file(folder / "model.safetensors"), strict=False)
         return EncoderPolicy(network.eval(), sound.card)
 
-    own = CHECKS["weights_that_are_not_exactly_the_models_are_refused"]
+    weights_check = CHECKS["weights_that_are_not_exactly_the_models_are_refused"]
     with subject_of("tests.support.encoder_vla.policy:load", checkpoint, monkeypatch) as subject:
-        own(subject)
+        weights_check(subject)
         monkeypatch.setattr(Subject, "load", load_nearly)
         with pytest.raises(CheckFailedError, match="a checkpoint in which a tensor is missing: no error"):
-            own(subject)
+            weights_check(subject)
 
 
 def test_a_recorded_output_that_differs_fails_its_check(golden_pi0: Path, tmp_path: Path) -> None:
     """A reference that lies beside the checkpoint is compared without being asked for."""
-    own, folder = CHECKS["recorded_outputs_are_reproduced"], tmp_path / "reference"
+    output_check, folder = CHECKS["recorded_outputs_are_reproduced"], tmp_path / "reference"
     shutil.copytree(golden_pi0, folder)
-    own(PolicySubject("pi0", folder / "checkpoint"))
+    output_check(PolicySubject("pi0", folder / "checkpoint"))
     with np.load(folder / "reference.npz") as stored:
         arrays = dict(stored)
     np.savez(folder / "reference.npz", **{**arrays, "actions": arrays["actions"] + 1})
     with pytest.raises(CheckFailedError, match="other values of actions;"):
-        own(PolicySubject("pi0", folder / "checkpoint"))
+        output_check(PolicySubject("pi0", folder / "checkpoint"))
 
 
 @pytest.mark.parametrize("family", ["pi0", "smolvla"])
@@ -495,15 +499,15 @@ def test_an_answer_model_without_a_picture_in_it_fails_the_checks_of_pictures() 
 
 def test_the_contracts_name_every_check_once() -> None:
     for checks in (POLICY_CHECKS, ANSWER_CHECKS):
-        assert len(checks) == len({str(own) for own in checks}) > 25
+        assert len(checks) == len({str(listed_check) for listed_check in checks}) > 25
 
 
 def test_every_check_is_a_sentence_with_an_advice() -> None:
-    for own in CHECKS.values():
-        for text in (own.sentence, own.change):
+    for declared_check in CHECKS.values():
+        for text in (declared_check.sentence, declared_check.change):
             assert text.endswith("."), text
             assert text[0].isupper(), text
-        assert len(own.sentence.split()) <= 25
+        assert len(declared_check.sentence.split()) <= 25
 
 
 def test_pytest_is_imported_nowhere() -> None:
@@ -527,12 +531,12 @@ def test_a_failure_carries_the_advice_of_its_check_unless_it_has_its_own() -> No
 
 
 def test_an_error_of_another_kind_is_not_taken_for_a_refusal() -> None:
-    with pytest.raises(CheckFailedError, match="no error; expected: KeyError"), refused("it", KeyError):
+    with pytest.raises(CheckFailedError, match="no error; expected: KeyError"), expect_refusal("it", KeyError):
         pass
-    with pytest.raises(ValueError, match="other"), refused("it", KeyError):
+    with pytest.raises(ValueError, match="other"), expect_refusal("it", KeyError):
         raise ValueError("other")
     unsaid = pytest.raises(CheckFailedError, match="a message about it that says 'name'")
-    with unsaid, refused("it", KeyError, says="name"):
+    with unsaid, expect_refusal("it", KeyError, says="name"):
         raise KeyError("nothing")
 
 

@@ -106,10 +106,10 @@ def test_an_edit_of_the_memory_is_what_every_iteration_reads(pi0_tiny: Pi0, obse
 def test_a_donor_of_another_number_of_tokens_is_refused(pi0_tiny: Pi0, observation: Observation) -> None:
     site = Site("kv", 0, "keys")
     donor = np.zeros((3, 16), np.float32)
-    own = Edit("replace", (site,), vector=vector_hash(donor))
+    replacement = Edit("replace", (site,), vector=vector_hash(donor))
     with (
         pytest.raises(UsageError, match=r"kv\.00\.keys has shape"),
-        apply_edits(pi0_tiny, [own], [observation], {own.vector: donor}),
+        apply_edits(pi0_tiny, [replacement], [observation], {replacement.vector: donor}),
     ):
         pi0_tiny.act([observation], [0])
 
@@ -134,8 +134,8 @@ class Guided(Model):
         self.role_names = {"expert": ("action",)}
         self.select: dict = {}
 
-    def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
-        return {"expert": [Roles.from_labels(["action"] * 4)] * len(seen)}
+    def roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
+        return {"expert": [Roles.from_labels(["action"] * 4)] * len(observations)}
 
     def tap(self, site: Site) -> Tap:
         self.stream_of(site)
@@ -221,16 +221,16 @@ def test_a_quantity_that_was_not_declared_is_refused_by_name() -> None:
 
 
 def test_what_the_card_rules_out_is_refused() -> None:
-    model, seen = Guided(), example_observations(["one", "two"])
-    model.check(seen, [0, 1])
+    model, observations = Guided(), example_observations(["one", "two"])
+    model.check(observations, [0, 1])
     with pytest.raises(ObservationError, match="2 observations but 1 seeds"):
-        model.check(seen, [0])
+        model.check(observations, [0])
     model.card = replace(CARD, batch=1)
     with pytest.raises(ObservationError, match="at most 1"):
-        model.check(seen)
+        model.check(observations)
     model.card = replace(CARD, needs=frozenset({"intrinsics", "camera.wrist"}))
     with pytest.raises(ObservationError, match=r"no camera\.wrist, which guided reads"):
-        model.check(seen[:1])
+        model.check(observations[:1])
 
 
 def test_a_stream_of_an_unknown_part_is_refused_and_old_names_tell_theirs() -> None:
@@ -255,18 +255,18 @@ DECLARED = (
 
 
 def test_texts_become_values_of_the_declared_kind() -> None:
-    given = read_pairs(["size=16", "crop=Yes", "scale=2", "prompt=a=b"])
-    assert check_options("mine", DECLARED, given) == {"size": 16, "crop": True, "scale": 2.0, "prompt": "a=b"}
+    texts = read_pairs(["size=16", "crop=Yes", "scale=2", "prompt=a=b"])
+    assert check_options("mine", DECLARED, texts) == {"size": 16, "crop": True, "scale": 2.0, "prompt": "a=b"}
 
 
 def test_values_that_have_the_kind_already_pass_and_whole_numbers_are_numbers() -> None:
-    found = check_options("mine", DECLARED, {"size": 8, "crop": False, "scale": 3})
-    assert found == {"size": 8, "crop": False, "scale": 3.0}
-    assert type(found["scale"]) is float
+    checked = check_options("mine", DECLARED, {"size": 8, "crop": False, "scale": 3})
+    assert checked == {"size": 8, "crop": False, "scale": 3.0}
+    assert type(checked["scale"]) is float
 
 
 @pytest.mark.parametrize(
-    ("given", "message"),
+    ("options", "message"),
     [
         ({"sice": "8"}, "no model option sice; it has crop, prompt, scale, size. Did you mean size"),
         ({"size": "9"}, "expected one of 8, 16"),
@@ -277,9 +277,9 @@ def test_values_that_have_the_kind_already_pass_and_whole_numbers_are_numbers() 
         ({"prompt": 3}, "expected text"),
     ],
 )
-def test_what_was_not_declared_is_refused(given: dict, message: str) -> None:
+def test_what_was_not_declared_is_refused(options: dict, message: str) -> None:
     with pytest.raises(UsageError, match=message):
-        check_options("mine", DECLARED, given)
+        check_options("mine", DECLARED, options)
 
 
 @pytest.mark.parametrize("pair", ["size", "=8", "  =8"])

@@ -206,15 +206,15 @@ class ReadingPolicy(Policy):
             execute=1,
         )  # fmt: skip
 
-    def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
-        self.check(seen, seeds)
+    def act(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+        self.check(observations, seeds)
         with torch.inference_mode():
-            hidden = [float(self.network(torch.from_numpy(picture_of(one)).float())) for one in seen]
+            hidden = [float(self.network(torch.from_numpy(picture_of(one)).float())) for one in observations]
         return np.array(hidden, np.float32)[:, None, None] * np.ones((1, 1, 7), np.float32)
 
-    def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
+    def roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
         expected = {"backbone": ["image.primary"] * 4, "expert": ["action"]}
-        return {name: [Roles.from_labels(labels)] * len(seen) for name, labels in expected.items()}
+        return {name: [Roles.from_labels(labels)] * len(observations) for name, labels in expected.items()}
 
     def tap(self, site: Site) -> Tap:
         return Tap(self.network.outputs[site.layer], 1)

@@ -26,13 +26,13 @@ REFUSALS = (CheckpointError, WeightsError)
 def copy_of(folder: Path) -> Callable[[Path], Path]:
     """A writer that copies a checkpoint with what lies beside it: sizes and tokenizers of golden references do."""
 
-    def write(place: Path) -> Path:
+    def write(target: Path) -> Path:
         if not folder.is_dir():
             pytest.skip(f"no golden reference at {folder}")
         if folder.name != "checkpoint":
-            return Path(shutil.copytree(folder, place / "checkpoint"))
-        shutil.copytree(folder.parent, place, ignore=shutil.ignore_patterns("*.npz", "*.gz"))
-        return place / "checkpoint"
+            return Path(shutil.copytree(folder, target / "checkpoint"))
+        shutil.copytree(folder.parent, target, ignore=shutil.ignore_patterns("*.npz", "*.gz"))
+        return target / "checkpoint"
 
     return write
 
@@ -104,10 +104,10 @@ def edit_json(checkpoint: Path, change: Callable[[dict[str, Any]], bool]) -> int
     changed = 0
     for file in sorted(checkpoint.rglob("*.json")):
         content = json.loads(file.read_text(encoding="utf-8"))
-        here = sum(change(one) for one in list(mappings(content)))
-        if here:
+        change_count = sum(change(mapping) for mapping in list(mappings(content)))
+        if change_count:
             file.write_text(json.dumps(content), encoding="utf-8")
-        changed += here
+        changed += change_count
     return changed
 
 
@@ -119,9 +119,9 @@ def edit_tensors(
     for file in sorted(checkpoint.rglob("*.safetensors")):
         tensors = load_file(file)
         new = {
-            name: given
+            name: replacement
             for name, old in tensors.items()
-            if only in name and (given := change(name, old)) is not None
+            if only in name and (replacement := change(name, old)) is not None
         }
         if new:
             save_file({**tensors, **new}, file)
@@ -132,7 +132,7 @@ def edit_tensors(
 def test_every_family_of_ours_is_looked_at() -> None:
     from probe_kit.hooks.registry import own_families
 
-    acting = {name for name, one in own_families().items() if one.acts}
+    acting = {name for name, entry in own_families().items() if entry.acts}
     assert acting - {"pi0-tiny-early", "pi0-tiny-state"} == FAMILIES.keys()
 
 
@@ -142,12 +142,12 @@ def test_every_family_of_ours_is_looked_at() -> None:
 def test_weights_of_a_kind_that_nobody_declared_are_refused(
     family: str, checkpoint: Path, kind: torch.dtype
 ) -> None:
-    done: list[str] = []
+    changed_names: list[str] = []
 
     def first(name: str, old: torch.Tensor) -> torch.Tensor | None:
-        if done or not old.is_floating_point() or old.ndim < 2:
+        if changed_names or not old.is_floating_point() or old.ndim < 2:
             return None
-        done.append(name)
+        changed_names.append(name)
         return old.to(kind)
 
     if not edit_tensors(checkpoint, first):
@@ -160,15 +160,15 @@ def test_weights_of_a_kind_that_nobody_declared_are_refused(
 def test_statistics_that_would_change_what_actions_mean_are_refused(
     family: str, checkpoint: Path, spoil: str
 ) -> None:
-    def bounds(one: dict[str, Any]) -> bool:
+    def bounds(mapping: dict[str, Any]) -> bool:
         for low, high in (("q01", "q99"), ("mean", "std")):
-            if isinstance(one.get(low), list) and isinstance(one.get(high), list) and len(one[low]):
+            if isinstance(mapping.get(low), list) and isinstance(mapping.get(high), list) and len(mapping[low]):
                 worse = {
-                    "turned around": (np.asarray(one[high]) + 1, -1 - np.abs(one[high])),
-                    "NaN": (np.asarray(one[low]) * np.nan, np.asarray(one[high])),
-                    "text": (np.full(np.shape(one[low]), "much"), np.asarray(one[high])),
+                    "turned around": (np.asarray(mapping[high]) + 1, -1 - np.abs(mapping[high])),
+                    "NaN": (np.asarray(mapping[low]) * np.nan, np.asarray(mapping[high])),
+                    "text": (np.full(np.shape(mapping[low]), "much"), np.asarray(mapping[high])),
                 }[spoil]
-                one[low], one[high] = (part.tolist() for part in worse)
+                mapping[low], mapping[high] = (part.tolist() for part in worse)
                 return True
         return False
 
@@ -194,10 +194,10 @@ def test_statistics_that_would_change_what_actions_mean_are_refused(
 
 
 def test_counts_without_bound_are_refused_before_anything_is_built(family: str, checkpoint: Path) -> None:
-    def absurd(one: dict[str, Any]) -> bool:
-        found = [name for name in COUNTS if type(one.get(name)) is int]
-        one.update(dict.fromkeys(found, 10**12))
-        return bool(found)
+    def absurd(mapping: dict[str, Any]) -> bool:
+        count_names = [name for name in COUNTS if type(mapping.get(name)) is int]
+        mapping.update(dict.fromkeys(count_names, 10**12))
+        return bool(count_names)
 
     if not edit_json(checkpoint, absurd):
         pytest.skip("its files hold no such count")
@@ -218,7 +218,9 @@ def test_an_index_may_only_name_files_beside_it(tmp_path: Path, name: Any) -> No
 
 def damage(checkpoint: Path, random: Random) -> str:
     """One accident, chosen at random; what it was."""
-    file = random.choice([one for one in sorted(checkpoint.rglob("*")) if one.is_file()])
+    file = random.choice(
+        [checkpoint_file for checkpoint_file in sorted(checkpoint.rglob("*")) if checkpoint_file.is_file()]
+    )
     kinds = ["cut", "flip", "unlink"] + ["deep", "other", "drop", "wrong", "wrong", "wrong"] * (
         file.suffix == ".json"
     )
@@ -237,25 +239,25 @@ def damage(checkpoint: Path, random: Random) -> str:
         )
     else:
         value = json.loads(content)
-        objects = [one for one in mappings(value) if one]
+        objects = [mapping for mapping in mappings(value) if mapping]
         if objects:
-            one = random.choice(objects)
-            key = random.choice(sorted(one))
+            mapping = random.choice(objects)
+            key = random.choice(sorted(mapping))
             if kind == "drop":
-                del one[key]
+                del mapping[key]
             else:
-                one[key] = random.choice(WRONG)
+                mapping[key] = random.choice(WRONG)
             file.write_text(json.dumps(value), encoding="utf-8")
     return f"{kind} {file.name}"
 
 
-def check(family: str, whole: Path, place: Path, seed: int) -> bool:
+def check(family: str, intact: Path, folder: Path, seed: int) -> bool:
     """Whether a damaged copy was refused.
 
     Damage a copy, and find it refused by the names of family and folder, or acting with finite numbers.
     """
-    beside = place / "whole"
-    copy = Path(shutil.copytree(beside, place / str(seed))) / whole.relative_to(beside)
+    original = folder / "whole"
+    copy = Path(shutil.copytree(original, folder / str(seed))) / intact.relative_to(original)
     what = damage(copy, Random(seed))
     refusal, actions = "", np.zeros(1)
     try:
@@ -266,7 +268,7 @@ def check(family: str, whole: Path, place: Path, seed: int) -> bool:
     if refusal:
         assert family in refusal.replace(str(copy), ""), (family, seed, what, refusal)
         assert str(copy) in refusal, (family, seed, what, refusal)
-    shutil.rmtree(place / str(seed))
+    shutil.rmtree(folder / str(seed))
     return bool(refusal)
 
 

@@ -15,7 +15,7 @@ from probe_kit.hooks import load_model
 from probe_kit.hooks.checkpoints.checkpoint import (
     cached_folder,
     hub_files,
-    pinned,
+    pin_revision,
     pinned_commits,
     without_revision,
 )
@@ -31,19 +31,19 @@ REPO, PART = "lab/tiny", "lab/part"
 @pytest.fixture
 def server(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Hub]:
     """A hub with two commits of one model, an empty cache and no token."""
-    with hub() as found:
+    with hub() as endpoint:
         monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", False)
-        monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", found.address)
+        monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", endpoint.address)
         monkeypatch.setattr(
             "huggingface_hub.constants.HUGGINGFACE_CO_URL_TEMPLATE",
-            found.address + "/{repo_id}/resolve/{revision}/{filename}",
+            endpoint.address + "/{repo_id}/resolve/{revision}/{filename}",
         )
-        monkeypatch.setattr("huggingface_hub.hf_api.api.endpoint", found.address)
+        monkeypatch.setattr("huggingface_hub.hf_api.api.endpoint", endpoint.address)
         monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path / "cache"))
         monkeypatch.setattr("huggingface_hub.get_token", lambda: None)
-        found.models[REPO] = {OLD: {"config.json": b'{"age": 1}'}, NEW: {"config.json": b'{"age": 2}'}}
-        found.names[REPO] = {"main": NEW, "v1": OLD, "refs/pr/1": OLD}
-        yield found
+        endpoint.models[REPO] = {OLD: {"config.json": b'{"age": 1}'}, NEW: {"config.json": b'{"age": 2}'}}
+        endpoint.names[REPO] = {"main": NEW, "v1": OLD, "refs/pr/1": OLD}
+        yield endpoint
 
 
 @pytest.fixture
@@ -58,7 +58,7 @@ def offline(monkeypatch: pytest.MonkeyPatch, server: Hub) -> Hub:
 def test_a_revision_names_the_commit_that_is_read(revision: str, age: int) -> None:
     folder = checkpoint_folder(f"{REPO}{revision}")
     assert (folder / "config.json").read_text(encoding="utf-8") == f'{{"age": {age}}}'
-    assert pinned(f"{REPO}{revision}") == f"{REPO}@{NEW if age == 2 else OLD}"
+    assert pin_revision(f"{REPO}{revision}") == f"{REPO}@{NEW if age == 2 else OLD}"
     assert cached_folder(f"{REPO}{revision}") == folder
     assert without_revision(f"{REPO}{revision}") == REPO
     assert hub_files(f"{REPO}{revision}") == ["config.json"]
@@ -81,8 +81,8 @@ def test_a_commit_is_read_again_without_the_network_although_the_branch_went_on(
 def test_the_card_and_a_repetition_have_the_commit(
     server: Hub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made = write_intact(tmp_path / "made")
-    files = {path.name: path.read_bytes() for path in made.iterdir() if path.is_file()}
+    checkpoint = write_intact(tmp_path / "made")
+    files = {path.name: path.read_bytes() for path in checkpoint.iterdir() if path.is_file()}
     server.models[REPO] = {OLD: files, NEW: {"config.json": b"{}"}}
     server.names[REPO] = {"main": OLD}
     card = load_model("pi0", REPO).card
@@ -97,10 +97,10 @@ def vlm_of(folder: Path, field: str, part: str) -> dict[str, bytes]:
     """A checkpoint that names a part of its folder as a repository; returns the part's files, which it loses."""
     config = json.loads((folder / "config.json").read_text(encoding="utf-8"))
     (folder / "config.json").write_text(json.dumps(config | {field: PART}), encoding="utf-8")
-    place = folder / part
-    names = [path for path in place.rglob("*") if path.is_file() and path.suffix != ".safetensors"]
-    files = {path.relative_to(place).as_posix(): path.read_bytes() for path in names}
-    shutil.rmtree(place)
+    part_folder = folder / part
+    names = [path for path in part_folder.rglob("*") if path.is_file() and path.suffix != ".safetensors"]
+    files = {path.relative_to(part_folder).as_posix(): path.read_bytes() for path in names}
+    shutil.rmtree(part_folder)
     return files
 
 
@@ -119,7 +119,11 @@ def base_of(folder: Path, *_: str) -> dict[str, bytes]:
     """The same of an adapter, whose base is a repository; the folder then holds the adapter alone."""
     files = {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
     tensors = load_file(folder / "model.safetensors")
-    name = next(own for own, tensor in tensors.items() if own.endswith("q_proj.weight") and tensor.ndim == 2)
+    name = next(
+        tensor_name
+        for tensor_name, tensor in tensors.items()
+        if tensor_name.endswith("q_proj.weight") and tensor.ndim == 2
+    )
     up, down = torch.zeros(len(tensors[name]), 2), torch.zeros(2, tensors[name].shape[1])
     module = f"base_model.model.{name.removesuffix('.weight')}"
     shutil.rmtree(folder)
@@ -147,10 +151,10 @@ PARTS: dict[str, tuple[str, Callable[..., dict[str, bytes]], str, str, str]] = {
 def test_the_card_has_the_commits_of_the_repositories_that_a_checkpoint_names_and_a_repetition_reads_them(
     kind: str, server: Hub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    family, taken, field, part, changed = PARTS[kind]
+    family, build, field, part, changed = PARTS[kind]
     write, options = WRITERS[family]
     folder = write(tmp_path / "model")
-    files = taken(folder, field, part)
+    files = build(folder, field, part)
     repo = {"default tokenizer": "google/paligemma-3b-pt-224", "a step's tokenizer": "facebook/bart-large"}.get(
         kind, PART
     )
@@ -172,7 +176,7 @@ def test_a_local_folder_with_an_at_sign_is_a_folder(tmp_path: Path, monkeypatch:
     monkeypatch.chdir(tmp_path)
     Path("lab/tiny@v1").mkdir(parents=True)
     assert checkpoint_folder("lab/tiny@v1") == Path("lab/tiny@v1")
-    assert pinned("lab/tiny@v1") == "lab/tiny@v1"
+    assert pin_revision("lab/tiny@v1") == "lab/tiny@v1"
 
 
 def test_labels_name_the_revision_also_one_with_slashes() -> None:
@@ -207,11 +211,11 @@ def test_a_refusal_of_the_hub_keeps_its_reason(
 
 
 def test_a_shard_that_the_repository_lacks_is_named(server: Hub, tmp_path: Path) -> None:
-    made = write_intact(tmp_path / "made")
+    checkpoint = write_intact(tmp_path / "made")
     index = b'{"weight_map": {"a": "model-00001-of-00002.safetensors", "b": "model-00002-of-00002.safetensors"}}'
-    shutil.copy(made / "model.safetensors", made / "model-00001-of-00002.safetensors")
-    (made / "model.safetensors").unlink()
-    files = {path.name: path.read_bytes() for path in made.iterdir() if path.is_file()}
+    shutil.copy(checkpoint / "model.safetensors", checkpoint / "model-00001-of-00002.safetensors")
+    (checkpoint / "model.safetensors").unlink()
+    files = {path.name: path.read_bytes() for path in checkpoint.iterdir() if path.is_file()}
     server.models[REPO][NEW] = {**files, "model.safetensors.index.json": index}
     with pytest.raises(
         WeightsError, match=r"model-00002-of-00002\.safetensors .*are missing.*repository lacks them"
@@ -220,7 +224,7 @@ def test_a_shard_that_the_repository_lacks_is_named(server: Hub, tmp_path: Path)
 
 
 def test_a_folder_called_snapshots_is_not_taken_for_the_cache(tmp_path: Path) -> None:
-    made = write_intact(tmp_path / "snapshots" / "step-100")
-    (made / "model.safetensors").unlink()
+    checkpoint = write_intact(tmp_path / "snapshots" / "step-100")
+    (checkpoint / "model.safetensors").unlink()
     with pytest.raises(WeightsError, match=r"no weights in .*step-100.*Download the checkpoint again"):
-        load_model("pi0", str(made))
+        load_model("pi0", str(checkpoint))

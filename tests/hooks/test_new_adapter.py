@@ -28,7 +28,7 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def ran(folder: Path, *arguments: str) -> str:
-    done = subprocess.run(
+    completed = subprocess.run(
         [sys.executable, "-m", *arguments],
         cwd=folder,
         capture_output=True,
@@ -36,8 +36,8 @@ def ran(folder: Path, *arguments: str) -> str:
         check=False,
         timeout=300,
     )
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
+    assert completed.returncode == 0, completed.stdout + completed.stderr
+    return completed.stdout
 
 
 @pytest.mark.slow
@@ -67,8 +67,8 @@ def test_the_written_family_goes_all_the_way_without_naming_a_folder_twice(
     ran(installed, "my_vla.checkpoint", "checkpoint")
     build_suite(installed / "suite", ["color"], 12, seed=5)
     played = ("--categories", "color", "--max-steps", "2", "--env-workers", "0", "--out", str(tmp_path / "run"))
-    chosen = ("--model", "my-vla", "--checkpoint", "checkpoint", "--suite", "suite")
-    ran(installed, "probe_kit", "extract", *chosen, *played)
+    options = ("--model", "my-vla", "--checkpoint", "checkpoint", "--suite", "suite")
+    ran(installed, "probe_kit", "extract", *options, *played)
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     ran(elsewhere, "probe_kit", "train", "../run", "--permutations", "20")

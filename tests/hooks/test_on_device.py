@@ -27,33 +27,35 @@ OF_LARGEST = 2e-3
 @pytest.mark.parametrize("family", WRITERS)
 def test_a_device_changes_nothing_but_roundings(family: str, device: str, tmp_path: Path) -> None:
     write, options = WRITERS[family]
-    place = str(write(tmp_path / family))
-    here, there = captured(family, place, "cpu", options), captured(family, place, device, options)
-    assert list(there) == list(here)
-    for name, expected in here.items():
+    checkpoint = str(write(tmp_path / family))
+    on_cpu, on_device = captured(family, checkpoint, "cpu", options), captured(family, checkpoint, device, options)
+    assert list(on_device) == list(on_cpu)
+    for name, expected in on_cpu.items():
         largest = np.abs(expected).max()
-        np.testing.assert_allclose(there[name], expected, rtol=0, atol=OF_LARGEST * largest, err_msg=name)
+        np.testing.assert_allclose(on_device[name], expected, rtol=0, atol=OF_LARGEST * largest, err_msg=name)
 
 
-def captured(family: str, place: str, device: str, options: dict[str, Any]) -> dict[str, NDArray[np.float32]]:
+def captured(family: str, checkpoint: str, device: str, options: dict[str, Any]) -> dict[str, NDArray[np.float32]]:
     """Every residual site by name, and what the model put out."""
-    model = load_model(family, place, device, "float32", **options)
+    model = load_model(family, checkpoint, device, "float32", **options)
     assert model.card.device.startswith(device)
     scene = SceneSpec()
     picture, state = np.zeros((*scene.picture_shape, 3), np.uint8), np.zeros(8, np.float32)
-    seen = Observation(picture, state, "Put the cube on the red shape", scene.intrinsics)
-    roles = model.roles([seen]) if isinstance(model, Policy) else {}
+    observation = Observation(picture, state, "Put the cube on the red shape", scene.intrinsics)
+    roles = model.roles([observation]) if isinstance(model, Policy) else {}
     with capture(model, model.sites()) as activations:
         if isinstance(model, Policy):
-            out = model.infer_without_acting([seen], [0])
+            out = model.infer_without_acting([observation], [0])
         else:
             assert isinstance(model, AnswerModel)
-            out = model.read([Prompt(seen, "Which of them is red?", ("a", "b"))]).option_logits
-    found = {str(site): activations[site].float().cpu().numpy() for site in model.sites()}
+            out = model.read([Prompt(observation, "Which of them is red?", ("a", "b"))]).option_logits
+    activations_by_site = {str(site): activations[site].float().cpu().numpy() for site in model.sites()}
     for site in model.sites():
         if site.stream in roles:
             # What padding attends to, where a mask forbids it everything, is the kernel's choice.
-            found[str(site)] = found[str(site)][:, ~roles[site.stream][0].mask("padding")]
+            activations_by_site[str(site)] = activations_by_site[str(site)][
+                :, ~roles[site.stream][0].mask("padding")
+            ]
     del model
     gc.collect()
-    return {**found, "out": np.asarray(out)}
+    return {**activations_by_site, "out": np.asarray(out)}

@@ -60,15 +60,17 @@ FUSED = (
 """Families whose decoder transformers runs with torch's fused attention."""
 
 
-def infer(model: Model, seen: Observation) -> NDArray[np.float32]:
+def infer(model: Model, observation: Observation) -> NDArray[np.float32]:
     if isinstance(model, Policy):
         return (
-            model.act([seen], [3])
+            model.act([observation], [3])
             if model.embodiment_mismatch() is None
-            else model.infer_without_acting([seen], [3])
+            else model.infer_without_acting([observation], [3])
         )
     assert isinstance(model, AnswerModel)
-    return model.read([Prompt(seen, seen.instruction, tuple(f"{model.lead}{own}" for own in "AB"))]).option_logits
+    return model.read(
+        [Prompt(observation, observation.instruction, tuple(f"{model.lead}{letter}" for letter in "AB"))]
+    ).option_logits
 
 
 def attentions_of(model: Any, sites: list[Site]) -> Mapping[Site, Any]:
@@ -78,14 +80,14 @@ def attentions_of(model: Any, sites: list[Site]) -> Mapping[Site, Any]:
     return {site: owner[model.tap(site).module] for site in sites}
 
 
-def returned_weights(model: Model, sites: list[Site], seen: Observation) -> dict[Site, Tensor]:
+def returned_weights(model: Model, sites: list[Site], observation: Observation) -> dict[Site, Tensor]:
     """By site, what plain torch hooks find that eager attention returns beside what it read."""
     with ExitStack() as stack:
-        found = {site: outputs_of(own, stack) for site, own in attentions_of(model, sites).items()}
-        infer(model, seen)
+        outputs = {site: outputs_of(attention, stack) for site, attention in attentions_of(model, sites).items()}
+        infer(model, observation)
     taps = {site: model.tap(site) for site in sites}
     return {
-        site: tap.rows.of(found[site][tap.first + (site.iteration or 0)][1])[:, :, tap.tokens]
+        site: tap.rows.of(outputs[site][tap.first + (site.iteration or 0)][1])[:, :, tap.tokens]
         for site, tap in taps.items()
     }
 
@@ -110,14 +112,14 @@ def test_patterns_of_fused_attention_are_those_of_transformers_eager_attention(
 ) -> None:
     write, options = WRITERS[family]
     model = load_model(family, str(write(tmp_path / "checkpoint")), **options)
-    (seen,) = examples_for(model, "Put the cube on the star")
-    streams = [own for own in model.streams.values() if own.name != "expert"]
-    sites = [site for own in streams for site in own.sites("heads")]
+    (observation,) = examples_for(model, "Put the cube on the star")
+    streams = [stream for stream in model.streams.values() if stream.name != "expert"]
+    sites = [site for stream in streams for site in stream.sites("heads")]
     with capture_patterns(model, sites) as patterns:
-        infer(model, seen)
+        infer(model, observation)
     for attention in attentions_of(model, sites).values():
         attention.config._attn_implementation = "eager"
-    for site, expected in returned_weights(model, sites, seen).items():
+    for site, expected in returned_weights(model, sites, observation).items():
         torch.testing.assert_close(patterns[site], expected.float(), rtol=1e-4, atol=1e-6)
 
 
@@ -126,17 +128,17 @@ def test_patterns_of_fused_attention_are_those_of_transformers_eager_attention(
 def test_patterns_of_half_precision_are_those_of_the_same_weights_in_full(family: str) -> None:
     """Each is checked with the values of its own call, within what half precision rounds."""
     half, full = load_model(family, dtype="bfloat16"), load_model(family, dtype="float32")
-    (seen,) = examples_for(half, "Put the cube on the red shape")
+    (observation,) = examples_for(half, "Put the cube on the red shape")
     sites = half.streams["backbone"].sites("heads")
-    found = []
+    recorded = []
     for model in (half, full):
-        plain = infer(model, seen)
+        plain = infer(model, observation)
         with capture_patterns(model, sites) as patterns:
-            np.testing.assert_array_equal(infer(model, seen), plain)
-        found.append(patterns)
+            np.testing.assert_array_equal(infer(model, observation), plain)
+        recorded.append(patterns)
     for site in sites:
-        assert found[0][site].dtype == torch.float32
-        torch.testing.assert_close(found[0][site], found[1][site], rtol=0, atol=0.05)
+        assert recorded[0][site].dtype == torch.float32
+        torch.testing.assert_close(recorded[0][site], recorded[1][site], rtol=0, atol=0.05)
 
 
 @pytest.mark.slow
@@ -149,13 +151,13 @@ def test_the_acting_streams_patterns_on_the_prompt_are_its_recorded_attention(fa
     write, options = WRITERS[family]
     model = load_model(family, str(write(tmp_path / "checkpoint")), **options)
     assert isinstance(model, Policy)
-    (seen,) = examples_for(model, "Put the cube on the star")
-    (stream,) = (own for own in model.streams.values() if own.part == "action")
+    (observation,) = examples_for(model, "Put the cube on the star")
+    (stream,) = (action_stream for action_stream in model.streams.values() if action_stream.part == "action")
     with capture_patterns(model, stream.sites("heads")) as patterns:
-        infer(model, seen)
+        infer(model, observation)
     with capture_attention(model) as mass:
-        infer(model, seen)
-    roles = model.roles([seen])
+        infer(model, observation)
+    roles = model.roles([observation])
     acting = torch.from_numpy(roles[stream.name][0].mask("action"))
     tokens = len(roles["backbone"][0])
     blocks = sorted({block for block, _ in mass.by_head})
@@ -175,8 +177,8 @@ def test_the_roles_of_what_is_attended_to_are_the_prompts_then_the_acting_stream
     assert len(keys) == len(prompt) + len(suffix) == patterns[site].shape[-1]
     assert (keys.mask("image") == np.append(prompt.mask("image"), np.zeros(len(suffix), bool))).all()
     assert keys.mask("action").sum() == suffix.mask("action").sum()
-    (own,) = attended_roles(pi0_tiny, roles, Site("backbone", 0, "heads"), len(prompt))
-    assert own == prompt
+    (attended,) = attended_roles(pi0_tiny, roles, Site("backbone", 0, "heads"), len(prompt))
+    assert attended == prompt
     with pytest.raises(RolesMismatchError, match=r"attends to 60 positions; backbone has 52 and expert 17"):
         attended_roles(pi0_tiny, roles, site, 60)
     with pytest.raises(RolesMismatchError, match="tokens of vision have no roles"):
@@ -206,16 +208,16 @@ def test_more_than_the_limit_is_refused_with_the_number(pi0_tiny: Pi0, observati
         capture_into(pi0_tiny, sites, observation, most_bytes=100_000)
 
 
-def capture_into(model: Model, sites: list[Site], seen: Observation, most_bytes: int = 10**9) -> None:
+def capture_into(model: Model, sites: list[Site], observation: Observation, most_bytes: int = 10**9) -> None:
     with capture_patterns(model, sites, most_bytes):
-        infer(model, seen)
+        infer(model, observation)
 
 
 def test_a_tap_that_is_not_directly_behind_the_attention_is_an_error(
     pi0_tiny: Pi0, observation: Observation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     site, right = Site("backbone", 1, "heads"), pi0_tiny.tap
-    monkeypatch.setattr(pi0_tiny, "tap", lambda own: right(replace(own, quantity="residual")))
+    monkeypatch.setattr(pi0_tiny, "tap", lambda tap: right(replace(tap, quantity="residual")))
     with pytest.raises(CaptureError, match=r"in front of backbone\.01\.heads does not give what its heads read"):
         capture_into(pi0_tiny, [site], observation)
 
@@ -223,7 +225,7 @@ def test_a_tap_that_is_not_directly_behind_the_attention_is_an_error(
 def test_a_wrong_number_of_heads_is_an_error(
     pi0_tiny: Pi0, observation: Observation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    streams = {name: replace(own, heads=2 * own.heads) for name, own in pi0_tiny.streams.items()}
+    streams = {name: replace(stream, heads=2 * stream.heads) for name, stream in pi0_tiny.streams.items()}
     heads = pi0_tiny.streams["backbone"].heads
     monkeypatch.setattr(pi0_tiny, "streams", streams)
     with pytest.raises(CaptureError, match=rf"has {heads} heads .*; expected {2 * heads} and"):
@@ -257,7 +259,7 @@ def test_rows_that_attend_to_nothing_are_zero_and_a_capture_inside_is_refused(tm
     model = load_model("qwen3-vl", str(WRITERS["qwen3-vl"][0](tmp_path / "checkpoint")))
     assert isinstance(model, AnswerModel)
     short, long = examples_for(model, "Put", "Put the cube on the red shape")
-    questions = [Prompt(own, own.instruction, ("A", "B")) for own in (short, long)]
+    questions = [Prompt(observation, observation.instruction, ("A", "B")) for observation in (short, long)]
     site = Site("backbone", 1, "heads")
     with capture_patterns(model, [site]) as patterns:
         with pytest.raises(CaptureError, match="captured already"), capture(model, [site]):
@@ -283,12 +285,12 @@ def test_every_head_adds_its_columns_of_the_projection_and_all_make_the_attentio
     weight, bias = projection.weight.detach(), projection.bias
     size = weight.shape[1] // heads
     for head in range(heads):
-        own = slice(head * size, (head + 1) * size)
+        columns = slice(head * size, (head + 1) * size)
         torch.testing.assert_close(
-            added[head], activations[site][..., own] @ weight[:, own].T, rtol=1e-4, atol=1e-5
+            added[head], activations[site][..., columns] @ weight[:, columns].T, rtol=1e-4, atol=1e-5
         )
-    whole = added.sum(dim=0) + (0 if bias is None else bias.detach())
-    torch.testing.assert_close(whole, activations[attention], rtol=1e-4, atol=1e-5)
+    summed = added.sum(dim=0) + (0 if bias is None else bias.detach())
+    torch.testing.assert_close(summed, activations[attention], rtol=1e-4, atol=1e-5)
 
 
 def test_a_site_by_name_is_the_same_and_another_quantity_is_refused(
@@ -338,9 +340,9 @@ TEXT = (
 
 @pytest.fixture(scope="module")
 def vlm() -> PaliGemma:
-    found = load_model("vlm-tiny")
-    assert isinstance(found, PaliGemma)
-    return found
+    model = load_model("vlm-tiny")
+    assert isinstance(model, PaliGemma)
+    return model
 
 
 @pytest.fixture

@@ -65,22 +65,24 @@ def test_what_must_be_downloaded_is_said_before_it_is_tried(tmp_path, monkeypatc
 def test_everything_a_family_still_needs_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     """A tokenizer from another repository, a configuration that is no config.json, a package of an extra."""
     monkeypatch.setattr("huggingface_hub.try_to_load_from_cache", lambda *_: None)
-    known = known_families()
+    families = known_families()
     for name, needed in (
         ("pi0", ("juexzz/INTACT-pi0-finetune-bridge", "google/paligemma-3b-pt-224")),
         ("smolvla", ("lerobot/smolvla_base", "HuggingFaceTB/SmolVLM2-500M-Video-Instruct")),
         ("internvla-m1", ("InternRobotics/InternVLA-M1-Pretrain-RT-1-Bridge", "Qwen/Qwen2.5-VL-3B-Instruct")),
         ("xiaomi-r0", ("XiaomiRobotics/Xiaomi-Robotics-0-SimplerEnv-WidowX",)),
     ):
-        assert known[name].missing() == f"download of {', '.join(needed)}"
+        assert families[name].missing() == f"download of {', '.join(needed)}"
     monkeypatch.setattr("probe_kit.hooks.family.find_spec", lambda _: None)
-    released, *towers_and_text = known["prismatic"].missing().split(", ")
+    released, *towers_and_text = families["prismatic"].missing().split(", ")
     assert released == "extra openvla and download of TRI-ML/prismatic-vlms/prism-dinosiglip-224px+7b"
     assert [name.partition("/")[0] for name in towers_and_text] == ["timm", "timm", "openvla"]
-    assert known["magma"].missing() == "extra magma and download of microsoft/Magma-8B"
-    there = ("InternRobotics/InternVLA-M1-Pretrain-RT-1-Bridge", "config.yaml")
-    monkeypatch.setattr("huggingface_hub.try_to_load_from_cache", lambda *asked: "x" if asked == there else None)
-    assert known["internvla-m1"].missing() == "download of Qwen/Qwen2.5-VL-3B-Instruct"
+    assert families["magma"].missing() == "extra magma and download of microsoft/Magma-8B"
+    hub_file = ("InternRobotics/InternVLA-M1-Pretrain-RT-1-Bridge", "config.yaml")
+    monkeypatch.setattr(
+        "huggingface_hub.try_to_load_from_cache", lambda *request: "x" if request == hub_file else None
+    )
+    assert families["internvla-m1"].missing() == "download of Qwen/Qwen2.5-VL-3B-Instruct"
 
 
 def test_the_seven_models_of_the_papers_tables_can_be_loaded_by_name() -> None:
@@ -100,9 +102,9 @@ def test_a_third_partys_family_that_breaks_is_named_and_takes_no_other_with_it(
     entry = SimpleNamespace(load=load, name="broken", value="theirs:FAMILY", dist=None)
     monkeypatch.setattr(registry, "family_entries", lambda: [entry])
     with pytest.warns(registry.BrokenFamilyWarning, match=f"'broken'.*{type(error).__name__}"):
-        known = known_families()
-    assert "pi0-tiny" in known
-    assert "broken" not in known
+        families = known_families()
+    assert "pi0-tiny" in families
+    assert "broken" not in families
     with pytest.raises(UnknownModelError, match=f"'broken'.*{type(error).__name__}"):
         load_policy("broken")
 

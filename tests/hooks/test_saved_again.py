@@ -23,7 +23,7 @@ from probe_kit.errors import CheckpointError, InstructionError, WeightsError
 from probe_kit.hooks import Observation, Prompt, load_model
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.families.shared.vlm import Prefill
-from probe_kit.models.checkpoint_files import LANGUAGE_FIRST, SIGLIP_TOWER, picture_values, renamed
+from probe_kit.models.checkpoint_files import LANGUAGE_FIRST, SIGLIP_TOWER, picture_values, rename_tensor
 from tests.support import saved_again
 from tests.support.every_checkpoint import WRITERS, families
 from tests.support.saved_again import CLASSES, LAYOUTS, copied, join_processor, rename_weights
@@ -83,7 +83,7 @@ def test_names_of_a_module_stay_as_they_are() -> None:
         "model.vision_tower.vision_model.encoder.layers.1.mlp.fc1.bias",
         "model.multi_modal_projector.linear.weight",
     ):
-        assert renamed(name, (*LANGUAGE_FIRST, *SIGLIP_TOWER)) == name
+        assert rename_tensor(name, (*LANGUAGE_FIRST, *SIGLIP_TOWER)) == name
 
 
 def test_a_tensor_that_another_naming_lacks_is_still_missed_by_name(tmp_path: Path) -> None:
@@ -128,22 +128,22 @@ def test_where_two_files_have_pictures_the_one_counts_that_transformers_reads(fi
     other = copied(folder, tmp_path / "other") / "preprocessor_config.json"
     values = json.loads(other.read_text(encoding="utf-8"))
     changed = {**values, "image_mean": [0.25, 0.5, 0.75]}
-    own, beside = (changed, values) if first == "processor_config.json" else (values, changed)
-    (folder / "processor_config.json").write_text(json.dumps({"image_processor": own}), encoding="utf-8")
-    (folder / "preprocessor_config.json").write_text(json.dumps(beside), encoding="utf-8")
+    used, unused = (changed, values) if first == "processor_config.json" else (values, changed)
+    (folder / "processor_config.json").write_text(json.dumps({"image_processor": used}), encoding="utf-8")
+    (folder / "preprocessor_config.json").write_text(json.dumps(unused), encoding="utf-8")
 
     model = load_model("qwen3-vl", str(folder))
 
     expected = Qwen2VLImageProcessor.from_pretrained(str(folder)).image_mean
-    assert model.pictures.settings["image_mean"] == list(expected) == own["image_mean"]
+    assert model.pictures.settings["image_mean"] == list(expected) == used["image_mean"]
     assert any("preprocessor_config.json beside it has another image_mean" in note for note in model.card.notes)
 
 
 def test_equal_settings_in_two_files_are_no_conflict(tmp_path: Path) -> None:
     folder = copied(written("paligemma", tmp_path), tmp_path / "both")
     values = json.loads((folder / "preprocessor_config.json").read_text(encoding="utf-8"))
-    named = {"image_processor": {**values, "image_processor_type": "SiglipImageProcessor"}}
-    (folder / "processor_config.json").write_text(json.dumps(named), encoding="utf-8")
+    settings = {"image_processor": {**values, "image_processor_type": "SiglipImageProcessor"}}
+    (folder / "processor_config.json").write_text(json.dumps(settings), encoding="utf-8")
     assert not any("pictures" in note for note in load_model("paligemma", str(folder)).card.notes)
 
 
@@ -264,9 +264,9 @@ def save_adapter(tuned: Any, folder: Path, base: Path) -> Path:
 def peft_logits(model: Any, network: Any) -> NDArray[Any]:
     """The logits of what peft loaded, for the question as the adapter's own model packs it."""
     packed, pictures = model.packed([model.prompt(QUESTION)]), model.picture_inputs([PICTURE])
-    further = {**pictures, **model.other_inputs(packed)}
+    other_inputs = {**pictures, **model.other_inputs(packed)}
     with torch.inference_mode():
-        return Prefill.of(network.eval(), packed, model.positions(packed, pictures), further).logits.numpy()
+        return Prefill.of(network.eval(), packed, model.positions(packed, pictures), other_inputs).logits.numpy()
 
 
 EMBEDDINGS: dict[str, Mapping[str, Any]] = {
@@ -298,9 +298,9 @@ def test_an_adapter_of_tied_embeddings_answers_as_peft_does_without_merging(kind
     folder = save_adapter(tuned_paligemma(base, **EMBEDDINGS[kind]), tmp_path / "tuned", base)
     model = load_model("paligemma", str(folder))
     loaded = PeftModel.from_pretrained(PaliGemmaForConditionalGeneration.from_pretrained(base), folder)
-    found = model.prefill([QUESTION]).logits.numpy()
-    np.testing.assert_allclose(found, peft_logits(model, loaded), atol=2e-5)
-    assert np.abs(found - outputs("paligemma", base)).max() > 0.01
+    logits = model.prefill([QUESTION]).logits.numpy()
+    np.testing.assert_allclose(logits, peft_logits(model, loaded), atol=2e-5)
+    assert np.abs(logits - outputs("paligemma", base)).max() > 0.01
     assert ("no longer tied" in model.card.audit["adapter"]) == (
         kind not in ("both, tied", "biases", "some layers")
     )
@@ -360,15 +360,15 @@ def newest(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("newest")
     uv = shutil.which("uv") or next(map(str, Path(__file__).parents[2].glob(".uv/bin/uv")), None)
     pip = [uv, "pip", "install", "--python", sys.executable] if uv else [sys.executable, "-m", "pip", "install"]
-    done = subprocess.run(
+    completed = subprocess.run(
         [*pip, "--no-deps", "--target", str(folder), *NEWEST],
         capture_output=True,
         text=True,
         check=False,
         encoding="utf-8",
     )
-    if done.returncode:
-        reason = (done.stderr.strip().splitlines() or ["no message"])[-1]
+    if completed.returncode:
+        reason = (completed.stderr.strip().splitlines() or ["no message"])[-1]
         pytest.skip(f"{' and '.join(NEWEST)} cannot be installed: {reason}")
     return folder
 
@@ -400,7 +400,7 @@ def _run(jobs: list[tuple[str, ...]], transformers: Path | None, root: Path) -> 
     file = root / "jobs.json"
     file.write_text(json.dumps(jobs), encoding="utf-8")
     path = {} if transformers is None else {"PYTHONPATH": str(transformers)}
-    done = subprocess.run(
+    completed = subprocess.run(
         [sys.executable, saved_again.__file__, str(file)],
         env={**os.environ, "HF_HUB_OFFLINE": "1", "TRANSFORMERS_VERBOSITY": "error", **path},
         capture_output=True,
@@ -408,7 +408,7 @@ def _run(jobs: list[tuple[str, ...]], transformers: Path | None, root: Path) -> 
         check=False,
         encoding="utf-8",
     )
-    assert done.returncode == 0, done.stderr[-3000:]
+    assert completed.returncode == 0, completed.stderr[-3000:]
 
 
 def names_in(folder: Path) -> set[str]:
@@ -442,9 +442,9 @@ def test_what_transformers_saved_again_gives_the_same_answers(
 @pytest.mark.parametrize("family", list(CLASSES))
 def test_an_adapter_and_its_merge_by_peft_give_the_same_answers(family: str, saved: tuple[str, Path]) -> None:
     folder = saved[1] / family
-    found = outputs(family, folder / "lora")
-    np.testing.assert_array_equal(found, outputs(family, folder / "lora-merged"))
-    assert np.abs(found - outputs(family, folder / "released")).max() > 0.001
+    adapter_outputs = outputs(family, folder / "lora")
+    np.testing.assert_array_equal(adapter_outputs, outputs(family, folder / "lora-merged"))
+    assert np.abs(adapter_outputs - outputs(family, folder / "released")).max() > 0.001
 
 
 @pytest.mark.slow

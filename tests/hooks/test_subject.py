@@ -32,8 +32,8 @@ def _listed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(registry, "family_entries", lambda: [entry])
 
 
-def of(checkpoint: Path | None = None, **told: Any) -> Subject:
-    return PolicySubject("mine", checkpoint, **told)
+def of(checkpoint: Path | None = None, **fields: Any) -> Subject:
+    return PolicySubject("mine", checkpoint, **fields)
 
 
 def test_other_values_are_known_of_switches_and_lists_and_where_they_are_told() -> None:
@@ -55,8 +55,8 @@ def test_a_checkpoint_that_is_too_large_to_copy_is_skipped(
 
 
 def test_what_was_written_is_removed() -> None:
-    with of() as own:
-        first, second = own.folder, own.folder
+    with of() as written_subject:
+        first, second = written_subject.folder, written_subject.folder
         assert first != second
         assert not any(first.iterdir())
     assert not first.exists()
@@ -64,9 +64,9 @@ def test_what_was_written_is_removed() -> None:
 
 
 def test_the_instructions_differ_in_length_and_some_are_alike() -> None:
-    own = of(model=SimpleNamespace(card=SimpleNamespace(needs=frozenset())))
-    assert len({len(one.instruction) for one in own.observations}) == 2
-    assert len({len(one.instruction) for one in own.alike}) < len(own.alike)
+    any_subject = of(model=SimpleNamespace(card=SimpleNamespace(needs=frozenset())))
+    assert len({len(observation.instruction) for observation in any_subject.observations}) == 2
+    assert len({len(observation.instruction) for observation in any_subject.alike}) < len(any_subject.alike)
 
 
 @pytest.mark.parametrize("instruction", [INSTRUCTIONS[0], "grasp it", "stop"])

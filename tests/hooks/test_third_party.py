@@ -50,8 +50,8 @@ def plant(folder: Path, marker: Path, names: Sequence[str], unknown_classes: boo
     classes that transformers does not have, for which it asks whether to run the code.
     """
     code = f"open({str(marker)!r}, 'w').close()\nclass Thing: pass\n"
-    made = {path.parent / TOKENIZER[0] for path in folder.rglob("tokenizer.json")}
-    files = {path for path in (*folder.rglob("*.json"), *made) if path.name in names}
+    tokenizer_files = {path.parent / TOKENIZER[0] for path in folder.rglob("tokenizer.json")}
+    files = {path for path in (*folder.rglob("*.json"), *tokenizer_files) if path.name in names}
     for path in files:
         content = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
         entry = dict.fromkeys(AUTO_CLASSES, "evil.Thing") | {"AutoTokenizer": ["evil.Thing", "evil.Thing"]}

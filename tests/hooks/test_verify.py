@@ -78,8 +78,10 @@ def verified(folder: str) -> Verification:
 def test_every_recorded_quantity_is_reproduced(folder: str) -> None:
     verification, count = verified(folder), REFERENCES[folder][1]
     assert verification.passed
-    assert {own.output for own in verification.comparisons if own.status != "ok"} == UNPRODUCED.get(folder, set())
-    assert sum(own.status == "ok" for own in verification.comparisons) == count
+    assert {
+        comparison.output for comparison in verification.comparisons if comparison.status != "ok"
+    } == UNPRODUCED.get(folder, set())
+    assert sum(comparison.status == "ok" for comparison in verification.comparisons) == count
 
 
 @pytest.mark.slow
@@ -89,17 +91,20 @@ def test_a_wrong_number_in_any_quantity_is_noticed(folder: str, tmp_path: Path) 
     copy = Path(shutil.copytree(GOLDEN / folder, tmp_path / "reference"))
     with np.load(copy / "reference.npz") as arrays:
         recorded = {name: arrays[name] for name in arrays.files}
-    compared = {own.output for own in verified(folder).comparisons if own.status == "ok"}
+    compared = {comparison.output for comparison in verified(folder).comparisons if comparison.status == "ok"}
     changed = sorted(compared & recorded.keys() - MASKS)
     for name in changed:
         values = recorded[name] = np.atleast_1d(recorded[name])
         worst = np.abs(values[np.isfinite(values)].astype(np.float64)).max(initial=0)
         for end in (0, -1):
-            place = (end,) * values.ndim
-            values[place] = values[place] + 0.01 * (1 + worst) if values.dtype.kind == "f" else 1 - values[place]
+            index = (end,) * values.ndim
+            values[index] = values[index] + 0.01 * (1 + worst) if values.dtype.kind == "f" else 1 - values[index]
     recorded["something_else"] = np.zeros(1)
     np.savez(copy / "reference.npz", **recorded)
-    status = {own.output: own.status for own in verify_reference(REFERENCES[folder][0], copy).comparisons}
+    status = {
+        comparison.output: comparison.status
+        for comparison in verify_reference(REFERENCES[folder][0], copy).comparisons
+    }
     assert [name for name in changed if status[name] != "over"] == []
     assert status["something_else"] == "not compared"
 
@@ -133,8 +138,10 @@ def test_the_tensors_take_as_many_bytes_as_the_published_file(
     """In GB, as the pages of the hub round it. twice: a name of tied embeddings that a file leaves out."""
     content = json.loads(gzip.decompress((GOLDEN / folder / "real_keys.json.gz").read_bytes()))["keys"]
     assert not twice or twice in content
-    held = [prod(own["shape"]) * BYTES[own["dtype"]] for name, own in content.items() if name != twice]
-    assert share * sum(held) / 1e9 == pytest.approx(published, abs=0.06 if published > 10 else 0.006)
+    tensor_bytes = [
+        prod(header["shape"]) * BYTES[header["dtype"]] for name, header in content.items() if name != twice
+    ]
+    assert share * sum(tensor_bytes) / 1e9 == pytest.approx(published, abs=0.06 if published > 10 else 0.006)
 
 
 @pytest.fixture(params=["pi0", "smolvla"])
@@ -171,8 +178,8 @@ def test_a_reference_that_asks_for_a_password_is_refused_by_name(tmp_path: Path)
 def test_nan_and_another_shape_are_never_ok() -> None:
     recorded = {"a": np.zeros(3), "b": np.zeros(3), "c": np.zeros(3), "in_x": np.zeros(1)}
     produced = {"a": lambda: np.array([0, np.nan, 0]), "b": lambda: np.zeros(4)}
-    found = {c.output: c.status for c in compare(recorded, Outputs(produced))}
-    assert found == {"a": "over", "b": "over", "c": "not compared"}
+    status_by_output = {c.output: c.status for c in compare(recorded, Outputs(produced))}
+    assert status_by_output == {"a": "over", "b": "over", "c": "not compared"}
 
 
 def test_a_reference_without_its_questions_is_refused(golden_vlm: Path, tmp_path: Path) -> None:
@@ -185,8 +192,8 @@ def test_a_reference_without_its_questions_is_refused(golden_vlm: Path, tmp_path
 def write_keys(source: Path, file: Path, gone: tuple[str, ...] = (), **added: object) -> Path:
     """Write a recorded list without some tensors and with others."""
     keys = json.loads(gzip.decompress(source.read_bytes()))["keys"]
-    kept = {name: entry for name, entry in keys.items() if name not in gone}
-    file.write_text(json.dumps({"keys": kept | added}), encoding="utf-8")
+    remaining = {name: entry for name, entry in keys.items() if name not in gone}
+    file.write_text(json.dumps({"keys": remaining | added}), encoding="utf-8")
     return file
 
 

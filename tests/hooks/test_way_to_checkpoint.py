@@ -30,7 +30,7 @@ PI0, OTHER = {"type": "pi0"}, {"type": "act"}
 
 
 @pytest.mark.parametrize(
-    ("files", "first", "further"),
+    ("files", "first", "alternatives"),
     [
         ({"checkpoints/000100/pretrained_model/config.json": PI0}, "checkpoints/000100/pretrained_model", []),
         (
@@ -46,19 +46,19 @@ PI0, OTHER = {"type": "pi0"}, {"type": "act"}
     ids=["lerobot", "numbers", "transformers", "another type", "adapter", "beside openpi's"],
 )
 def test_the_latest_checkpoint_of_the_type_below_is_named_first(
-    files: dict[str, Any], first: str, further: list[str], tmp_path: Path
+    files: dict[str, Any], first: str, alternatives: list[str], tmp_path: Path
 ) -> None:
     folder = write(tmp_path / "train", files)
-    more = f" (or {', '.join(str(folder / name) for name in further)})" if further else ""
+    more = f" (or {', '.join(str(folder / name) for name in alternatives)})" if alternatives else ""
     assert said_of(folder).endswith(f". One lies in it: pass --checkpoint {folder / first}{more}")
 
 
 def test_the_link_to_the_last_checkpoint_counts_once_and_first(tmp_path: Path) -> None:
     folder = write(tmp_path / "train", {f"checkpoints/{step}/config.json": PI0 for step in ("100", "200")})
     (folder / "checkpoints" / "last").symlink_to("200")
-    said = said_of(folder)
-    assert f"pass --checkpoint {folder / 'checkpoints' / 'last'} (or {folder / 'checkpoints' / '100'})" in said
-    assert str(folder / "checkpoints" / "200") not in said
+    advice = said_of(folder)
+    assert f"pass --checkpoint {folder / 'checkpoints' / 'last'} (or {folder / 'checkpoints' / '100'})" in advice
+    assert str(folder / "checkpoints" / "200") not in advice
 
 
 def test_the_model_beside_the_state_of_its_training_is_named(tmp_path: Path) -> None:
@@ -78,9 +78,9 @@ def test_the_model_beside_the_state_of_its_training_is_named(tmp_path: Path) -> 
     ],
 )  # fmt: skip
 def test_a_folder_of_openpi_is_named_as_such(files: dict[str, Any], layout: str, tmp_path: Path) -> None:
-    said = said_of(write(tmp_path / "ours", files))
-    assert f"This is {layout}" in said
-    assert "take a checkpoint that lerobot-train saved" in said
+    advice = said_of(write(tmp_path / "ours", files))
+    assert f"This is {layout}" in advice
+    assert "take a checkpoint that lerobot-train saved" in advice
 
 
 @pytest.mark.parametrize(

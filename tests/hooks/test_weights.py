@@ -81,9 +81,9 @@ def test_a_dead_output_head_may_be_absent_and_is_listed(checkpoint: Path) -> Non
 
 
 def test_shards_load_like_one_file(checkpoint: Path) -> None:
-    whole = Pi0.load(str(checkpoint)).card
+    card = Pi0.load(str(checkpoint)).card
     shard(checkpoint)
-    assert Pi0.load(str(checkpoint)).card.weights_sha256 == whole.weights_sha256
+    assert Pi0.load(str(checkpoint)).card.weights_sha256 == card.weights_sha256
 
 
 def test_a_missing_shard_is_named(checkpoint: Path) -> None:
@@ -163,18 +163,18 @@ def test_a_loaded_policy_is_in_eval_mode(checkpoint: Path) -> None:
 
 
 def test_a_pickled_state_dict_is_read_without_running_code(checkpoint: Path, tmp_path: Path) -> None:
-    whole = Pi0.load(str(checkpoint)).card.weights_sha256
+    plain_hash = Pi0.load(str(checkpoint)).card.weights_sha256
     tensors = load_file(checkpoint / WEIGHTS_FILE)
     (checkpoint / WEIGHTS_FILE).unlink()
     torch.save(tensors, checkpoint / "model.pt")
-    assert Pi0.load(str(checkpoint)).card.weights_sha256 == whole
+    assert Pi0.load(str(checkpoint)).card.weights_sha256 == plain_hash
     torch.save({"trap": Path(tmp_path)}, checkpoint / "model.pt")
     with pytest.raises(WeightsError, match="plain tensors"):
         Pi0.load(str(checkpoint))
 
 
 @pytest.mark.parametrize(
-    ("before", "told"),
+    ("before", "prefix"),
     [
         ("_orig_mod.", "_orig_mod."),
         ("module.", "module."),
@@ -183,10 +183,10 @@ def test_a_pickled_state_dict_is_read_without_running_code(checkpoint: Path, tmp
         ("agent.policy.", "agent.policy."),
     ],
 )
-def test_a_name_in_front_of_all_tensors_is_told(checkpoint: Path, before: str, told: str) -> None:
+def test_a_name_in_front_of_all_tensors_is_told(checkpoint: Path, before: str, prefix: str) -> None:
     tensors = {before + name: tensor for name, tensor in load_file(checkpoint / WEIGHTS_FILE).items()}
     save_file(tensors, checkpoint / WEIGHTS_FILE)
-    with pytest.raises(WeightsError, match=f"names hold '{told}'.*save its tensors again without") as caught:
+    with pytest.raises(WeightsError, match=f"names hold '{prefix}'.*save its tensors again without") as caught:
         Pi0.load(str(checkpoint))
     assert "missing" not in str(caught.value)
 
@@ -223,9 +223,9 @@ PLACE = "model.paligemma_with_expert.gemma_expert.model.layers.0.self_attn.q_pro
 
 def network_of(model: Any) -> nn.Module:
     """The module whose tensors were audited."""
-    found = getattr(model, "network", None)
-    assert isinstance(found, nn.Module)
-    return found
+    network = getattr(model, "network", None)
+    assert isinstance(network, nn.Module)
+    return network
 
 
 def without_weights(base: Path, folder: Path) -> Path:
@@ -286,12 +286,12 @@ def test_an_adapter_is_added_to_the_weights_of_the_base_in_every_family(family: 
     plain = load_model(family, str(base), **options)
     before = {name: tensor.clone() for name, tensor in network_of(plain).state_dict().items()}
     module = last_linear(network_of(plain))
-    own = factors(module, before[f"{module}.weight"])
-    tuned = write_adapter(without_weights(base, tmp_path / "tuned"), own, str(base))
+    adapter_factors = factors(module, before[f"{module}.weight"])
+    tuned = write_adapter(without_weights(base, tmp_path / "tuned"), adapter_factors, str(base))
 
     model = load_model(family, str(tuned), **options)
 
-    down, up = own.values()
+    down, up = adapter_factors.values()
     changed = {
         name: tensor
         for name, tensor in network_of(model).state_dict().items()
@@ -317,11 +317,11 @@ def weights_of(base: Path) -> dict[str, torch.Tensor]:
 
 def test_the_hash_covers_the_base_the_factors_and_how_they_are_scaled(folders: tuple[Path, Path]) -> None:
     base, tuned = folders
-    own = factors(PLACE, weights_of(base)[f"{PLACE}.weight"])
+    adapter_factors = factors(PLACE, weights_of(base)[f"{PLACE}.weight"])
     other = factors(PLACE, weights_of(base)[f"{PLACE}.weight"], seed=1)
     hashes = [
         load_model("pi0", str(write_adapter(tuned, tensors, "../base", lora_alpha=alpha))).card.weights_sha256
-        for tensors, alpha in ((own, 6), (own, 7), (other, 6), (own, 6))
+        for tensors, alpha in ((adapter_factors, 6), (adapter_factors, 7), (other, 6), (adapter_factors, 6))
     ]
     assert len(set(hashes)) == 3
     assert hashes[0] == hashes[3]
@@ -349,21 +349,21 @@ def test_the_other_ways_of_scaling_give_what_peft_computes(
         json.dumps({**settings, "base_model_name_or_path": "../base"}), encoding="utf-8"
     )
     expected = wrapped.merge_and_unload().get_submodule(PLACE).weight
-    found = load_model("pi0", str(tuned)).network.get_submodule(PLACE).weight
-    torch.testing.assert_close(found, expected.detach())
-    assert not torch.allclose(found, weights_of(base)[f"{PLACE}.weight"])
+    weight = load_model("pi0", str(tuned)).network.get_submodule(PLACE).weight
+    torch.testing.assert_close(weight, expected.detach())
+    assert not torch.allclose(weight, weights_of(base)[f"{PLACE}.weight"])
 
 
 def test_a_layer_that_was_trained_whole_replaces_the_bases(folders: tuple[Path, Path]) -> None:
     base, tuned = folders
-    whole = torch.full_like(weights_of(base)["model.state_proj.weight"], 0.25)
+    trained_layer = torch.full_like(weights_of(base)["model.state_proj.weight"], 0.25)
     tensors = {
         **factors(PLACE, weights_of(base)[f"{PLACE}.weight"]),
-        "base_model.model.model.state_proj.weight": whole,
+        "base_model.model.model.state_proj.weight": trained_layer,
         "base_model.model.model.state_proj.bias": weights_of(base)["model.state_proj.bias"],
     }
     write_adapter(tuned, tensors, "../base", modules_to_save=["state_proj"])
-    assert torch.equal(load_model("pi0", str(tuned)).network.model.state_proj.weight, whole)
+    assert torch.equal(load_model("pi0", str(tuned)).network.model.state_proj.weight, trained_layer)
 
 
 def test_an_adapter_of_todays_names_fits_a_base_of_older_ones(folders: tuple[Path, Path]) -> None:
@@ -373,8 +373,8 @@ def test_an_adapter_of_todays_names_fits_a_base_of_older_ones(folders: tuple[Pat
              for name, t in stored.items()}  # fmt: skip
     assert older.keys() != stored.keys()
     module = "model.paligemma_with_expert.paligemma.model.language_model.layers.0.self_attn.q_proj"
-    own = factors(module, stored[f"{module}.weight"])
-    write_adapter(tuned, own, "../base")
+    adapter_factors = factors(module, stored[f"{module}.weight"])
+    write_adapter(tuned, adapter_factors, "../base")
     first = load_model("pi0", str(tuned)).network.get_submodule(module).weight
     save_file(older, base / "model.safetensors")
     assert torch.equal(load_model("pi0", str(tuned)).network.get_submodule(module).weight, first)
@@ -483,14 +483,14 @@ def test_an_adapter_alone_is_its_base_plus_what_it_learned_in_every_family(famil
     base = write(tmp_path / "base")
     plain = load_model(family, str(base), **options)
     module = last_linear(network_of(plain))
-    own = factors(module, network_of(plain).state_dict()[f"{module}.weight"])
-    beside = write_adapter(without_weights(base, tmp_path / "beside"), own, str(base))
+    adapter_factors = factors(module, network_of(plain).state_dict()[f"{module}.weight"])
+    adapter = write_adapter(without_weights(base, tmp_path / "beside"), adapter_factors, str(base))
     (tmp_path / "alone").mkdir()
-    alone = write_adapter(tmp_path / "alone", own, str(base))
+    alone = write_adapter(tmp_path / "alone", adapter_factors, str(base))
 
     card = load_model(family, str(alone), **options).card
 
-    expected = load_model(family, str(beside), **options).card
+    expected = load_model(family, str(adapter), **options).card
     assert card.weights_sha256 == expected.weights_sha256 != plain.card.weights_sha256
     assert card.settings == expected.settings
     assert card.checkpoint == str(alone)
@@ -503,9 +503,9 @@ def test_an_adapter_alone_is_its_base_plus_what_it_learned_in_every_family(famil
 def doubled(values: Any) -> Any:
     """The same JSON with every number of a statistic twice as large."""
     if isinstance(values, dict):
-        return {name: own if name == "mask" else doubled(own) for name, own in values.items()}
+        return {name: value if name == "mask" else doubled(value) for name, value in values.items()}
     if isinstance(values, list):
-        return [doubled(own) for own in values]
+        return [doubled(value) for value in values]
     return values * 2 if isinstance(values, float) else values
 
 
@@ -561,7 +561,7 @@ def test_tensors_of_processors_in_the_folder_of_an_adapter_replace_its_bases(
     first = chunk(family, base, options)
     alone = without_effect(family, base, tmp_path / "alone", options)
     (file,) = base.glob("policy_postprocessor*.safetensors")
-    save_file({name: 2 * own if own.is_floating_point() else own for name, own in load_file(file).items()},
+    save_file({name: 2 * data if data.is_floating_point() else data for name, data in load_file(file).items()},
               alone / file.name)  # fmt: skip
     if with_steps:
         shutil.copy(base / "policy_postprocessor.json", alone)
@@ -571,22 +571,22 @@ def test_tensors_of_processors_in_the_folder_of_an_adapter_replace_its_bases(
 def chunk(family: str, folder: Path, options: dict[str, Any]) -> Any:
     """The first three numbers of the actions of one inference."""
     policy = load_policy(family, str(folder), **options)
-    seen = Observation(
+    observation = Observation(
         image=np.full((64, 64, 3), 90, np.uint8),
         state=np.zeros(8, np.float32),
         instruction="red",
         intrinsics=np.array([[60, 0, 32], [0, 60, 32], [0, 0, 1]], np.float32),
     )
-    return policy.act([seen], [3])[..., :3]
+    return policy.act([observation], [3])[..., :3]
 
 
 def without_effect(family: str, base: Path, folder: Path, options: dict[str, Any]) -> Path:
     """An adapter alone whose factors add nothing."""
     plain = load_model(family, str(base), **options)
     module = last_linear(network_of(plain))
-    own = factors(module, network_of(plain).state_dict()[f"{module}.weight"])
+    adapter_factors = factors(module, network_of(plain).state_dict()[f"{module}.weight"])
     folder.mkdir()
-    return write_adapter(folder, {name: 0 * tensor for name, tensor in own.items()}, str(base))
+    return write_adapter(folder, {name: 0 * tensor for name, tensor in adapter_factors.items()}, str(base))
 
 
 @pytest.mark.parametrize("family", ["pi0", "openvla", "xvla", "magma", "spatialvla"])
@@ -621,10 +621,10 @@ def test_an_adapter_whose_base_has_no_configuration_is_refused_by_name(tmp_path:
 def test_adapters_whose_bases_lead_back_to_them_are_refused_by_name_in_plan_and_run(
     base: str, message: str, tmp_path: Path
 ) -> None:
-    own = factors("q_proj", torch.zeros(4, 4))
-    for name, named in (("tuned", base.format(folder=tmp_path)), ("other", "../tuned")):
+    adapter_factors = factors("q_proj", torch.zeros(4, 4))
+    for name, base_path in (("tuned", base.format(folder=tmp_path)), ("other", "../tuned")):
         (tmp_path / name).mkdir()
-        write_adapter(tmp_path / name, own, named)
+        write_adapter(tmp_path / name, adapter_factors, base_path)
     for read in (find_family("pi0").outline, find_family("pi0").load):
         with pytest.raises(CheckpointError, match=message):
             read(str(tmp_path / "tuned"))
@@ -632,11 +632,11 @@ def test_adapters_whose_bases_lead_back_to_them_are_refused_by_name_in_plan_and_
 
 def test_the_outline_follows_every_file_of_a_folder_and_passes_over_links_to_nothing(tmp_path: Path) -> None:
     write, options = WRITERS["internvla-m1"]
-    place, family = write(tmp_path / "model"), find_family("internvla-m1")
-    first = family.outline(str(place), options)
-    folder = place if place.is_dir() else place.parent
+    model_folder, family = write(tmp_path / "model"), find_family("internvla-m1")
+    first = family.outline(str(model_folder), options)
+    folder = model_folder if model_folder.is_dir() else model_folder.parent
     (folder / "left.json").symlink_to(tmp_path / "nothing")
-    assert family.outline(str(place), options) is first
+    assert family.outline(str(model_folder), options) is first
     configuration = folder / "config.yaml"
     configuration.write_text(configuration.read_text(encoding="utf-8") + "\n", encoding="utf-8")
-    assert family.outline(str(place), options) is not first
+    assert family.outline(str(model_folder), options) is not first

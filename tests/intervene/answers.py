@@ -55,9 +55,9 @@ def follower(episodes: int) -> tuple[Cell, Cell]:
 def habit(episodes: int) -> tuple[Cell, Cell]:
     """Always goes left, but for tiny shifts whose sign is drawn once per item."""
     draw = np.random.default_rng(1)
-    left = np.where([(n // 2 + n % 2) % 2 == 0 for n in range(episodes)], 0.1, -0.1)
+    displacements = np.where([(n // 2 + n % 2) % 2 == 0 for n in range(episodes)], 0.1, -0.1)
     nudge = np.repeat(draw.permutation([1e-5, -1e-5] * (episodes // 4)), 2)
-    return left, left - nudge
+    return displacements, displacements - nudge
 
 
 def store_outcomes(
@@ -66,12 +66,12 @@ def store_outcomes(
     settings: Mapping[str, Any],
     outcomes: ConditionOutcomes,
     certificate: Mapping[str, Any] | None = None,
-    further: Mapping[str, bytes] | None = None,
+    extra_files: Mapping[str, bytes] | None = None,
 ) -> str:
     """Stored as if they had been measured, with the effects of their kind; gives the key."""
     check = {"replay": {"episodes": 0, "compared": 0, "equal": 0, "largest_difference": 0.0}}
     run = SimpleNamespace(location=location, seed_text=seed_text, settings={})
-    return save(run, settings, outcomes, certificate or check, further or {})  # type: ignore[arg-type]
+    return save(run, settings, outcomes, certificate or check, extra_files or {})  # type: ignore[arg-type]
 
 
 def measured(

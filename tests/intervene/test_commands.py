@@ -33,33 +33,33 @@ def ask(run: Run | str, *options: str) -> tuple[int, str, str]:
 
 
 def test_the_table_says_what_follows(run: Run) -> None:
-    code, shown, said = ask(run)
+    code, output, message = ask(run)
     assert code == 0
-    assert "follow %" in shown
-    assert "100.0" in shown
-    assert "random weights" in shown
-    assert "47 of 48 clean inferences" in said
+    assert "follow %" in output
+    assert "100.0" in output
+    assert "random weights" in output
+    assert "47 of 48 clean inferences" in message
 
 
 @pytest.mark.slow
 def test_what_was_stored_is_said_to_be_read_back_whatever_policy_was_named(run: Run) -> None:
-    code, _, said = ask(run, "--checkpoint", "/nowhere", "--suite", "/nowhere")
+    code, _, message = ask(run, "--checkpoint", "/nowhere", "--suite", "/nowhere")
     assert code == 0
-    assert "loaded the stored result; no model was run" in " ".join(said.split())
+    assert "loaded the stored result; no model was run" in " ".join(message.split())
 
 
 def test_json_holds_settings_and_effects(run: Run) -> None:
-    code, shown, _ = ask(run, "--format", "json")
-    found = json.loads(shown)
+    code, output, _ = ask(run, "--format", "json")
+    answer = json.loads(output)
     assert code == 0
-    assert [row["category"] for row in found["effects"]] == ["color", "shape"]
-    assert found["effects"][0]["follow_p"] == 2.0**-12
-    assert found["settings"]["kind"] == "image-swap"
+    assert [row["category"] for row in answer["effects"]] == ["color", "shape"]
+    assert answer["effects"][0]["follow_p"] == 2.0**-12
+    assert answer["settings"]["kind"] == "image-swap"
 
 
 def test_csv_is_what_is_stored_with_the_verdict(run: Run) -> None:
-    _, shown, _ = ask(run, "--format", "csv")
-    header, first, *_ = shown.splitlines()
+    _, output, _ = ask(run, "--format", "csv")
+    header, first, *_ = output.splitlines()
     assert header.endswith("verdict,behaviour,reversed,reason,where,tie")
     assert first.startswith("color,24,12,12,1.0,0.0,1.0,")
 
@@ -76,15 +76,15 @@ def test_csv_is_what_is_stored_with_the_verdict(run: Run) -> None:
     ],
 )
 def test_what_cannot_be_is_refused(run: Run, options: tuple[str, ...], code: int, words: str) -> None:
-    ended, _, said = ask(run, *options)
+    ended, _, message = ask(run, *options)
     assert ended == code
-    assert words in said
+    assert words in message
 
 
 def test_a_folder_that_is_no_run_is_refused(tmp_path: Path) -> None:
-    code, _, said = ask(str(tmp_path))
+    code, _, message = ask(str(tmp_path))
     assert code == 2
-    assert "is not a run" in said
+    assert "is not a run" in message
 
 
 @pytest.mark.slow
@@ -109,9 +109,9 @@ def test_a_folder_that_is_no_run_is_refused(tmp_path: Path) -> None:
     ],
 )
 def test_options_of_another_kind_are_refused(run: Run, options: tuple[str, ...], words: str) -> None:
-    code, _, said = ask(run, *options)
+    code, _, message = ask(run, *options)
     assert code == 2
-    assert words in " ".join(said.split())
+    assert words in " ".join(message.split())
 
 
 @pytest.mark.slow
@@ -123,6 +123,6 @@ def test_a_closed_loop_needs_a_located_place_or_a_named_one(run: Run) -> None:
         (("--sites", "backbone.02", "--direction", "none", "--controls", "1"), "--controls 0"),
         (("--sites", "backbone.02", "--suite", "nowhere"), "is not a suite"),
     ):
-        code, _, said = ask(run, "--kind", "closed-loop", *options)
+        code, _, message = ask(run, "--kind", "closed-loop", *options)
         assert code == 2
-        assert words in " ".join(said.split())
+        assert words in " ".join(message.split())

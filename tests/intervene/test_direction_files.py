@@ -83,13 +83,13 @@ def test_probes_directions_are_written_for_the_sites_and_weights_that_they_are_o
     session: SceneSession, tmp_path: Path
 ) -> None:
     weights = np.random.default_rng(0).normal(size=(3, WIDTH)).astype(np.float32)
-    place = ("color", "mean:image", Site("backbone", 2))
-    probes = {place: Direction(weights, np.zeros(3), np.array([1.0, 2.0, 3.0]))}
+    direction_key = ("color", "mean:image", Site("backbone", 2))
+    probes = {direction_key: Direction(weights, np.zeros(3), np.array([1.0, 2.0, 3.0]))}
     path = tmp_path / "probes.safetensors"
     assert write_direction_file(probes, path, session.run.weights_sha256) == 1
     direction = read_direction(f"{path}#color.mean:image.backbone.02")
     assert (direction.site, direction.role, direction.weights) == (SITE, "image", session.run.weights_sha256)
-    np.testing.assert_allclose(direction.vectors[0], 2 * probes[place].unit, rtol=1e-5)
+    np.testing.assert_allclose(direction.vectors[0], 2 * probes[direction_key].unit, rtol=1e-5)
     assert Interchange(sites=(SITE,), direction=str(path)).conditions(session)
     for view, role in (("mean", "all"), ("last", "")):
         assert about_direction("color", view, Site("backbone", 2), None)[1]["role"] == role
@@ -114,20 +114,20 @@ def test_an_export_has_half_the_difference_of_the_class_means_and_steers_by_it(
     run, file = session.run, tmp_path / "means.npz"
     export_run(run.location, "directions", file, sites=[SITE], view="mean:image")
     rows = (run.episodes["category"] == "color").to_numpy()
-    left = (run.episodes["side_correct"] == "left").to_numpy()
+    is_left = (run.episodes["side_correct"] == "left").to_numpy()
     features = run.column(Site("backbone", 2), "mean:image").astype(np.float64)
-    half = (features[rows & left].mean(axis=0) - features[rows & ~left].mean(axis=0)) / 2
+    half = (features[rows & is_left].mean(axis=0) - features[rows & ~is_left].mean(axis=0)) / 2
     name = f"{file}#color.mean:image.base.{SITE}"
     np.testing.assert_allclose(read_direction(name).vectors[0], half, rtol=1e-5, atol=1e-7)
-    asked = Steering(sites=(SITE,), role="image", direction=name, coefficients=(1.0,), controls=0)
-    (bases,) = directions_of(session, asked).values()
-    np.testing.assert_allclose(bases.shift(asked.direction, "", 1.0), half, rtol=1e-5, atol=1e-7)
+    steering = Steering(sites=(SITE,), role="image", direction=name, coefficients=(1.0,), controls=0)
+    (bases,) = directions_of(session, steering).values()
+    np.testing.assert_allclose(bases.shift(steering.direction, "", 1.0), half, rtol=1e-5, atol=1e-7)
     with pytest.raises(UsageError, match=r"ending \.safetensors or \.npz"):
         export_run(run.location, "directions", tmp_path / "means.txt")
 
 
 @pytest.mark.parametrize(
-    ("vectors", "name", "named"),
+    ("vectors", "name", "mention"),
     [
         ({"a": np.ones(3), "b": np.ones(3)}, "", "directions a, b"),
         ({"a": np.ones(3)}, "#c", "directions a"),
@@ -138,10 +138,10 @@ def test_an_export_has_half_the_difference_of_the_class_means_and_steers_by_it(
     ],
 )
 def test_a_file_without_the_direction_is_refused(
-    tmp_path: Path, vectors: dict[str, Any], name: str, named: str
+    tmp_path: Path, vectors: dict[str, Any], name: str, mention: str
 ) -> None:
     path = written(tmp_path / "some.npz", vectors)
-    with pytest.raises(UsageError, match=named):
+    with pytest.raises(UsageError, match=mention):
         read_direction(f"{path}{name}")
 
 
@@ -160,12 +160,12 @@ def test_a_direction_that_float32_cannot_hold_is_refused(tmp_path: Path, length:
         read_direction(str(tmp_path / "some.npz"))
 
 
-@pytest.mark.parametrize(("scale", "named"), [([0.0, 1.0], "a row of zeros"), ([np.inf, 1.0], "infinity")])
-def test_a_scale_that_leaves_no_direction_is_refused(tmp_path: Path, scale: list[float], named: str) -> None:
+@pytest.mark.parametrize(("scale", "mention"), [([0.0, 1.0], "a row of zeros"), ([np.inf, 1.0], "infinity")])
+def test_a_scale_that_leaves_no_direction_is_refused(tmp_path: Path, scale: list[float], mention: str) -> None:
     path = tmp_path / "some.npz"
     values = {"a": np.array([1.0, 0.0]), "a.scale": np.array(scale)}
     write_directions(path, values, {"a": {"space": "standardised"}})
-    with pytest.raises(UsageError, match=named):
+    with pytest.raises(UsageError, match=mention):
         read_direction(str(path))
 
 
@@ -247,7 +247,7 @@ def test_settings_of_an_autoencoder_that_are_none_are_refused_and_never_waited_f
 
 
 @pytest.mark.parametrize(
-    ("width", "about", "named"),
+    ("width", "about", "mention"),
     [
         (WIDTH - 1, {}, "has 95 numbers; backbone.02 has 96"),
         (WIDTH, {"weights": "0" * 64}, "was found in the weights"),
@@ -255,12 +255,12 @@ def test_settings_of_an_autoencoder_that_are_none_are_refused_and_never_waited_f
     ],
 )
 def test_another_width_model_or_site_is_refused(
-    session: SceneSession, tmp_path: Path, width: int, about: dict[str, str], named: str
+    session: SceneSession, tmp_path: Path, width: int, about: dict[str, str], mention: str
 ) -> None:
     path = written(tmp_path / "some.npz", {"a": np.ones(width)}, **about)
-    asked = Interchange(sites=(SITE,), roles=("image",), direction=str(path), controls=0)
-    with pytest.raises(UsageError, match=named):
-        asked.conditions(session)
+    interchange = Interchange(sites=(SITE,), roles=("image",), direction=str(path), controls=0)
+    with pytest.raises(UsageError, match=mention):
+        interchange.conditions(session)
 
 
 @pytest.mark.slow
@@ -269,7 +269,9 @@ def test_patching_within_the_whole_space_is_patching_in_full(session: SceneSessi
     within = Interchange(sites=(SITE,), roles=("image",), direction=str(path))
     full = Interchange(sites=(SITE,), roles=("image",))
     pairs = session.pairs(str(session.run.episodes["item_id"][0]))
-    (*_, a), (*_, b) = (replay(session, pairs, asked.conditions(session)).displacement for asked in (within, full))
+    (*_, a), (*_, b) = (
+        replay(session, pairs, intervention.conditions(session)).displacement for intervention in (within, full)
+    )
     np.testing.assert_allclose(a, b, atol=1e-5)
     assert within.parameters()["direction"].startswith("all-")
     assert "vector" not in within.parameters()
@@ -279,9 +281,9 @@ def test_steering_adds_so_many_vectors_of_the_file(session: SceneSession, tmp_pa
     """By hand: a hook that adds the vector to the picture's tokens."""
     vector = np.random.default_rng(0).normal(size=WIDTH)
     path = written(tmp_path / "one.safetensors", {"one": vector}, site=SITE)
-    asked = Steering(sites=(SITE,), role="image", direction=f"{path}#one", coefficients=(2.0,), controls=1)
-    conditions = asked.conditions(session)
-    steered = next(one for one in conditions if one.name.endswith(f"|{asked.direction}|2"))
+    steering = Steering(sites=(SITE,), role="image", direction=f"{path}#one", coefficients=(2.0,), controls=1)
+    conditions = steering.conditions(session)
+    steered = next(condition for condition in conditions if condition.name.endswith(f"|{steering.direction}|2"))
     pair = replace(session.pairs(str(session.run.episodes["item_id"][0]))[0], side=None)
     chunk = steered.play(ConditionContext(session, pair)).chunk
 
@@ -292,12 +294,12 @@ def test_steering_adds_so_many_vectors_of_the_file(session: SceneSession, tmp_pa
     np.testing.assert_allclose(
         chunk, run_with_hooks(session.policy, pair.clean, {SITE: add}, pair.seed), atol=1e-5
     )
-    (bases,) = directions_of(session, asked).values()
+    (bases,) = directions_of(session, steering).values()
     control = bases.shift("control-1", pair.episode, 1.0)
     assert np.linalg.norm(control) == pytest.approx(np.linalg.norm(vector), rel=1e-5)
     assert abs(float(control @ vector)) < 1e-3 * np.linalg.norm(vector) ** 2
 
 
-def directions_of(session: SceneSession, asked: Steering) -> dict[Cell, Directions]:
-    cells = [Cell(place, asked.role) for place in resolve_sites(SITE, session.policy)]
-    return asked.fit_directions(session, cells, asked.sites)
+def directions_of(session: SceneSession, steering: Steering) -> dict[Cell, Directions]:
+    cells = [Cell(site_group, steering.role) for site_group in resolve_sites(SITE, session.policy)]
+    return steering.fit_directions(session, cells, steering.sites)

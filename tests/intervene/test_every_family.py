@@ -41,11 +41,11 @@ def test_every_family_that_acts_is_here() -> None:
 
 
 @pytest.fixture(scope="module", params=FAMILIES)
-def made(
+def measured_run(
     request: pytest.FixtureRequest, small_suite: Suite, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Run, ReplaySource]:
     tiny = FAMILIES[request.param]
-    checkpoint = tiny.made(small_suite, tmp_path_factory.mktemp("checkpoint"))
+    checkpoint = tiny.prepare_checkpoint(small_suite, tmp_path_factory.mktemp("checkpoint"))
     settings = ExtractSettings(
         request.param, checkpoint, suite=small_suite.folder, items=ITEMS, categories=("color",), frames="none",
         scene=SceneSpec(max_steps=2), options=tiny.options, env_workers=0,
@@ -110,8 +110,8 @@ def asked_of(run: Run, kind: str) -> Intervention:
         "closed-loop",
     ],
 )
-def test_every_kind_runs_or_is_refused_by_name(made: tuple[Run, ReplaySource], kind: str) -> None:
-    run, source = made
+def test_every_kind_runs_or_is_refused_by_name(measured_run: tuple[Run, ReplaySource], kind: str) -> None:
+    run, source = measured_run
     intervention, supported = asked_of(run, kind), find_family(run.model).interventions
     if any(not supported.supports(needed) for needed in intervention.required_capabilities):
         with pytest.raises(UnsupportedInterventionError, match=f"{run.model} does not support"):
@@ -134,10 +134,10 @@ def _check_ledger(run: Run, effects: InterventionResult) -> None:
     """Every change fired; what writes back what is there, or is read by nothing, changes nothing."""
     supported = find_family(run.model).interventions
     last = f"backbone.{run.streams['backbone'].layers - 1:02d}|"
-    for name, said in effects.certificate["edits"].items():
-        assert said["fires"] > 0, name
+    for name, counts in effects.certificate["edits"].items():
+        assert counts["fires"] > 0, name
         if name == "clean" or name.endswith("|0"):
-            assert said["max_action_change"] == 0.0
-            assert said["no_op_fires"] == said["fires"]
+            assert counts["max_action_change"] == 0.0
+            assert counts["no_op_fires"] == counts["fires"]
         if name.startswith(last) and "backbone" in supported.unread:
-            assert said["max_action_change"] == 0.0, name
+            assert counts["max_action_change"] == 0.0, name

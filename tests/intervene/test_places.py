@@ -62,16 +62,16 @@ if TYPE_CHECKING:
 def test_a_pattern_names_places_whose_names_survive_parsing(
     pi0_tiny: Pi0, pattern: str, places: int, sites: int
 ) -> None:
-    found = resolve_sites(pattern, pi0_tiny)
-    assert [len(place.sites) for place in found] == [sites] * places
-    assert len({place.name for place in found}) == places
-    for place in found:
-        assert str(PlaceName.parse(place.name)) == place.name
-        assert resolve_sites(place.name, pi0_tiny) == [place]
+    site_groups = resolve_sites(pattern, pi0_tiny)
+    assert [len(site_group.sites) for site_group in site_groups] == [sites] * places
+    assert len({site_group.name for site_group in site_groups}) == places
+    for site_group in site_groups:
+        assert str(PlaceName.parse(site_group.name)) == site_group.name
+        assert resolve_sites(site_group.name, pi0_tiny) == [site_group]
 
 
 @pytest.mark.parametrize(
-    ("pattern", "said"),
+    ("pattern", "reason"),
     [
         ("backbone", "names no place; expected STREAM.LAYER"),
         ("nowhere.02", "of the streams backbone, expert, vision, kv"),
@@ -84,8 +84,8 @@ def test_a_pattern_names_places_whose_names_survive_parsing(
         ("kv.00.heads.0", "the stream kv has no quantity 'heads'"),
     ],
 )
-def test_what_is_no_place_is_refused_with_what_there_is(pi0_tiny: Pi0, pattern: str, said: str) -> None:
-    with pytest.raises(UnknownSiteError, match=said):
+def test_what_is_no_place_is_refused_with_what_there_is(pi0_tiny: Pi0, pattern: str, reason: str) -> None:
+    with pytest.raises(UnknownSiteError, match=reason):
         resolve_sites(pattern, pi0_tiny)
 
 
@@ -101,7 +101,7 @@ def test_a_pattern_is_not_the_name_of_a_place(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("names", "said"),
+    ("names", "expected"),
     [
         ([], ""),
         (["backbone.01", "backbone.02"], "backbone.01, backbone.02"),
@@ -111,45 +111,50 @@ def test_a_pattern_is_not_the_name_of_a_place(name: str) -> None:
         ([f"backbone.{layer:02d}.heads.3" for layer in (7, 8, 9)], "backbone.07.heads.3 to backbone.09.heads.3"),
     ],
 )
-def test_consecutive_layers_are_named_by_the_first_and_the_last(names: list[str], said: str) -> None:
-    assert list_places(names) == said
+def test_consecutive_layers_are_named_by_the_first_and_the_last(names: list[str], expected: str) -> None:
+    assert list_places(names) == expected
 
 
 def test_a_layer_comes_before_its_parts_and_after_shallower_ones() -> None:
     names = ["backbone.01", "backbone.01.heads", "backbone.01.heads.2", "backbone.01.heads.10", "backbone.02"]
-    assert [str(one) for one in sorted(map(PlaceName.parse, names[::-1]), key=lambda one: one.depth)] == names
+    assert [
+        str(place_name)
+        for place_name in sorted(map(PlaceName.parse, names[::-1]), key=lambda place_name: place_name.depth)
+    ] == names
     assert [PlaceName.parse(name).is_whole_layer for name in names] == [True, False, False, False, True]
     assert not PlaceName.parse("expert.03@0-4").is_whole_layer
 
 
 @pytest.mark.parametrize("pattern", ["backbone.02.heads.1", "backbone.02.mlp", "kv.01.values"])
 def test_a_place_without_stored_means_has_no_direction(pi0_tiny: Pi0, pattern: str) -> None:
-    (place,) = resolve_sites(pattern, pi0_tiny)
+    (site_group,) = resolve_sites(pattern, pi0_tiny)
     with pytest.raises(UnknownSiteError, match="of which a run stores no means, so that no direction is found"):
-        _ = place.only_site
+        _ = site_group.only_site
 
 
 def test_a_patch_of_one_head_is_that_of_a_plain_torch_hook_bit_for_bit(
     pi0_tiny: Pi0, observation: Observation
 ) -> None:
     other = Observation(255 - observation.image, observation.state, observation.instruction)
-    (place,) = resolve_sites("backbone.01.heads.2", pi0_tiny)
-    with capture(pi0_tiny, place.sites) as source:
+    (site_group,) = resolve_sites("backbone.01.heads.2", pi0_tiny)
+    with capture(pi0_tiny, site_group.sites) as source:
         pi0_tiny.act([other], [5])
     mask = token_mask(pi0_tiny, observation, "backbone", "image")
-    image, size = torch.from_numpy(mask), source[place.sites[0]].shape[-1] // 8
+    image, size = torch.from_numpy(mask), source[site_group.sites[0]].shape[-1] // 8
 
     def patch(_: object, inputs: tuple[torch.Tensor, ...]) -> tuple[torch.Tensor]:
         passing = inputs[0].clone()
         columns = slice(2 * size, 3 * size)
-        passing[:, image, columns] = source[place.sites[0]][:, image, columns]
+        passing[:, image, columns] = source[site_group.sites[0]][:, image, columns]
         return (passing,)
 
     handle = pi0_tiny.tap(Site("backbone", 1, "heads")).module.register_forward_pre_hook(patch)
     expected = pi0_tiny.act([observation], [5])
     handle.remove()
     tokens = TokenSelection.of(mask, "cpu")
-    with apply_patch(pi0_tiny, place.sites, tokens, place.limit(ReplaceWith(source, tokens.count))) as log:
+    with apply_patch(
+        pi0_tiny, site_group.sites, tokens, site_group.limit(ReplaceWith(source, tokens.count))
+    ) as log:
         patched = pi0_tiny.act([observation], [5])
     np.testing.assert_array_equal(patched, expected)
     assert (patched != pi0_tiny.act([observation], [5])).any()
@@ -164,11 +169,13 @@ def test_patches_of_all_heads_of_a_block_are_the_patch_of_the_block(
     with capture(pi0_tiny, block.sites) as source:
         pi0_tiny.act([other], [5])
     tokens = TokenSelection.of(token_mask(pi0_tiny, observation, "backbone", "image"), "cpu")
-    whole = ReplaceWith(source, tokens.count)
-    heads = [(tokens, place.limit(whole)) for place in resolve_sites("backbone.01.heads.*", pi0_tiny)]
+    replacement = ReplaceWith(source, tokens.count)
+    heads = [
+        (tokens, site_group.limit(replacement)) for site_group in resolve_sites("backbone.01.heads.*", pi0_tiny)
+    ]
     with apply_patches(pi0_tiny, {block.sites[0]: heads}):
         one_by_one = pi0_tiny.act([observation], [5])
-    with apply_patch(pi0_tiny, block.sites, tokens, block.limit(whole)):
+    with apply_patch(pi0_tiny, block.sites, tokens, block.limit(replacement)):
         np.testing.assert_array_equal(pi0_tiny.act([observation], [5]), one_by_one)
 
 
@@ -214,7 +221,7 @@ def test_the_end_of_an_unread_stream_is_unread_and_nothing_before_it(
     ids=lambda intervention: str(intervention.kind),
 )
 def test_conditions_name_the_places_that_they_edit(session: ReplaySession, intervention: Intervention) -> None:
-    edited = {place for condition in intervention.conditions(session) for place in condition.places}
+    edited = {site_group for condition in intervention.conditions(session) for site_group in condition.places}
     assert "backbone.03" in edited
     assert "backbone.00" not in edited or isinstance(intervention, Interchange)
 
@@ -243,16 +250,16 @@ def test_a_note_before_the_replay_names_what_is_really_patched(
 def test_a_wildcard_passes_over_places_without_a_direction_and_a_named_place_is_refused(
     session: ReplaySession,
 ) -> None:
-    asked = {"role": "language", "categories": ("color",), "controls": 1, "coefficients": (2.0,)}
+    options = {"role": "language", "categories": ("color",), "controls": 1, "coefficients": (2.0,)}
     session.passed_over.clear()
-    found = Steering(sites=("backbone.*",), **asked).conditions(session)  # type: ignore[arg-type]
+    conditions = Steering(sites=("backbone.*",), **options).conditions(session)  # type: ignore[arg-type]
     assert list(session.passed_over) == ["backbone.00 language"]
     assert "class means of left and right are equal" in session.passed_over["backbone.00 language"]
-    names = {condition.name.partition("|")[0] for condition in found[1:]}
+    names = {condition.name.partition("|")[0] for condition in conditions[1:]}
     assert "backbone.00" not in names
     assert "backbone.01" in names
     with pytest.raises(NoDirectionError, match=r"backbone\.00"):
-        Steering(sites=("backbone.00",), **asked).conditions(session)  # type: ignore[arg-type]
+        Steering(sites=("backbone.00",), **options).conditions(session)  # type: ignore[arg-type]
     session.passed_over.clear()
 
 
@@ -307,11 +314,15 @@ def test_both_tiles_are_held_against_the_same_plain_patches(
     session: ReplaySession, copy: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (replay_input, _) = session.pairs(str(copy.episodes["item_id"][0]))
-    act, seen = session.policy.act, []
-    monkeypatch.setattr(session.policy, "act", lambda own, seeds: seen.append(own[0].image) or act(own, seeds))
+    act, images = session.policy.act, []
+    monkeypatch.setattr(
+        session.policy,
+        "act",
+        lambda observations, seeds: images.append(observations[0].image) or act(observations, seeds),
+    )
     tokens = PairTokens(session.policy, replay_input)
     together = [tokens.mask("backbone", role) for role in TILES]
-    assert len(seen) == 1 + len(TILES)
+    assert len(images) == 1 + len(TILES)
     for role, mask in zip(TILES, together, strict=True):
         np.testing.assert_array_equal(mask, PairTokens(session.policy, replay_input).mask("backbone", role))
 
@@ -323,14 +334,14 @@ def test_tiles_are_exchanged_apart(copy: Run, small_suite: Suite, twin: "Policy"
         roles=("image", "image.left", "image.right"),
     )  # fmt: skip
     effects = run_intervention(copy, intervention, ReplaySource(small_suite.folder), load=lambda *_: twin)
-    said = effects.certificate["edits"]
+    edits = effects.certificate["edits"]
     roles = ("image", *TILES)
-    assert set(said) == {f"{place}|{role}" for place in ("backbone.00", "kv.01") for role in roles}
-    for place, fires in (("backbone.00", 2), ("kv.01", 4)):
-        assert all(said[f"{place}|{role}"]["fires"] == fires for role in roles)
-        assert said[f"{place}|image.left"]["max_action_change"] > 0
-        whole = said[f"{place}|image"]["largest_change"]
-        assert all(0 < said[f"{place}|{role}"]["largest_change"] <= whole for role in TILES)
+    assert set(edits) == {f"{site}|{role}" for site in ("backbone.00", "kv.01") for role in roles}
+    for site, fires in (("backbone.00", 2), ("kv.01", 4)):
+        assert all(edits[f"{site}|{role}"]["fires"] == fires for role in roles)
+        assert edits[f"{site}|image.left"]["max_action_change"] > 0
+        image_change = edits[f"{site}|image"]["largest_change"]
+        assert all(0 < edits[f"{site}|{role}"]["largest_change"] <= image_change for role in TILES)
 
 
 @pytest.mark.parametrize("family", ["xiaomi-r0", "magma", "internvla-m1"])

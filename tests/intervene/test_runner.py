@@ -103,11 +103,11 @@ def test_the_other_layout_is_the_same_scene_with_its_pictures_exchanged(copy: Ru
 def test_left_of_the_middle_is_positive(session: ReplaySession, copy: Run) -> None:
     (replay_input, _) = session.pairs(str(copy.episodes["item_id"][0]))
     still = np.zeros((4, 7), np.float32)
-    left = still.copy()
-    left[:, 1] = 0.05
+    moved_left = still.copy()
+    moved_left[:, 1] = 0.05
     at_rest = session.lateral_displacement(still, replay_input.clean)
     assert at_rest == pytest.approx(replay_input.clean.state[1] - 0.028, abs=1e-6)
-    assert session.lateral_displacement(left, replay_input.clean) == pytest.approx(at_rest + 0.2, abs=1e-6)
+    assert session.lateral_displacement(moved_left, replay_input.clean) == pytest.approx(at_rest + 0.2, abs=1e-6)
 
 
 def test_another_policy_is_noticed_by_what_it_does(session: ReplaySession, copy: Run) -> None:
@@ -133,9 +133,9 @@ def test_what_is_stored_is_read_back_and_not_played_again(copy: Run, effects: In
 
 
 def test_an_intervened_run_is_whole(copy: Run, effects: InterventionResult) -> None:
-    found = verify_run(copy.path, deep=True)
-    assert (found.problems, found.strays) == ((), ())
-    assert [one.key for one in stored_interventions(copy)] == [effects.key]
+    verification = verify_run(copy.path, deep=True)
+    assert (verification.problems, verification.strays) == ((), ())
+    assert [intervention.key for intervention in stored_interventions(copy)] == [effects.key]
 
 
 def test_killed_and_resumed_gives_the_same_bytes(
@@ -143,11 +143,11 @@ def test_killed_and_resumed_gives_the_same_bytes(
 ) -> None:
     folder = mine.path / "interventions" / effects.key
     shutil.rmtree(folder)
-    seen = []
+    calls = []
 
-    def stop(done: int, _total: int, what: str) -> None:
-        seen.append(what)
-        if done == 3:
+    def stop(finished: int, _total: int, what: str) -> None:
+        calls.append(what)
+        if finished == 3:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -171,8 +171,8 @@ def test_a_damaged_piece_is_said_and_computed_again(
     folder = mine.path / "interventions" / effects.key
     shutil.rmtree(folder)
 
-    def stop(done: int, *_: object) -> None:
-        if done == 2:
+    def stop(finished: int, *_: object) -> None:
+        if finished == 2:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):

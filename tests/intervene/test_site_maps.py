@@ -48,7 +48,7 @@ LAST = 3
 
 
 @pytest.fixture(scope="module")
-def whole(copy: Run, source: ReplaySource, twin: "Policy") -> InterventionResult:
+def site_map(copy: Run, source: ReplaySource, twin: "Policy") -> InterventionResult:
     intervention = Interchange(
         categories=("color",),
         items=2,
@@ -59,15 +59,15 @@ def whole(copy: Run, source: ReplaySource, twin: "Policy") -> InterventionResult
 
 
 @pytest.mark.slow
-def test_all_tokens_of_the_first_layer_are_the_whole_exchange(whole: InterventionResult) -> None:
-    outcomes = whole.outcomes
+def test_all_tokens_of_the_first_layer_are_the_whole_exchange(site_map: InterventionResult) -> None:
+    outcomes = site_map.outcomes
     np.testing.assert_allclose(outcomes.of("backbone.00|all"), outcomes.of("image_swap"), atol=1e-6)
 
 
 @pytest.mark.slow
-def test_a_site_that_nothing_reads_leaves_every_action_bit_for_bit(whole: InterventionResult) -> None:
+def test_a_site_that_nothing_reads_leaves_every_action_bit_for_bit(site_map: InterventionResult) -> None:
     """The ledger tells it from hooks that missed: they fired, and moved what passed."""
-    (row,) = (row for row in whole.effects if (row.sites, row.role) == ("backbone.03", "all"))
+    (row,) = (row for row in site_map.effects if (row.sites, row.role) == ("backbone.03", "all"))
     assert row.max_action_change == 0.0
     assert (row.fires, row.no_op_fires) == (4, 0)
     assert row.relative_change > 0
@@ -75,17 +75,17 @@ def test_a_site_that_nothing_reads_leaves_every_action_bit_for_bit(whole: Interv
 
 
 @pytest.mark.slow
-def test_words_are_the_same_before_and_after_the_exchange(whole: InterventionResult) -> None:
+def test_words_are_the_same_before_and_after_the_exchange(site_map: InterventionResult) -> None:
     """In the embeddings only pictures differ, so that taking the words over moves nothing."""
-    said = whole.certificate["edits"]["backbone.00|language"]
-    assert (said["fires"], said["no_op_fires"], said["max_action_change"]) == (4.0, 4.0, 0.0)
+    counts = site_map.certificate["edits"]["backbone.00|language"]
+    assert (counts["fires"], counts["no_op_fires"], counts["max_action_change"]) == (4.0, 4.0, 0.0)
 
 
 @pytest.mark.slow
-def test_an_expert_is_changed_at_every_iteration_that_is_named(whole: InterventionResult) -> None:
-    said = whole.certificate["edits"]["expert.02@0-1|all"]
-    assert said["fires"] == 2 * 4
-    assert "expert.02@0-1|language" not in whole.certificate["edits"]
+def test_an_expert_is_changed_at_every_iteration_that_is_named(site_map: InterventionResult) -> None:
+    counts = site_map.certificate["edits"]["expert.02@0-1|all"]
+    assert counts["fires"] == 2 * 4
+    assert "expert.02@0-1|language" not in site_map.certificate["edits"]
 
 
 @pytest.mark.slow
@@ -114,8 +114,8 @@ def test_a_role_that_nothing_plays_there_is_refused_and_nothing_is_stored(
 
 
 @pytest.mark.slow
-def test_it_is_read_back_beside_what_else_is_stored(copy: Run, whole: InterventionResult) -> None:
-    assert load_effects(copy, kind="interchange").to_csv() == whole.to_csv()
+def test_it_is_read_back_beside_what_else_is_stored(copy: Run, site_map: InterventionResult) -> None:
+    assert load_effects(copy, kind="interchange").to_csv() == site_map.to_csv()
     assert {row.sites for row in stored_site_effects(copy)["color"]} == {
         "backbone.00",
         "backbone.03",
@@ -125,13 +125,13 @@ def test_it_is_read_back_beside_what_else_is_stored(copy: Run, whole: Interventi
 
 @pytest.mark.slow
 def test_an_interchange_along_a_direction_takes_no_maps_place(
-    copy: Run, source: ReplaySource, twin: "Policy", whole: InterventionResult
+    copy: Run, source: ReplaySource, twin: "Policy", site_map: InterventionResult
 ) -> None:
     intervention = Interchange(
         categories=("color",), items=1, sites=("backbone.02",), roles=("image",), direction="mean-difference"
     )
-    assert run_intervention(copy, intervention, source, load=lambda *_: twin).key != whole.key
-    assert {row.key for row in stored_site_effects(copy)["color"]} == {whole.key}
+    assert run_intervention(copy, intervention, source, load=lambda *_: twin).key != site_map.key
+    assert {row.key for row in stored_site_effects(copy)["color"]} == {site_map.key}
 
 
 @pytest.mark.slow
@@ -144,10 +144,10 @@ def test_steering_by_nothing_changes_nothing_and_controls_move_as_far(
     effects = run_intervention(copy, intervention, source, load=lambda *_: twin)
     edits = effects.certificate["edits"]
     assert edits["backbone.02|image|mean-difference|0"]["max_action_change"] == 0.0
-    own, control = (edits[f"backbone.02|image|{name}|2"] for name in ("mean-difference", "control-1"))
-    assert own["change"] > 0
-    assert control["change"] == pytest.approx(own["change"], rel=1e-4)
-    assert own["largest_change"] == pytest.approx(own["change"], rel=0.5)
+    along, control = (edits[f"backbone.02|image|{name}|2"] for name in ("mean-difference", "control-1"))
+    assert along["change"] > 0
+    assert control["change"] == pytest.approx(along["change"], rel=1e-4)
+    assert along["largest_change"] == pytest.approx(along["change"], rel=0.5)
     assert {row.coefficient for row in effects.effects} == {"0", "2"}
     assert "image_swap" in effects.outcomes.conditions, "the effect is a share of the swap"
 
@@ -164,15 +164,17 @@ def test_the_mean_difference_is_found_without_the_episode_it_is_used_on(copy: Ru
     name, category = str(episodes["episode_id"][0]), str(episodes["category"][0])
     features = copy.column(Site("backbone", 2), "mean:image").astype(float)
     unit = axes.basis("mean-difference", name)[0]
-    in_fold = {one for one in axes.halves if np.array_equal(axes.basis("mean-difference", one)[0], unit)}
-    own = (episodes["category"] == category).to_numpy()
-    others = own & ~episodes["episode_id"].isin(in_fold).to_numpy()
-    left = (episodes["side_correct"] == "left").to_numpy()
-    expected = features[others & left].mean(axis=0) - features[others & ~left].mean(axis=0)
+    in_fold = {half for half in axes.halves if np.array_equal(axes.basis("mean-difference", half)[0], unit)}
+    in_category = (episodes["category"] == category).to_numpy()
+    outside_fold = in_category & ~episodes["episode_id"].isin(in_fold).to_numpy()
+    is_left = (episodes["side_correct"] == "left").to_numpy()
+    expected = features[outside_fold & is_left].mean(axis=0) - features[outside_fold & ~is_left].mean(axis=0)
     np.testing.assert_allclose(unit, expected / np.linalg.norm(expected), atol=1e-5)
     assert axes.halves[name].item() == pytest.approx(np.linalg.norm(expected) / 2, rel=1e-5)
     groups = dict(zip(episodes["episode_id"].astype(str), episodes["group_id"].astype(str), strict=True))
-    assert not {groups[one] for one in in_fold} & {str(group) for group in episodes["group_id"][others]}
+    assert not {groups[episode] for episode in in_fold} & {
+        str(group) for group in episodes["group_id"][outside_fold]
+    }
     for control in axes.control_names:
         vector = axes.basis(control, name)[0]
         assert np.linalg.norm(vector) == pytest.approx(1.0, rel=1e-5)
@@ -209,19 +211,19 @@ def test_along_every_direction_is_the_whole_and_along_none_is_nothing() -> None:
     import torch
 
     draw = np.random.default_rng(0)
-    own, other = (torch.from_numpy(draw.normal(size=(5, 4)).astype(np.float32)) for _ in range(2))
+    received, other = (torch.from_numpy(draw.normal(size=(5, 4)).astype(np.float32)) for _ in range(2))
     site, mask = Site("backbone", 0), np.array([True, False, True, True, True])
     basis = np.linalg.qr(draw.normal(size=(4, 4)))[0].astype(np.float32)
     source = {site: other[None]}
     where = torch.from_numpy(np.flatnonzero(mask))
-    taken = own[None, where]
-    whole = ReplaceWith(source, 5)(site, taken, where)  # type: ignore[arg-type]
-    np.testing.assert_array_equal(whole[0].numpy(), other.numpy()[mask])
-    along = ReplaceInSubspace(source, 5, basis)(site, taken, where)  # type: ignore[arg-type]
-    np.testing.assert_allclose(along.numpy(), whole.numpy(), atol=1e-5)
-    rank_one = ReplaceInSubspace(source, 5, basis[:1])(site, taken, where)  # type: ignore[arg-type]
-    np.testing.assert_allclose(rank_one.numpy() @ basis[0], whole.numpy() @ basis[0], atol=1e-5)
-    np.testing.assert_allclose(rank_one.numpy() @ basis[1], taken.numpy() @ basis[1], atol=1e-5)
+    edited_tokens = received[None, where]
+    replaced = ReplaceWith(source, 5)(site, edited_tokens, where)  # type: ignore[arg-type]
+    np.testing.assert_array_equal(replaced[0].numpy(), other.numpy()[mask])
+    along = ReplaceInSubspace(source, 5, basis)(site, edited_tokens, where)  # type: ignore[arg-type]
+    np.testing.assert_allclose(along.numpy(), replaced.numpy(), atol=1e-5)
+    rank_one = ReplaceInSubspace(source, 5, basis[:1])(site, edited_tokens, where)  # type: ignore[arg-type]
+    np.testing.assert_allclose(rank_one.numpy() @ basis[0], replaced.numpy() @ basis[0], atol=1e-5)
+    np.testing.assert_allclose(rank_one.numpy() @ basis[1], edited_tokens.numpy() @ basis[1], atol=1e-5)
 
 
 @pytest.mark.slow
@@ -230,8 +232,8 @@ def test_what_fires_moved_is_summed_whatever_their_shapes() -> None:
     import torch
 
     active, sites = ActiveEdits(), (Site("backbone", 0), Site("backbone", 1), Site("expert", 0))
-    one, other = torch.tensor([[3.0, 4.0], [0.0, 1.0]]), torch.tensor([[2.0, 0.0, 0.0]])
-    tokens = (one, one + torch.tensor([[0.0, 2.0], [0.0, 4.0]])), (other, -other), (one, one)
+    matrix, other = torch.tensor([[3.0, 4.0], [0.0, 1.0]]), torch.tensor([[2.0, 0.0, 0.0]])
+    tokens = (matrix, matrix + torch.tensor([[0.0, 2.0], [0.0, 4.0]])), (other, -other), (matrix, matrix)
     active.fired += [
         (site, before[None], after[None]) for site, (before, after) in zip(sites, tokens, strict=True)
     ]
@@ -247,7 +249,7 @@ def test_what_fires_moved_is_summed_whatever_their_shapes() -> None:
 
 @pytest.mark.slow
 def test_places_are_layers_or_layers_over_iterations(twin: "Policy") -> None:
-    assert [place.name for place in resolve_sites("backbone.*", twin)] == [
+    assert [site_group.name for site_group in resolve_sites("backbone.*", twin)] == [
         f"backbone.{n:02d}" for n in range(LAST + 1)
     ]
     (some,) = resolve_sites("expert.01@2-4", twin)
@@ -317,9 +319,9 @@ def run(tmp_path: Path) -> ArrayRun:
         }
     )  # fmt: skip
     draw = np.random.default_rng(0)
-    left = np.where(ANSWERS.sides == "left", 1.0, -1.0)[:, None]
+    sign = np.where(ANSWERS.sides == "left", 1.0, -1.0)[:, None]
     features = {
-        (Site("backbone", layer), "mean"): draw.normal(size=(EPISODES, 4)) + 4 * left * (layer == 3)
+        (Site("backbone", layer), "mean"): draw.normal(size=(EPISODES, 4)) + 4 * sign * (layer == 3)
         for layer in range(4)
     }
     return ArrayRun(tmp_path, "pi0-tiny", "suite@1#0123456789ab", episodes, features)
@@ -407,13 +409,13 @@ SUITE = "suite@1#0123456789ab"
 
 def with_changes(signs: tuple[np.ndarray, np.ndarray], **changes: np.ndarray) -> ConditionOutcomes:
     """changes: by condition (`__` for `|`, `_` for `-`), metres toward the clean images' correct side."""
-    made = outcomes_of({"color": signs})
+    outcomes = outcomes_of({"color": signs})
     names = [name.replace("__", "|").replace("_", "-") for name in changes]
-    more = np.stack([made.correct_sign * values for values in changes.values()])
-    displacement = np.vstack([made.displacement, more])
+    more = np.stack([outcomes.correct_sign * values for values in changes.values()])
+    displacement = np.vstack([outcomes.displacement, more])
     return replace(
-        made,
-        conditions=(*made.conditions, *names),
+        outcomes,
+        conditions=(*outcomes.conditions, *names),
         displacement=displacement,
         max_action_change=np.abs(displacement - displacement[0]),
         edit_log=np.tile([1.0, 0.0, 10.0, 5.0, 9.0], (*displacement.shape, 1)),
@@ -438,7 +440,7 @@ def test_what_carries_it_in_every_policy_locates_nothing() -> None:
     """The swapped images themselves, and the action itself: *used* rested on an expert site."""
     plain, exchanged = follower(48)
     places = ("backbone.00", "backbone.01", "kv.00", "expert.01", "expert.01@0-3")
-    rows = rows_of(with_changes((plain, exchanged), **{f"{place}__all": exchanged for place in places}))
+    rows = rows_of(with_changes((plain, exchanged), **{f"{site}__all": exchanged for site in places}))
     assert all(row.is_localised for row in rows.values())
     assert localised_sites(list(rows.values())) == ("backbone.01", "kv.00")
 
@@ -446,11 +448,11 @@ def test_what_carries_it_in_every_policy_locates_nothing() -> None:
 @pytest.mark.parametrize("target_side", ["wrong", "left", "right", "correct"])
 def test_a_steering_is_a_share_of_the_swap_whichever_side_it_pushes_to(target_side: str) -> None:
     plain, exchanged = follower(48)
-    made = with_changes((plain, exchanged), a__image__mean_difference__2=exchanged)
+    outcomes = with_changes((plain, exchanged), a__image__mean_difference__2=exchanged)
     # Every action moves by half of the swap's 0.2 m, toward the side that is pushed to.
-    pushed = made.of("clean") + 0.1 * target_sign(made, target_side)
-    displacement = np.vstack([made.displacement[:2], pushed])
-    (row,) = patches_of(replace(made, displacement=displacement), SUITE, target_side)
+    pushed = outcomes.of("clean") + 0.1 * target_sign(outcomes, target_side)
+    displacement = np.vstack([outcomes.displacement[:2], pushed])
+    (row,) = patches_of(replace(outcomes, displacement=displacement), SUITE, target_side)
     assert row.effect == pytest.approx(0.5)
     assert row.mean_displacement == pytest.approx(0.1)
 
@@ -501,9 +503,9 @@ def test_the_ledger_is_summed_and_norms_are_compared() -> None:
 
 
 def test_controls_are_of_the_same_cell_and_coefficient() -> None:
-    whole, along, control = (EditedCell("backbone.02", "image", name) for name in ("", "probe", "control-1"))
+    plain_cell, along, control = (EditedCell("backbone.02", "image", name) for name in ("", "probe", "control-1"))
     assert control.is_control_of(along)
-    assert not control.is_control_of(whole)
+    assert not control.is_control_of(plain_cell)
     assert not along.is_control_of(along)
     assert not replace(control, coefficient="2").is_control_of(along)
     assert not replace(control, role="language").is_control_of(along)
@@ -525,15 +527,15 @@ def test_cells_of_conditions_are_stored_as_columns_and_read_from_the_names_of_an
     names = ("clean", *map(str, CELLS[1:]))
     numbers = np.zeros((len(names), 4))
     episodes = np.array(list("abcd"))
-    made = ConditionOutcomes(
+    outcomes = ConditionOutcomes(
         names, episodes, episodes, episodes, episodes, np.full(4, "left"), numbers, numbers,
         np.zeros((len(names), 4, 5)), plain, **columns_of(CELLS),
     )  # fmt: skip
-    assert made.cells == CELLS
-    stored = arrays_from_bytes(made.to_bytes())
+    assert outcomes.cells == CELLS
+    stored = arrays_from_bytes(outcomes.to_bytes())
     assert stored["coefficients"].tolist() == ["", "", "", "2", "", ""]
     assert ConditionOutcomes(**stored).cells == CELLS
-    assert made.by_category()[0][1].cells == CELLS
+    assert outcomes.by_category()[0][1].cells == CELLS
     former = {name: values for name, values in stored.items() if name not in COLUMNS}
     assert ConditionOutcomes(**former).cells == CELLS
     renamed = {**stored, "conditions": np.array(["clean", *(f"{number}|x" for number in range(1, len(names)))])}
@@ -541,14 +543,14 @@ def test_cells_of_conditions_are_stored_as_columns_and_read_from_the_names_of_an
     assert measured(ConditionOutcomes(**renamed), "").outcomes.cells == CELLS
     file = io.BytesIO()
     np.savez(file, **{name: values for name, values in stored.items() if name != "roles"})
-    halved = replace(measured(made, ""), read=lambda _: file.getvalue())
+    halved = replace(measured(outcomes, ""), read=lambda _: file.getvalue())
     halved.run.location = "RUN"
     with pytest.raises(RunDamagedError, match="lacks roles"):
         _ = halved.outcomes
 
 
 def test_the_place_is_said_beside_the_behaviour_and_does_not_change_it() -> None:
-    (found,) = swaps_of(outcomes_of({"color": follower(48)}), SUITE)
+    (swap,) = swaps_of(outcomes_of({"color": follower(48)}), SUITE)
     places = {
         None: "",
         (): "no place that was tried carries half of it",
@@ -557,7 +559,7 @@ def test_the_place_is_said_beside_the_behaviour_and_does_not_change_it() -> None
         ("backbone.01", "kv.02", "backbone.02"): "passes at backbone.01, backbone.02; read at kv.02",
     }
     for located, expected in places.items():
-        use = classify_use(True, found, None, Places(located))
+        use = classify_use(True, swap, None, Places(located))
         assert (use.behaviour, use.where) == ("used", expected)
     jointly = "no single place: read jointly at kv.01 language + kv.02 language"
     assert str(Places((), jointly=jointly)) == jointly

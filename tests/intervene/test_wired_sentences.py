@@ -64,7 +64,7 @@ TRUTHS = {
 
 
 @pytest.fixture(scope="module")
-def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, UseVerdict]:
+def verdicts(tmp_path_factory: pytest.TempPathFactory) -> dict[str, UseVerdict]:
     return concluded(WiredSession(), list(WIRINGS), tmp_path_factory.mktemp("wired"))
 
 
@@ -73,8 +73,8 @@ def test_every_wiring_has_a_truth() -> None:
 
 
 @pytest.mark.parametrize("name", WIRINGS)
-def test_behaviour_place_and_tie_are_true_of_the_wiring(name: str, found: dict[str, UseVerdict]) -> None:
-    assert (found[name].verdict, found[name].where, found[name].tie) == (VERDICTS[name], *TRUTHS[name])
+def test_behaviour_place_and_tie_are_true_of_the_wiring(name: str, verdicts: dict[str, UseVerdict]) -> None:
+    assert (verdicts[name].verdict, verdicts[name].where, verdicts[name].tie) == (VERDICTS[name], *TRUTHS[name])
 
 
 def test_a_later_search_of_a_part_does_not_replace_that_of_all_kv(
@@ -83,22 +83,22 @@ def test_a_later_search_of_a_part_does_not_replace_that_of_all_kv(
     """The end of the backbone is unread: the verdict said *past backbone*."""
     part = JointPlaces(sites=("backbone.03",), roles=("image", "language", "state"))
     folder = tmp_path_factory.mktemp("part")
-    found = concluded(WiredSession(), ["blocks", "constant"], folder, further=(part,))
-    assert (found["blocks"].where, found["blocks"].tie) == TRUTHS["blocks"]
+    verdicts = concluded(WiredSession(), ["blocks", "constant"], folder, more_interventions=(part,))
+    assert (verdicts["blocks"].where, verdicts["blocks"].tie) == TRUTHS["blocks"]
 
 
 def test_a_direction_that_carries_it_is_no_missing_copy(tmp_path_factory: pytest.TempPathFactory) -> None:
     """Nine permutations show nothing. The sentence had *carried by* beside *no readable copy found*."""
     folder = tmp_path_factory.mktemp("few")
-    found = concluded(WiredSession(), ["copied", "constant"], folder, permutations=9)["copied"]
-    said = "probes find no copy beyond chance, but a linear direction carries it (backbone.01 language)"
-    assert (found.where, found.tie) == (ALONG, said)
+    verdict = concluded(WiredSession(), ["copied", "constant"], folder, permutations=9)["copied"]
+    expected = "probes find no copy beyond chance, but a linear direction carries it (backbone.01 language)"
+    assert (verdict.where, verdict.tie) == (ALONG, expected)
 
 
 def test_an_answer_read_at_one_iteration_of_ten_is_found(tmp_path_factory: pytest.TempPathFactory) -> None:
     """At the eighth. What it reads is the same at every iteration, so that the place is where it lies."""
-    found = concluded(WiredSession(iterations=10), ["once", "constant"], tmp_path_factory.mktemp("once"))
-    assert (found["once"].verdict, found["once"].where, found["once"].tie) == ("used", *BLOCK_1)
+    verdicts = concluded(WiredSession(iterations=10), ["once", "constant"], tmp_path_factory.mktemp("once"))
+    assert (verdicts["once"].verdict, verdicts["once"].where, verdicts["once"].tie) == ("used", *BLOCK_1)
 
 
 def test_a_copy_in_the_pictures_with_the_opposite_sign_is_not_the_one_that_is_used(
@@ -106,6 +106,6 @@ def test_a_copy_in_the_pictures_with_the_opposite_sign_is_not_the_one_that_is_us
 ) -> None:
     """Probes of the pictures find a decoy; the words of block 2 are read."""
     folder = tmp_path_factory.mktemp("opposite")
-    found = concluded(WiredSession(), ["opposite", "constant"], folder, view="mean:image")["opposite"]
-    assert (found.verdict, found.tie) == ("used", ELSEWHERE)
-    assert "read at kv.02 language" in found.where
+    verdict = concluded(WiredSession(), ["opposite", "constant"], folder, view="mean:image")["opposite"]
+    assert (verdict.verdict, verdict.tie) == ("used", ELSEWHERE)
+    assert "read at kv.02 language" in verdict.where

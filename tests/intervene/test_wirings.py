@@ -113,13 +113,13 @@ def test_what_is_decided_after_the_first_chunk_shows_in_the_episode(wired: Wired
     names = ["late", "constant", "copied"]
     outcomes = outcomes_of(wired, names, calls=3)
     rows = {row.category: row for row in swaps_of(outcomes, SUITE, readout=PER_STEP)}
-    found = classify_all(rows, {})
-    assert {name: one.verdict for name, one in found.items()} == {
+    uses = classify_all(rows, {})
+    assert {name: use.verdict for name, use in uses.items()} == {
         "late": "used", "constant": "not used", "copied": "used",
     }  # fmt: skip
     first = {row.category: row for row in swaps_of(outcomes_of(wired, names), SUITE)}
-    both = classify_all(first, {}, other_readouts=found)
-    assert {name: one.verdict for name, one in both.items()} == {
+    both = classify_all(first, {}, other_readouts=uses)
+    assert {name: use.verdict for name, use in both.items()} == {
         "late": "first chunk not used; episode used", "constant": "not used", "copied": "used",
     }  # fmt: skip
     assert both["copied"].sentence == "The answer is used in the first chunk and over the whole episode."
@@ -132,9 +132,9 @@ def test_what_is_decided_after_the_first_chunk_shows_in_the_episode(wired: Wired
 
 def patched(session: WiredSession, name: str, *patterns: str, role: str = "all") -> ConditionOutcomes:
     """With every place of these patterns patched, one at a time."""
-    places = [place for pattern in patterns for place in resolve_sites(pattern, session.policy)]
-    sites = tuple(site for place in places for site in place.sites)
-    conditions: list[Condition] = [patch_of(Cell(place, role), sites) for place in places]
+    places = [site_group for pattern in patterns for site_group in resolve_sites(pattern, session.policy)]
+    sites = tuple(site for site_group in places for site in site_group.sites)
+    conditions: list[Condition] = [patch_of(Cell(site_group, role), sites) for site_group in places]
     return outcomes_of(session, [name], conditions)
 
 
@@ -164,11 +164,11 @@ def joint(
     session: WiredSession, name: str, sites: str = "kv.*", roles: tuple[str, ...] = ("language",)
 ) -> dict[str, JointEffect]:
     """By part and cells, what `--kind joint` finds."""
-    asked = JointPlaces(categories=(name,), sites=(sites,), roles=roles)
-    conditions = asked.conditions(session)
+    intervention = JointPlaces(categories=(name,), sites=(sites,), roles=roles)
+    conditions = intervention.conditions(session)
     outcomes = outcomes_of(session, [name], conditions[2:])
     entries = dict(session.certificate)
-    measurement = measured(outcomes, SUITE, asked.parameters(), entries, lambda _: b"")
+    measurement = measured(outcomes, SUITE, intervention.parameters(), entries, lambda _: b"")
     rows = JointPlaces.effects(measurement)
     return {row.cells if row.part == "cell" else row.part: row for row in rows}
 
@@ -188,9 +188,13 @@ def test_a_majority_of_blocks_is_read_jointly_and_at_no_single_place(wired: Wire
     words = [rows[f"kv.{block:02d} language"] for block in range(3)]
     assert {row.finding for row in words} == {"nothing alone"}
     assert all(abs(row.alone or 0) <= 0.02 and abs(row.needed or 0) <= 0.02 for row in words)
-    found = rows["minimal"]
-    assert (found.cells, found.finding, found.n_groups) == ("kv.01 language + kv.02 language", "read jointly", 6)
-    assert (found.alone or 0) >= 0.95
+    joint_row = rows["minimal"]
+    assert (joint_row.cells, joint_row.finding, joint_row.n_groups) == (
+        "kv.01 language + kv.02 language",
+        "read jointly",
+        6,
+    )
+    assert (joint_row.alone or 0) >= 0.95
     assert describe_joint_places(list(rows.values())).startswith("no single place: read jointly at kv.01")
 
 
@@ -205,19 +209,19 @@ def test_what_bypasses_the_backbone_is_past_all_cells(wired: WiredSession) -> No
     assert rows["every-cell"].finding == "past it"
     assert "minimal" not in rows
     assert describe_joint_places(list(rows.values())) == "past kv language"
-    for site, said in (
+    for site, sentence in (
         ("kv.01", "past kv.01 language, state"),
         ("backbone.02", "past backbone.02 language, state"),
     ):
         part = joint(wired, "bypass", site, ("language", "state"))
-        assert describe_joint_places(list(part.values())) == said, "null results of a part are of that part"
+        assert describe_joint_places(list(part.values())) == sentence, "null results of a part are of that part"
 
 
 def test_a_place_that_carries_half_is_named_with_the_one_that_carries_the_rest(wired: WiredSession) -> None:
     """Was *read at kv.01 language*."""
     rows = joint(wired, "shared", "kv.01", ("image", "language", "state"))
-    said = "read jointly at kv.01 language + kv.01 state (alone: kv.01 language 0.55)"
-    assert describe_joint_places(list(rows.values())) == said
+    expected = "read jointly at kv.01 language + kv.01 state (alone: kv.01 language 0.55)"
+    assert describe_joint_places(list(rows.values())) == expected
 
 
 def test_what_opposes_the_effect_is_read_too(wired: WiredSession) -> None:
@@ -281,22 +285,22 @@ class OneDirection:
 def probed_direction(session: WiredSession, name: str, site: Site) -> np.ndarray:
     """(D,) unit weights of a logistic probe of the answer in the mean over the words."""
     features, labels = [], []
-    for one in replay_inputs(name):
+    for replay_input in replay_inputs(name):
         with capture(session.policy, [site]) as cache:
-            session.act(one.clean, one.seed)
+            session.act(replay_input.clean, replay_input.seed)
         features.append(cache[site][0, WORDS].mean(0).numpy())
-        labels.append(one.side)
+        labels.append(replay_input.side)
     weights = LogisticRegression(C=0.1).fit(np.array(features), labels).coef_[0]
     return (weights / np.linalg.norm(weights)).astype(np.float32)
 
 
 def tie_of(session: WiredSession, name: str, layer: int, called: str = "mean-difference") -> str:
     """At the words of one layer of the backbone. called: as what the direction is stored."""
-    (place,) = resolve_sites(f"backbone.{layer:02d}", session.policy)
-    direction = OneDirection(probed_direction(session, name, place.only_site))
+    (site_group,) = resolve_sites(f"backbone.{layer:02d}", session.policy)
+    direction = OneDirection(probed_direction(session, name, site_group.only_site))
     roles = ("language", "all", "image", "state")
-    conditions: list[Condition] = [patch_of(Cell(place, role), place.sites) for role in roles]
-    conditions += patches_within(called, direction, Cell(place, "language"), place.sites)
+    conditions: list[Condition] = [patch_of(Cell(site_group, role), site_group.sites) for role in roles]
+    conditions += patches_within(called, direction, Cell(site_group, "language"), site_group.sites)
     rows = patches_of(outcomes_of(session, [name], conditions), SUITE)
     layer, along = rows[: len(roles)], rows[len(roles) :]
     return tie_at_site(layer[0], [row for row in along if not row.is_control], layer)

@@ -39,7 +39,7 @@ def scene_pairs(session: SceneSession) -> list[Pair]:
 
 
 @pytest.fixture(scope="module")
-def shown(scene_pairs: list[Pair], tmp_path_factory: pytest.TempPathFactory) -> Run:
+def shown_run(scene_pairs: list[Pair], tmp_path_factory: pytest.TempPathFactory) -> Run:
     """A run on recordings whose episodes are the first frames of the scene, one frame each."""
     pytest.importorskip("lerobot.datasets.lerobot_dataset", reason="the extra `datasets` is not installed")
     folder = tmp_path_factory.mktemp("recorded")
@@ -51,18 +51,18 @@ def shown(scene_pairs: list[Pair], tmp_path_factory: pytest.TempPathFactory) -> 
 
 
 @pytest.fixture(scope="module")
-def table(shown: Run, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def table(shown_run: Run, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Every frame with the other layout of its item."""
     file = tmp_path_factory.mktemp("pairs") / "pairs.csv"
-    rows = [f"{at},0,{at ^ 1},0" for at in range(len(shown.episodes))]
+    rows = [f"{at},0,{at ^ 1},0" for at in range(len(shown_run.episodes))]
     file.write_text("\n".join(["episode,frame,donor_episode,donor_frame", *rows]), encoding="utf-8")
     return file
 
 
 @pytest.fixture
-def observed(shown: Run, table: Path, twin: "Policy") -> Iterator[FrameSession]:
+def observed(shown_run: Run, table: Path, twin: "Policy") -> Iterator[FrameSession]:
     choice = ImageSwap(pairs=read_pairs(table))
-    with open_session(shown, ReplaySource(), lambda *_: twin, choice) as opened, opened.ready():
+    with open_session(shown_run, ReplaySource(), lambda *_: twin, choice) as opened, opened.ready():
         assert isinstance(opened, FrameSession)
         yield opened
 
@@ -72,17 +72,20 @@ def test_recordings_of_scene_frames_give_the_numbers_of_the_scene_bit_for_bit(
 ) -> None:
     """Same frames and seeds: the chunks, the displacements toward the source and the shares of patches."""
     recorded = [pair for item in observed.items for pair in observed.pairs(item)]
-    seeded = [replace(pair, seed=own.seed, stored=None) for pair, own in zip(recorded, scene_pairs, strict=True)]
-    for pair, own in zip(seeded, scene_pairs, strict=True):
+    seeded = [
+        replace(pair, seed=scene_pair.seed, stored=None)
+        for pair, scene_pair in zip(recorded, scene_pairs, strict=True)
+    ]
+    for pair, scene_pair in zip(seeded, scene_pairs, strict=True):
         assert isinstance(pair.clean, Observation)
-        assert isinstance(own.source, Observation)
+        assert isinstance(scene_pair.source, Observation)
         assert isinstance(pair.source, Observation)
-        np.testing.assert_array_equal(pair.source.image, own.source.image)
-        np.testing.assert_array_equal(pair.clean.state, own.source.state)
-    asked = Interchange(sites=("backbone.01", "kv.01"), roles=("all", "image"))
+        np.testing.assert_array_equal(pair.source.image, scene_pair.source.image)
+        np.testing.assert_array_equal(pair.clean.state, scene_pair.source.state)
+    interchange = Interchange(sites=("backbone.01", "kv.01"), roles=("all", "image"))
     seeded = seeded[:4]  # both layouts of two items
     batches = [
-        replay(opened, pairs[:4], asked.conditions(opened))
+        replay(opened, pairs[:4], interchange.conditions(opened))
         for opened, pairs in ((session, scene_pairs), (observed, seeded))
     ]
     scene, frames = (batch.in_spreads() for batch in batches)
@@ -95,17 +98,17 @@ def test_recordings_of_scene_frames_give_the_numbers_of_the_scene_bit_for_bit(
     assert not np.array_equal(scene.displacement, scene.toward), "in the scene also metres"
     groups = np.arange(len(seeded)).astype(str)
     rows = [
-        patches_of(replace(one, groups=groups, categories=np.full(len(seeded), "all")), "seed")
-        for one in (scene, frames)
+        patches_of(replace(outcomes, groups=groups, categories=np.full(len(seeded), "all")), "seed")
+        for outcomes in (scene, frames)
     ]
     assert [row.action_share for row in rows[0]] == [row.action_share for row in rows[1]]
     assert all(row.action_share is not None for row in rows[0])
 
 
 @pytest.mark.slow
-def test_a_swap_of_pictures_is_stored_and_read_again(shown: Run, table: Path, twin: "Policy") -> None:
-    asked = ImageSwap(pairs=read_pairs(table))
-    result = run_intervention(shown, asked, load=lambda *_: twin)
+def test_a_swap_of_pictures_is_stored_and_read_again(shown_run: Run, table: Path, twin: "Policy") -> None:
+    swap = ImageSwap(pairs=read_pairs(table))
+    result = run_intervention(shown_run, swap, load=lambda *_: twin)
     (row,) = result.effects
     assert (row.vary, row.n_episodes, row.n_items) == ("picture", 2 * ITEMS, 2 * ITEMS)
     assert row.share == pytest.approx(1.0), "only the pictures differ in these pairs"
@@ -113,12 +116,12 @@ def test_a_swap_of_pictures_is_stored_and_read_again(shown: Run, table: Path, tw
     assert row.is_of_the_seed, "the network is untrained"
     assert row.finding != "decides", "a share of next to nothing"
     assert "the seed decides it" in result.findings[0]
-    again = run_intervention(shown, asked, load=not_loaded)
+    again = run_intervention(shown_run, swap, load=not_loaded)
     assert again.to_csv() == result.to_csv()
     assert result.verdicts == {}
     assert "the picture" in result.sentences[0]
     assert result.to_rich() is not None
-    assert run_intervention(shown, ImageSwap(), load=lambda *_: twin).key != result.key, "other pairs"
+    assert run_intervention(shown_run, ImageSwap(), load=lambda *_: twin).key != result.key, "other pairs"
 
 
 def not_loaded(*_: object) -> "Policy":
@@ -126,7 +129,7 @@ def not_loaded(*_: object) -> "Policy":
 
 
 @pytest.mark.parametrize(
-    ("words", "named"),
+    ("words", "mention"),
     [
         (("--kind", "closed-loop", "--sites", "backbone.02"), "closed-loop"),
         (("--kind", "erase", "--sites", "backbone.02"), "erase"),
@@ -136,17 +139,17 @@ def not_loaded(*_: object) -> "Policy":
     ],
 )
 def test_what_needs_sides_or_another_input_is_refused_by_name(
-    shown: Run, words: tuple[str, ...], named: str
+    shown_run: Run, words: tuple[str, ...], mention: str
 ) -> None:
-    answer = CliRunner().invoke(app, ["intervene", str(shown.path), *words], env={"COLUMNS": "200"})
+    answer = CliRunner().invoke(app, ["intervene", str(shown_run.path), *words], env={"COLUMNS": "200"})
     assert answer.exit_code == 2
-    assert named in " ".join(answer.stderr.split())
+    assert mention in " ".join(answer.stderr.split())
 
 
 @pytest.mark.slow
-def test_a_frame_with_two_donors_is_read_toward_each_of_them(shown: Run, table: Path, twin: "Policy") -> None:
+def test_a_frame_with_two_donors_is_read_toward_each_of_them(shown_run: Run, table: Path, twin: "Policy") -> None:
     choice = ImageSwap(pairs=(*read_pairs(table), ("episode-000000", 0, "episode-000004", 0)))
-    with open_session(shown, ReplaySource(), lambda *_: twin, choice) as opened, opened.ready():
+    with open_session(shown_run, ReplaySource(), lambda *_: twin, choice) as opened, opened.ready():
         assert isinstance(opened, FrameSession)
         near, far = (pair for pair in opened.pairs(opened.items[0]) if pair.row == 0)
         for pair in (near, far):
@@ -162,9 +165,9 @@ def test_pairs_are_refused_in_the_scene(copy: Run, table: Path) -> None:
         ImageSwap(pairs=read_pairs(table)).check_run(copy)
 
 
-def test_recordings_that_were_changed_or_moved_are_refused(shown: Run, observed: FrameSession) -> None:
-    run = open_run(shown.path)
-    run.__dict__["origins"] = (replace(shown.origins[0], files={}),)
+def test_recordings_that_were_changed_or_moved_are_refused(shown_run: Run, observed: FrameSession) -> None:
+    run = open_run(shown_run.path)
+    run.__dict__["origins"] = (replace(shown_run.origins[0], files={}),)
     with pytest.raises(UsageError, match="--dataset"):
         open_session(run, ReplaySource())
     frame = observed.frames.index[0]
@@ -175,17 +178,17 @@ def test_recordings_that_were_changed_or_moved_are_refused(shown: Run, observed:
 
 
 @pytest.mark.parametrize(
-    ("text", "named"),
+    ("text", "mention"),
     [
         ("episode,frame\n0,0", "donor_episode"),
         ("episode,frame,donor_episode,donor_frame\n0,zero,1,0", "number of a frame"),
         ("episode,frame,donor_episode,donor_frame\n", "names no pair"),
     ],
 )
-def test_a_table_that_names_no_pairs_is_refused_with_its_line(tmp_path: Path, text: str, named: str) -> None:
+def test_a_table_that_names_no_pairs_is_refused_with_its_line(tmp_path: Path, text: str, mention: str) -> None:
     file = tmp_path / "pairs.csv"
     file.write_text(text, encoding="utf-8")
-    with pytest.raises(UsageError, match=named):
+    with pytest.raises(UsageError, match=mention):
         read_pairs(file)
 
 
@@ -206,18 +209,20 @@ def test_displacements_are_shares_of_the_source_and_flat_numbers_do_not_count() 
 
 
 @pytest.mark.slow
-def test_a_table_and_a_command_give_the_same_rows(shown: Run, table: Path, twin: "Policy") -> None:
-    result = run_intervention(shown, ImageSwap(pairs=read_pairs(table)), load=lambda *_: twin)
-    answer = CliRunner().invoke(app, ["intervene", str(shown.path), "--pairs", str(table), "--format", "json"])
+def test_a_table_and_a_command_give_the_same_rows(shown_run: Run, table: Path, twin: "Policy") -> None:
+    result = run_intervention(shown_run, ImageSwap(pairs=read_pairs(table)), load=lambda *_: twin)
+    answer = CliRunner().invoke(app, ["intervene", str(shown_run.path), "--pairs", str(table), "--format", "json"])
     assert answer.exit_code == 0, answer.stderr
     assert json.loads(answer.stdout)["key"] == result.key
 
 
 @pytest.mark.slow
-def test_estimates_by_gradients_are_kept_where_nothing_has_a_side(shown: Run, table: Path, twin: "Policy") -> None:
+def test_estimates_by_gradients_are_kept_where_nothing_has_a_side(
+    shown_run: Run, table: Path, twin: "Policy"
+) -> None:
     """An estimate adds to the clean action's displacement, which no inference shows."""
     screen = AttributionPatching(pairs=read_pairs(table), sites=("backbone.00",), roles=("image",))
-    result = run_intervention(shown, screen, load=lambda *_: twin)
+    result = run_intervention(shown_run, screen, load=lambda *_: twin)
     (estimates,) = (
         row
         for name, row in zip(result.outcomes.conditions, result.outcomes.displacement, strict=True)

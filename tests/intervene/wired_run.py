@@ -23,33 +23,37 @@ ROLES = (ALL, "image", "language", "state")
 
 def wired_run(session: WiredSession, names: Sequence[str], folder: Path) -> ArrayRun:
     """Activations of the clean inferences of these wirings, each a category."""
-    inputs = [one for name in names for one in replay_inputs(name)]
+    inputs = [replay_input for name in names for replay_input in replay_inputs(name)]
     sites = [Site("backbone", layer) for layer in range(BLOCKS + 1)]
     features: dict[tuple[Site, str], list[np.ndarray]] = {(site, view): [] for site in sites for view in VIEWS}
-    for one in inputs:
+    for replay_input in inputs:
         with capture(session.policy, sites) as cache:
-            session.act(one.clean, one.seed)
+            session.act(replay_input.clean, replay_input.seed)
         for site, view in features:
             features[site, view].append(cache[site][0, VIEWS[view]].mean(0).numpy())
     columns = {"episode_id": "episode", "item_id": "item", "group_id": "group", "side_correct": "side"}
-    episodes = pd.DataFrame({name: [getattr(one, field) for one in inputs] for name, field in columns.items()})
-    episodes["category"] = [one.category for one in inputs]
-    episodes["layout"] = ["original" if one.episode.endswith(":o") else "swapped" for one in inputs]
+    episodes = pd.DataFrame(
+        {name: [getattr(replay_input, field) for replay_input in inputs] for name, field in columns.items()}
+    )
+    episodes["category"] = [replay_input.category for replay_input in inputs]
+    episodes["layout"] = [
+        "original" if replay_input.episode.endswith(":o") else "swapped" for replay_input in inputs
+    ]
     episodes["outcome"], episodes["side_placed"] = "correct", episodes["side_correct"]
     run = ArrayRun(folder, "wired", SUITE, episodes, {key: np.array(rows) for key, rows in features.items()})
     session.run = run  # type: ignore[assignment]
     return run
 
 
-def intervene(session: WiredSession, run: ArrayRun, asked: Intervention) -> None:
+def intervene(session: WiredSession, run: ArrayRun, planned: Intervention) -> None:
     """Store what `run_intervention` would."""
     names = list(dict.fromkeys(run.episodes["category"]))
-    conditions = asked.conditions(session)
+    conditions = planned.conditions(session)
     outcomes = outcomes_of(session, names, conditions[2:])
     entries = dict(session.certificate)
     settings = {
-        "format": FORMAT, "kind": asked.kind, "run_settings": run.settings_sha256, "stamp": "", "wording": None,
-        "categories": names, "readout": asked.readout, **asked.parameters(),
+        "format": FORMAT, "kind": planned.kind, "run_settings": run.settings_sha256, "stamp": "", "wording": None,
+        "categories": names, "readout": planned.readout, **planned.parameters(),
     }  # fmt: skip
     check = {"episodes": 0, "compared": 0, "equal": 0, "largest_difference": 0.0}
     store_outcomes(run.location, run.suite, settings, outcomes, {"replay": check, **entries})
@@ -61,19 +65,19 @@ def concluded(
     folder: Path,
     view: str = "mean:language",
     permutations: int = 199,
-    further: Sequence[Intervention] = (),
+    more_interventions: Sequence[Intervention] = (),
 ) -> dict[str, UseVerdict]:
     """By wiring the verdict with place and tie, from probes of one view, all interventions and further ones."""
     run = wired_run(session, names, folder)
     train_probes(run, views=(view,), permutations=permutations, controls=())
     role = view.partition(":")[2] or ALL
     sites = tuple(f"backbone.{layer:02d}" for layer in range(1, BLOCKS + 1))
-    for asked in (
+    for intervention in (
         ImageSwap(),
         Interchange(sites=("backbone.*", "kv.*"), roles=ROLES),
         Interchange(sites=sites, roles=(role,), direction="mean-difference", controls=1),
         JointPlaces(roles=ROLES[1:]),
-        *further,
+        *more_interventions,
     ):
-        intervene(session, run, asked)
+        intervene(session, run, intervention)
     return verdicts_of(run)

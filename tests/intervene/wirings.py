@@ -82,84 +82,95 @@ class Wiring:
     items: int = 12
 
 
-def _product(seen: Inference) -> Tensor:
-    return seen.words(FACTOR) * seen.words(PRODUCT)
+def _product(inference: Inference) -> Tensor:
+    return inference.words(FACTOR) * inference.words(PRODUCT)
 
 
-def _of_roles(seen: Inference) -> Tensor:
+def _of_roles(inference: Inference) -> Tensor:
     """Majority of words, image and state of block 1."""
-    one = seen.values[1]
+    block_values = inference.values[1]
     return torch.sign(
-        sum(torch.sign(own) for own in (one[WORDS, EACH].mean(), one[IMAGE, EACH].mean(), one[STATE, EACH]))
+        sum(
+            torch.sign(reading)
+            for reading in (
+                block_values[WORDS, EACH].mean(),
+                block_values[IMAGE, EACH].mean(),
+                block_values[STATE, EACH],
+            )
+        )
     )
 
 
-def _of_blocks(seen: Inference) -> Tensor:
+def _of_blocks(inference: Inference) -> Tensor:
     """Majority of the words of all blocks."""
-    return torch.sign(sum(torch.sign(seen.words(EACH, block)) for block in range(BLOCKS)))
+    return torch.sign(sum(torch.sign(inference.words(EACH, block)) for block in range(BLOCKS)))
 
 
-def _with_backup(seen: Inference) -> Tensor:
+def _with_backup(inference: Inference) -> Tensor:
     """Block 1; block 2 where that is silent."""
-    return seen.words() if seen.words().abs() > 0.5 else seen.words(block=2)
+    return inference.words() if inference.words().abs() > 0.5 else inference.words(block=2)
 
 
-def _with_repair(seen: Inference) -> Tensor:
+def _with_repair(inference: Inference) -> Tensor:
     """Block 1; the marks where its norm is not the ordinary one."""
-    norm = seen.values[1][WORDS].norm(dim=-1).mean()
-    return seen.marks if (norm - ORDINARY).abs() > 0.5 else seen.words()
+    norm = inference.values[1][WORDS].norm(dim=-1).mean()
+    return inference.marks if (norm - ORDINARY).abs() > 0.5 else inference.words()
 
 
-def _of_norms(seen: Inference) -> Tensor:
+def _of_norms(inference: Inference) -> Tensor:
     """The norms of the words of block 1."""
-    return torch.sign(seen.values[1][WORDS].norm(dim=-1).mean() - ORDINARY)
+    return torch.sign(inference.values[1][WORDS].norm(dim=-1).mean() - ORDINARY)
 
 
-def _of_two_roles(seen: Inference) -> Tensor:
+def _of_two_roles(inference: Inference) -> Tensor:
     """The words of block 1, and to a smaller part its state."""
-    return 0.55 * seen.words(EACH) + 0.45 * seen.values[1][STATE, EACH]
+    return 0.55 * inference.words(EACH) + 0.45 * inference.values[1][STATE, EACH]
 
 
-def _where_the_other_lies_left(seen: Inference) -> Tensor:
+def _where_the_other_lies_left(inference: Inference) -> Tensor:
     """Block 1 if the picture with the second property lies left, else always left."""
-    return seen.words() if seen.values[0][IMAGE, OTHER].mean() > 0 else torch.ones(())
+    return inference.words() if inference.values[0][IMAGE, OTHER].mean() > 0 else torch.ones(())
 
 
 ONE_COPY = {ANSWER: 1.0}
 WIRINGS: Mapping[str, Wiring] = {
-    "copied": Wiring(lambda seen: seen.words(), ONE_COPY),
-    "unread": Wiring(lambda seen: torch.sign(seen.noise[8]), {COPY: 1.0}),
+    "copied": Wiring(lambda inference: inference.words(), ONE_COPY),
+    "unread": Wiring(lambda inference: torch.sign(inference.noise[8]), {COPY: 1.0}),
     "nonlinear": Wiring(_product, has_product=True),
-    "marks": Wiring(lambda seen: seen.marks),
-    "other": Wiring(lambda seen: seen.values[0][IMAGE, OTHER].mean()),
+    "marks": Wiring(lambda inference: inference.marks),
+    "other": Wiring(lambda inference: inference.values[0][IMAGE, OTHER].mean()),
     "constant": Wiring(lambda _: torch.ones(())),
-    "noise": Wiring(lambda seen: torch.sign(seen.noise[8])),
+    "noise": Wiring(lambda inference: torch.sign(inference.noise[8])),
     "roles": Wiring(_of_roles, is_everywhere=True),
     "blocks": Wiring(_of_blocks, is_everywhere=True),
     "backup": Wiring(_with_backup, ONE_COPY),
     "repair": Wiring(_with_repair, ONE_COPY),
-    "bypass": Wiring(lambda seen: torch.tensor(seen.answer), ONE_COPY),
-    "elsewhere": Wiring(lambda seen: seen.marks, {COPY: 1.0}),
+    "bypass": Wiring(lambda inference: torch.tensor(inference.answer), ONE_COPY),
+    "elsewhere": Wiring(lambda inference: inference.marks, {COPY: 1.0}),
     "code": Wiring(_product, {COPY: 1.0}, has_product=True, items=24),
-    "decoy": Wiring(lambda seen: 2 * seen.words(), {ANSWER: 0.5, LOUD: 4.0}),
-    "weak": Wiring(lambda seen: -0.6 + 0.5 * seen.words(), ONE_COPY),
-    "shifted": Wiring(lambda seen: -1 + 0.3 * seen.words(), ONE_COPY),
-    "faint": Wiring(lambda seen: 0.2 * seen.words(), ONE_COPY),
-    "one-sided": Wiring(lambda seen: seen.words() if seen.words() > 0 else torch.tensor(0.05), ONE_COPY),
-    "rarely": Wiring(lambda seen: seen.words() if seen.is_rare else torch.ones(()), ONE_COPY, items=24),
-    "trace": Wiring(lambda seen: -0.6 + 0.033 * seen.words(), ONE_COPY),
-    "late": Wiring(lambda seen: torch.zeros(()) if seen.is_first else seen.words(), ONE_COPY),
-    "against": Wiring(lambda seen: -seen.words(), ONE_COPY),
-    "once": Wiring(lambda seen: seen.words(), ONE_COPY, only_at=7),
-    "opposite": Wiring(lambda seen: seen.words(block=2), ONE_COPY, decoy=-1.0),
+    "decoy": Wiring(lambda inference: 2 * inference.words(), {ANSWER: 0.5, LOUD: 4.0}),
+    "weak": Wiring(lambda inference: -0.6 + 0.5 * inference.words(), ONE_COPY),
+    "shifted": Wiring(lambda inference: -1 + 0.3 * inference.words(), ONE_COPY),
+    "faint": Wiring(lambda inference: 0.2 * inference.words(), ONE_COPY),
+    "one-sided": Wiring(
+        lambda inference: inference.words() if inference.words() > 0 else torch.tensor(0.05), ONE_COPY
+    ),
+    "rarely": Wiring(
+        lambda inference: inference.words() if inference.is_rare else torch.ones(()), ONE_COPY, items=24
+    ),
+    "trace": Wiring(lambda inference: -0.6 + 0.033 * inference.words(), ONE_COPY),
+    "late": Wiring(lambda inference: torch.zeros(()) if inference.is_first else inference.words(), ONE_COPY),
+    "against": Wiring(lambda inference: -inference.words(), ONE_COPY),
+    "once": Wiring(lambda inference: inference.words(), ONE_COPY, only_at=7),
+    "opposite": Wiring(lambda inference: inference.words(block=2), ONE_COPY, decoy=-1.0),
     "half": Wiring(_where_the_other_lies_left, ONE_COPY, items=24),
     "norms": Wiring(_of_norms, has_norms=True),
     "shared": Wiring(_of_two_roles, is_everywhere=True),
-    "beside": Wiring(lambda seen: 0.4 * seen.words() + 0.6 * seen.answer, ONE_COPY),
-    "opposing": Wiring(lambda seen: 3 * seen.answer - 2 * seen.words(), ONE_COPY),
-    "balance": Wiring(lambda seen: 2 * seen.words() - seen.words(block=2), ONE_COPY),
-    "behind": Wiring(lambda seen: seen.marks, ONE_COPY, copied_at=1),
-    "either": Wiring(lambda seen: seen.words() * (-1 if seen.is_rare else 1), ONE_COPY),
+    "beside": Wiring(lambda inference: 0.4 * inference.words() + 0.6 * inference.answer, ONE_COPY),
+    "opposing": Wiring(lambda inference: 3 * inference.answer - 2 * inference.words(), ONE_COPY),
+    "balance": Wiring(lambda inference: 2 * inference.words() - inference.words(block=2), ONE_COPY),
+    "behind": Wiring(lambda inference: inference.marks, ONE_COPY, copied_at=1),
+    "either": Wiring(lambda inference: inference.words() * (-1 if inference.is_rare else 1), ONE_COPY),
 }
 
 
@@ -181,10 +192,10 @@ class _Network(nn.Module):
 
     def values(self, tokens: Tensor, wiring: Wiring) -> list[Tensor]:
         """(T, D) of every block, from the (1, T, D) embedded tokens."""
-        kept = []
+        residuals = []
         for number, block in enumerate(self.blocks):
             residual = block.norm(tokens)
-            kept.append(residual[:, None].clone())
+            residuals.append(residual[:, None].clone())
             is_copied = number == wiring.copied_at
             change = self._copied(residual, wiring) if is_copied else torch.zeros_like(residual)
             tokens = residual + block.attention(change)
@@ -192,21 +203,21 @@ class _Network(nn.Module):
         self.norm(tokens)
         keys, values = self.prompt_kv.keys, self.prompt_kv.values
         for passage in keys:
-            passage(torch.zeros_like(kept[0]))
-        return [passage(own)[0, 0] for passage, own in zip(values, kept, strict=True)]
+            passage(torch.zeros_like(residuals[0]))
+        return [passage(block_residual)[0, 0] for passage, block_residual in zip(values, residuals, strict=True)]
 
-    def act(self, seen: Inference, wiring: Wiring) -> Tensor:
+    def act(self, inference: Inference, wiring: Wiring) -> Tensor:
         """The action after the last iteration, 1 for the left tile."""
         last = self.iterations - 1
         only_at = None if wiring.only_at is None else min(wiring.only_at, last)
         tokens = torch.zeros(1, 2, WIDTH)
         for iteration in range(self.iterations):
-            kept = tokens[0, 1, 0]
+            passed_on = tokens[0, 1, 0]
             tokens = torch.zeros(1, 2, WIDTH)
-            tokens[0, 1, NOISE : NOISE + 7] = seen.noise[:7]
+            tokens[0, 1, NOISE : NOISE + 7] = inference.noise[:7]
             tokens = self.acting.norm(tokens)
             change = torch.zeros_like(tokens)
-            change[0, 1, 0] = wiring.read(seen) if only_at in (None, iteration) else kept
+            change[0, 1, 0] = wiring.read(inference) if only_at in (None, iteration) else passed_on
             tokens = tokens + self.acting.attention(change)
             tokens = self.acting_norm(tokens + self.acting.mlp(torch.zeros_like(tokens)))
         return tokens[0, 1, 0]
@@ -241,28 +252,30 @@ class WiredPolicy(Policy):
         }  # fmt: skip
         self.prompt_kv = kv_stream(BLOCKS, WIDTH)
 
-    def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+    def act(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
         """Metres toward the tile in the lateral coordinate; 4 mm of it are noise."""
-        self.check(seen, seeds)
-        chunks = np.zeros((len(seen), CHUNK, 7), np.float32)
+        self.check(observations, seeds)
+        chunks = np.zeros((len(observations), CHUNK, 7), np.float32)
         with torch.inference_mode():
-            for row, (observation, seed) in enumerate(zip(seen, seeds, strict=True)):
+            for row, (observation, seed) in enumerate(zip(observations, seeds, strict=True)):
                 chunks[row, :, 1] = float(self._lateral(observation, seed)) / CHUNK
         return chunks
 
-    def differentiable(self, seen: Sequence[Observation], seeds: Sequence[int]) -> Tensor:
+    def differentiable(self, observations: Sequence[Observation], seeds: Sequence[int]) -> Tensor:
         """The same with a graph; what decides by a sign has no slope."""
-        self.check(seen, seeds)
-        lateral = torch.stack([self._lateral(one, seed) for one, seed in zip(seen, seeds, strict=True)])
-        chunks = torch.zeros(len(seen), CHUNK, 7)
+        self.check(observations, seeds)
+        lateral = torch.stack(
+            [self._lateral(observation, seed) for observation, seed in zip(observations, seeds, strict=True)]
+        )
+        chunks = torch.zeros(len(observations), CHUNK, 7)
         chunks[:, :, 1] = lateral[:, None] / CHUNK
         return chunks
 
-    def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
+    def roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
         """The same of every observation."""
         backbone = Roles.from_labels(["image.primary"] * 8 + ["language"] * 4 + ["state"])
         expert = Roles.from_labels(["state", "action"])
-        return {"backbone": [backbone] * len(seen), "expert": [expert] * len(seen)}
+        return {"backbone": [backbone] * len(observations), "expert": [expert] * len(observations)}
 
     def tap(self, site: Site) -> Tap:
         """Inputs of norms for residuals, outputs of attention and MLP."""
@@ -318,27 +331,32 @@ class WiredSession(SceneSession):
 
     def __init__(self, iterations: int = 2) -> None:
         self.policy, self.on_fit_progress, self.certificate = WiredPolicy(iterations), None, {}
-        inputs = [one for name in WIRINGS for one in replay_inputs(name)]
-        columns = {"category": [one.category for one in inputs], "item_id": [one.item for one in inputs]}
+        inputs = [replay_input for name in WIRINGS for replay_input in replay_inputs(name)]
+        columns = {
+            "category": [replay_input.category for replay_input in inputs],
+            "item_id": [replay_input.item for replay_input in inputs],
+        }
         self.run = SimpleNamespace(model="wired", episodes=pd.DataFrame(columns))  # type: ignore[assignment]
         self._middle, self._across = np.zeros(2), np.array([0.0, 1.0])
 
     def pairs(self, item: str) -> list[Pair]:
         """Both layouts of one item."""
-        return [one for one in replay_inputs(item.rpartition("-")[0]) if one.item == item]
+        return [
+            replay_input for replay_input in replay_inputs(item.rpartition("-")[0]) if replay_input.item == item
+        ]
 
 
 def replay_inputs(name: str, x: float = 0.0) -> list[Pair]:
     """Two layouts of every item, each a group of its own. x: where the hand is, zero before the first chunk."""
     state = np.array([x, 0, 0.13, 0, 0, 0, 0, 0.8], np.float32)
-    found = []
+    pairs = []
     for item in range(WIRINGS[name].items):
         answer = 1.0 if item % 2 else -1.0
         other = float(np.random.default_rng(derive_seed("other", 0, name, str(item))).choice([-1, 1]))
         layouts = [Observation(_picture(sign * answer, sign * other), state, f"{name}:{item}") for sign in (1, -1)]
         for number, sign in enumerate((1.0, -1.0)):
             side: Literal["left", "right"] = "left" if sign * answer > 0 else "right"
-            found.append(
+            pairs.append(
                 Pair(
                     clean=layouts[number],
                     source=layouts[1 - number],
@@ -346,13 +364,13 @@ def replay_inputs(name: str, x: float = 0.0) -> list[Pair]:
                     toward=-1 if side == "left" else 1,
                     group=f"{name}-{item}",
                     item=f"{name}-{item}",
-                    row=len(found),
+                    row=len(pairs),
                     episode=f"{name}-{item}:{'os'[number]}",
                     category=name,
                     side=side,
                 )
             )
-    return found
+    return pairs
 
 
 def _picture(answer: float, other: float) -> NDArray[np.uint8]:
@@ -363,16 +381,18 @@ def _picture(answer: float, other: float) -> NDArray[np.uint8]:
 
 
 def outcomes_of(
-    session: WiredSession, names: Sequence[str], further: Sequence[Condition] = (), calls: int = 1
+    session: WiredSession, names: Sequence[str], more_conditions: Sequence[Condition] = (), calls: int = 1
 ) -> ConditionOutcomes:
     """What swapped images and further conditions do, as `run_intervention` stores it.
 
     calls: inferences of an episode, whose displacements are summed; the hand leaves its place after the first.
     """
-    conditions: list[Condition] = [CLEAN_RUN, SOURCE_RUN, *further]
-    inputs = [one for name in names for one in replay_inputs(name)]
+    conditions: list[Condition] = [CLEAN_RUN, SOURCE_RUN, *more_conditions]
+    inputs = [replay_input for name in names for replay_input in replay_inputs(name)]
     outcomes = replay(session, inputs, conditions)
     for _ in range(calls - 1):
-        later = replay(session, [one for name in names for one in replay_inputs(name, 0.03)], conditions)
+        later = replay(
+            session, [replay_input for name in names for replay_input in replay_inputs(name, 0.03)], conditions
+        )
         outcomes.displacement[:] += later.displacement
     return replace(outcomes, chunks=None)

@@ -63,9 +63,9 @@ def test_a_number_that_is_none_is_refused_with_its_field_and_value(name: str, va
     inside[last] = value
     with pytest.raises(CheckpointError) as refusal:
         read(changed, "a file")
-    said = str(refusal.value)
-    assert "a file does not describe" in said
-    assert f"{field} is {value!r}" in said
+    message = str(refusal.value)
+    assert "a file does not describe" in message
+    assert f"{field} is {value!r}" in message
 
 
 class Sizes(ConfigFile):

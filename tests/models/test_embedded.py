@@ -70,8 +70,8 @@ def test_models_words_lists_every_word_and_no_special_token() -> None:
     assert {"red", "square", "cube"} <= set(listed)
     assert set(filter(None, listed)) == {word for word in known_words() if word.strip()}
     assert not set(SPECIAL) & set(listed)
-    named = CliRunner().invoke(app, ["models", "vlm-tiny", "--words", "--json"])
-    assert json.loads(named.stdout) == list(filter(None, listed))
+    result = CliRunner().invoke(app, ["models", "vlm-tiny", "--words", "--json"])
+    assert json.loads(result.stdout) == list(filter(None, listed))
     other = CliRunner().invoke(app, ["models", "pi0", "--words"])
     assert (other.exit_code, "pi0 reads any text" in other.stderr) == (2, True)
 
@@ -186,7 +186,7 @@ def test_the_weights_that_come_with_the_package_are_small_and_say_how_they_were_
 
 def test_it_knows_every_word_of_the_suite_in_every_prompt(vlm: PaliGemma) -> None:
     assert set(vocabulary()) <= set(WORDS)
-    phrases = {concept.phrase for own in GENERATORS.values() for pair in own.pairs for concept in pair}
+    phrases = {concept.phrase for generator in GENERATORS.values() for pair in generator.pairs for concept in pair}
     longest = 0
     for template in TEMPLATES.values():
         for order in ORDERS:

@@ -30,13 +30,13 @@ from tests.support.internvla_checkpoints import COT, config, dims_values, networ
 from tests.support.qwen_checkpoints import ID
 
 
-def named(**framework: Any) -> InternVLAConfig:
+def configuration(**framework: Any) -> InternVLAConfig:
     """Without the file of other sizes: what the names of the run's file mean."""
     return InternVLAConfig.from_values(run_values(**framework), vlm_values(), "test")
 
 
 def test_the_names_of_the_runs_file_mean_the_released_sizes() -> None:
-    built = named()
+    built = configuration()
     assert (built.dino.width, built.dino.blocks, built.dino.heads, built.dino.patch, built.dino.side) == (
         384, 12, 6, 14, 224,
     )  # fmt: skip
@@ -61,7 +61,7 @@ def test_the_spelling_of_the_released_file_and_the_right_one_are_read() -> None:
 
 
 @pytest.mark.parametrize(
-    ("field", "change", "said"),
+    ("field", "change", "reason"),
     [
         ("framework_py", "QwenGR00T", "'QwenGR00T'"),
         ("dino", {"dino_backbone": "dinov3_vits16"}, "dinov3_vits16"),
@@ -72,10 +72,10 @@ def test_the_spelling_of_the_released_file_and_the_right_one_are_read() -> None:
         ("layer_qformer", {"ouptput_dim": 30}, "width 30 and 8 heads"),
     ],
 )
-def test_what_does_not_fit_is_refused(field: str, change: Any, said: str) -> None:
+def test_what_does_not_fit_is_refused(field: str, change: Any, reason: str) -> None:
     before = run_values()["framework"][field]
-    with pytest.raises(CheckpointError, match=said):
-        named(**{field: {**before, **change} if isinstance(change, dict) else change})
+    with pytest.raises(CheckpointError, match=reason):
+        configuration(**{field: {**before, **change} if isinstance(change, dict) else change})
 
 
 def test_the_files_are_found_beside_the_weights_or_one_folder_up(tmp_path: Path) -> None:
@@ -84,8 +84,8 @@ def test_the_files_are_found_beside_the_weights_or_one_folder_up(tmp_path: Path)
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(run_values()), encoding="utf-8")
     (tmp_path / "dims.json").write_text(json.dumps(dims_values()), encoding="utf-8")
     for folder in (tmp_path, tmp_path / "checkpoints"):
-        values, place = find_config(folder)
-        assert place == tmp_path
+        values, config_folder = find_config(folder)
+        assert config_folder == tmp_path
         assert values["qformer_heads"] == 4
         assert values["framework"]["layer_qformer"]["num_query_tokens"] == 6
     (tmp_path / "config.yaml").write_text("a: [", encoding="utf-8")
@@ -133,10 +133,10 @@ def test_true_noise_leads_back_to_the_signal_it_was_added_to() -> None:
 def rows_of(
     diffusing: InternVLANetwork, condition: Tensor, noise: Tensor, scale: float
 ) -> tuple[Tensor, list[int]]:
-    seen: list[int] = []
-    handle = diffusing.head.register_forward_pre_hook(lambda _, given: seen.append(len(given[0])))
+    row_counts: list[int] = []
+    handle = diffusing.head.register_forward_pre_hook(lambda _, arguments: row_counts.append(len(arguments[0])))
     try:
-        return diffusing.denoise(condition, noise, Schedule.of(5, 100), scale), seen
+        return diffusing.denoise(condition, noise, Schedule.of(5, 100), scale), row_counts
     finally:
         handle.remove()
 
@@ -144,22 +144,22 @@ def rows_of(
 @torch.inference_mode()
 def test_guidance_runs_both_halves_and_mixes_them(diffusing: InternVLANetwork) -> None:
     condition, noise = torch.randn(2, 6, 32), torch.randn(2, 4, 7)
-    mixed, seen = rows_of(diffusing, condition, noise, 1.5)
-    assert seen == [4] * 5
+    mixed, row_counts = rows_of(diffusing, condition, noise, 1.5)
+    assert row_counts == [4] * 5
     schedule, path = Schedule.of(5, 100), noise
     nothing = diffusing.head.z_embedder.uncondition.expand(2, -1, -1)
     for index in reversed(range(5)):
         moment = torch.full((2,), int(schedule.moments[index]))
-        without, found = diffusing.head(path, moment, nothing), diffusing.head(path, moment, condition)
-        path = schedule.back(index, path, without + 1.5 * (found - without))
+        without, conditional = diffusing.head(path, moment, nothing), diffusing.head(path, moment, condition)
+        path = schedule.back(index, path, without + 1.5 * (conditional - without))
     torch.testing.assert_close(mixed, path, rtol=0, atol=2e-5)
 
 
 @torch.inference_mode()
 @pytest.mark.parametrize("scale", [1.0, 0.5])
 def test_without_guidance_only_the_conditional_rows_run(diffusing: InternVLANetwork, scale: float) -> None:
-    plain, seen = rows_of(diffusing, torch.randn(2, 6, 32), torch.randn(2, 4, 7), scale)
-    assert seen == [2] * 5
+    plain, row_counts = rows_of(diffusing, torch.randn(2, 6, 32), torch.randn(2, 4, 7), scale)
+    assert row_counts == [2] * 5
     assert torch.isfinite(plain).all()
 
 
@@ -256,14 +256,14 @@ def test_padding_changes_the_condition_so_only_one_row_at_a_time_is_honest(built
     )
     assert int(both.mask[1].sum()) == 13
     assert (built.read(alone, views(2)[1:])[0] - together[1]).abs().max() > 1e-3
-    whole = QwenInputs(both.ids[:1], both.mask[:1], both.pixel_values[:16], both.grid[:1], both.image_token)
-    torch.testing.assert_close(built.read(whole, views(2)[:1])[0], together[0], rtol=0, atol=1e-5)
+    first_row = QwenInputs(both.ids[:1], both.mask[:1], both.pixel_values[:16], both.grid[:1], both.image_token)
+    torch.testing.assert_close(built.read(first_row, views(2)[:1])[0], together[0], rtol=0, atol=1e-5)
 
 
 @torch.inference_mode()
 def test_the_queries_read_the_chosen_states_and_the_last_is_normed(built: InternVLANetwork) -> None:
-    kept: list[Tensor] = []
-    handle = built.layer_qformer.register_forward_pre_hook(lambda _, given: kept.extend(given[0]))
+    queries: list[Tensor] = []
+    handle = built.layer_qformer.register_forward_pre_hook(lambda _, arguments: queries.extend(arguments[0]))
     try:
         built.read(inputs(), views(1))
     finally:
@@ -275,9 +275,9 @@ def test_the_queries_read_the_chosen_states_and_the_last_is_normed(built: Intern
     for hook in hooks:
         hook.remove()
     positions = inputs().ids.shape[1]
-    assert [state.shape[1] for state in kept] == [positions + 16] * 2
-    assert torch.equal(kept[0][:, :positions], states[2])
-    assert torch.equal(kept[1][:, :positions], language.norm(states[3]))
+    assert [state.shape[1] for state in queries] == [positions + 16] * 2
+    assert torch.equal(queries[0][:, :positions], states[2])
+    assert torch.equal(queries[1][:, :positions], language.norm(states[3]))
 
 
 @torch.inference_mode()
@@ -295,14 +295,14 @@ def test_a_network_without_memory_has_its_rotary_frequencies() -> None:
     assert all(buffer.dtype == torch.float32 and not buffer.is_meta for buffer in empty.buffers())
 
 
-@pytest.mark.parametrize("asked", [torch.float32, torch.bfloat16])
-def test_every_part_has_the_precision_that_is_asked_for_whatever_the_files_say(asked: torch.dtype) -> None:
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_every_part_has_the_precision_that_is_asked_for_whatever_the_files_say(dtype: torch.dtype) -> None:
     stored = {"torch_dtype": "float16"}
     values = vlm_values() | stored
     values["text_config"] |= stored
     values["vision_config"] |= stored
-    empty = build_internvla(config(values), asked, device="cpu")
-    assert {parameter.dtype for parameter in empty.parameters()} == {asked}
+    empty = build_internvla(config(values), dtype, device="cpu")
+    assert {parameter.dtype for parameter in empty.parameters()} == {dtype}
 
 
 @torch.inference_mode()

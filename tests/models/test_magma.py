@@ -119,8 +119,8 @@ def test_a_picture_takes_its_placeholders_place_row_by_row_with_a_separator_behi
 @torch.no_grad()
 def test_the_global_strategy_looks_at_the_whole_picture_at_once() -> None:
     network, wide = small_network(vision={"img_anyres_strategy": "global"}), picture(60, 128)
-    whole = torch.cat([wide.crops[0], wide.crops[1]], dim=2)[None]
-    expected = network.multi_modal_projector(network.vision_tower(whole).permute(0, 2, 3, 1))[0]
+    full_picture = torch.cat([wide.crops[0], wide.crops[1]], dim=2)[None]
+    expected = network.multi_modal_projector(network.vision_tower(full_picture).permute(0, 2, 3, 1))[0]
     assert torch.equal(network.look([wide])[0].reshape(2, 5, 64)[:, :4], expected)
     crops = small_network()
     assert not torch.allclose(crops.look([wide])[0], network.look([wide])[0])
@@ -131,9 +131,9 @@ def test_cached_steps_choose_what_one_pass_over_prompt_and_answer_would_choose()
     network, view = small_network(), picture(50, 50)
     decoded = network.decode([LONG], [view], steps=5)
     fed = LONG + decoded.ids[0, :-1].tolist()
-    whole = network([fed], [view]).logits[:, -5:]
-    torch.testing.assert_close(decoded.logits, whole, rtol=0, atol=2e-5)
-    assert torch.equal(decoded.ids, whole.argmax(dim=-1))
+    full_pass = network([fed], [view]).logits[:, -5:]
+    torch.testing.assert_close(decoded.logits, full_pass, rtol=0, atol=2e-5)
+    assert torch.equal(decoded.ids, full_pass.argmax(dim=-1))
 
 
 @torch.no_grad()
@@ -178,12 +178,12 @@ def test_a_network_without_memory_has_real_rotary_frequencies_in_float32() -> No
     assert torch.get_default_dtype() == torch.float32
 
 
-@pytest.mark.parametrize(("stored", "asked"), [("bfloat16", torch.float32), ("float32", torch.bfloat16)])
+@pytest.mark.parametrize(("stored", "dtype"), [("bfloat16", torch.float32), ("float32", torch.bfloat16)])
 def test_a_network_has_one_precision_whatever_a_part_of_its_configuration_says(
-    stored: str, asked: torch.dtype
+    stored: str, dtype: torch.dtype
 ) -> None:
     config = MagmaConfig.from_json(config_values(text={"torch_dtype": stored}))
-    assert {parameter.dtype for parameter in build_magma(config, asked, device="cpu").parameters()} == {asked}
+    assert {parameter.dtype for parameter in build_magma(config, dtype, device="cpu").parameters()} == {dtype}
 
 
 def test_the_trunk_of_the_released_size_has_the_norms_of_convnext_xxlarge() -> None:
@@ -232,9 +232,9 @@ def test_crops_are_torchvisions_pixels_stretched_and_cut_bit_for_bit(height: int
     prepared = prepare_picture(picture, SETTINGS)
     pixels = Compose([ToTensor(), Normalize(SETTINGS.mean, SETTINGS.deviation)])(Image.fromarray(picture))
     rows, columns = prepared.grid.rows, prepared.grid.columns
-    whole = torch.nn.functional.interpolate(pixels[None], size=(64 * rows, 64 * columns), mode="bilinear")[0]
+    resized = torch.nn.functional.interpolate(pixels[None], size=(64 * rows, 64 * columns), mode="bilinear")[0]
     expected = [
-        whole[:, 64 * row : 64 * (row + 1), 64 * column : 64 * (column + 1)]
+        resized[:, 64 * row : 64 * (row + 1), 64 * column : 64 * (column + 1)]
         for row in range(rows)
         for column in range(columns)
     ]
@@ -252,8 +252,13 @@ def test_the_checkpoints_own_processor_wins_over_its_configuration(tmp_path: Pat
     assert PictureSettings.of(vision, tmp_path) == SETTINGS
     file = tmp_path / "preprocessor_config.json"
     file.write_text(json.dumps({"base_img_size": 96, "num_crops": 2, "image_mean": [0, 0.5, 1]}), encoding="utf-8")
-    found = PictureSettings.of(vision, tmp_path)
-    assert (found.base, found.crops, found.mean, found.deviation) == (96, 2, (0, 0.5, 1), SETTINGS.deviation)
+    settings = PictureSettings.of(vision, tmp_path)
+    assert (settings.base, settings.crops, settings.mean, settings.deviation) == (
+        96,
+        2,
+        (0, 0.5, 1),
+        SETTINGS.deviation,
+    )
     file.write_text(json.dumps({"num_crops": 2}), encoding="utf-8")
     with pytest.raises(CheckpointError, match="base_img_size"):
         PictureSettings.of(vision, tmp_path)

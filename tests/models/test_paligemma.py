@@ -28,8 +28,8 @@ def test_a_cropped_picture_is_the_part_by_itself(tmp_path: Path) -> None:
 
 
 def test_without_a_crop_all_of_a_picture_is_looked_at(tmp_path: Path) -> None:
-    whole = pictures(tmp_path, **{CROP: [0, 0, 1, 1]}).pixels([PICTURE])
-    np.testing.assert_array_equal(pictures(tmp_path).pixels([PICTURE]), whole)
+    uncropped = pictures(tmp_path, **{CROP: [0, 0, 1, 1]}).pixels([PICTURE])
+    np.testing.assert_array_equal(pictures(tmp_path).pixels([PICTURE]), uncropped)
 
 
 @pytest.mark.parametrize(

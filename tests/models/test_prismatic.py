@@ -147,9 +147,9 @@ def test_cached_steps_choose_what_one_pass_over_prompt_and_answer_would_choose(l
     ids, mask, pixels = inputs(built)
     decoded = built.decode(ids, mask, pixels, steps=5)
     fed = torch.cat([ids, decoded.ids[:, :-1]], dim=1)
-    whole = built(fed, torch.ones_like(fed, dtype=torch.bool), pixels).logits[:, -5:]
-    torch.testing.assert_close(decoded.logits, whole, rtol=0, atol=2e-5)
-    assert torch.equal(decoded.ids, whole.argmax(dim=-1))
+    full_pass = built(fed, torch.ones_like(fed, dtype=torch.bool), pixels).logits[:, -5:]
+    torch.testing.assert_close(decoded.logits, full_pass, rtol=0, atol=2e-5)
+    assert torch.equal(decoded.ids, full_pass.argmax(dim=-1))
 
 
 @pytest.mark.parametrize("language", LANGUAGE)
@@ -159,9 +159,9 @@ def test_padding_before_the_last_token_changes_nothing(language: str) -> None:
     ids, mask, pixels = inputs(built)
     alone = built.decode(ids[:1], mask[:1], pixels[:1], steps=4)
     padded = torch.cat([ids[:1, :-1], torch.full((1, 3), 320), ids[:1, -1:]], dim=1)
-    seen = padded != 320
-    beside = torch.cat([ids[1:], ids[1:, :3]], dim=1)
-    both = torch.cat([padded, beside]), torch.cat([seen, torch.ones_like(beside, dtype=torch.bool)])
+    padding_mask = padded != 320
+    unpadded = torch.cat([ids[1:], ids[1:, :3]], dim=1)
+    both = torch.cat([padded, unpadded]), torch.cat([padding_mask, torch.ones_like(unpadded, dtype=torch.bool)])
     together = built.decode(*both, pixels, steps=4)
     torch.testing.assert_close(together.logits[:1], alone.logits, rtol=0, atol=2e-5)
 
@@ -174,12 +174,12 @@ def test_rotary_frequencies_stay_float32_and_real_on_a_network_built_without_mem
     assert torch.get_default_dtype() == torch.float32
 
 
-@pytest.mark.parametrize("asked", [torch.float32, torch.bfloat16])
-def test_every_part_has_the_precision_that_is_asked_for_whatever_the_file_says(asked: torch.dtype) -> None:
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_every_part_has_the_precision_that_is_asked_for_whatever_the_file_says(dtype: torch.dtype) -> None:
     values = config_values()
     values["text_config"]["torch_dtype"] = "float16"
-    built = build_prismatic(PrismaticConfig.from_json(values), asked, device="cpu")
-    assert {parameter.dtype for parameter in built.parameters()} == {asked}
+    built = build_prismatic(PrismaticConfig.from_json(values), dtype, device="cpu")
+    assert {parameter.dtype for parameter in built.parameters()} == {dtype}
 
 
 @pytest.mark.slow
@@ -199,18 +199,20 @@ def settings(strategy: str, folder: Path = Path("nowhere")) -> PictureSettings:
     return PictureSettings.of(PrismaticConfig.from_json(values), folder)
 
 
-def by_torchvision(image: np.ndarray, chosen: PictureSettings) -> np.ndarray:
+def by_torchvision(image: np.ndarray, picture_settings: PictureSettings) -> np.ndarray:
     """The same in torchvision's words, whose rounding the original software has."""
-    whole = Image.fromarray(image)
-    if chosen.strategy == "letterbox":
-        longer = max(whole.size)
-        left, top = int((longer - whole.width) / 2), int((longer - whole.height) / 2)
-        fill = tuple(int(255 * value) for value in chosen.means[-1])
-        whole = functional.pad(whole, [left, top, left, top], fill=fill)
+    canvas = Image.fromarray(image)
+    if picture_settings.strategy == "letterbox":
+        longer = max(canvas.size)
+        left, top = int((longer - canvas.width) / 2), int((longer - canvas.height) / 2)
+        fill = tuple(int(255 * value) for value in picture_settings.means[-1])
+        canvas = functional.pad(canvas, [left, top, left, top], fill=fill)
     channels = []
-    for side, mean, deviation in zip(chosen.sides, chosen.means, chosen.deviations, strict=True):
-        size = [side, side] if chosen.strategy == "resize-naive" else side
-        resized = functional.resize(whole, size, InterpolationMode.BICUBIC)
+    for side, mean, deviation in zip(
+        picture_settings.sides, picture_settings.means, picture_settings.deviations, strict=True
+    ):
+        size = [side, side] if picture_settings.strategy == "resize-naive" else side
+        resized = functional.resize(canvas, size, InterpolationMode.BICUBIC)
         tensor = functional.to_tensor(functional.center_crop(resized, [side, side]))
         channels.append(functional.normalize(tensor, list(mean), list(deviation)))
     return torch.cat(channels).numpy()
@@ -219,10 +221,10 @@ def by_torchvision(image: np.ndarray, chosen: PictureSettings) -> np.ndarray:
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("strategy", ["resize-naive", "letterbox", "resize-crop"])
 def test_pixel_values_are_torchvisions_bit_for_bit(strategy: str, shape: tuple[int, int]) -> None:
-    chosen = settings(strategy)
-    ours = prepare_picture(picture(shape), chosen)
+    picture_settings = settings(strategy)
+    ours = prepare_picture(picture(shape), picture_settings)
     assert ours.dtype == np.float32
-    np.testing.assert_array_equal(ours, by_torchvision(picture(shape), chosen))
+    np.testing.assert_array_equal(ours, by_torchvision(picture(shape), picture_settings))
 
 
 def test_the_checkpoints_own_preprocessor_wins_over_the_table(tmp_path: Path) -> None:
@@ -234,8 +236,8 @@ def test_the_checkpoints_own_preprocessor_wins_over_the_table(tmp_path: Path) ->
         "interpolations": ["bicubic", "bilinear"],
     }
     (tmp_path / "preprocessor_config.json").write_text(json.dumps(stored), encoding="utf-8")
-    found = settings("letterbox", tmp_path)
-    assert (found.strategy, found.resampling, found.means[1]) == (
+    picture_settings = settings("letterbox", tmp_path)
+    assert (picture_settings.strategy, picture_settings.resampling, picture_settings.means[1]) == (
         "resize-crop",
         ("bicubic", "bilinear"),
         (0.4, 0.5, 0.6),

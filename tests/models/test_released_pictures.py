@@ -68,19 +68,19 @@ def test_pictures_are_prepared_as_by_the_released_processors(
     (tmp_path / "preprocessor_config.json").write_text(json.dumps(FILES[family]), encoding="utf-8")
     expected = json.loads((reference / "dims.json").read_text(encoding="utf-8"))[f"{family}_{size}"]
     with np.load(reference / "reference.npz") as arrays:
-        made, tokens = PREPARE[family](tmp_path, arrays[f"picture_{size}"])
-        named = {part: arrays[f"{family}_{size}_{part}"] for part in ("shape", "index", "at", "sum")}
-    assert made.shape == tuple(named["shape"])
+        prepared, tokens = PREPARE[family](tmp_path, arrays[f"picture_{size}"])
+        recorded = {part: arrays[f"{family}_{size}_{part}"] for part in ("shape", "index", "at", "sum")}
+    assert prepared.shape == tuple(recorded["shape"])
     assert tokens == expected["image_tokens"]
-    np.testing.assert_allclose(made.ravel()[named["index"]], named["at"], rtol=0, atol=1e-6)
-    whole = made.astype(np.float64)
-    np.testing.assert_allclose([whole.sum(), np.abs(whole).sum()], named["sum"], rtol=1e-6)
+    np.testing.assert_allclose(prepared.ravel()[recorded["index"]], recorded["at"], rtol=0, atol=1e-6)
+    doubles = prepared.astype(np.float64)
+    np.testing.assert_allclose([doubles.sum(), np.abs(doubles).sum()], recorded["sum"], rtol=1e-6)
 
 
 def test_one_tile_on_wish_shows_the_whole_picture(golden_vlm: Path, tmp_path: Path) -> None:
     (tmp_path / "preprocessor_config.json").write_text(json.dumps(FILES["internvl"]), encoding="utf-8")
     with np.load(golden_vlm / "preprocess" / "reference.npz") as arrays:
         picture = arrays["picture_560x480"]
-    tiled, one = (TiledPictures.from_folder(tmp_path, 448, tiled) for tiled in (True, False))
-    assert (tiled.tiles(480, 560), one.tiles(480, 560)) == (13, 1)
-    np.testing.assert_array_equal(tiled.pixels([picture])[-1:], one.pixels([picture]))
+    tiled, single_tile = (TiledPictures.from_folder(tmp_path, 448, tiled) for tiled in (True, False))
+    assert (tiled.tiles(480, 560), single_tile.tiles(480, 560)) == (13, 1)
+    np.testing.assert_array_equal(tiled.pixels([picture])[-1:], single_tile.pixels([picture]))

@@ -81,7 +81,7 @@ def test_what_is_missing_is_named(missing: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("field", "value", "said"),
+    ("field", "value", "reason"),
     [
         ("model_type", "paligemma", "paligemma"),
         ("projection_dim", 48, "projection_dim 48"),
@@ -91,8 +91,8 @@ def test_what_is_missing_is_named(missing: str) -> None:
         ("vision_config", {"model_type": "clip_vision_model"}, "clip_vision_model"),
     ],
 )
-def test_what_contradicts_is_refused_by_name(field: str, value: object, said: str) -> None:
-    with pytest.raises(CheckpointError, match=said):
+def test_what_contradicts_is_refused_by_name(field: str, value: object, reason: str) -> None:
+    with pytest.raises(CheckpointError, match=reason):
         SpatialVLAConfig.from_json({**config_values(), field: value})
 
 
@@ -116,9 +116,9 @@ CAMERA = torch.tensor([[60.0, 0, 20], [0, 62, 22], [0, 0, 1]])
 
 @pytest.fixture(scope="module")
 def built() -> SpatialVLANetwork:
-    made = network()
-    made.embed_actions()
-    return made
+    model = network()
+    model.embed_actions()
+    return model
 
 
 def prompt(length: int, patches: int = 9, seed: int = 0) -> list[int]:
@@ -137,16 +137,16 @@ def test_cached_steps_choose_what_one_pass_over_prompt_and_actions_would_choose(
     features = built.look(pictures(), CAMERA).features
     decoded = built.decode(packed.ids, packed.mask, features, steps=6)
     embeddings = torch.cat([built.embed(packed.ids, features), built.embed(decoded.ids[:, :-1])], dim=1)
-    length, known = embeddings.shape[1], packed.ids.shape[1]
+    length, prompt_length = embeddings.shape[1], packed.ids.shape[1]
     hidden = torch.full((length, length), -torch.inf).triu(1)
-    hidden[:known, :known] = 0
-    whole = built.language_model(
+    hidden[:prompt_length, :prompt_length] = 0
+    full_pass = built.language_model(
         inputs_embeds=embeddings,
         position_ids=torch.arange(1, length + 1)[None],
         attention_mask={"full_attention": hidden[None, None], "sliding_attention": hidden[None, None]},
     ).logits[:, -6:]
-    torch.testing.assert_close(decoded.logits, whole, rtol=0, atol=2e-5)
-    assert torch.equal(decoded.ids, whole.argmax(dim=-1))
+    torch.testing.assert_close(decoded.logits, full_pass, rtol=0, atol=2e-5)
+    assert torch.equal(decoded.ids, full_pass.argmax(dim=-1))
 
 
 @torch.inference_mode()
@@ -164,17 +164,17 @@ def test_the_picture_reads_the_text_and_padding_is_read_by_nothing(built: Spatia
 
 @torch.inference_mode()
 def test_positions_count_tokens_from_one(built: SpatialVLANetwork) -> None:
-    seen: list[Tensor] = []
+    positions: list[Tensor] = []
     rotary = built.language_model.model.rotary_emb
-    handle = rotary.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[1].clone()))
+    handle = rotary.register_forward_pre_hook(lambda _, inputs: positions.append(inputs[1].clone()))
     try:
         packed = Packed.of([prompt(2), prompt(4)], 0)
         built.decode(packed.ids, packed.mask, built.look(pictures(2), CAMERA).features, steps=2)
     finally:
         handle.remove()
-    assert seen[0][1].tolist() == list(range(1, 16))
-    assert seen[0][0, [0, 11, -1]].tolist() == [1, 12, 13]
-    assert seen[1].tolist() == [[14], [16]]
+    assert positions[0][1].tolist() == list(range(1, 16))
+    assert positions[0][0, [0, 11, -1]].tolist() == [1, 12, 13]
+    assert positions[1].tolist() == [[14], [16]]
 
 
 @torch.inference_mode()
@@ -188,15 +188,15 @@ def test_features_stay_as_they_are_where_words_are_scaled(built: SpatialVLANetwo
 
 
 def test_action_ids_are_embedded_by_their_own_table_and_put_out_by_another() -> None:
-    made = network(seed=4)
-    head = made.language_model.lm_head.weight.clone()
-    stale = made.language_model.model.embed_tokens.weight[FIRST_ACTION:].clone()
-    made.embed_actions()
-    ids = torch.arange(FIRST_ACTION, FIRST_ACTION + made.config.actions)[None]
-    own = made.spatial_embed_tokens.weight
-    torch.testing.assert_close(made.embed(ids)[0], own * 32**0.5)
-    assert (stale - own).abs().max() > 0.01
-    assert torch.equal(made.language_model.lm_head.weight, head)
+    model = network(seed=4)
+    head = model.language_model.lm_head.weight.clone()
+    stale = model.language_model.model.embed_tokens.weight[FIRST_ACTION:].clone()
+    model.embed_actions()
+    ids = torch.arange(FIRST_ACTION, FIRST_ACTION + model.config.actions)[None]
+    table = model.spatial_embed_tokens.weight
+    torch.testing.assert_close(model.embed(ids)[0], table * 32**0.5)
+    assert (stale - table).abs().max() > 0.01
+    assert torch.equal(model.language_model.lm_head.weight, head)
 
 
 def test_another_number_of_places_than_patches_is_refused(built: SpatialVLANetwork) -> None:
@@ -205,13 +205,13 @@ def test_another_number_of_places_than_patches_is_refused(built: SpatialVLANetwo
 
 
 def test_attention_without_the_soft_cap_is_refused() -> None:
-    made = network()
+    model = network()
     mask = torch.ones((1, 3), dtype=torch.bool)
-    made.language_model.set_attn_implementation("sdpa")
+    model.language_model.set_attn_implementation("sdpa")
     with pytest.raises(UsageError, match="'sdpa', which drops the soft cap"):
-        made(torch.zeros(1, 3, 32), mask)
-    made.language_model.set_attn_implementation("eager")
-    assert torch.isfinite(made(torch.ones(1, 3, 32), mask).logits).all()
+        model(torch.zeros(1, 3, 32), mask)
+    model.language_model.set_attn_implementation("eager")
+    assert torch.isfinite(model(torch.ones(1, 3, 32), mask).logits).all()
 
 
 @pytest.mark.slow
@@ -220,10 +220,12 @@ def test_the_soft_cap_is_in_force() -> None:
     values = config_values()
     logits = []
     for cap in (50.0, 0.5):
-        made = network(text_config={**values["text_config"], "attn_logit_softcapping": cap})
-        made.embed_actions()
+        model = network(text_config={**values["text_config"], "attn_logit_softcapping": cap})
+        model.embed_actions()
         packed = Packed.of([prompt(5)], 0)
-        logits.append(made.decode(packed.ids, packed.mask, made.look(pictures(), CAMERA).features, steps=1).logits)
+        logits.append(
+            model.decode(packed.ids, packed.mask, model.look(pictures(), CAMERA).features, steps=1).logits
+        )
     assert (logits[0] - logits[1]).abs().max() > 1e-3
     assert max(each.abs().max() for each in logits) < 30
 
@@ -245,18 +247,18 @@ def test_slots_and_fed_tokens_are_obeyed(built: SpatialVLANetwork) -> None:
 @torch.inference_mode()
 def test_a_model_without_depth_reads_sight_alone() -> None:
     values = {"use_vision_zoe": False, "vision_zoe_config": None}
-    made = network(**values)
-    seen = made.look(pictures(), CAMERA)
-    assert seen.depth is seen.points is seen.positions is None
-    torch.testing.assert_close(seen.features, made.multi_modal_projector(seen.tower))
-    assert not any("zoe" in name or "position_embedding_3d" in name for name in made.state_dict())
+    model = network(**values)
+    sight = model.look(pictures(), CAMERA)
+    assert sight.depth is sight.points is sight.positions is None
+    torch.testing.assert_close(sight.features, model.multi_modal_projector(sight.tower))
+    assert not any("zoe" in name or "position_embedding_3d" in name for name in model.state_dict())
 
 
 def test_a_network_built_without_memory_has_real_constants_and_the_right_dtype() -> None:
-    made = build_spatialvla(SpatialVLAConfig.from_json(config_values()), torch.bfloat16)
-    assert all(parameter.is_meta and parameter.dtype == torch.bfloat16 for parameter in made.parameters())
-    assert not any(buffer.is_meta for buffer in made.buffers())
-    assert made.language_model.model.rotary_emb.inv_freq.dtype == torch.float32
+    model = build_spatialvla(SpatialVLAConfig.from_json(config_values()), torch.bfloat16)
+    assert all(parameter.is_meta and parameter.dtype == torch.bfloat16 for parameter in model.parameters())
+    assert not any(buffer.is_meta for buffer in model.buffers())
+    assert model.language_model.model.rotary_emb.inv_freq.dtype == torch.float32
     assert torch.get_default_dtype() == torch.float32
 
 
@@ -274,15 +276,15 @@ def test_constants_are_the_same_with_and_without_memory() -> None:
 @pytest.mark.slow
 @torch.inference_mode()
 def test_bfloat16_runs_with_pictures_and_depth_in_float32() -> None:
-    made = network().to(torch.bfloat16)
-    made.embed_actions()
-    seen = made.look(pictures(), CAMERA)
-    assert seen.depth is not None
-    assert seen.points is not None
-    assert seen.depth.metres.dtype == seen.points.dtype == torch.float32
+    model = network().to(torch.bfloat16)
+    model.embed_actions()
+    sight = model.look(pictures(), CAMERA)
+    assert sight.depth is not None
+    assert sight.points is not None
+    assert sight.depth.metres.dtype == sight.points.dtype == torch.float32
     packed = Packed.of([prompt(4), prompt(2)], 0)
-    features = made.look(pictures(2), CAMERA).features
-    assert torch.isfinite(made.decode(packed.ids, packed.mask, features, 3).logits).all()
+    features = model.look(pictures(2), CAMERA).features
+    assert torch.isfinite(model.decode(packed.ids, packed.mask, features, 3).logits).all()
 
 
 def domain_pictures() -> Tensor:
@@ -297,15 +299,15 @@ def domain_pictures() -> Tensor:
 @pytest.fixture
 def divided() -> SpatialVLANetwork:
     """A network whose depth head takes one of the domain_pictures for another domain than the other two."""
-    made = network(seed=2)
+    model = network(seed=2)
     with torch.inference_mode():
-        logits = estimate_depth(made.vision_zoe_model, domain_pictures()).domains
+        logits = estimate_depth(model.vision_zoe_model, domain_pictures()).domains
     assert logits is not None
     difference = (logits[:, 1] - logits[:, 0]).sort().values
     between = float(difference[:2].mean())
     with torch.no_grad():
-        made.vision_zoe_model.metric_head.mlp_classifier.linear2.bias[0] += between
-    return made
+        model.vision_zoe_model.metric_head.mlp_classifier.linear2.bias[0] += between
+    return model
 
 
 @pytest.mark.slow
@@ -324,11 +326,11 @@ def test_a_picture_has_the_depth_it_has_alone_whatever_else_is_in_the_batch(divi
 @torch.inference_mode()
 def test_the_originals_vote_gives_the_minority_another_head(divided: SpatialVLANetwork) -> None:
     zoe = divided.vision_zoe_model
-    own, voted = estimate_depth(zoe, domain_pictures()), estimate_depth(zoe, domain_pictures(), vote=True)
-    assert own.domains is not None
-    minority = own.domains.argmax(dim=-1) != own.domains.sum(dim=0).argmax()
-    torch.testing.assert_close(own.raw[~minority], voted.raw[~minority], rtol=0, atol=1e-5)
-    assert (own.raw[minority] - voted.raw[minority]).abs().max() > 1e-3
+    unvoted, voted = estimate_depth(zoe, domain_pictures()), estimate_depth(zoe, domain_pictures(), vote=True)
+    assert unvoted.domains is not None
+    minority = unvoted.domains.argmax(dim=-1) != unvoted.domains.sum(dim=0).argmax()
+    torch.testing.assert_close(unvoted.raw[~minority], voted.raw[~minority], rtol=0, atol=1e-5)
+    assert (unvoted.raw[minority] - voted.raw[minority]).abs().max() > 1e-3
 
 
 @pytest.mark.slow
@@ -336,8 +338,8 @@ def test_the_originals_vote_gives_the_minority_another_head(divided: SpatialVLAN
 def test_a_depth_network_of_one_head_needs_no_vote() -> None:
     values = network().config.depth.to_dict()
     values["bin_configurations"] = values["bin_configurations"][:1]
-    made = network(vision_zoe_config=values)
-    depth = estimate_depth(made.vision_zoe_model, domain_pictures())
+    model = network(vision_zoe_config=values)
+    depth = estimate_depth(model.vision_zoe_model, domain_pictures())
     assert depth.domains is None
     assert depth.metres.shape == (3, 1, SIDE, SIDE)
 
@@ -345,12 +347,12 @@ def test_a_depth_network_of_one_head_needs_no_vote() -> None:
 def test_the_margin_is_a_mirror_and_the_range_is_minus_one_to_one() -> None:
     picture = torch.zeros(1, 3, 64, 64)
     picture[..., :, 10] = 1  # a line; its mirror image lies as far beyond the edge
-    seen = depth_input(picture)
-    assert seen.shape == (1, 3, DEPTH_SIDE, DEPTH_SIDE)
+    padded = depth_input(picture)
+    assert padded.shape == (1, 3, DEPTH_SIDE, DEPTH_SIDE)
     scale = (DEPTH_SIDE - 1) / (64 + 2 * MARGIN - 1)
-    bright = seen[0, 0, 200] > 0
-    for place in (MARGIN + 10, MARGIN - 10):
-        assert bright[round(place * scale)]
+    bright = padded[0, 0, 200] > 0
+    for row in (MARGIN + 10, MARGIN - 10):
+        assert bright[round(row * scale)]
     torch.testing.assert_close(depth_input(torch.full((1, 3, 64, 64), 0.5)), torch.zeros(1, 3, 384, 384))
 
 
@@ -360,19 +362,19 @@ def test_points_project_back_to_the_middles_of_a_patchs_parts(side: int, patch: 
     generator = torch.Generator().manual_seed(0)
     camera = torch.tensor([[210.0, 0, 25.8], [0, 123.2, 25.2], [0, 0, 1]])
     metres = 1 + torch.rand((2, 1, side, side), generator=generator)
-    found = back_project(metres, camera, patch, points).double()
+    projected = back_project(metres, camera, patch, points).double()
     part, along = patch // points, side // patch
     for row in range(2):
         for index in range(along**2):
             top, left = index // along * patch, index % along * patch
             for inner in range(points**2):
                 y, x = top + inner // points * part, left + inner % points * part
-                point = found[row, index, 3 * inner : 3 * inner + 3]
+                point = projected[row, index, 3 * inner : 3 * inner + 3]
                 depth = metres[row, 0, y : y + part, x : x + part].double().mean()
-                seen = camera.double() @ point
+                pixel = camera.double() @ point
                 assert point[2] == pytest.approx(float(depth), abs=1e-6)
                 middle = [x + part / 2, y + part / 2]
-                np.testing.assert_allclose((seen[:2] / seen[2]).numpy(), middle, atol=1e-4)
+                np.testing.assert_allclose((pixel[:2] / pixel[2]).numpy(), middle, atol=1e-4)
 
 
 def test_every_row_may_have_its_own_camera() -> None:
@@ -415,10 +417,10 @@ def test_pixels_are_transformers_pil_processors_bit_for_bit(
 ) -> None:
     from transformers import SiglipImageProcessorPil
 
-    chosen = settings(tmp_path, **fields)
+    picture_settings = settings(tmp_path, **fields)
     theirs = SiglipImageProcessorPil(**{k: v for k, v in preprocessor_values(**fields).items() if "type" not in k})
     expected = np.asarray(theirs(picture(*shape), return_tensors="np")["pixel_values"][0])
-    ours = prepare_picture(picture(*shape), chosen)
+    ours = prepare_picture(picture(*shape), picture_settings)
     assert ours.dtype == np.float32
     np.testing.assert_array_equal(ours, expected)
 
@@ -429,20 +431,20 @@ def test_without_a_file_pictures_are_prepared_as_released(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    ("fields", "said"),
+    ("fields", "reason"),
     [({"side": 56}, "side 56"), ({"do_resize": False}, "side -1"), ({"resample": 17}, "resample is 17")],
 )
-def test_a_file_that_contradicts_the_model_is_refused(tmp_path: Path, fields: dict[str, Any], said: str) -> None:
-    with pytest.raises(CheckpointError, match=said):
+def test_a_file_that_contradicts_the_model_is_refused(tmp_path: Path, fields: dict[str, Any], reason: str) -> None:
+    with pytest.raises(CheckpointError, match=reason):
         settings(tmp_path, **fields)
 
 
 def test_a_camera_sees_the_same_point_in_the_same_part_of_the_squeezed_picture() -> None:
     camera = known_cameras(processor_values(), "file")["default"]
     point = np.array([0.1, -0.2, 0.9])
-    place = camera.matrix @ point / point[2]
+    pixel = camera.matrix @ point / point[2]
     squeezed = camera.at(224) @ point / point[2]
-    np.testing.assert_allclose(squeezed[:2] / 224, place[:2] / [640, 480], rtol=1e-6)
+    np.testing.assert_allclose(squeezed[:2] / 224, pixel[:2] / [640, 480], rtol=1e-6)
 
 
 def test_a_matrix_that_is_no_cameras_is_refused() -> None:
@@ -467,59 +469,59 @@ def test_the_three_slots_follow_each_other_and_end_the_vocabulary() -> None:
 
 
 def test_every_rotation_and_gripper_id_is_found_again_from_its_value() -> None:
-    own = bins()
-    ids = np.array([[own.slots[0][0], r, g] for r in own.slots[1] for g in own.slots[2]])
-    np.testing.assert_array_equal(own.ids(own.values(ids))[:, 1:], ids[:, 1:])
+    action_bins = bins()
+    ids = np.array([[action_bins.slots[0][0], r, g] for r in action_bins.slots[1] for g in action_bins.slots[2]])
+    np.testing.assert_array_equal(action_bins.ids(action_bins.values(ids))[:, 1:], ids[:, 1:])
 
 
 def test_every_movement_that_no_edge_cuts_off_is_found_again_from_its_value() -> None:
-    own = bins()
-    ids = np.array([[m, own.slots[1][0], own.slots[2][0]] for m in own.slots[0]])
-    values = own.values(ids)
+    action_bins = bins()
+    ids = np.array([[m, action_bins.slots[1][0], action_bins.slots[2][0]] for m in action_bins.slots[0]])
+    values = action_bins.values(ids)
     inside = (np.abs(values[:, :3]) < 1).all(axis=1)
     assert inside.sum() == 12  # the inner of two radii
-    np.testing.assert_array_equal(own.ids(values)[inside], ids[inside])
+    np.testing.assert_array_equal(action_bins.ids(values)[inside], ids[inside])
 
 
 def test_a_movement_is_direction_and_length() -> None:
     """Straight up, by hand: the smallest polar angle, the smaller radius."""
-    own = bins()
-    theta, phi, radius = own.edges[:3]
+    action_bins = bins()
+    theta, phi, radius = action_bins.edges[:3]
     middles = [(edges[0] + edges[1]) / 2 for edges in (theta, phi, radius)]
     expected = middles[2] * np.array(
         [np.sin(middles[0]) * np.cos(middles[1]), np.sin(middles[0]) * np.sin(middles[1]), np.cos(middles[0])]
     )
-    ids = np.array([slot.start for slot in own.slots])
-    np.testing.assert_allclose(own.values(ids)[:3], np.clip(expected, -1, 1))
-    second_radius = own.values(ids + np.array([1, 0, 0]))[:3]
+    ids = np.array([slot.start for slot in action_bins.slots])
+    np.testing.assert_allclose(action_bins.values(ids)[:3], np.clip(expected, -1, 1))
+    second_radius = action_bins.values(ids + np.array([1, 0, 0]))[:3]
     assert np.linalg.norm(second_radius) > np.linalg.norm(expected)
 
 
 def test_an_id_outside_its_slot_counts_as_the_nearest_and_is_not_known() -> None:
-    own = bins()
-    inside = np.array([slot[0] for slot in own.slots])
-    below, above = np.array([0, 0, 0]), np.array([slot[-1] for slot in own.slots])
-    np.testing.assert_array_equal(own.values(below), own.values(inside))
-    np.testing.assert_array_equal(own.values(above + 100), own.values(above))
-    assert own.is_action(inside).all()
-    assert not own.is_action(below).any()
-    assert own.is_action(np.stack([inside, inside[::-1]])).tolist() == [[True] * 3, [False, True, False]]
+    action_bins = bins()
+    inside = np.array([slot[0] for slot in action_bins.slots])
+    below, above = np.array([0, 0, 0]), np.array([slot[-1] for slot in action_bins.slots])
+    np.testing.assert_array_equal(action_bins.values(below), action_bins.values(inside))
+    np.testing.assert_array_equal(action_bins.values(above + 100), action_bins.values(above))
+    assert action_bins.is_action(inside).all()
+    assert not action_bins.is_action(below).any()
+    assert action_bins.is_action(np.stack([inside, inside[::-1]])).tolist() == [[True] * 3, [False, True, False]]
 
 
 def test_the_gripper_is_closed_or_open() -> None:
-    own = bins()
+    action_bins = bins()
     for value, expected in ((-1, 0), (0.49, 0), (0.5, 1), (1, 1)):
-        found = own.values(own.ids(np.array([0.1, 0.2, 0.3, 0, 0, 0, value])))
-        assert found[6] == expected
+        values = action_bins.values(action_bins.ids(np.array([0.1, 0.2, 0.3, 0, 0, 0, value])))
+        assert values[6] == expected
 
 
 def test_where_edges_are_absent_they_come_from_the_gaussians() -> None:
-    own = bins(bin_policy=None, gs_params=GAUSSIANS)
-    for edges, (axis, shape) in zip(own.edges, GAUSSIANS.items(), strict=True):
+    action_bins = bins(bin_policy=None, gs_params=GAUSSIANS)
+    for edges, (axis, shape) in zip(action_bins.edges, GAUSSIANS.items(), strict=True):
         mass = np.diff(norm.cdf(edges, shape["mu"], shape["sigma"]))
         np.testing.assert_allclose(mass, mass[0], rtol=1e-6, err_msg=axis)
-    assert own.edges[0][0] == 0
-    assert own.edges[1][-1] == pytest.approx(np.pi)
+    assert action_bins.edges[0][0] == 0
+    assert action_bins.edges[1][-1] == pytest.approx(np.pi)
 
 
 def test_a_floor_of_the_deviation_is_kept() -> None:
@@ -537,10 +539,10 @@ def test_even_edges_have_to_be_asked_for() -> None:
 
 def test_axes_may_be_cartesian() -> None:
     plain = {**processor_values()["action_config"], "use_spherical": False}
-    own = bins(action_config=plain)
-    ids = np.array([slot.start for slot in own.slots])
-    expected = [(edges[0] + edges[1]) / 2 for edges in own.edges[:3]]
-    np.testing.assert_allclose(own.values(ids)[:3], np.clip(expected, -1, 1))
+    action_bins = bins(action_config=plain)
+    ids = np.array([slot.start for slot in action_bins.slots])
+    expected = [(edges[0] + edges[1]) / 2 for edges in action_bins.edges[:3]]
+    np.testing.assert_allclose(action_bins.values(ids)[:3], np.clip(expected, -1, 1))
 
 
 def test_bins_of_another_checkpoint_are_refused() -> None:
@@ -557,7 +559,7 @@ def test_the_stored_edges_are_those_of_the_gaussians_beside_them(golden_spatialv
     values = json.loads((golden_spatialvla / "checkpoint" / "processor_config.json").read_text(encoding="utf-8"))
     model = json.loads((golden_spatialvla / "checkpoint" / "config.json").read_text(encoding="utf-8"))
     first, actions = model["action_token_begin_idx"], model["spatial_token_num"]
-    own = ActionBins.of(values, first, actions, "golden")
+    action_bins = ActionBins.of(values, first, actions, "golden")
     gaussian = ActionBins.of({k: v for k, v in values.items() if k != "bin_policy"}, first, actions, "golden")
-    for ours, stored in zip(gaussian.edges, own.edges, strict=True):
+    for ours, stored in zip(gaussian.edges, action_bins.edges, strict=True):
         np.testing.assert_allclose(ours, stored, rtol=0, atol=1e-12)

@@ -40,7 +40,7 @@ def test_without_dit_config_the_released_size_is_meant() -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "reason"),
     [
         ({"head_dim": 8}, "head_dim 8, the VLM's cache has 16"),
         ({"num_key_value_heads": 4}, "num_key_value_heads 4, the VLM's cache has 2"),
@@ -48,9 +48,9 @@ def test_without_dit_config_the_released_size_is_meant() -> None:
         ({"hidden_size": 40}, "hidden_size 40"),
     ],
 )
-def test_a_flow_transformer_that_cannot_read_the_cache_is_refused(change: dict[str, int], said: str) -> None:
+def test_a_flow_transformer_that_cannot_read_the_cache_is_refused(change: dict[str, int], reason: str) -> None:
     flow = config_values()["dit_config"] | change
-    with pytest.raises(CheckpointError, match=said):
+    with pytest.raises(CheckpointError, match=reason):
         XiaomiConfig.from_json(config_values(dit_config=flow))
 
 
@@ -112,9 +112,12 @@ def test_a_batch_with_padding_equals_its_rows_one_by_one(network: XiaomiNetwork)
             both.grid[row : row + 1],
             both.image_token,
         )
-        one = slice(row, row + 1)
+        row_slice = slice(row, row + 1)
         torch.testing.assert_close(
-            network(alone, state[one], used[one], noise[one], STEPS)[0], together[row], rtol=0, atol=1e-5
+            network(alone, state[row_slice], used[row_slice], noise[row_slice], STEPS)[0],
+            together[row],
+            rtol=0,
+            atol=1e-5,
         )
 
 
@@ -156,11 +159,11 @@ def test_an_action_sees_the_ones_before_it_and_no_later_one(network: XiaomiNetwo
 def test_only_the_last_layers_of_the_prompt_are_read(network: XiaomiNetwork) -> None:
     assert len(network.read(inputs()).caches) == 2
     layers = network.vlm.model.language_model.layers
-    seen = network.read(inputs()).caches
+    caches = network.read(inputs()).caches
     assert len(layers) == 4
-    for kept, number in zip(seen, (2, 3), strict=True):
-        whole = network.vlm.model(**inputs().keywords(network.vlm.model), use_cache=True).past_key_values
-        assert torch.equal(kept[0], whole.layers[number].keys)
+    for cache, number in zip(caches, (2, 3), strict=True):
+        full_cache = network.vlm.model(**inputs().keywords(network.vlm.model), use_cache=True).past_key_values
+        assert torch.equal(cache[0], full_cache.layers[number].keys)
 
 
 def test_a_network_without_memory_has_its_rotary_frequencies() -> None:
@@ -171,12 +174,12 @@ def test_a_network_without_memory_has_its_rotary_frequencies() -> None:
     assert torch.get_default_dtype() == torch.float32
 
 
-@pytest.mark.parametrize("asked", [torch.float32, torch.bfloat16])
-def test_every_part_has_the_precision_that_is_asked_for_whatever_the_files_say(asked: torch.dtype) -> None:
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_every_part_has_the_precision_that_is_asked_for_whatever_the_files_say(dtype: torch.dtype) -> None:
     vlm = config_values()["vlm_config"] | {"dtype": "float16"}
     vlm["text_config"]["torch_dtype"] = vlm["vision_config"]["dtype"] = "float16"
-    built = build_xiaomi(XiaomiConfig.from_json(config_values(vlm_config=vlm)), asked, device="cpu")
-    assert {parameter.dtype for parameter in built.parameters()} == {asked}
+    built = build_xiaomi(XiaomiConfig.from_json(config_values(vlm_config=vlm)), dtype, device="cpu")
+    assert {parameter.dtype for parameter in built.parameters()} == {dtype}
 
 
 @torch.inference_mode()
@@ -254,17 +257,17 @@ def test_only_the_first_letter_changes_and_no_stop_is_doubled() -> None:
 def test_the_rim_is_cut_off_and_the_size_kept(robot: str, shape: tuple[int, ...]) -> None:
     inside = np.full(shape, 90, np.uint8)
     inside[:4], inside[-4:], inside[:, :4], inside[:, -4:] = 255, 255, 255, 255
-    seen = look(inside, robot_of(robot))
-    assert seen.shape == shape
-    assert (seen == 90).all()
+    model_picture = look(inside, robot_of(robot))
+    assert model_picture.shape == shape
+    assert (model_picture == 90).all()
 
 
 def test_a_whole_frame_is_squeezed_not_cut() -> None:
     frame = np.zeros((480, 640, 3), np.uint8)
     frame[:, 320:] = 200
-    seen = look(frame, robot_of("bridge_delta"))
-    assert seen[:, :120].max() == 0
-    assert seen[:, 136:].min() == 200
+    model_picture = look(frame, robot_of("bridge_delta"))
+    assert model_picture[:, :120].max() == 0
+    assert model_picture[:, 136:].min() == 200
 
 
 def test_the_states_of_the_two_robots() -> None:

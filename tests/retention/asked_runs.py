@@ -56,14 +56,14 @@ def episodes(right: dict[str, tuple[np.ndarray, ...]], readable: float = 1.0, se
     return pd.DataFrame(rows)
 
 
-def asked(path: Path, right: dict, model: str = "qwen3-vl", called: str = "", **ask: object) -> SaidRun:
+def answer_run(path: Path, right: dict, model: str = "qwen3-vl", called: str = "", **ask: object) -> SaidRun:
     """A VLM run whose text is right where `right` says; its logits always say left, and debiased the truth."""
     table = episodes(right, readable=0.5, seed=1)
-    left = table["side_correct"] == "left"
+    is_left = table["side_correct"] == "left"
     table = table.assign(
         parse="letter",
         parse_tier=np.where(np.arange(len(table)) % 4 == 0, "clause", "strict"),
-        outcome_logits=np.where(left, "correct", "wrong"),
+        outcome_logits=np.where(is_left, "correct", "wrong"),
         side_logits="left",
         outcome_debiased="correct",
         side_debiased=table["side_correct"],
@@ -88,16 +88,16 @@ def probes(
     draw = np.random.default_rng(seed)
     curves = {}
     for category, shares in accuracies.items():
-        own = run.episodes[run.episodes["category"] == category]
-        labels = (own["side_correct"] == "left").to_numpy()
-        groups = own["group_id"].to_numpy(dtype=str)
+        category_episodes = run.episodes[run.episodes["category"] == category]
+        labels = (category_episodes["side_correct"] == "left").to_numpy()
+        groups = category_episodes["group_id"].to_numpy(dtype=str)
         fold_of = np.unique(groups, return_inverse=True)[1] % 5
-        right = draw.random((len(shares), len(own))) < np.array(shares)[:, None]
+        right = draw.random((len(shares), len(category_episodes))) < np.array(shares)[:, None]
         curves[category, "mean"] = ProbeCurve(
             sites=tuple(Site("backbone", layer) for layer in range(len(shares))),
             labels=labels,
-            episodes=own["episode_id"].to_numpy(dtype=str),
-            items=own["item_id"].to_numpy(dtype=str),
+            episodes=category_episodes["episode_id"].to_numpy(dtype=str),
+            items=category_episodes["item_id"].to_numpy(dtype=str),
             groups=groups,
             fold_of=fold_of,
             decisions=np.where(right == labels, 1.0, -1.0),

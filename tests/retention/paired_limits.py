@@ -11,19 +11,19 @@ def mover(mine: pd.DataFrame, theirs: pd.DataFrame) -> tuple[float, float]:
 
     Its variance is at least that of runs that agree in all groups, as some groups may be unseen.
     """
-    found, rests, variances = [], [], []
+    means, rests, variances = [], [], []
     for table in (mine, theirs):
         by_group = (table["outcome"] == "correct").groupby(table["group_id"]).agg(["sum", "size"])
         E, G, s = by_group["size"].sum(), len(by_group), (table["outcome"] == "correct").mean()
-        rest = by_group["sum"] - s * by_group["size"]
-        variance = (rest**2).sum() * G / (G - 1) / E**2
+        residual = by_group["sum"] - s * by_group["size"]
+        variance = (residual**2).sum() * G / (G - 1) / E**2
         # The limits of one share have tests of their own in `tests/statistics`.
         sums, sizes = (by_group[name].to_numpy(float) for name in ("sum", "size"))
         low, high = korn_graubard_limits(sums[None], sizes)
-        found.append((s, float(low[0]), float(high[0])))
-        rests.append(rest / E)
+        means.append((s, float(low[0]), float(high[0])))
+        rests.append(residual / E)
         variances.append(variance)
-    (a, a_low, a_high), (b, b_low, b_high) = found
+    (a, a_low, a_high), (b, b_low, b_high) = means
     shared = (rests[0] * rests[1]).sum() * G / (G - 1)
     shared = min(shared, max(0, (sum(variances) - 2 / ((G + 1) * (G + 2))) / 2))
     rho = shared / np.sqrt(variances[0] * variances[1])

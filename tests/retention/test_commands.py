@@ -28,7 +28,7 @@ PATHS = ["runs/pi0", "elsewhere/smolvla/", "s3://bucket/study/run"]
 
 
 @pytest.mark.parametrize(
-    ("chosen", "keys"),
+    ("choices", "keys"),
     [
         ([], [None, None, None]),
         (["runs/pi0=abc"], ["abc", None, None]),
@@ -36,12 +36,12 @@ PATHS = ["runs/pi0", "elsewhere/smolvla/", "s3://bucket/study/run"]
         (["s3://bucket/study/run=123"], [None, None, "123"]),
     ],
 )
-def test_a_run_goes_by_its_path_or_by_the_name_of_its_folder(chosen: list[str], keys: list[str | None]) -> None:
-    assert _keys(PATHS, chosen) == keys
+def test_a_run_goes_by_its_path_or_by_the_name_of_its_folder(choices: list[str], keys: list[str | None]) -> None:
+    assert _keys(PATHS, choices) == keys
 
 
 @pytest.mark.parametrize(
-    ("chosen", "message"),
+    ("choices", "message"),
     [
         (["abc"], "is not RUN=KEY"),
         (["runs/pi0="], "is not RUN=KEY"),
@@ -49,9 +49,9 @@ def test_a_run_goes_by_its_path_or_by_the_name_of_its_folder(chosen: list[str], 
         (["pi0=abc", "runs/pi0=def"], "twice"),
     ],
 )
-def test_what_names_no_run_or_two_keys_is_refused(chosen: list[str], message: str) -> None:
+def test_what_names_no_run_or_two_keys_is_refused(choices: list[str], message: str) -> None:
     with pytest.raises(UsageError, match=message):
-        _keys(PATHS, chosen)
+        _keys(PATHS, choices)
 
 
 @pytest.mark.parametrize(
@@ -175,7 +175,7 @@ def test_a_table_without_probes_says_in_one_line_what_is_missing(probed_run: Pro
 def test_a_run_of_too_few_groups_is_not_sent_to_train_which_refuses_it(probed_run: ProbedRun) -> None:
     probed = probed_run({"color": SIGNAL, "shape": SIGNAL})
     episodes = probed.episodes.copy()
-    for lacking, said in (
+    for lacking, advice in (
         (
             {"color"},
             "color has 2. Extract more items. `probe-kit train PLACE --categories shape` probes the others.",
@@ -187,8 +187,8 @@ def test_a_run_of_too_few_groups_is_not_sent_to_train_which_refuses_it(probed_ru
         groups = kinds.astype(str) + episodes["category"]
         few = replace(probed, path=probed.path.parent / "few", episodes=episodes.assign(group_id=groups))
         (note,) = retention_table([few]).notes
-        place = said.replace("PLACE", str(few.path))
-        assert note.endswith(f"Probes need 5 independent groups of items: {place}")
+        expected = advice.replace("PLACE", str(few.path))
+        assert note.endswith(f"Probes need 5 independent groups of items: {expected}")
 
 
 MIXTURES = {
@@ -205,12 +205,12 @@ FIRST, *OTHERS = MIXTURES
 @pytest.mark.parametrize("name", [FIRST, *(pytest.param(name, marks=pytest.mark.slow) for name in OTHERS)])
 def test_rows_of_other_settings_are_pointed_out_in_every_format(probed_run: ProbedRun, name: str) -> None:
     value, words = MIXTURES[name]
-    one, other = (probed_run({"color": SIGNAL}, model) for model in ("one", "other"))
-    assert retention_table([one, other]).notes == ()
+    first, other = (probed_run({"color": SIGNAL}, model) for model in ("one", "other"))
+    assert retention_table([first, other]).notes == ()
     key = probed_again(other, **{name: value}).key
-    table = retention_table([one, other], keys=[None, key])
+    table = retention_table([first, other], keys=[None, key])
     assert words in table.notes[-1]
-    for text in (table.to_markdown(), table.to_latex("all"), as_text(table), report_html([one, other], table)):
+    for text in (table.to_markdown(), table.to_latex("all"), as_text(table), report_html([first, other], table)):
         assert words in " ".join(text.split())
 
 
@@ -272,30 +272,30 @@ def test_a_row_has_the_numbers_of_its_run_and_drift_is_that_from_the_first_step(
     late = probed_run({"color": SIGNAL_TRAINING_STEPS, "shape": NONE}, "late")
     table = retention_table([early, late])
     steps = {str(early.location): 500, str(late.location): 2000}
-    made = step_table(table, steps)
-    color = [one for one in made.numbers if one["category"] == "color"]
-    assert [one["step"] for one in color] == [500, 2000]
+    by_step = step_table(table, steps)
+    color = [record for record in by_step.numbers if record["category"] == "color"]
+    assert [record["step"] for record in color] == [500, 2000]
     rows = [row for row in table.rows if row.category == "color"]
-    for one, row in zip(color, rows, strict=True):
-        assert (one["sr"], one["backbone"], one["retention"]) == (
+    for record, row in zip(color, rows, strict=True):
+        assert (record["sr"], record["backbone"], record["retention"]) == (
             row.success.sr, row.backbone.score, row.retention.value,
         )  # fmt: skip
     assert color[0]["drift"] is None
     assert color[1]["drift"] == pytest.approx(color[1]["backbone"] - color[0]["backbone"]), (
         "the later minus the first"
     )
-    assert made.all_notes[0].endswith(
+    assert by_step.all_notes[0].endswith(
         "drift: the backbone's accuracy minus that of the first step, paired by items where "
         "both ran the same; each with its 95 % interval; view mean; mean over Color, Shape"
     )
-    shape = [one for one in made.numbers if one["category"] == "shape"]
-    assert [one["retention"] for one in shape] == [None, None], "no signal, nothing to retain"
-    cells = list(csv.DictReader(io.StringIO(made.to_csv())))
+    shape = [record for record in by_step.numbers if record["category"] == "shape"]
+    assert [record["retention"] for record in shape] == [None, None], "no signal, nothing to retain"
+    cells = list(csv.DictReader(io.StringIO(by_step.to_csv())))
     assert [float(cells[0][f"backbone_ci_{end}"]) for end in ("low", "high")] == pytest.approx(
         color[0]["backbone_ci"]
     )
     assert (cells[0]["drift_ci_low"], cells[0]["drift_ci_high"]) == ("", ""), "the first step drifts from nothing"
-    drawn = draw_training_steps(made, ())
+    drawn = draw_training_steps(by_step, ())
     labels = [axes.get_ylabel() for axes in drawn.axes if axes.get_visible()]
     assert labels == ["success (%)", "backbone (%)", "retention", "drift of the backbone (points)"]
 
@@ -305,13 +305,13 @@ def test_a_mean_over_other_categories_stands_last_and_is_named_and_absent_column
 ) -> None:
     early = probed_run({"color": NONE}, "early")
     late = probed_run({"color": SIGNAL_TRAINING_STEPS, "shape": NONE}, "late")
-    made = step_table(retention_table([early, late]), {str(early.location): 500, str(late.location): 2000})
-    assert [one["category"] for one in made.numbers] == ["color", "color", "shape", "mean", "mean"]
-    assert made.all_notes[0].endswith("mean over Color (step 500), Color, Shape (step 2000)")
+    by_step = step_table(retention_table([early, late]), {str(early.location): 500, str(late.location): 2000})
+    assert [record["category"] for record in by_step.numbers] == ["color", "color", "shape", "mean", "mean"]
+    assert by_step.all_notes[0].endswith("mean over Color (step 500), Color, Shape (step 2000)")
     bare = step_table(
         retention_table([early, late], keys=["", ""]), {str(early.location): 500, str(late.location): 2000}
     )
-    assert made.columns[3:] == ("backbone %", "action %", "retention", "drift of the backbone, points")
+    assert by_step.columns[3:] == ("backbone %", "action %", "retention", "drift of the backbone, points")
     assert bare.columns == ("category", "step", "success %")
     assert bare.all_notes[0] == (
         "step: of the training; success: the cube ends on the correct picture; each with its 95 % interval; "

@@ -31,9 +31,9 @@ table = retention_table([ArrayRun(Path("run"), "pi0", "suite@1#0123456789ab", ep
 
 def block(heading: str, language: str) -> str:
     """The first block of a section in a language."""
-    found = re.search(rf"```{language}\n(.*?)```", PAGE.partition(f"## {heading}")[2], re.DOTALL)
-    assert found, heading
-    return found[1]
+    match = re.search(rf"```{language}\n(.*?)```", PAGE.partition(f"## {heading}")[2], re.DOTALL)
+    assert match, heading
+    return match[1]
 
 
 def apply(diff: str, package: Path) -> None:
@@ -62,11 +62,11 @@ def use(tmp_path: Path, outcome_table: Callable[..., pd.DataFrame]) -> Callable[
     def run(heading: str, code: str) -> str:
         apply(block(heading, "diff"), tmp_path)
         script = USE.format(episodes=str(data)) + code
-        done = subprocess.run(
+        completed = subprocess.run(
             [sys.executable, "-c", script], cwd=tmp_path, capture_output=True, encoding="utf-8", check=False
         )
-        assert done.returncode == 0, done.stderr
-        return done.stdout
+        assert completed.returncode == 0, completed.stderr
+        return completed.stdout
 
     return run
 

@@ -134,9 +134,9 @@ def test_plot_draws_on_the_given_axes_and_returns_the_display(probed_run: Probed
     assert display.plot(axes) is display
     assert display.ax_ is axes
     assert axes.lines
-    own = display.plot().ax_
-    assert own is not axes
-    assert "settings" in own.figure.caption
+    new_axes = display.plot().ax_
+    assert new_axes is not axes
+    assert "settings" in new_axes.figure.caption
 
 
 # -- maps, roles, depths ---------------------------------------------------------------------------------------
@@ -198,8 +198,8 @@ def test_tables_hold_the_rows_numbers_with_the_mean_last(probed_run: ProbedRun) 
     assert [cell.values for cell in success.cells[0]] == [(0.6,)] * 3
     assert [cell.bold for cell in success.cells[0]] == [False] * 3, "above 0.5 + Δ = 0.569; the interval holds 0.5"
     row, other = table.rows
-    known = replace(row, success=replace(row.success, regime=Regime.KNOWLEDGE))
-    bold = SuccessTableDisplay.from_table(RetentionTable([known, other], table.means)).cells[0]
+    known_row = replace(row, success=replace(row.success, regime=Regime.KNOWLEDGE))
+    bold = SuccessTableDisplay.from_table(RetentionTable([known_row, other], table.means)).cells[0]
     assert [cell.bold for cell in bold] == [True, False, False]
     assert SideTableDisplay.from_table(table).cells[0][0].values == (row.success.sr_left, row.success.sr_right)
     color, shape, _ = RetentionTableDisplay.from_table(table).cells[0]
@@ -359,8 +359,8 @@ def test_runs_whose_folders_have_one_name_get_figures_of_their_own(tmp_path: Pat
 
 def test_the_line_below_a_figure_has_no_hole_where_one_model_was_not_probed() -> None:
     probed = ProvenanceLine("pi0", False, "a" * 64, "suite@1", "n = 4 episodes", "s" * 64, "probes1", call=0)
-    asked = replace(probed, model="vlm", probes=None, call=None)
+    vlm_run = replace(probed, model="vlm", probes=None, call=None)
     figure = Figure()
-    caption(figure, asked, probed)
+    caption(figure, vlm_run, probed)
     assert not re.search(r"(^|·)\s*,|,\s*(·|$)", figure.get_supxlabel())
     assert "call 0" in figure.get_supxlabel()

@@ -71,8 +71,8 @@ def drawn(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
     if request.param == "one category":
         runs = [in_two_views(probed_run({"color": SIGNAL}, "pi0"))]
     else:
-        known = TWELVE[:2] if "two categories" in request.param else TWELVE
-        names = {name: SIGNAL if at % 2 else NOISE for at, name in enumerate(known)}
+        categories = TWELVE[:2] if "two categories" in request.param else TWELVE
+        names = {name: SIGNAL if at % 2 else NOISE for at, name in enumerate(categories)}
         runs = [
             in_two_views(probed_run(names, "pi0-with-a-rather-long-name", random_weights=True)),
             in_two_views(probed_run(names, "smolvla", suite="another-suite-with-a-name@1.0.0#ba9876543210")),
@@ -126,7 +126,7 @@ def results(probed_run: ProbedRun) -> ProbeResults:
 
 
 @pytest.mark.parametrize(
-    ("iterations", "shown", "accuracy"),
+    ("iterations", "expected_iterations", "accuracy"),
     [
         ("all", [0, 1, 2, 3], [0.6, 0.9, 0.9]),
         ("best", [None], [0.6, 0.9, 0.9]),
@@ -135,11 +135,11 @@ def results(probed_run: ProbedRun) -> ProbeResults:
     ],
 )
 def test_iterations_choose_the_lines_in_figures_as_they_do_in_tables(
-    results: ProbeResults, iterations: str | int, shown: list[int | None], accuracy: list[float]
+    results: ProbeResults, iterations: str | int, expected_iterations: list[int | None], accuracy: list[float]
 ) -> None:
     display = LayerCurveDisplay.from_results(results, "color", iterations=iterations)  # type: ignore[arg-type]
     backbone, expert = display.streams
-    assert [line.iteration for line in expert.lines] == shown
+    assert [line.iteration for line in expert.lines] == expected_iterations
     assert [line.iteration for line in backbone.lines] == [None]
     np.testing.assert_allclose(expert.score, accuracy)
     display.plot()
@@ -148,12 +148,12 @@ def test_iterations_choose_the_lines_in_figures_as_they_do_in_tables(
 @pytest.mark.slow
 def test_the_figures_of_a_table_show_the_iterations_of_the_table(probed_run: ProbedRun) -> None:
     run = probed_run({"color": SIGNAL})
-    for iterations, wanted in (("all", 4), ("best", 0), ("last", 0), (2, 0)):
+    for iterations, expected in (("all", 4), ("best", 0), ("last", 0), (2, 0)):
         table = retention_table([run], iterations=iterations)  # type: ignore[arg-type]
         (curves,) = [exhibit for exhibit in collect_figures([run], table) if exhibit.name == "pi0-layer-curves"]
         with curves.drawn() as figure:
             labels = [label for axes in figure.axes for label in axes.get_legend_handles_labels()[1]]
-            assert sum(label.startswith("iteration") for label in labels) == wanted
+            assert sum(label.startswith("iteration") for label in labels) == expected
             if isinstance(iterations, int):
                 assert "action expert, iteration 2" in labels
     with pytest.raises(UsageError, match="iterations 0 to 3, not 7"):
@@ -203,7 +203,7 @@ def test_iterations_get_darker_one_by_one(results: ProbeResults) -> None:
 @pytest.mark.slow
 def test_filled_and_open_markers_mean_the_same_in_every_figure(drawn: Drawn) -> None:
     """Wherever a line or point has an open marker, the legend says what that is, in the same words."""
-    seen = 0
+    figure_count = 0
     for name, figure in drawn[1].items():
         hollow = [
             line for axes in figure.axes for line in axes.lines
@@ -212,11 +212,11 @@ def test_filled_and_open_markers_mean_the_same_in_every_figure(drawn: Drawn) -> 
         ]  # fmt: skip
         if not hollow:
             continue
-        seen += 1
+        figure_count += 1
         legends = [*figure.legends, *(axes.get_legend() for axes in figure.axes)]
         words = [text.get_text() for legend in legends if legend is not None for text in legend.get_texts()]
         assert {FILLED, OPEN} <= set(words), name
-    assert seen >= 2
+    assert figure_count >= 2
 
 
 def is_white(colour: object) -> bool:
@@ -256,10 +256,10 @@ def linear(colour: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(colour <= 0.04045, colour / 12.92, ((colour + 0.055) / 1.055) ** 2.4)
 
 
-def lab(colour: NDArray[np.float64], seen: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
-    """CIELAB of an sRGB colour, as seen with the matrix `seen`."""
+def lab(colour: NDArray[np.float64], deficiency: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
+    """CIELAB of an sRGB colour, as seen with the matrix `deficiency`."""
     light = linear(colour)
-    light = light if seen is None else (seen @ light).clip(0, 1)
+    light = light if deficiency is None else (deficiency @ light).clip(0, 1)
     ratios = _XYZ @ light / [0.95047, 1, 1.08883]
     roots = np.where(ratios > 0.008856, np.cbrt(ratios), 7.787 * ratios + 16 / 116)
     return np.array([116 * roots[1] - 16, 500 * (roots[0] - roots[1]), 200 * (roots[1] - roots[2])])
@@ -267,8 +267,8 @@ def lab(colour: NDArray[np.float64], seen: NDArray[np.float64] | None = None) ->
 
 def test_heat_colours_are_told_apart_without_red_and_green_and_in_grey() -> None:
     colours = [np.array(to_rgb(f"#{rgb}")) for _, _, rgb in HEAT]
-    for seen in (None, _DEUTERANOPIA):
-        points = [lab(colour, seen) for colour in colours]
+    for deficiency in (None, _DEUTERANOPIA):
+        points = [lab(colour, deficiency) for colour in colours]
         apart = [np.linalg.norm(a - b) for at, a in enumerate(points) for b in points[at + 1 :]]
         assert min(apart) > 15, "2.3 is what can just be told apart side by side"
     lightness = [lab(colour)[0] for colour in colours]

@@ -75,11 +75,15 @@ def intervals(rows: Sequence[RetentionRow] | Sequence[Difference]) -> Iterator[F
         fields = asdict(row)
         parts = [("", fields), *((name, part) for name, part in fields.items() if isinstance(part, dict))]
         for part, inner in parts:
-            for name, found in inner.items():
-                if not (name == "ci" or name.endswith("_ci")) or found is None or found == (None, None):
+            for name, field_value in inner.items():
+                if (
+                    not (name == "ci" or name.endswith("_ci"))
+                    or field_value is None
+                    or field_value == (None, None)
+                ):
                     continue
                 of = OF_PART[part] if name == "ci" else name.removesuffix("_ci")
-                yield f"{row.category} {part}.{name}", inner[of], *found
+                yield f"{row.category} {part}.{name}", inner[of], *field_value
 
 
 def of_probes(table: RetentionTable) -> Iterator[Found]:
@@ -97,12 +101,12 @@ def of_probes(table: RetentionTable) -> Iterator[Found]:
 
 
 def test_no_interval_is_without_width_and_each_holds_its_number(table: RetentionTable) -> None:
-    found = [*intervals(table.all_rows), *intervals(table.differences), *of_probes(table)]
-    assert len(found) > 40
-    names = {name.split(" ", 1)[1] for name, *_ in found}
+    all_limits = [*intervals(table.all_rows), *intervals(table.differences), *of_probes(table)]
+    assert len(all_limits) > 40
+    names = {name.split(" ", 1)[1] for name, *_ in all_limits}
     assert names >= {"success.ci", "backbone.ci", "action.ci", "rules.sr_answered_ci"}
     assert names >= {".sr_ci", ".backbone_ci", ".action_ci"}
-    for name, value, low, high in found:
+    for name, value, low, high in all_limits:
         assert high - low > 1e-3, name
         assert low <= value <= high, name
 
@@ -149,7 +153,9 @@ def test_one_number_has_one_interval_in_rows_curves_and_scores(table: RetentionT
 def test_the_interval_of_a_site_is_wilsons_in_scores_and_figures(table: RetentionTable) -> None:
     for results in table.results.values():
         for (category, view), curve in results.curves.items():
-            own = results.scores[(results.scores["category"] == category) & (results.scores["view"] == view)]
+            view_scores = results.scores[
+                (results.scores["category"] == category) & (results.scores["view"] == view)
+            ]
             display = LayerCurveDisplay.from_results(results, category)
             drawn = {
                 (stream.stream, int(layer), line.iteration): (line.low[at], line.high[at])
@@ -157,11 +163,11 @@ def test_the_interval_of_a_site_is_wilsons_in_scores_and_figures(table: Retentio
                 for line in stream.lines
                 for at, layer in enumerate(line.layers)
             }
-            for row, (_, score) in enumerate(own.iterrows()):
-                wanted = wilson(curve.correct[row].reshape(-1, 2).sum(axis=1))
-                assert (score["ci_low"], score["ci_high"]) == pytest.approx(wanted)
+            for row, (_, score) in enumerate(view_scores.iterrows()):
+                expected = wilson(curve.correct[row].reshape(-1, 2).sum(axis=1))
+                assert (score["ci_low"], score["ci_high"]) == pytest.approx(expected)
                 site = curve.sites[row]
-                assert drawn[site.stream, site.layer, site.iteration] == pytest.approx(wanted)
+                assert drawn[site.stream, site.layer, site.iteration] == pytest.approx(expected)
 
 
 def wilson(right: np.ndarray[Any, np.dtype[np.int64]]) -> tuple[float, float]:
@@ -187,13 +193,13 @@ def wilson(right: np.ndarray[Any, np.dtype[np.int64]]) -> tuple[float, float]:
 def test_a_mean_is_as_wide_as_its_only_category_and_else_as_its_parts_together(table: RetentionTable) -> None:
     """Independent categories: squares of the arms add up, of success rates and of accuracies."""
     for mean in table.means:
-        own = [row for row in table.rows if row.run.location == mean.run.location]
-        if len(own) == 1:
+        run_rows = [row for row in table.rows if row.run.location == mean.run.location]
+        if len(run_rows) == 1:
             for name in ("success", "backbone", "action", "retention"):
-                assert getattr(mean, name).ci == pytest.approx(getattr(own[0], name).ci), name
+                assert getattr(mean, name).ci == pytest.approx(getattr(run_rows[0], name).ci), name
             continue
         for part, field in (("success", "sr"), ("backbone", "score"), ("action", "score")):
-            arms = [(getattr(getattr(row, part), field), *getattr(row, part).ci) for row in own]
+            arms = [(getattr(getattr(row, part), field), *getattr(row, part).ci) for row in run_rows]
             below = sqrt(sum((value - low) ** 2 for value, low, _ in arms)) / len(arms)
             above = sqrt(sum((high - value) ** 2 for value, _, high in arms)) / len(arms)
             middle = sum(value for value, *_ in arms) / len(arms)
@@ -201,22 +207,24 @@ def test_a_mean_is_as_wide_as_its_only_category_and_else_as_its_parts_together(t
 
 
 def scores_of(table: RetentionTable, row: RetentionRow) -> Scores:
-    found = curve_scores(
+    scores = curve_scores(
         table.results[row.run.location, row.target].curves[row.category, "mean"], seed_text=row.run.suite
     )
-    assert found is not None
-    return found.scores
+    assert scores is not None
+    return scores.scores
 
 
 def test_limits_of_mean_retention_are_fiellers_for_the_mean_scores(table: RetentionTable) -> None:
     """All ratios whose numerator minus ratio times denominator is not shown to differ from 0."""
     for mean in table.means:
-        own = [row for row in table.rows if row.run.location == mean.run.location]
-        scores = [scores_of(table, row) for row in own]
-        parts = [float(np.diag(one.covariance).sum()) for one in scores]
-        df = sum(parts) ** 2 / sum(part**2 / one.df for part, one in zip(parts, scores, strict=True))
-        V, t = sum(one.covariance for one in scores) / len(own) ** 2, stats.t.ppf(0.975, df)
-        top, bottom = np.mean([one.above for one in scores], axis=0)
+        run_rows = [row for row in table.rows if row.run.location == mean.run.location]
+        scores = [scores_of(table, row) for row in run_rows]
+        parts = [float(np.diag(part_scores.covariance).sum()) for part_scores in scores]
+        df = sum(parts) ** 2 / sum(
+            part**2 / part_scores.df for part, part_scores in zip(parts, scores, strict=True)
+        )
+        V, t = sum(part_scores.covariance for part_scores in scores) / len(run_rows) ** 2, stats.t.ppf(0.975, df)
+        top, bottom = np.mean([part_scores.above for part_scores in scores], axis=0)
         low, high = mean.retention.ci or (None, None)
         if bottom - t * sqrt(V[1, 1]) < bottom / 4 or bottom <= 0:
             assert (low, high) == (None, None)
@@ -243,15 +251,15 @@ def test_a_mean_of_equal_categories_without_variance_has_a_width(probed_run: Pro
 def test_groups_that_agree_have_an_interval_that_narrows_with_their_number(value: float, count: int) -> None:
     """As many tosses as groups, however many episodes these have."""
     names = np.repeat([f"g{at:03}" for at in range(count + 1)], 4)
-    found, more = (Share.of(np.full(4 * n, value), names[: 4 * n]).interval() for n in (count, count + 1))
-    assert 0.0 <= found.low <= value <= found.high <= 1.0
-    assert 0 < more.high - more.low < found.high - found.low + 1e-12
+    interval, more = (Share.of(np.full(4 * n, value), names[: 4 * n]).interval() for n in (count, count + 1))
+    assert 0.0 <= interval.low <= value <= interval.high <= 1.0
+    assert 0 < more.high - more.low < interval.high - interval.low + 1e-12
     if count == 1:
-        assert (found.low, found.high) == (0, 1)
+        assert (interval.low, interval.high) == (0, 1)
     elif value in (0, 1):
         exact = stats.binomtest(int(value * count), count).proportion_ci(0.95, "exact")
-        assert (found.low, found.high) == pytest.approx((exact.low, exact.high))
-        assert found.high - found.low < 4 / count
+        assert (interval.low, interval.high) == pytest.approx((exact.low, exact.high))
+        assert interval.high - interval.low < 4 / count
 
 
 def test_an_untrained_network_that_is_beaten_alike_in_every_group_has_an_interval(probed_run: ProbedRun) -> None:
@@ -268,7 +276,9 @@ def test_a_band_of_few_permuted_labels_is_not_drawn(probed_run: ProbedRun) -> No
     results = load_results(probed_run({"color": GOOD}))
     assert LayerCurveDisplay.from_results(results, "color").grounds[0].null_band is not None
     for count, is_drawn in ((5, False), (19, False), (20, True)):
-        few = {place: replace(curve, null=curve.null[:, :count]) for place, curve in results.curves.items()}
+        few = {
+            curve_key: replace(curve, null=curve.null[:, :count]) for curve_key, curve in results.curves.items()
+        }
         band = LayerCurveDisplay.from_results(replace(results, curves=few), "color").grounds[0].null_band
         assert (band is not None) == is_drawn
         layer_curve(replace(results, curves=few))
@@ -279,8 +289,8 @@ def test_the_band_holds_the_middle_95_percent_of_the_accuracies_of_permuted_labe
     results = load_results(probed_run({"color": GOOD}))
     accuracies = np.random.default_rng(0).permutation(np.arange(1, 201) / 100)
     curves = {
-        place: replace(curve, null=np.resize(accuracies, (len(curve.sites), 200)))
-        for place, curve in results.curves.items()
+        curve_key: replace(curve, null=np.resize(accuracies, (len(curve.sites), 200)))
+        for curve_key, curve in results.curves.items()
     }
     display = LayerCurveDisplay.from_results(replace(results, curves=curves), "color")
     assert display.grounds[0].null_band is not None
@@ -302,26 +312,26 @@ def test_no_retention_has_a_limit_that_only_a_hardly_known_backbone_sets(
     curve_of: Callable[..., ProbeCurve], outcome_table: Callable[..., pd.DataFrame], items: int, backbone: float,
     expert: float,
 ) -> None:  # fmt: skip
-    found = measure_retention(
+    measurement = measure_retention(
         curve_of(outcome_table(2 * items, 0, 0), [0.5, backbone, backbone], [[expert, expert]])
     )
-    assert found is not None
+    assert measurement is not None
     if items == 4:
-        assert found.streams is None
-        assert not found.interval.bounded
+        assert measurement.streams is None
+        assert not measurement.interval.bounded
         return
-    assert found.streams is not None
-    scores = found.streams.scores
+    assert measurement.streams is not None
+    scores = measurement.streams.scores
     quantile = stats.t.ppf(0.975, items - 1)
     (top, bottom), V = scores.above, scores.covariance
-    known = bottom - quantile * sqrt(V[1, 1]) >= bottom / 4 > 0
-    assert found.interval.bounded == known
-    if known:  # four times what the expert alone would allow at the most
-        assert found.interval.high <= 4 * (top + quantile * sqrt(V[0, 0])) / bottom
-    pooled = PooledScores.of([found.streams])
+    is_known = bottom - quantile * sqrt(V[1, 1]) >= bottom / 4 > 0
+    assert measurement.interval.bounded == is_known
+    if is_known:  # four times what the expert alone would allow at the most
+        assert measurement.interval.high <= 4 * (top + quantile * sqrt(V[0, 0])) / bottom
+    pooled = PooledScores.of([measurement.streams])
     assert pooled is not None
     difference = retention_difference(scores, scores, pooled.covariance_with(pooled)).interval
-    assert difference.bounded == known
+    assert difference.bounded == is_known
 
 
 def test_five_groups_of_a_weak_signal_are_too_few_for_a_ratio_and_so_is_every_difference_with_them(
@@ -334,14 +344,16 @@ def test_five_groups_of_a_weak_signal_are_too_few_for_a_ratio_and_so_is_every_di
     )
     assert few is not None
     assert many is not None
-    here, there = retention(few.scores), retention(many.scores)
-    assert (here.value, there.value) == pytest.approx((1, 1))
-    assert (here.interval.bounded, there.interval.bounded) == (False, True)
-    for one, other in ((few, many), (many, few)):
-        assert not retention_difference(one.scores, other.scores).interval.bounded
+    few_retention, many_retention = retention(few.scores), retention(many.scores)
+    assert (few_retention.value, many_retention.value) == pytest.approx((1, 1))
+    assert (few_retention.interval.bounded, many_retention.interval.bounded) == (False, True)
+    for first, other in ((few, many), (many, few)):
+        assert not retention_difference(first.scores, other.scores).interval.bounded
     mean = retention(Scores.mean([few.scores, many.scores]))
     assert mean.interval.bounded
-    assert np.diff([mean.interval.low, mean.interval.high]) > np.diff([there.interval.low, there.interval.high])
+    assert np.diff([mean.interval.low, mean.interval.high]) > np.diff(
+        [many_retention.interval.low, many_retention.interval.high]
+    )
 
 
 @pytest.mark.parametrize("right", [3.0, 0.0])
@@ -351,10 +363,10 @@ def test_a_score_is_no_better_known_for_one_group_that_is_unlike_the_others(righ
     alike = GroupSums(np.full((3, groups), 4.0), sizes)
     sums = alike.sums.copy()
     sums[:, 0] = right
-    streams = [[stream_of(found, range(3))] * 2 for found in (GroupSums(sums, sizes), alike)]
-    one, same = (crossfit(pair, list(map(str, range(groups)))) for pair in streams)
+    streams = [[stream_of(group_sums, range(3))] * 2 for group_sums in (GroupSums(sums, sizes), alike)]
+    fit, same = (crossfit(pair, list(map(str, range(groups)))) for pair in streams)
     for stream in range(2):
-        assert accuracy_interval(one, stream).low < accuracy_interval(same, stream).low
+        assert accuracy_interval(fit, stream).low < accuracy_interval(same, stream).low
 
 
 def test_two_runs_that_differ_in_one_group_are_not_surer_alike_than_two_that_never_do(
@@ -363,11 +375,11 @@ def test_two_runs_that_differ_in_one_group_are_not_surer_alike_than_two_that_nev
     right = outcome_table(32, 0, 0)
     wrong = right.copy()
     wrong.loc[wrong["item_id"] == wrong["item_id"].iloc[0], "outcome"] = "wrong"
-    here, there = (Rate.pooled([success_share(one, "suite")]) for one in (right, wrong))
-    same, other = here.minus(here).interval, here.minus(there).interval
+    first, second = (Rate.pooled([success_share(outcomes, "suite")]) for outcomes in (right, wrong))
+    same, other = first.minus(first).interval, first.minus(second).interval
     assert same.low < 0 < same.high
     assert other.low >= same.low
     assert other.high >= same.high
-    assert there.interval.low < here.interval.low, "a group that is wrong makes nothing surer"
-    several = Rate.pooled([success_share(one, "suite") for one in (right, wrong)])
-    assert there.interval.low < several.interval.low < several.value < several.interval.high
+    assert second.interval.low < first.interval.low, "a group that is wrong makes nothing surer"
+    several = Rate.pooled([success_share(outcomes, "suite") for outcomes in (right, wrong)])
+    assert second.interval.low < several.interval.low < several.value < several.interval.high

@@ -35,11 +35,11 @@ mpl.use("agg")
 SIGNAL = ([0.5, 0.9], [[0.7]])
 
 
-def store(run: ArrayRun, kind: str, answers: ConditionOutcomes, **asked: str) -> None:
+def store(run: ArrayRun, kind: str, answers: ConditionOutcomes, **options: str) -> None:
     categories = list(dict.fromkeys(answers.categories.tolist()))
     settings = {
         "format": FORMAT, "kind": kind, "run_settings": run.settings_sha256, "stamp": "", "wording": None,
-        "categories": categories, **asked,
+        "categories": categories, **options,
     }  # fmt: skip
     store_outcomes(run.location, run.suite, settings, answers)
 
@@ -70,10 +70,10 @@ def used(row: RetentionRow) -> UseVerdict:
 @pytest.fixture
 def run(probed_run: Callable[..., ArrayRun]) -> ArrayRun:
     """Color follows, shape does not; both can be read at layer 1."""
-    made = probed_run({"color": SIGNAL, "shape": SIGNAL})
+    probed = probed_run({"color": SIGNAL, "shape": SIGNAL})
     answers = outcomes_of({"color": follower(48), "shape": habit(48)})
-    store(made, "image-swap", answers)
-    return made
+    store(probed, "image-swap", answers)
+    return probed
 
 
 def test_it_shows_accuracies_and_turned_episodes_by_layer(run: ArrayRun) -> None:
@@ -203,8 +203,8 @@ def noted(drawn_run: ArrayRun) -> AttentionShares:
     weights[:, [0, 2]] = [[0.3, 0.1], [0.1, 0.2]]
     episodes = drawn_run.episodes["episode_id"].to_numpy(str)[:4]
     patches = PatchAttention(episodes, np.zeros(4, int), weights, np.array(["top"] * 2), boxes)
-    further = {ATTENTION_FILE: arrays_to_bytes(weighed), PATCHES_FILE: arrays_to_bytes(patches)}
-    store_outcomes(drawn_run.location, drawn_run.suite, settings, answers, further=further)
+    extra_files = {ATTENTION_FILE: arrays_to_bytes(weighed), PATCHES_FILE: arrays_to_bytes(patches)}
+    store_outcomes(drawn_run.location, drawn_run.suite, settings, answers, extra_files=extra_files)
     return weighed
 
 
@@ -223,10 +223,12 @@ def test_it_shows_means_by_block_and_how_heads_and_iterations_differ(drawn_run: 
     labels = {line.get_label() for line in display.ax_.get_lines()}
     assert {"correct picture's tile", "other picture's tile", "its own tokens", "language"} <= labels
     assert len(attention_curve(drawn_run).axes) == 1
-    (shown,) = (
-        one for one in collect_figures([drawn_run], retention_table([drawn_run])) if one.name.endswith("attention")
+    (attention_exhibit,) = (
+        exhibit
+        for exhibit in collect_figures([drawn_run], retention_table([drawn_run]))
+        if exhibit.name.endswith("attention")
     )
-    assert "no verdict" in shown.reading
+    assert "no verdict" in attention_exhibit.reading
 
 
 def test_the_attention_of_each_block_is_drawn_over_the_stored_picture(drawn_run: ArrayRun) -> None:
@@ -235,15 +237,21 @@ def test_the_attention_of_each_block_is_drawn_over_the_stored_picture(drawn_run:
         attention_on_picture(drawn_run)
     pixels = np.zeros((24, 32, 3), np.uint8)
     drawn_run.location.write(thumbnail_key(0), as_thumbnail((pixels, pixels)))
-    axes = [own for own in attention_on_picture(drawn_run, "color").axes if own.get_visible()]
-    assert [own.get_title(loc="left") for own in axes] == ["all blocks: 35 %", "block 0: 40 %", "block 2: 30 %"]
-    overlays = [own.collections[0].get_facecolor()[:, 3] for own in axes]
+    axes = [panel for panel in attention_on_picture(drawn_run, "color").axes if panel.get_visible()]
+    assert [panel.get_title(loc="left") for panel in axes] == [
+        "all blocks: 35 %",
+        "block 0: 40 %",
+        "block 2: 30 %",
+    ]
+    overlays = [panel.collections[0].get_facecolor()[:, 3] for panel in axes]
     np.testing.assert_allclose(overlays, [[0.8, 0.6], [0.8, 0.8 / 3], [0.4, 0.8]], rtol=1e-2)
     left, right = axes[0].collections[0].get_paths()
     assert left.get_extents().bounds == pytest.approx((-0.5, -0.5, 16, 24))
     assert right.get_extents().bounds == pytest.approx((15.5, -0.5, 16, 24))
     names = [
-        one.name for one in collect_figures([drawn_run], retention_table([drawn_run])) if "attention" in one.name
+        exhibit.name
+        for exhibit in collect_figures([drawn_run], retention_table([drawn_run]))
+        if "attention" in exhibit.name
     ]
     assert [name.partition("-attention")[2] for name in names] == ["-picture", ""]
 
@@ -256,7 +264,8 @@ def test_without_attention_there_is_no_such_figure(drawn_run: ArrayRun) -> None:
         with pytest.raises(NoInterventionsError, match="--kind attention"):
             draw()
     assert not any(
-        one.name.endswith("attention") for one in collect_figures([drawn_run], retention_table([drawn_run]))
+        exhibit.name.endswith("attention")
+        for exhibit in collect_figures([drawn_run], retention_table([drawn_run]))
     )
 
 

@@ -74,7 +74,7 @@ def test_the_layer_curve_has_the_best_site_of_a_layer_its_own_null_and_the_best_
     assert ground.chance == pytest.approx(curve.null[best].mean())
     assert ground.null_band is not None
     assert [end[0] for end in ground.null_band] == pytest.approx(np.percentile(curve.null[best], [2.5, 97.5]))
-    state = max(results.controls.scores, key=lambda one: one.score)
+    state = max(results.controls.scores, key=lambda control_score: control_score.score)
     assert ground.control == (state.name, state.score) == ("state", pytest.approx(1.0, abs=0.01))
     table = results.scores.set_index("site")
     assert backbone.low[1] == table.loc["backbone.01.residual", "ci_low"]
@@ -113,7 +113,7 @@ def test_scores_by_step_are_means_of_the_samples_and_their_mean_is_the_metric(ru
         assert axes.get_lines()[0].get_markerfacecolor() == colour, "open markers where nothing is shown"
     assert list(display.controls) == ["state", "step"], "the best one, and the step"
     for name, scores in display.controls.items():
-        (control,) = [one for one in results.controls.scores if one.name == name]
+        (control,) = [control_score for control_score in results.controls.scores if control_score.name == name]
         assert scores.mean() == pytest.approx(control.score)
     assert (display.limits[0] < display.score).all()
     with pytest.raises(UsageError, match="has one step"):
@@ -186,7 +186,7 @@ def test_predicted_values_are_held_out_and_coloured_by_group(run: Run) -> None:
 def test_every_figure_of_a_table_is_drawn_unclipped_and_says_what_it_is_of(run: Run) -> None:
     table = retention_table([run], target=["sim.tool_y", "sim.phase", "a/b: <i>"])
     exhibits = collect_figures([run], table)
-    assert [one.name for one in exhibits] == [
+    assert [drawn_exhibit.name for drawn_exhibit in exhibits] == [
         "run-sim.tool_y-layer-curves", "run-sim.tool_y-steps", "run-sim.tool_y-predicted",
         "run-sim.phase-layer-curves", "run-sim.phase-steps", "run-sim.phase-confusion",
         "run-a-b-i-layer-curves", "run-a-b-i-confusion",
@@ -219,10 +219,10 @@ def test_names_of_files_differ_where_columns_do() -> None:
 def test_the_command_writes_figures_and_a_page_of_several_labels(run: Run, tmp_path: Path) -> None:
     page, folder = tmp_path / "report.html", tmp_path / "figures"
     targets = ["--target", "sim.tool_y", "--target", "a/b: <i>"]
-    done = CliRunner().invoke(
+    result = CliRunner().invoke(
         app, ["retention", str(run.path), *targets, "--html", str(page), "--figures", str(folder)]
     )
-    assert done.exit_code == 0, done.output
+    assert result.exit_code == 0, result.output
     assert {path.suffix for path in folder.iterdir()} == {".png", ".pdf"}
     assert len(list(folder.iterdir())) == 10
     text = page.read_text(encoding="utf-8")
@@ -232,16 +232,16 @@ def test_the_command_writes_figures_and_a_page_of_several_labels(run: Run, tmp_p
     assert "http://" not in text.replace("http://www.w3.org", ""), "needs no network"
     assert text.count("data:image/svg+xml,") + text.count("data:image/webp") == 5
     assert "control state" in text
-    shown = retention_table([run], target=["sim.tool_y", "a/b: <i>"]).summary_table
-    assert shown.columns == ("label", "metric", "backbone above chance", "action above chance", "retention")
-    assert [cells[-1] for cells in shown.texts] == ["n/a", "n/a"]
+    summary = retention_table([run], target=["sim.tool_y", "a/b: <i>"]).summary_table
+    assert summary.columns == ("label", "metric", "backbone above chance", "action above chance", "retention")
+    assert [cells[-1] for cells in summary.texts] == ["n/a", "n/a"]
     for wrong, message in (
         (["--html", str(tmp_path)], "is a folder"),
         (["--figures", str(page)], "is a file"),
     ):
-        done = CliRunner().invoke(app, ["retention", str(run.path), *targets, *wrong])
-        assert done.exit_code == 2
-        assert message in " ".join(done.stderr.split())
+        result = CliRunner().invoke(app, ["retention", str(run.path), *targets, *wrong])
+        assert result.exit_code == 2
+        assert message in " ".join(result.stderr.split())
 
 
 @pytest.mark.slow

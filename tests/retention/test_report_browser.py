@@ -47,19 +47,19 @@ def read(page: Path, script: str, width: int = 1400, dark: bool = False) -> Any:
     A browser's own window cannot be narrow.
     """
     inner, outer = page.with_suffix(".read.html"), page.with_suffix(".frame.html")
-    text, end, rest = page.read_text(encoding="utf-8").rpartition("</body>")
-    inner.write_text(f"{text}{READER.format(script=script)}{end}{rest}", encoding="utf-8")
+    text, end, tail = page.read_text(encoding="utf-8").rpartition("</body>")
+    inner.write_text(f"{text}{READER.format(script=script)}{end}{tail}", encoding="utf-8")
     outer.write_text(FRAME.format(width=width, source=inner.as_uri()), encoding="utf-8")
     scheme = f"--blink-settings=preferredColorScheme={0 if dark else 1}"
     profile = f"--user-data-dir={page.parent / 'profile'}"
-    done = subprocess.run(
+    completed = subprocess.run(
         ["chromium", *FLAGS, scheme, profile, "--dump-dom", outer.as_uri()],
         capture_output=True, encoding="utf-8", timeout=120, check=True,
     )  # fmt: skip
-    assert [line for line in done.stderr.splitlines() if "CONSOLE" in line] == []
-    found = re.search(r'<pre id="found">(.+?)</pre>', done.stdout, re.DOTALL)
-    assert found, done.stdout[-500:]
-    answer = json.loads(html.unescape(found[1]))
+    assert [line for line in completed.stderr.splitlines() if "CONSOLE" in line] == []
+    match = re.search(r'<pre id="found">(.+?)</pre>', completed.stdout, re.DOTALL)
+    assert match, completed.stdout[-500:]
+    answer = json.loads(html.unescape(match[1]))
     assert not (isinstance(answer, dict) and "error" in answer), answer
     return answer
 
@@ -100,8 +100,8 @@ def comparison(tmp_path_factory: pytest.TempPathFactory) -> Path:
     table["episode_id"] = table["item_id"] + ":" + table["layout"].str[0]
     runs = []
     for name, outcome in (("a-policy-of-a-long-name", "correct"), ("another-policy-of-a-long-name", "wrong")):
-        own = table.assign(outcome=[outcome, "oob", "correct", "wrong"] * (len(table) // 4))
-        runs.append(ArrayRun(folder / name, name, "suite@1#0123456789ab", own.reset_index(drop=True), {}))
+        outcomes = table.assign(outcome=[outcome, "oob", "correct", "wrong"] * (len(table) // 4))
+        runs.append(ArrayRun(folder / name, name, "suite@1#0123456789ab", outcomes.reset_index(drop=True), {}))
     return write_report(runs, folder / "two.html")
 
 
@@ -179,8 +179,8 @@ def test_the_page_never_scrolls_sideways_and_what_is_wide_is_announced(
     assert page_width <= window == width
     assert boxes
     assert width == 1400 or any(wide for wide, *_ in boxes)
-    for wide, said, reached, first_stays in boxes:
-        assert said == wide
+    for wide, announced, reached, first_stays in boxes:
+        assert announced == wide
         assert reached
         assert first_stays
 
@@ -207,7 +207,7 @@ def test_the_title_names_every_run(comparison: Path) -> None:
 
 
 def test_filters_show_exactly_the_episodes_they_name(report: Path) -> None:
-    at_first, picked, words, none, said, *whole = read(
+    at_first, picked, words, none, count_text, *after_reset = read(
         report,
         """
         const form = document.getElementById("filters");
@@ -232,8 +232,8 @@ def test_filters_show_exactly_the_episodes_they_name(report: Path) -> None:
     assert picked == [f"{n // 2}:{'os'[n % 2]}" for n in range(60) if n % 3 == 0 and n % 2 == 1 and n < 40]
     assert words == ["29:o", "29:s"]
     assert none == []
-    assert "0 match, 60 in all" in said
-    assert whole == [60, True, 30]
+    assert "0 match, 60 in all" in count_text
+    assert after_reset == [60, True, 30]
 
 
 def test_sections_are_folded_and_open_for_links_for_the_button_and_for_print(report: Path) -> None:
@@ -261,7 +261,7 @@ def test_sections_are_folded_and_open_for_links_for_the_button_and_for_print(rep
 
 
 def test_what_has_the_focus_shows_it_and_the_first_of_all_skips_the_contents(report: Path) -> None:
-    first, hidden, shown, outlines = read(
+    first, hidden, visible, outlines = read(
         report,
         """
         for (const one of document.querySelectorAll("details")) one.open = true;
@@ -279,7 +279,7 @@ def test_what_has_the_focus_shows_it_and_the_first_of_all_skips_the_contents(rep
         """,
     )
     assert first == "#summary"
-    assert hidden < 0 <= shown
+    assert hidden < 0 <= visible
     assert len(outlines) > 10
     assert [name for name, style in outlines if style == "none"] == []
 
@@ -311,6 +311,6 @@ CONTRAST = """
 @pytest.mark.parametrize(("dark", "paper"), [(False, "rgb(255, 255, 255)"), (True, "rgb(20, 23, 26)")])
 def test_every_word_can_be_read_in_both_colour_schemes(comparison: Path, dark: bool, paper: str) -> None:
     """The contrast that WCAG asks for of text (AA): 4.5."""
-    found, low = read(comparison, CONTRAST, dark=dark)
-    assert found == paper
+    background, low = read(comparison, CONTRAST, dark=dark)
+    assert background == paper
     assert low == []

@@ -102,10 +102,10 @@ def test_shares_of_an_episode_count_as_shares() -> None:
     episodes["share_correct"] = [1, 0.5, 0, 0, 0.25, 0, 0, 0.25]
     episodes["share_wrong"] = [0, 0.5, 1, 1, 0, 0, 0, 0]
     episodes["share_oob"] = 1 - episodes["share_correct"] - episodes["share_wrong"]
-    found = success_rate(episodes)
-    assert (found.sr, found.share_wrong, found.share_outside) == (0.25, 0.3125, 0.4375)
-    assert found.ci[0] < 0.25 < found.ci[1]
-    assert (found.paired.both, found.paired.both_wrong) == (1, 1)
+    rate = success_rate(episodes)
+    assert (rate.sr, rate.share_wrong, rate.share_outside) == (0.25, 0.3125, 0.4375)
+    assert rate.ci[0] < 0.25 < rate.ci[1]
+    assert (rate.paired.both, rate.paired.both_wrong) == (1, 1)
 
 
 def test_a_run_by_another_rule_leaves_the_run_as_it_was(idle: Run) -> None:
@@ -138,12 +138,12 @@ def test_a_table_with_its_report_reads_every_trajectory_once(idle: Run, monkeypa
 def test_a_table_without_behaviour_reads_no_trajectory_and_has_the_same_rates(
     idle: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole = retention_table([idle]).rows
+    full_rows = retention_table([idle]).rows
     monkeypatch.delattr(Trajectory, "of_frames")
     rows = retention_table([open_run(idle.path)], with_behaviour=False).rows
-    assert [row.success for row in rows] == [row.success for row in whole]
+    assert [row.success for row in rows] == [row.success for row in full_rows]
     assert [(row.rules.sr_answered, row.rules.sr_by_rule) for row in rows] == [
-        (row.rules.sr_answered, {}) for row in whole
+        (row.rules.sr_answered, {}) for row in full_rows
     ]
     with pytest.raises(AttributeError):
         retention_table([open_run(idle.path)], rule="box", with_behaviour=False)
@@ -218,12 +218,14 @@ def test_a_conditional_share_has_the_interval_of_its_own_episodes() -> None:
     groups = np.repeat(np.arange(40), 2)
     answered = generator.random(80) < 0.5
     right = answered & (generator.random(80) < 0.6)
-    found = Share.of(right[answered], groups[answered])
+    rate = Share.of(right[answered], groups[answered])
     weighted = Share.of(right, groups, answered)
-    assert weighted.value == found.value == right.sum() / answered.sum()
-    assert weighted.interval() == found.interval()
-    by_group = [(right[groups == one].sum(), answered[groups == one].sum()) for one in np.unique(groups[answered])]
-    share, episodes = found.value, answered.sum()
+    assert weighted.value == rate.value == right.sum() / answered.sum()
+    assert weighted.interval() == rate.interval()
+    by_group = [
+        (right[groups == group].sum(), answered[groups == group].sum()) for group in np.unique(groups[answered])
+    ]
+    share, episodes = rate.value, answered.sum()
     variance = sum((hits - share * size) ** 2 for hits, size in by_group) / episodes**2
     variance *= len(by_group) / (len(by_group) - 1)
     df = episodes**2 / sum(size**2 for _, size in by_group) - 1
@@ -231,7 +233,7 @@ def test_a_conditional_share_has_the_interval_of_its_own_episodes() -> None:
     count *= (stats.t.ppf(0.975, episodes - 1) / stats.t.ppf(0.975, df)) ** 2
     low = stats.beta.ppf(0.025, share * count, (1 - share) * count + 1)
     high = stats.beta.ppf(0.975, share * count + 1, (1 - share) * count)
-    assert (found.interval().low, found.interval().high) == pytest.approx((low, high))
+    assert (rate.interval().low, rate.interval().high) == pytest.approx((low, high))
 
 
 def test_answered_and_grasped_rates_are_of_their_own_episodes(tmp_path: Path) -> None:

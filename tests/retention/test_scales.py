@@ -29,7 +29,7 @@ BELOW = ([0.5, 0.1, 0.5], [[0.5, 0.05], [0.5, 0.5]])
 
 
 @pytest.fixture
-def known(probed_run: ProbedRun) -> ProbeResults:
+def known_results(probed_run: ProbedRun) -> ProbeResults:
     return load_results(probed_run({"color": KNOWS}, "known"))
 
 
@@ -39,7 +39,7 @@ def guessed(probed_run: ProbedRun) -> ProbeResults:
 
 
 def drawn(axes: "Sequence[Axes]") -> "list[Axes]":
-    return [one for one in axes if one.get_visible() and (one.lines or one.images)]
+    return [panel for panel in axes if panel.get_visible() and (panel.lines or panel.images)]
 
 
 def limits(figure: "Figure") -> set[tuple[float, float]]:
@@ -52,36 +52,36 @@ def colours(figure: "Figure") -> set[tuple[float, float]]:
 
 @pytest.mark.slow
 def test_maps_run_from_chance_to_100_percent_whatever_they_hold(
-    known: ProbeResults, guessed: ProbeResults
+    known_results: ProbeResults, guessed: ProbeResults
 ) -> None:
-    for results in (known, guessed):
+    for results in (known_results, guessed):
         assert colours(iteration_maps(results)) == {(50.0, 100.0)}
         (image,) = IterationMapDisplay.from_results(results, "color").plot().ax_.images  # type: ignore[union-attr]
         assert image.get_clim() == (50.0, 100.0)
 
 
 def test_the_best_guess_of_an_untrained_network_is_pale_and_full_knowledge_nearly_black(
-    known: ProbeResults, guessed: ProbeResults
+    known_results: ProbeResults, guessed: ProbeResults
 ) -> None:
     darkest = []
-    for results in (known, guessed):
+    for results in (known_results, guessed):
         (image,) = IterationMapDisplay.from_results(results, "color").plot().ax_.images  # type: ignore[union-attr]
-        shown = image.to_rgba(image.get_array())[..., :3]
-        darkest.append(float(shown.sum(axis=-1).min()))
+        grey_levels = image.to_rgba(image.get_array())[..., :3]
+        darkest.append(float(grey_levels.sum(axis=-1).min()))
     assert darkest[0] < 0.5
     assert darkest[1] > 2.2
 
 
 @pytest.mark.slow
 def test_accuracies_have_one_axis_in_every_figure_alone_and_together(
-    known: ProbeResults, guessed: ProbeResults
+    known_results: ProbeResults, guessed: ProbeResults
 ) -> None:
-    figures = [layer_curve(results) for results in (known, guessed)]
+    figures = [layer_curve(results) for results in (known_results, guessed)]
     figures += [
-        curves_side_by_side(some, [one.settings.model for one in some], "mean")
-        for some in ([known, guessed], [guessed, known])
+        curves_side_by_side(some, [probe_results.settings.model for probe_results in some], "mean")
+        for some in ([known_results, guessed], [guessed, known_results])
     ]
-    for results in (known, guessed):
+    for results in (known_results, guessed):
         figures += [
             display.plot().ax_.figure  # type: ignore[union-attr,misc]
             for display in (
@@ -94,9 +94,9 @@ def test_accuracies_have_one_axis_in_every_figure_alone_and_together(
 
 @pytest.mark.slow
 def test_depth_and_knowledge_have_fixed_axes(
-    probed_run: ProbedRun, known: ProbeResults, guessed: ProbeResults
+    probed_run: ProbedRun, known_results: ProbeResults, guessed: ProbeResults
 ) -> None:
-    assert limits(model_depths([guessed])) == limits(model_depths([known, guessed])) == {(-30.0, 51.0)}
+    assert limits(model_depths([guessed])) == limits(model_depths([known_results, guessed])) == {(-30.0, 51.0)}
     for accuracies in (KNOWS, GUESSES):
         table = retention_table([probed_run({"color": accuracies}, "again")])
         axes = KnowledgeActionDisplay.from_table(table).plot().ax_
@@ -114,30 +114,30 @@ def test_what_the_axis_does_not_reach_is_marked_with_its_number(probed_run: Prob
 
 @pytest.mark.slow
 def test_side_by_side_every_run_has_a_line_and_a_map_of_its_own(
-    known: ProbeResults, guessed: ProbeResults
+    known_results: ProbeResults, guessed: ProbeResults
 ) -> None:
     names = ["known", "guessed (random weights)"]
-    curves = curves_side_by_side([known, guessed], names, "mean")
+    curves = curves_side_by_side([known_results, guessed], names, "mean")
     for axes in drawn(curves.axes):
-        shown = [line for line in axes.lines if line.get_label() in names]
-        assert [line.get_label() for line in shown] == names
-        assert len({(line.get_color(), line.get_marker()) for line in shown}) == 2
+        run_lines = [line for line in axes.lines if line.get_label() in names]
+        assert [line.get_label() for line in run_lines] == names
+        assert len({(line.get_color(), line.get_marker()) for line in run_lines}) == 2
     backbone = curves.axes[0]
     (line,) = [line for line in backbone.lines if line.get_label() == "known"]
     np.testing.assert_allclose(line.get_ydata(), [50, 100, 90])
-    maps = maps_side_by_side([known, guessed], names, "mean")
+    maps = maps_side_by_side([known_results, guessed], names, "mean")
     assert [axes.get_title(loc="left") for axes in drawn(maps.axes)][:2] == [f"Color: {name}" for name in names]
     assert colours(maps) == {(50.0, 100.0)}
 
 
 def test_the_gallery_of_several_runs_names_each_apart(probed_run: ProbedRun) -> None:
     runs = [probed_run({"color": KNOWS}, "pi0"), probed_run({"color": GUESSES}, "untrained", random_weights=True)]
-    shown = {exhibit.name: exhibit for exhibit in collect_figures(runs, retention_table(runs))}
-    assert {"curves-side-by-side", "maps-side-by-side", "model-depths"} <= set(shown)
+    exhibits = {exhibit.name: exhibit for exhibit in collect_figures(runs, retention_table(runs))}
+    assert {"curves-side-by-side", "maps-side-by-side", "model-depths"} <= set(exhibits)
     assert not {"curves-side-by-side", "maps-side-by-side"} & {
-        one.name for one in collect_figures(runs[:1], retention_table(runs[:1]))
+        exhibit.name for exhibit in collect_figures(runs[:1], retention_table(runs[:1]))
     }
-    with shown["model-depths"].drawn() as figure:
+    with exhibits["model-depths"].drawn() as figure:
         labels = {text.get_text() for legend in figure.legends for text in legend.get_texts()}
     assert labels == {
         "pi0, 3 layers",

@@ -66,8 +66,8 @@ def test_retention_of_the_mean_is_the_ratio_of_the_two_columns_beside_it(table: 
     """Over all probed categories: leaving out those without signal would choose lucky backbones."""
     (mean,) = table.means
     for part in ("backbone", "action"):
-        own = [getattr(row, part).score for row in table.rows]
-        assert getattr(mean, part).score == pytest.approx(sum(own) / 3)
+        category_scores = [getattr(row, part).score for row in table.rows]
+        assert getattr(mean, part).score == pytest.approx(sum(category_scores) / 3)
     assert mean.retention.value == pytest.approx((mean.action.score - 0.5) / (mean.backbone.score - 0.5))  # type: ignore[operator]
     assert mean.categories == ("color", "shape", "counting")
 
@@ -258,12 +258,12 @@ def test_selectivity_is_the_peak_above_the_permuted_probes(table_category_mean: 
 def held_against(run: ArrayRun, p: float, control: str = "random-features") -> ArrayRun:
     """The run with every site compared with a control."""
     results = load_results(run)
-    found = [
+    comparisons = [
         ControlComparison(control, category, view, str(site), 0.8, p)
         for (category, view), curve in results.curves.items()
         for site in curve.sites
     ]
-    save_results(replace(results, controls=Controls().with_scores([], found)), run.path)
+    save_results(replace(results, controls=Controls().with_scores([], comparisons)), run.path)
     return run
 
 

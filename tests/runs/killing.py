@@ -49,7 +49,7 @@ def rollout(plan: Plan, number: int) -> writer.EpisodeRecord:
 def extract(run: str, plan: Plan) -> None:
     """What an extraction does with its episodes."""
     writing = writer.RunWriter(locate(run), plan, SETTINGS)
-    with writing.owned(), writing.location.explained_errors():
+    with writing.claim(), writing.location.explained_errors():
         for number in writing.remaining():
             writing.write(rollout(plan, number))
         verify.seal(run)
@@ -61,8 +61,8 @@ def die_at(point: str) -> None:
     put, commit = ArrayStore.set, writer.write_commit
     calls = {"put": 0, "commit": 0}
 
-    def reached(here: str, thing: str) -> None:
-        if (here, thing, calls[thing]) == (when, what, FATAL[thing]):
+    def reached(moment: str, call_name: str) -> None:
+        if (moment, call_name, calls[call_name]) == (when, what, FATAL[call_name]):
             os.kill(os.getpid(), signal.SIGKILL)
 
     async def deadly_put(store: ArrayStore, key: str, value: Buffer) -> None:

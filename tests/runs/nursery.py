@@ -27,7 +27,7 @@ def extract(run: str, suite: str) -> None:
     """What an extraction does with its episodes."""
     plan = little_plan(load_suite(Path(suite)))
     writer = RunWriter(locate(run), plan, little_settings())
-    with writer.owned():
+    with writer.claim():
         certify(writer)
         for number in writer.remaining():
             writer.write(episode(plan, number))
@@ -61,8 +61,8 @@ def start(task: str, run: str, suite: str) -> int:
 def ended(pid: int, deadline: float | None) -> bool:
     """Whether a process ended by itself, and well; it is killed at the deadline."""
     while True:
-        done, status = os.waitpid(pid, os.WNOHANG)
-        if done:
+        finished_pid, status = os.waitpid(pid, os.WNOHANG)
+        if finished_pid:
             break
         if deadline is not None and time.monotonic() > deadline:
             os.kill(pid, signal.SIGKILL)
@@ -80,7 +80,7 @@ def main() -> None:
         job = json.loads(line)
         began = time.monotonic()
         pids = [start(job["task"], job["run"], job["suite"]) for _ in job["patience"]]
-        deadlines = [None if one is None else began + one for one in job["patience"]]
+        deadlines = [None if seconds is None else began + seconds for seconds in job["patience"]]
         ends = [ended(pid, deadline) for pid, deadline in zip(pids, deadlines, strict=True)]
         print(json.dumps({"ended": ends, "seconds": time.monotonic() - began}), flush=True)
 

@@ -56,10 +56,10 @@ def test_rows_of_two_writers_get_numbers_in_the_order_of_their_arrival(tmp_path:
     run = open_run(tmp_path / "run")
     assert run.episodes[["episode", "episode_id"]].to_numpy().tolist() == [[0, "a"], [1, "b"], [2, "c"], [3, "d"]]
     assert run.inputs is not None
-    kept = run.inputs.read("picture.base")
-    assert kept.dtype == np.uint8
-    assert kept[:, 0, 0, 0, 0].tolist() == [7, 0, 0, 9]
-    assert not kept[:, 1].any()  # an inference that was not made
+    pictures = run.inputs.read("picture.base")
+    assert pictures.dtype == np.uint8
+    assert pictures[:, 0, 0, 0, 0].tolist() == [7, 0, 0, 9]
+    assert not pictures[:, 1].any()  # an inference that was not made
     audit = verify_run(tmp_path / "run", deep=True)
     assert (audit.problems, audit.strays) == ((), ())
 

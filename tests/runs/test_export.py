@@ -92,14 +92,14 @@ def test_recordings_keep_episode_and_frame_of_their_data_set(shown_run: Run, tmp
 def test_a_memory_map_holds_the_stored_bits_and_its_index_leads_back(recorded_run: Run, tmp_path: Path) -> None:
     out = export_run(recorded_run.path, "sae", tmp_path / "sae", sites=["expert.03", "backbone.01"], view="tokens")
     index = pd.read_parquet(out / "expert" / "index.parquet")
-    found = np.load(out / "expert" / f"{SITE}.npy", mmap_mode="r")
-    assert isinstance(found, np.memmap)
+    mapped = np.load(out / "expert" / f"{SITE}.npy", mmap_mode="r")
+    assert isinstance(mapped, np.memmap)
     values, mask = recorded_run.tokens(SITE)
-    assert found.shape == (mask.sum(), values.shape[2])
+    assert mapped.shape == (mask.sum(), values.shape[2])
     assert not index.duplicated(["episode_id", "inference", "token"]).any()
     rows = index["episode_id"].map(rows_of(recorded_run)).to_numpy()
-    np.testing.assert_array_equal(found, bits_of(recorded_run, SITE)[rows, index["token"]])
-    as_torch = torch.from_numpy(np.array(found)).view(torch.bfloat16).float().numpy()
+    np.testing.assert_array_equal(mapped, bits_of(recorded_run, SITE)[rows, index["token"]])
+    as_torch = torch.from_numpy(np.array(mapped)).view(torch.bfloat16).float().numpy()
     np.testing.assert_array_equal(as_torch, values[rows, index["token"]])
     steps = np.diff(rows)
     assert (steps != 0).mean() > 0.5  # rows of one episode lie apart
@@ -120,7 +120,7 @@ def test_pooled_memory_maps_are_rounded_as_torch_does_and_share_one_order(
     assert orders[wide].tolist() != orders[half].tolist()
     assert orders[wide].equals(pd.read_parquet(wide / "backbone" / "index.parquet")["episode_id"])
     column = torch.from_numpy(recorded_run.column(SITE))
-    rows = {folder: own.map(rows_of(recorded_run)).to_numpy() for folder, own in orders.items()}
+    rows = {folder: order.map(rows_of(recorded_run)).to_numpy() for folder, order in orders.items()}
     bits = torch.from_numpy(np.load(wide / "expert" / f"{SITE}.npy")).view(torch.bfloat16)
     assert torch.equal(bits, column[rows[wide]].to(torch.bfloat16))
     stored = torch.from_numpy(np.load(half / "expert" / f"{SITE}.npy"))
@@ -193,7 +193,7 @@ def test_safetensors_hold_the_numbers_and_true_bfloat16(recorded_run: Run, tmp_p
 def test_a_chunk_of_h5_is_a_part_of_one_episode_below_the_limit(shape: list[int], item: int, limit: int) -> None:
     chunk = _chunk_below((1, *shape), item, limit)
     assert item * math.prod(chunk) <= limit
-    assert all(1 <= part <= whole for part, whole in zip(chunk, (1, *shape), strict=True))
+    assert all(1 <= part <= extent for part, extent in zip(chunk, (1, *shape), strict=True))
     if item * math.prod(shape) <= limit:
         assert chunk == (1, *shape)
 
@@ -210,8 +210,8 @@ def test_h5_holds_the_numbers_and_the_episodes(recorded_run: Run, tmp_path: Path
 def test_parquet_holds_a_row_per_vector(recorded_run: Run, tmp_path: Path) -> None:
     pq = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed")
     table = pq.read_table(export_run(recorded_run.path, "parquet", tmp_path / "run.parquet")).to_pandas()
-    chosen = table[(table["site"] == str(FIRST_SITE)) & (table["view"] == "mean")]
-    np.testing.assert_array_equal(np.stack(chosen["vector"]), recorded_run.column(FIRST_SITE))
+    vectors = table[(table["site"] == str(FIRST_SITE)) & (table["view"] == "mean")]
+    np.testing.assert_array_equal(np.stack(vectors["vector"]), recorded_run.column(FIRST_SITE))
 
 
 @pytest.mark.slow

@@ -57,12 +57,12 @@ def writer_of(where: Path, plan: Plan) -> RunWriter:
 
 def play(writer: RunWriter, last: Plan, numbers: Sequence[int] | None = None) -> None:
     """What an episode gives follows from its place in `last`, whatever its number is."""
-    places = {one.content.episode_id: place for place, one in enumerate(last.episodes)}
+    places = {episode_plan.content.episode_id: index for index, episode_plan in enumerate(last.episodes)}
     for number in writer.remaining() if numbers is None else numbers:
         planned = writer.plan.episode(number)
-        place = places[planned.content.episode_id]
-        record = episode(last, place)
-        pictures = {thumbnail_key(number): as_thumbnail(still(0, place))}
+        position = places[planned.content.episode_id]
+        record = episode(last, position)
+        pictures = {thumbnail_key(number): as_thumbnail(still(0, position))}
         arrays = {"pooled": record.arrays["pooled"]}
         writer.write(replace(record, planned=planned, pictures=pictures, arrays=arrays))
 
@@ -91,15 +91,15 @@ def files_of(run: Path) -> dict[str, bytes]:
 
 def contents(run: Run) -> dict[str, Any]:
     """By episode, every byte that belongs to it, under names that hold no number."""
-    found = {}
+    by_episode = {}
     for number, name in zip(run.episodes["episode"], run.episodes["episode_id"], strict=True):
         commit = json.loads((run.path / f"commits/{number:08d}.json").read_bytes())
         objects = {key.replace(f"/c/{number}/", "/c/#/"): (run.path / "data.zarr" / key).read_bytes()
                    for key in commit["objects"]}  # fmt: skip
-        said = {key: commit[key] for key in ("run", "episode_id", "outcome", "roles", "instruction_ids",
+        facts = {key: commit[key] for key in ("run", "episode_id", "outcome", "roles", "instruction_ids",
                                              "control_steps", "provenance")}  # fmt: skip
-        found[name] = [said, objects, (run.path / thumbnail_key(number)).read_bytes()]
-    return found
+        by_episode[name] = [facts, objects, (run.path / thumbnail_key(number)).read_bytes()]
+    return by_episode
 
 
 # -- what grew is what would have been extracted at once ---------------------------------------------------
@@ -125,11 +125,12 @@ def test_a_grown_run_equals_one_extracted_at_once_episode_by_episode(
     for site in [*grown.sites("backbone"), *grown.sites("expert")]:
         np.testing.assert_array_equal(grown.column(site), at_once.column(site))
     np.testing.assert_array_equal(
-        [one.frames for one in grown.trajectories], [one.frames for one in at_once.trajectories]
+        [trajectory.frames for trajectory in grown.trajectories],
+        [trajectory.frames for trajectory in at_once.trajectories],
     )
     assert grown.sealed
-    found = verify_run(grown.path, deep=True)
-    assert (found.ok, found.finished, found.strays) == (True, True, ())
+    verification = verify_run(grown.path, deep=True)
+    assert (verification.ok, verification.finished, verification.strays) == (True, True, ())
 
 
 def test_plain_zarr_reads_the_episodes_of_a_grown_run(small_suite: Suite, tmp_path: Path) -> None:
@@ -151,16 +152,16 @@ def test_plain_zarr_reads_the_episodes_of_a_grown_run(small_suite: Suite, tmp_pa
 @pytest.mark.parametrize("query", QUERIES)
 def test_the_plan_of_more_items_holds_the_plan_of_fewer(query: Any, small_suite: Suite) -> None:
     for category in ("color", "shape"):
-        plans, named = [], []
+        plans, phrases_by_item = [], []
         for items in (2, 4, 12):
             suite = small_suite.select([category], items)
-            own = phrases(suite, query)
+            item_phrases = phrases(suite, query)
             rows = make_plan(suite, [], 3, 1, False, ("knowledge", "side")).columns
             plans.append({row["episode_id"]: {**row, "episode": None} for row in rows})
-            named.append({item: phrase.text for item, phrase in own.items()})
+            phrases_by_item.append({item: phrase.text for item, phrase in item_phrases.items()})
         for fewer, more in ((0, 1), (1, 2)):
             assert plans[fewer].items() <= plans[more].items()
-            assert named[fewer].items() <= named[more].items()
+            assert phrases_by_item[fewer].items() <= phrases_by_item[more].items()
 
 
 def test_a_plan_that_was_made_without_its_model_is_compared_with_the_stored_one(
@@ -171,9 +172,11 @@ def test_a_plan_that_was_made_without_its_model_is_compared_with_the_stored_one(
     plan = replace(plan_of(small_suite, COLOR[1]), bytes=800)
     settings: Any = ExtractSettings("pi0-tiny", suite=small_suite.folder)
     declared = Extraction(settings, settings.source.open(), plan, {"weights_sha256": None}, None, declared="so")
-    further = declared.further_plan(run.location)
-    assert {one.content.episode_id for one in further.episodes}.isdisjoint(run.episodes["episode_id"])
-    assert (len(further.episodes), further.bytes) == (4, 400)
+    growth = declared.further_plan(run.location)
+    assert {planned_episode.content.episode_id for planned_episode in growth.episodes}.isdisjoint(
+        run.episodes["episode_id"]
+    )
+    assert (len(growth.episodes), growth.bytes) == (4, 400)
 
 
 # -- never fewer ------------------------------------------------------------------------------------------
@@ -234,9 +237,9 @@ def test_arrays_of_all_tokens_take_no_longer_instructions_and_pooled_ones_do(
             with pytest.raises(SettingsMismatchError, match=r"stores 130 tokens of backbone .* needs 131"):
                 RunWriter(where, plan, settings)
         else:
-            assert [one.tokens for one in RunWriter(where, plan, settings).streams] == [131, 4]
+            assert [stream.tokens for stream in RunWriter(where, plan, settings).streams] == [131, 4]
             fewer = make_plan(small_suite.select(["color"], 2), list(STREAMS), 0, 1, False)
-            assert [one.tokens for one in RunWriter(where, fewer, settings).streams] == [131, 4]
+            assert [stream.tokens for stream in RunWriter(where, fewer, settings).streams] == [131, 4]
 
 
 # -- kills, other processes, readers -----------------------------------------------------------------------
@@ -288,15 +291,15 @@ def test_a_run_that_was_killed_before_its_first_plan_says_so_and_begins(
         writer_of(tmp_path / "run", plan_of(small_suite, COLOR[0]))
     with pytest.raises(RunIncompleteError, match="has no plan yet"):
         open_run(tmp_path / "run", allow_partial=True)
-    found = verify_run(tmp_path / "run")
-    assert (found.ok, found.finished) == (True, False)
+    verification = verify_run(tmp_path / "run")
+    assert (verification.ok, verification.finished) == (True, False)
     assert files_of(extracted(tmp_path / "run", small_suite, COLOR[:1]).path) == files_of(
         extracted(tmp_path / "other", small_suite, COLOR[:1]).path
     )
 
 
 def test_processes_that_begin_with_nested_plans_at_once_leave_one_run(small_suite: Suite, tmp_path: Path) -> None:
-    plans = [plan_of(small_suite, one) for one in [*COLOR, (["color", "shape"], 6, None)]]
+    plans = [plan_of(small_suite, selection) for selection in [*COLOR, (["color", "shape"], 6, None)]]
     with ThreadPoolExecutor(4) as processes:
         writers = list(processes.map(lambda plan: writer_of(tmp_path / "run", plan), plans))
         list(processes.map(lambda writer: play(writer, plans[-1]), writers))
@@ -307,7 +310,7 @@ def test_processes_that_begin_with_nested_plans_at_once_leave_one_run(small_suit
 
 
 def test_who_works_with_the_smaller_plan_is_not_disturbed_by_a_growth(small_suite: Suite, tmp_path: Path) -> None:
-    small, large = (plan_of(small_suite, one) for one in COLOR[:2])
+    small, large = (plan_of(small_suite, selection) for selection in COLOR[:2])
     first = writer_of(tmp_path / "run", small)
     second = writer_of(tmp_path / "run", large)
     play(second, large, second.remaining()[-2:])
@@ -344,14 +347,14 @@ def test_former_probes_and_seals_are_named_and_not_read(small_suite: Suite, tmp_
     play(writer_of(run.path, plan), plan)
     grown = open_run(run.path)
     assert not grown.sealed
-    assert [(one.key, one.state) for one in inventory(grown).probes] == [(key, "other episodes")]
+    assert [(entry.key, entry.state) for entry in inventory(grown).probes] == [(key, "other episodes")]
     with pytest.raises(NoProbesError, match="of 1 stored, none: other episodes"):
         load_results(grown)
     assert seal(run.path)
     assert len(list((run.path / "sealed").iterdir())) == 1
     again = train_probes(open_run(run.path), permutations=1)
     assert again.key != key
-    assert {one.state for one in inventory(open_run(run.path)).probes} == {"used", "other episodes"}
+    assert {entry.state for entry in inventory(open_run(run.path)).probes} == {"used", "other episodes"}
 
 
 # -- a growth record is a record ---------------------------------------------------------------------------

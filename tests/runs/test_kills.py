@@ -86,19 +86,19 @@ def kill_often(
     usual = nursery(task, begin(rounds))["seconds"]
     while kills < KILLS:
         rounds += 1
-        run, seen = begin(rounds), set[str]()
-        done = False
-        while not done:
+        run, before = begin(rounds), set[str]()
+        finished = False
+        while not finished:
             often = [draw.uniform(0, 1.1) * usual if kills < KILLS else None for _ in range(workers)]
             ends = nursery(task, run, *often)["ended"]
             kills += ends.count(False)
             now = committed(run)
-            assert seen <= now, "a commit was lost"
-            seen = now
+            assert before <= now, "a commit was lost"
+            before = now
             if now:
-                found = verify_run(run, deep=True)
-                assert found.ok, found.problems
-            done = True in ends
+                verification = verify_run(run, deep=True)
+                assert verification.ok, verification.problems
+            finished = True in ends
         if workers > 1:
             nursery(task, run)  # one may have been killed when the other was done; the next one clears
         assert objects(run) == expected
@@ -122,9 +122,9 @@ def test_kills_of_what_is_derived(nursery: Nursery, tmp_path: Path, task: str) -
     def begin(number: int) -> Path:
         return Path(shutil.copytree(tmp_path / "begun", tmp_path / str(number)))
 
-    whole = begin(-1)
-    nursery(task, whole)
-    kill_often(nursery, task, begin, objects(whole), workers=1, seed=2)
+    uninterrupted = begin(-1)
+    nursery(task, uninterrupted)
+    kill_often(nursery, task, begin, objects(uninterrupted), workers=1, seed=2)
 
 
 def test_kills_in_an_object_store(suite: Suite, tmp_path: Path, bucket: str) -> None:

@@ -337,21 +337,21 @@ def suite(tmp_path_factory: pytest.TempPathFactory) -> Suite:
 
 
 @pytest.fixture(scope="module")
-def whole(suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def reference_run(suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Synthetic episodes in a folder."""
     run = tmp_path_factory.mktemp("whole") / "run"
     assert start(run, suite).wait() == 0
     return run
 
 
-def copy_to(bucket: str, here: Location) -> Run:
+def copy_to(bucket: str, source: Location) -> Run:
     """The run without its probes in a bucket, sealed there."""
-    there = locate(f"{bucket}/run")
-    for key in here.keys(""):
+    target = locate(f"{bucket}/run")
+    for key in source.keys(""):
         if not key.startswith((COLUMNS, "probes", "interventions")):
-            there.write(key, here.read(key))
-    assert seal(there)
-    return open_run(there)
+            target.write(key, source.read(key))
+    assert seal(target)
+    return open_run(target)
 
 
 @pytest.fixture
@@ -368,19 +368,21 @@ def test_a_run_in_a_bucket_has_the_same_bytes_as_one_in_a_folder(
     local = extract_run(settings, tmp_path / "run")
     remote = extract_run(settings, f"{bucket}/prefix/run")
     assert (remote.stamp, remote.settings_sha256, remote.sealed) == (local.stamp, local.settings_sha256, True)
-    there, here = (
-        {key: content for key, content in objects(place).items() if not key.startswith("times/")}
-        for place in (f"{bucket}/prefix/run", tmp_path / "run")
+    in_bucket, in_local_folder = (
+        {key: content for key, content in objects(location).items() if not key.startswith("times/")}
+        for location in (f"{bucket}/prefix/run", tmp_path / "run")
     )
-    assert there == here
+    assert in_bucket == in_local_folder
 
 
 @pytest.mark.slow
-def test_three_writers_at_once_give_the_same_store_in_a_bucket(suite: Suite, whole: Path, bucket: str) -> None:
+def test_three_writers_at_once_give_the_same_store_in_a_bucket(
+    suite: Suite, reference_run: Path, bucket: str
+) -> None:
     run = f"{bucket}/run"
     writers = [start(run, suite) for _ in range(3)]
     assert [writer.wait() for writer in writers] == [0, 0, 0]
-    assert objects(run) == objects(whole)
+    assert objects(run) == objects(reference_run)
 
 
 @pytest.mark.slow
@@ -410,12 +412,12 @@ def test_a_store_that_ignores_conditions_is_refused_before_a_run_is_begun(
 
 
 def test_a_run_is_not_continued_in_a_store_that_ignores_conditions(in_folder: Run, deaf_bucket: str) -> None:
-    here, there = in_folder.location, locate(f"{deaf_bucket}/run")
-    for key in here.keys(""):
-        there.write(key, here.read(key))
+    source, target = in_folder.location, locate(f"{deaf_bucket}/run")
+    for key in source.keys(""):
+        target.write(key, source.read(key))
     with pytest.raises(StoreError, match=r"created run\.json a second time"):
-        check_exclusive(there, "run.json")
-    check_exclusive(here, "run.json")
+        check_exclusive(target, "run.json")
+    check_exclusive(source, "run.json")
 
 
 @pytest.mark.slow
@@ -426,14 +428,16 @@ def test_numbers_and_probes_of_a_bucket_are_those_of_a_folder(trainable_run: Run
     for ours, theirs in zip(copied.tokens(SITE), trainable_run.tokens(SITE), strict=True):
         np.testing.assert_array_equal(ours, theirs)
     assert copied.xarray().sizes == trainable_run.xarray().sizes
-    chosen = {"categories": ["color"], "views": ["mean"], "permutations": 0}
-    results = train_probes(copied, **chosen)
-    expected = train_probes(trainable_run, **chosen)
+    options = {"categories": ["color"], "views": ["mean"], "permutations": 0}
+    results = train_probes(copied, **options)
+    expected = train_probes(trainable_run, **options)
     again = load_results(open_run(copied.location))
     assert again.key == results.key == expected.key
     np.testing.assert_array_equal(again.scores["accuracy"], expected.scores["accuracy"])
-    place = next(iter(expected.directions))
-    np.testing.assert_array_equal(again.directions[place].weights, expected.directions[place].weights)
+    direction_key = next(iter(expected.directions))
+    np.testing.assert_array_equal(
+        again.directions[direction_key].weights, expected.directions[direction_key].weights
+    )
 
 
 def flip_a_bit(location: Location, key: str) -> None:
@@ -464,10 +468,10 @@ def test_the_commands_take_urls(copied: Run, tmp_path: Path, bucket: str) -> Non
         return subprocess.run(command, capture_output=True, encoding="utf-8", check=False, cwd=tmp_path)
 
     run = str(copied.location)
-    made = probe_kit("extract", "--model", "expert", "--categories", "color", "--items", "2", "--max-steps", "2",
+    answer = probe_kit("extract", "--model", "expert", "--categories", "color", "--items", "2", "--max-steps", "2",
                      "--out", f"{bucket}/scripted")  # fmt: skip
-    assert (made.returncode, made.stdout.strip()) == (0, f"{bucket}/scripted"), made.stderr
-    assert f"probe-kit retention {bucket}/scripted" in made.stderr
+    assert (answer.returncode, answer.stdout.strip()) == (0, f"{bucket}/scripted"), answer.stderr
+    assert f"probe-kit retention {bucket}/scripted" in answer.stderr
     verified = probe_kit("run", "verify", run, "--deep")
     assert (verified.returncode, "sealed; every byte checked" in verified.stdout) == (0, True), verified.stderr
     assert "nothing to seal" in probe_kit("run", "verify", run, "--seal").stderr
@@ -493,12 +497,12 @@ def test_a_bucket_that_is_not_there_is_named() -> None:
 def test_missing_credentials_are_named_and_not_the_address_that_was_asked_for_them() -> None:
     from obstore.exceptions import GenericError
 
-    asked = "Error performing PUT http://169.254.169.254/latest/api/token in 23ms - Server returned 403"
+    server_message = "Error performing PUT http://169.254.169.254/latest/api/token in 23ms - Server returned 403"
     with (
         pytest.raises(StoreError, match=r"no credentials.*AWS_ACCESS_KEY_ID") as caught,
         locate("s3://b/r").explained_errors(),
     ):
-        raise GenericError(asked)
+        raise GenericError(server_message)
     assert "169.254" not in str(caught.value)
 
 
@@ -511,7 +515,7 @@ def write(run: Path | str, server_suite: Suite) -> Run:
     """What an extraction does with its episodes."""
     plan = little_plan(server_suite, episodes=EPISODES)
     writer = little_writer(locate(run), plan)
-    with writer.owned():
+    with writer.claim():
         for number in writer.remaining():
             writer.write(episode(plan, number))
         seal(run)
@@ -545,8 +549,10 @@ def impatient(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -
 
 def every(count: int, ills: Sequence[str], method: str = "") -> Callable[[str, str], str | None]:
     """Every so many requests of this method have one of these, in turn; a repeated one has not."""
-    asked, turns = itertools.count(1), itertools.cycle(ills)
-    return lambda kind, _path: next(turns) if kind.startswith(method) and next(asked) % count == 0 else None
+    request_count, turns = itertools.count(1), itertools.cycle(ills)
+    return lambda kind, _path: (
+        next(turns) if kind.startswith(method) and next(request_count) % count == 0 else None
+    )
 
 
 @pytest.mark.slow
@@ -621,25 +627,27 @@ def test_a_server_that_dies_and_returns_is_waited_for(
 
 
 @pytest.fixture
-def kept(little_runs: Path, bad_server: BadServer) -> Run:
+def remote_run(little_runs: Path, bad_server: BadServer) -> Run:
     """A run with probes on a server that was well when it was made."""
-    here, there = locate(little_runs / "run"), locate(f"{bad_server.url}/run")
-    for key in here.keys(""):
-        there.write(key, here.read(key))
-    return open_run(there)
+    source, target = locate(little_runs / "run"), locate(f"{bad_server.url}/run")
+    for key in source.keys(""):
+        target.write(key, source.read(key))
+    return open_run(target)
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("impatient")
 @pytest.mark.parametrize("ill", ["busy", pytest.param("silent", marks=pytest.mark.slow)])
-def test_reading_from_a_server_that_fails_says_what_to_do(ill: str, kept: Run, bad_server: BadServer) -> None:
+def test_reading_from_a_server_that_fails_says_what_to_do(
+    ill: str, remote_run: Run, bad_server: BadServer
+) -> None:
     asks: tuple[Callable[[], object], ...] = (
-        partial(kept.column, PROBED_SITE, "mean"),
-        partial(kept.rows("expert", "tokens").__getitem__, 1),
-        lambda: kept.xarray()["expert"].values,
-        partial(load_results, kept),
-        partial(verify_run, kept.location, deep=True),
-        partial(open_run, str(kept.location)),
+        partial(remote_run.column, PROBED_SITE, "mean"),
+        partial(remote_run.rows("expert", "tokens").__getitem__, 1),
+        lambda: remote_run.xarray()["expert"].values,
+        partial(load_results, remote_run),
+        partial(verify_run, remote_run.location, deep=True),
+        partial(open_run, str(remote_run.location)),
     )
     bad_server.day.ail = lambda *_: ill
     for ask in asks:
@@ -648,15 +656,15 @@ def test_reading_from_a_server_that_fails_says_what_to_do(ill: str, kept: Run, b
 
 
 @pytest.mark.slow
-def test_reading_from_a_server_on_a_bad_day_gives_the_same_numbers(kept: Run, bad_server: BadServer) -> None:
-    column, tokens = kept.column(PROBED_SITE, "mean"), kept.rows("expert", "tokens")[1]
-    scores = load_results(kept).scores
+def test_reading_from_a_server_on_a_bad_day_gives_the_same_numbers(remote_run: Run, bad_server: BadServer) -> None:
+    column, tokens = remote_run.column(PROBED_SITE, "mean"), remote_run.rows("expert", "tokens")[1]
+    scores = load_results(remote_run).scores
     bad_server.day.ail = now_and_then(("busy", "torn", "unanswered", "cut"), 0.3, seed=1)
-    again = open_run(kept.location)
+    again = open_run(remote_run.location)
     np.testing.assert_array_equal(again.column(PROBED_SITE, "mean"), column)
     np.testing.assert_array_equal(again.rows("expert", "tokens")[1], tokens)
     assert load_results(again).scores.equals(scores)
-    assert verify_run(kept.location, deep=True).ok
+    assert verify_run(remote_run.location, deep=True).ok
     assert bad_server.day.seen.total() > 5
 
 
@@ -665,10 +673,10 @@ def test_reading_from_a_server_on_a_bad_day_gives_the_same_numbers(kept: Run, ba
 def test_a_store_that_never_answered_is_given_up_soon(bad_server: BadServer) -> None:
     bad_server.stop()
     try:
-        found = CliRunner().invoke(app, ["run", "show", f"{bad_server.url}/run"])
+        result = CliRunner().invoke(app, ["run", "show", f"{bad_server.url}/run"])
     finally:
         bad_server.start()
-    assert isinstance(found.exception, StoreError) or found.exit_code == 3, found.output
+    assert isinstance(result.exception, StoreError) or result.exit_code == 3, result.output
 
 
 @pytest.mark.parametrize("where", ["folder", pytest.param("bucket", marks=pytest.mark.slow)])
@@ -680,20 +688,20 @@ def test_who_reads_while_another_writes_sees_whole_episodes_only(
     little_writer(locate(run), little_plan(server_suite, episodes=EPISODES))
     writing = Thread(target=write, args=(run, server_suite), daemon=True)
     writing.start()
-    seen, alive = set[int](), True
+    lengths, alive = set[int](), True
     while alive:
         writing.join(0.02)  # the writer has a core too
         alive = writing.is_alive()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NotSealedWarning)
             opened = open_run(run, allow_partial=True)
-            seen.add(len(opened.episodes))
+            lengths.add(len(opened.episodes))
             if len(opened.episodes):
                 assert opened.column(PROBED_SITE, "mean").shape == (len(opened.episodes), 4)
         for row, number in enumerate(opened.episodes["episode"]):
             np.testing.assert_array_equal(opened.rows("expert", "tokens")[row], expected[number])
         assert verify_run(run, deep=True).problems == ()
-    assert EPISODES in seen
+    assert EPISODES in lengths
     assert objects(run) == whole_run
 
 

@@ -65,9 +65,14 @@ def assert_reads_as_written(run: Run, plan: Plan, written: list[int], calls: int
     for site in run.sites("backbone"):
         for call in range(calls):
             for position, view in enumerate(stream.views):
-                expected = [one["pooled"]["backbone"][(call, *stream.at(site), position)] for one in stored]
+                expected = [
+                    episode_arrays["pooled"]["backbone"][(call, *stream.at(site), position)]
+                    for episode_arrays in stored
+                ]
                 np.testing.assert_array_equal(run.column(site, view, call), np.stack(expected))
-            bits = np.stack([one["tokens"]["backbone"][(call, *stream.at(site))] for one in stored])
+            bits = np.stack(
+                [episode_arrays["tokens"]["backbone"][(call, *stream.at(site))] for episode_arrays in stored]
+            )
             values, _ = run.tokens(site, None, call)
             np.testing.assert_array_equal(values, (bits.astype(np.uint32) << 16).view(np.float32))
 
@@ -118,7 +123,7 @@ class Extraction(RuleBasedStateMachine):
     def resume(self) -> None:
         """A new process comes along."""
         self.writer = RunWriter(locate(self.folder / "run"), self.plan, choices(self.calls, "all", "zstd"))
-        with self.writer.owned():
+        with self.writer.claim():
             self.writer.begin()
             assert self.writer.remaining() == [n for n in range(self.count) if n not in self.committed]
         assert not list((self.folder / "run").rglob("*.tmp")), "leftovers are cleared"

@@ -50,8 +50,8 @@ class Note(Record):
 
 def test_a_record_is_plain_json_with_the_hash_of_its_canonical_json() -> None:
     stored = json.loads(as_record(CONTENT))
-    own = json.dumps(CONTENT, sort_keys=True, separators=(",", ":")).encode()
-    assert stored.pop(HASH) == blake2b(own, digest_size=32).hexdigest()
+    canonical = json.dumps(CONTENT, sort_keys=True, separators=(",", ":")).encode()
+    assert stored.pop(HASH) == blake2b(canonical, digest_size=32).hexdigest()
     assert stored == CONTENT
 
 
@@ -76,8 +76,8 @@ def test_a_deep_verification_takes_a_record_in_no_other_bytes(spell) -> None:
 def test_a_changed_byte_is_refused_or_changes_no_value(content: dict[str, object], data: st.DataObject) -> None:
     content.pop(HASH, None)
     raw = bytearray(as_record(content))
-    place = data.draw(st.integers(0, len(raw) - 1))
-    raw[place] ^= data.draw(st.integers(1, 255))
+    offset = data.draw(st.integers(0, len(raw) - 1))
+    raw[offset] ^= data.draw(st.integers(1, 255))
     try:
         read = read_record(bytes(raw), "it", "do")
     except RunDamagedError:
@@ -242,11 +242,11 @@ def test_sealing_again_gives_the_same_bytes_and_a_second_time_does_nothing(copy:
 @pytest.mark.parametrize("finished", [True, False])
 def test_what_a_killed_seal_left_is_cleared_by_the_next_one(copy: Path, finished: bool) -> None:
     before = hashes(copy)
-    left = copy / "columns.zarr" / "of-fewer"
-    left.mkdir()
-    (left / "zarr.json").write_bytes(b"{}")
+    leftover = copy / "columns.zarr" / "of-fewer"
+    leftover.mkdir()
+    (leftover / "zarr.json").write_bytes(b"{}")
     if not finished:
-        (columns,) = (path for path in left.parent.iterdir() if path != left)
+        (columns,) = (path for path in leftover.parent.iterdir() if path != leftover)
         (columns / "zarr.json").write_bytes(b"{}")
         shutil.rmtree(copy / "sealed")
     seal(copy)
@@ -293,11 +293,11 @@ DERIVED = ("provenance/*", "certificates/*", "certificate.json")
 def test_a_record_that_follows_from_the_others_is_made_again(copy: Path, lost: str) -> None:
     before, files = hashes(copy), list(copy.glob(lost))
     run = open_run(copy)
-    said = (run.certificate, run.provenances, run.origins)
+    records = (run.certificate, run.provenances, run.origins)
     for file in files:
         file.unlink()
     again = open_run(copy)
-    assert (again.certificate, again.provenances, again.origins) == said
+    assert (again.certificate, again.provenances, again.origins) == records
     assert re.search(rf"{re.escape(files[0].name)} is missing.*--seal", verify_run(copy).problems[0])
     again.restore_records()
     assert hashes(copy) == before

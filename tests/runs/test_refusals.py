@@ -44,9 +44,9 @@ def first(answer: str, call: str, key: str = "", times: int | None = 1) -> Calla
     """The first calls of a kind, to keys that a pattern matches, have this answer; None: all of them."""
     number = itertools.count(1)
 
-    def attack(made: Call) -> str | None:
-        wanted = made.call == call and re.search(key, made.key)
-        return answer if wanted and (times is None or next(number) <= times) else None
+    def attack(request: Call) -> str | None:
+        matches = request.call == call and re.search(key, request.key)
+        return answer if matches and (times is None or next(number) <= times) else None
 
     return attack
 
@@ -56,14 +56,14 @@ def ask(location: Location, call: str) -> object:
     if call in ("put", *MULTIPART):
         location.write("object", LARGE if call in MULTIPART else b"new")
         return None
-    asked: dict[str, Callable[[], object]] = {
+    requests: dict[str, Callable[[], object]] = {
         "create": partial(location.create, "created", b"ours"),
         "get": partial(location.read, "kept"),
         "head": partial(location.exists, "kept"),
         "list": partial(location.keys, ""),
         "delete": partial(location.delete, "kept"),
     }
-    return asked[call]()
+    return requests[call]()
 
 
 def check_done(location: Location, call: str, answer: object) -> None:
@@ -96,7 +96,7 @@ def attacked(server: BadServer, call: str, answer: str, times: int | None) -> tu
 def test_one_bad_answer_to_any_call_changes_nothing(bad_server: BadServer) -> None:
     for call, answer in itertools.product(CALLS, ANSWERS):
         if call not in MULTIPART:
-            check_done(*((made := attacked(bad_server, call, answer, 1))[0], call, made[1]))
+            check_done(*((attack := attacked(bad_server, call, answer, 1))[0], call, attack[1]))
 
 
 @pytest.mark.slow
@@ -104,8 +104,8 @@ def test_one_bad_answer_to_any_call_changes_nothing(bad_server: BadServer) -> No
 @pytest.mark.parametrize("call", MULTIPART)
 def test_one_bad_answer_to_an_upload_in_parts_changes_nothing(bad_server: BadServer, call: str) -> None:
     for answer in ANSWERS:
-        location, done = attacked(bad_server, call, answer, 1)
-        check_done(location, call, done)
+        location, outcome = attacked(bad_server, call, answer, 1)
+        check_done(location, call, outcome)
 
 
 @pytest.mark.usefixtures("quick")
@@ -174,7 +174,7 @@ def extracted(run: str, suite: Suite) -> None:
     """What `extract` does with two episodes."""
     plan = little_plan(suite, episodes=2)
     writer = little_writer(locate(run), plan)
-    with writer.owned():
+    with writer.claim():
         for number in writer.remaining():
             writer.write(episode(plan, number))
         seal(run)
@@ -214,11 +214,11 @@ def clean(color: Suite, tmp_path_factory: pytest.TempPathFactory) -> str:
 
 def attacks(server: BadServer, make: Callable[[str], None], run: str) -> list[tuple[str, str]]:
     """Every kind of object that is put there, and the call that puts it."""
-    made: list[Call] = []
-    server.day.attack = made.append  # type: ignore[assignment]  # which answers None: nothing happens
+    calls: list[Call] = []
+    server.day.attack = calls.append  # type: ignore[assignment]  # which answers None: nothing happens
     make(run)
     server.day.attack = lambda _call: None
-    return list(dict.fromkeys((kind_of(c.key.removeprefix("run/")), c.call) for c in made if c.call in PUTS))
+    return list(dict.fromkeys((kind_of(c.key.removeprefix("run/")), c.call) for c in calls if c.call in PUTS))
 
 
 def errors_under(
@@ -265,16 +265,18 @@ def test_no_kind_of_object_of_an_extraction_is_lost_or_believed(
 @pytest.fixture
 def with_results(little_runs: Path, bad_server: BadServer, tmp_path: Path) -> tuple[str, dict[str, bytes]]:
     """A run in a bucket to which results are added, and those of the same run in a folder."""
-    here = locate(tmp_path / "run")
-    whole = locate(little_runs / "run")
+    location = locate(tmp_path / "run")
+    little_run = locate(little_runs / "run")
     plain = {
-        key: whole.read(key) for key in whole.keys("") if key.partition("/")[0] not in ("probes", "interventions")
+        key: little_run.read(key)
+        for key in little_run.keys("")
+        if key.partition("/")[0] not in ("probes", "interventions")
     }
     for key, content in plain.items():
-        here.write(key, content)
-    results_of(str(here))
-    made = {key: content for key, content in timeless(str(here)).items() if key not in plain}
-    return f"{bad_server.url}/run", made
+        location.write(key, content)
+    results_of(str(location))
+    result_objects = {key: content for key, content in timeless(str(location)).items() if key not in plain}
+    return f"{bad_server.url}/run", result_objects
 
 
 @pytest.mark.slow
@@ -284,19 +286,19 @@ def test_no_kind_of_object_of_a_result_is_lost_or_believed(
     bad_server: BadServer, with_results: tuple[str, dict[str, bytes]], little_runs: Path, answer: str
 ) -> None:
     run, expected = with_results
-    there, whole = locate(run), locate(little_runs / "run")
-    for key in whole.keys(""):
+    target, little_run = locate(run), locate(little_runs / "run")
+    for key in little_run.keys(""):
         if key.partition("/")[0] not in ("probes", "interventions"):
-            there.write(key, whole.read(key))
+            target.write(key, little_run.read(key))
     kinds = attacks(bad_server, results_of, run)
     for kind, call in kinds:
         for home in ("probes", "interventions", DIAGNOSES):
-            there.remove(home)
+            target.remove(home)
         bad_server.day.seen.clear()
         assert errors_under(bad_server, results_of, run, first(answer, call, kind)) == []
-        assert {key: there.read(key) for key in expected} == expected, kind
+        assert {key: target.read(key) for key in expected} == expected, kind
         load_results(open_run(run))
-        read_bundle(there, DIAGNOSES, KEY)
+        read_bundle(target, DIAGNOSES, KEY)
         assert bad_server.day.seen[answer], (kind, call)
     print(f"{answer}: {len(kinds)} trials")
     assert len(kinds) >= 8

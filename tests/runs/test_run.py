@@ -41,7 +41,7 @@ from probe_kit.runs.store import locate
 from probe_kit.runs.writer import RunWriter
 from probe_kit.train import load_results, train_probes
 from probe_kit.train.builtin_columns import label_frame
-from probe_kit.view.commands import _opened
+from probe_kit.view.commands import _open_runs
 from tests.support.recorded_run import ACTION, CALLS, CHUNK, EVERY, SHORT, recorded_plan, write_recorded_run
 from tests.support.rehashing import rehash
 
@@ -122,9 +122,9 @@ def test_other_tools_read_all_of_a_finished_run_at_once(kind: str, request: pyte
     for name, path in every_array(run):
         array = zarr.open_array(path, mode="r")
         assert (array.shape[0], array.attrs["episodes"]) == (len(run.episodes),) * 2
-        whole, rows = array[:], Rows(open_array(run.data, name), run.episodes["episode"].tolist())
-        np.testing.assert_array_equal(whole[run.episodes["episode"]], np.stack(list(rows)))
-        np.testing.assert_array_equal(tree[name].load().values, whole)
+        full_array, rows = array[:], Rows(open_array(run.data, name), run.episodes["episode"].tolist())
+        np.testing.assert_array_equal(full_array[run.episodes["episode"]], np.stack(list(rows)))
+        np.testing.assert_array_equal(tree[name].load().values, full_array)
         names.append(name)
     assert {*run.root.arrays} <= {*names}
     for columns in (run.path / "columns.zarr").iterdir():
@@ -136,8 +136,8 @@ def test_tensorstore_reads_all_of_a_finished_run_at_once(recorded_run: Run, tmp_
     """In an environment of its own: it is none of probe_kit's."""
     python = tmp_path / "env/bin/python"
     subprocess.run([sys.executable, "-m", "venv", tmp_path / "env"], check=True)
-    made = subprocess.run([python, "-m", "pip", "install", "-q", "tensorstore==0.1.86"], check=False)
-    if made.returncode:
+    installed = subprocess.run([python, "-m", "pip", "install", "-q", "tensorstore==0.1.86"], check=False)
+    if installed.returncode:
         pytest.skip("tensorstore cannot be installed here")
     code = "import sys, tensorstore as ts, numpy as np\n" + (
         "array = ts.open({'driver': 'zarr3', 'kvstore': f'file://{sys.argv[1]}/'}).result()\n"
@@ -152,8 +152,8 @@ def test_tensorstore_reads_all_of_a_finished_run_at_once(recorded_run: Run, tmp_
 
 def test_the_labelled_dataset_selects_by_name(recorded_run: Run) -> None:
     dataset = recorded_run.xarray()
-    chosen = dataset["backbone_pooled"].sel(backbone_view="mean:language").isel(call=0, backbone_layer=2)
-    np.testing.assert_array_equal(chosen, recorded_run.column(Site("backbone", 2), "mean:language"))
+    selected = dataset["backbone_pooled"].sel(backbone_view="mean:language").isel(call=0, backbone_layer=2)
+    np.testing.assert_array_equal(selected, recorded_run.column(Site("backbone", 2), "mean:language"))
     assert dataset["category"].values.tolist() == recorded_run.episodes["category"].tolist()
 
 
@@ -197,9 +197,9 @@ def test_a_folder_without_a_run_is_refused(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_run_shows_the_first_items_of_some_categories(recorded_run: Run) -> None:
     part = recorded_run.only(["color"], 4)
-    whole = recorded_run.episodes
-    first = list(dict.fromkeys(whole.loc[whole["category"] == "color", "item_id"]))[:4]
-    mine = whole["item_id"].isin(first).to_numpy()
+    all_episodes = recorded_run.episodes
+    first = list(dict.fromkeys(all_episodes.loc[all_episodes["category"] == "color", "item_id"]))[:4]
+    mine = all_episodes["item_id"].isin(first).to_numpy()
     assert part.episodes["item_id"].unique().tolist() == first
     assert (part.planned, len(part.items)) == (8, 4)
     assert part.planned_items == recorded_run.planned_items  # by which its suite is found again
@@ -236,9 +236,9 @@ def test_a_part_of_a_run_has_probes_of_its_own(little_runs: Path, tmp_path: Path
     part, stored = run.only(items=10), load_results(run).key
     with pytest.raises(NoProbesError, match="other episodes"):
         load_results(part)
-    own = train_probes(part, permutations=0)
-    assert (load_results(part).key, load_results(run).key) == (own.key, stored)
-    assert len(own.curves["color", "mean"].episodes) == 20
+    part_probes = train_probes(part, permutations=0)
+    assert (load_results(part).key, load_results(run).key) == (part_probes.key, stored)
+    assert len(part_probes.curves["color", "mean"].episodes) == 20
 
 
 TOKENS, WIDTH = 7, 3
@@ -281,11 +281,11 @@ def test_every_token_of_a_role_comes_once_and_zeros_stand_for_all_others(
     expected = belongs != "padding" if role is None else belongs == role
     mask = role_mask(SPANS, TOKENS, role)
     np.testing.assert_array_equal(mask, expected)
-    found = np.zeros((2, TOKENS, WIDTH), np.float32)
+    filled = np.zeros((2, TOKENS, WIDTH), np.float32)
     for part in token_blocks(rows, (0, 1), mask, block):
         np.testing.assert_array_equal(part.mask, expected[:, part.start : part.start + block])
-        found[:, part.start : part.start + block] += part.values
-    np.testing.assert_array_equal(found, np.where(expected[..., None], values[:, 0, 1], 0))
+        filled[:, part.start : part.start + block] += part.values
+    np.testing.assert_array_equal(filled, np.where(expected[..., None], values[:, 0, 1], 0))
 
 
 @pytest.fixture
@@ -390,9 +390,9 @@ def test_a_folder_that_holds_no_run_is_refused(folder: Path) -> None:
 def test_the_list_names_every_run_and_the_one_that_cannot_be_read(folder: Path) -> None:
     (folder / "broken").mkdir()
     (folder / "broken" / "run.json").write_text("{", encoding="utf-8")
-    done = CliRunner().invoke(app, ["run", "list", str(folder), "--format", "json"])
-    assert done.exit_code == 0, done.output
-    lines = json.loads(done.stdout)
+    result = CliRunner().invoke(app, ["run", "list", str(folder), "--format", "json"])
+    assert result.exit_code == 0, result.output
+    lines = json.loads(result.stdout)
     assert [line["run"] for line in lines] == ["b", "broken", "deep/a"]
     assert "error" in lines[1]
     assert lines[0]["episodes"] == lines[2]["episodes"] > 0
@@ -410,7 +410,7 @@ def test_names_of_runs_can_be_copied_from_a_narrow_terminal(folder: Path, monkey
 
 
 def test_the_viewer_opens_all_runs_of_a_folder(folder: Path) -> None:
-    assert [run.location.name for run in _opened([str(folder)], True)] == ["b", "a"]
+    assert [run.location.name for run in _open_runs([str(folder)], True)] == ["b", "a"]
 
 
 def test_inputs_are_read_as_they_were_shown_and_nan_behind_the_last_frame(shown_run: Run) -> None:
@@ -464,15 +464,17 @@ def test_it_grows_by_further_episodes_and_keeps_those_it_has(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(
-    ("wanted", "refused"),
+    ("requirement", "refused"),
     [
         ("retention table", lambda run: retention_table([run])),
         ("probe of the side .side.correct.", train_probes),
     ],
 )
-def test_what_needs_a_scene_or_an_outcome_is_refused_by_name(shown_run: Run, wanted: str, refused: object) -> None:
+def test_what_needs_a_scene_or_an_outcome_is_refused_by_name(
+    shown_run: Run, requirement: str, refused: object
+) -> None:
     assert callable(refused)
-    with pytest.raises(UsageError, match=rf"shows recordings \(kitchen#.*{wanted} is not possible"):
+    with pytest.raises(UsageError, match=rf"shows recordings \(kitchen#.*{requirement} is not possible"):
         refused(shown_run)
 
 
@@ -492,8 +494,8 @@ def actions(run: Run) -> tuple[np.ndarray, np.ndarray]:
     """(n, chunk, D) recorded and predicted, of the shown frames."""
     assert run.inputs is not None
     recorded, predicted = (run.inputs.read(kind).astype(np.float64) for kind in ("action", "prediction"))
-    shown = np.isfinite(recorded[:, :, 0, 0])
-    return recorded[shown], predicted[shown]
+    is_finite = np.isfinite(recorded[:, :, 0, 0])
+    return recorded[is_finite], predicted[is_finite]
 
 
 def test_the_error_of_a_number_is_what_its_r2_says(shown_run: Run, errors: ActionErrors) -> None:
@@ -501,11 +503,11 @@ def test_the_error_of_a_number_is_what_its_r2_says(shown_run: Run, errors: Actio
     recorded, predicted = actions(shown_run)
     table = errors.by_number.set_index("number")
     assert list(table.index) == ["dx", "grip"]
-    for place, name in enumerate(table.index):
-        expected = 1 - r2_score(recorded[:, 0, place], predicted[:, 0, place])
+    for column, name in enumerate(table.index):
+        expected = 1 - r2_score(recorded[:, 0, column], predicted[:, 0, column])
         assert table.loc[name, "first"] ** 2 == pytest.approx(expected)
-        assert table.loc[name, "deviation"] == pytest.approx(recorded[:, 0, place].std())
-        squares = ((predicted - recorded)[:, :, place] / recorded[:, 0, place].std()) ** 2
+        assert table.loc[name, "deviation"] == pytest.approx(recorded[:, 0, column].std())
+        squares = ((predicted - recorded)[:, :, column] / recorded[:, 0, column].std()) ** 2
         assert table.loc[name, "chunk"] == pytest.approx(np.sqrt(squares.mean()))
 
 
@@ -518,8 +520,8 @@ def test_frames_and_episodes_have_errors_of_their_own(shown_run: Run, errors: Ac
     np.testing.assert_allclose(frames["first"], np.sqrt((scaled[:, 0] ** 2).mean(axis=1)))
     np.testing.assert_allclose(frames["chunk"], np.sqrt((scaled**2).mean(axis=(1, 2))))
     assert episodes["frames"].tolist() == [CALLS - (number == SHORT) for number in range(12)]
-    own = frames[frames["source_episode"] == 3]["first"]
-    assert episodes["first"][3] == pytest.approx(np.sqrt((own**2).mean()))
+    episode_errors = frames[frames["source_episode"] == 3]["first"]
+    assert episodes["first"][3] == pytest.approx(np.sqrt((episode_errors**2).mean()))
 
 
 def test_the_error_of_a_frame_is_a_label(shown_run: Run, errors: ActionErrors) -> None:
@@ -529,10 +531,10 @@ def test_the_error_of_a_frame_is_a_label(shown_run: Run, errors: ActionErrors) -
 def test_steps_behind_the_end_of_a_recording_and_constant_numbers_count_nowhere(errors: ActionErrors) -> None:
     cut = errors.errors.copy()
     cut[0, 0, 1:] = np.nan
-    found = replace(errors, errors=cut, deviations=np.array([errors.deviations[0], 0.0]))
-    assert found.by_frame["chunk"][0] == pytest.approx(found.by_frame["first"][0])
-    assert np.isnan(found.by_number["first"][1])
-    assert np.isfinite(found.by_frame["first"]).all()
+    cut_errors = replace(errors, errors=cut, deviations=np.array([errors.deviations[0], 0.0]))
+    assert cut_errors.by_frame["chunk"][0] == pytest.approx(cut_errors.by_frame["first"][0])
+    assert np.isnan(cut_errors.by_number["first"][1])
+    assert np.isfinite(cut_errors.by_frame["first"]).all()
 
 
 @pytest.mark.parametrize(
@@ -547,12 +549,12 @@ def test_actions_that_are_not_the_same_numbers_are_not_compared(
     tmp_path: Path, inputs: dict[str, list[int] | None], reason: str | None, message: str
 ) -> None:
     plan = recorded_plan(3)
-    data_set, chosen = plan.identity[DATASET], plan.selection["recording"]
+    data_set, recording = plan.identity[DATASET], plan.selection["recording"]
     shapes = {name: shape for name, shape in {**data_set["inputs"], **inputs}.items() if shape is not None}
     plan = replace(
         plan,
         identity={DATASET: {**data_set, "inputs": shapes}},
-        selection={"recording": {**chosen, OTHER_ACTIONS: reason}},
+        selection={"recording": {**recording, OTHER_ACTIONS: reason}},
     )
     settings = {
         "model": "shown", "weights_sha256": "0" * 64, "random_weights": False, "captured_calls": CALLS,
@@ -574,9 +576,9 @@ def test_the_command_prints_a_line_per_number_and_json_every_episode(
 ) -> None:
     run = write_recorded_run(tmp_path / "run", 3)
     command = ["run", "show", str(run.path), "--action-errors"]
-    shown = CliRunner().invoke(app, command).stdout
-    assert "dx" in shown
-    assert "12 frames" in shown
-    found = json.loads(CliRunner().invoke(app, [*command, "--json"]).stdout)
-    assert [row["number"] for row in found["numbers"]] == ["dx", "grip"]
-    assert [row["source_episode"] for row in found["episodes"]] == [0, 1, 2]
+    output = CliRunner().invoke(app, command).stdout
+    assert "dx" in output
+    assert "12 frames" in output
+    answer = json.loads(CliRunner().invoke(app, [*command, "--json"]).stdout)
+    assert [row["number"] for row in answer["numbers"]] == ["dx", "grip"]
+    assert [row["source_episode"] for row in answer["episodes"]] == [0, 1, 2]

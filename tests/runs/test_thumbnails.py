@@ -99,7 +99,11 @@ def test_all_frames_are_those_that_the_environment_draws_in_the_same_episode(
     assert sheet.count == row["steps"] + 1 == 9
     frames = decode_frames(sheet.content, sheet.count)
     assert film_settings.source.suite is not None
-    item = next(one for one in load_suite(film_settings.source.suite).items if one.item_id == row["item_id"])
+    item = next(
+        suite_item
+        for suite_item in load_suite(film_settings.source.suite).items
+        if suite_item.item_id == row["item_id"]
+    )
     env = Act2AnswerEnv(film_settings.scene)
     env.reset(seed=int(row["scene_seed"]), options={"item": item, "layout": row["layout"]})
     expert = ScriptedExpert(env)

@@ -134,15 +134,15 @@ def interrupt(number: int, act: Callable[[], object], monkeypatch: pytest.Monkey
     """`act` once, before array `number` of the next episode is written, or after all of them before its commit."""
     counted, open_array, write_commit = itertools.count(), zarr.open_array, writers.write_commit
 
-    def open_later(*given: Any, **options: Any) -> Any:
+    def open_later(*arguments: Any, **options: Any) -> Any:
         if next(counted) == number:
             act()
-        return open_array(*given, **options)
+        return open_array(*arguments, **options)
 
-    def commit_later(*given: Any) -> bool:
+    def commit_later(*arguments: Any) -> bool:
         if number == ARRAYS and next(counted) == number:
             act()
-        return write_commit(*given)
+        return write_commit(*arguments)
 
     monkeypatch.setattr(zarr, "open_array", open_later)
     monkeypatch.setattr(writers, "write_commit", commit_later)
@@ -158,12 +158,12 @@ def test_an_episode_that_two_processes_write_at_once_is_that_of_one_of_them(
     interrupt(number, lambda: second.write(rounded_otherwise(episode(plan, 0))), monkeypatch)
     first.write(episode(plan, 0))
     assert verify_run(where, deep=True).problems == ()
-    found = open_run(where, allow_partial=True)
+    opened = open_run(where, allow_partial=True)
     stored_outcome = json.loads(locate(where).read(commit_key(0)))["outcome"]
     possible = episode(plan, 0), rounded_otherwise(episode(plan, 0))
     (written,) = [record for record in possible if record.outcome == stored_outcome]
-    np.testing.assert_array_equal(found.rows("backbone")[0], written.arrays["pooled"]["backbone"])
-    np.testing.assert_array_equal(found.rows("expert", "tokens")[0], written.arrays["tokens"]["expert"])
+    np.testing.assert_array_equal(opened.rows("backbone")[0], written.arrays["pooled"]["backbone"])
+    np.testing.assert_array_equal(opened.rows("expert", "tokens")[0], written.arrays["tokens"]["expert"])
 
 
 def test_equal_numbers_of_two_processes_leave_the_first_commit(
@@ -172,18 +172,18 @@ def test_equal_numbers_of_two_processes_leave_the_first_commit(
     where = str(tmp_path / "run")
     first, second = (little_writer(locate(where), plan) for _ in range(2))
     interrupt(2, lambda: second.write(episode(plan, 0)), monkeypatch)
-    seen = []
+    stamps = []
     create = writers.write_commit
 
-    def create_and_look(*given: Any) -> bool:
-        written = create(*given)
-        seen.append((tmp_path / "run" / commit_key(0)).stat().st_ino)
+    def create_and_look(*arguments: Any) -> bool:
+        written = create(*arguments)
+        stamps.append((tmp_path / "run" / commit_key(0)).stat().st_ino)
         return written
 
     monkeypatch.setattr(writers, "write_commit", create_and_look)
     first.write(episode(plan, 0))
-    assert len(seen) == 2
-    assert (tmp_path / "run" / commit_key(0)).stat().st_ino == seen[0] == seen[1]
+    assert len(stamps) == 2
+    assert (tmp_path / "run" / commit_key(0)).stat().st_ino == stamps[0] == stamps[1]
 
 
 @dataclass
@@ -252,7 +252,7 @@ def suite(tmp_path_factory: pytest.TempPathFactory) -> Suite:
 
 
 @pytest.fixture(scope="module")
-def whole(suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def reference_run(suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An undisturbed run."""
     run = tmp_path_factory.mktemp("whole") / "run"
     extract(str(run), plan_for(suite.folder))
@@ -267,7 +267,7 @@ def whole(suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Path:
     ],
 )
 def test_a_kill_at_any_point_of_an_episode_costs_at_most_that_episode(
-    point: str, suite: Suite, whole: Path, tmp_path: Path
+    point: str, suite: Suite, reference_run: Path, tmp_path: Path
 ) -> None:
     run = tmp_path / "run"
     assert start(run, suite, point).wait() == -signal.SIGKILL
@@ -275,21 +275,21 @@ def test_a_kill_at_any_point_of_an_episode_costs_at_most_that_episode(
     assert len(open_run(run, allow_partial=True).episodes) == committed
     assert verify_run(run, deep=True).ok
     extract(str(run), plan_for(suite.folder))
-    assert hashes(run) == hashes(whole)
+    assert hashes(run) == hashes(reference_run)
 
 
 @pytest.mark.slow
 def test_leftovers_of_a_killed_process_are_cleared_by_the_next_owner(
-    suite: Suite, whole: Path, tmp_path: Path
+    suite: Suite, reference_run: Path, tmp_path: Path
 ) -> None:
-    run = Path(shutil.copytree(whole, tmp_path / "run"))
+    run = Path(shutil.copytree(reference_run, tmp_path / "run"))
     aside = ("commits", "times", "failed", "certificates", "provenance", "sealed", "frames", "videos")
     data = ("data.zarr/backbone/pooled/c/0/x.tmp", "columns.zarr/x/zarr.json")
     for orphan in (*(f"{folder}/abc.tmp" for folder in aside), *data):
         (run / orphan).parent.mkdir(parents=True, exist_ok=True)
         (run / orphan).write_text("torn", encoding="utf-8")
     extract(str(run), plan_for(suite.folder))
-    assert hashes(run) == hashes(whole)
+    assert hashes(run) == hashes(reference_run)
 
 
 @pytest.fixture
@@ -311,7 +311,9 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 @pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="mounts a tmpfs")
-def test_a_full_disk_is_named_and_leaves_a_store_that_resumes(suite: Suite, whole: Path, small_disk: Path) -> None:
+def test_a_full_disk_is_named_and_leaves_a_store_that_resumes(
+    suite: Suite, reference_run: Path, small_disk: Path
+) -> None:
     run = small_disk / "run"
     process = subprocess.run(
         [sys.executable, *KILLING, str(run), str(suite.folder)],
@@ -321,13 +323,13 @@ def test_a_full_disk_is_named_and_leaves_a_store_that_resumes(suite: Suite, whol
         check=False,
     )
     assert "is full" in process.stderr
-    found = verify_run(run, deep=True)
-    assert found.ok
-    assert 0 < found.committed < 12
+    verification = verify_run(run, deep=True)
+    assert verification.ok
+    assert 0 < verification.committed < 12
     assert not list(run.rglob("*.tmp"))
     subprocess.run(["mount", "-o", "remount,size=20m", str(small_disk)], check=True)
     extract(str(run), plan_for(suite.folder))
-    assert hashes(run) == hashes(whole)
+    assert hashes(run) == hashes(reference_run)
 
 
 def test_other_errors_of_the_disk_keep_their_name(tmp_path: Path) -> None:
@@ -365,10 +367,10 @@ def test_a_full_disk_is_named_and_nothing_is_left(little_runs: Path, full_disk: 
     name, *options = words.split()
     out = ["--out", str(full_disk / "out")] if name == "export" else [str(full_disk / "out")]
     command = ["run", name, str(little_runs / "run"), *options, *out]
-    done = CliRunner().invoke(app, command)
-    assert done.exit_code == DiskSpaceError.exit_code, done.stderr
-    assert "DiskSpaceError" in done.stderr
-    assert "is full; nothing was written there" in " ".join(done.stderr.split())
+    result = CliRunner().invoke(app, command)
+    assert result.exit_code == DiskSpaceError.exit_code, result.stderr
+    assert "DiskSpaceError" in result.stderr
+    assert "is full; nothing was written there" in " ".join(result.stderr.split())
     assert list(full_disk.iterdir()) == []
     subprocess.run(["mount", "-o", "remount,size=40m", str(full_disk)], check=True)
     again = CliRunner().invoke(app, command)
@@ -397,9 +399,9 @@ def umask(request: pytest.FixtureRequest) -> Iterator[int]:
 def test_files_and_folders_of_runs_copies_and_exports_follow_the_umask(
     small_suite: Suite, tmp_path: Path, umask: int
 ) -> None:
-    made = write_little_run(tmp_path / "made" / "run", small_suite.select(["color"]), 0)
-    probe_little_run(made)
-    intervene_on_little_run(made)
+    little_run = write_little_run(tmp_path / "made" / "run", small_suite.select(["color"]), 0)
+    probe_little_run(little_run)
+    intervene_on_little_run(little_run)
     run = str(tmp_path / "made" / "run")
     for command in (
         ["run", "copy", run, str(tmp_path / "made" / "copy")],
@@ -408,13 +410,13 @@ def test_files_and_folders_of_runs_copies_and_exports_follow_the_umask(
         ["run", "export", run, "--format", "h5", "--out", str(tmp_path / "made" / "run.h5")],
         ["view", run, "--export", str(tmp_path / "made" / "page")],
     ):
-        done = CliRunner().invoke(app, command)
-        assert done.exit_code == 0, done.output
+        result = CliRunner().invoke(app, command)
+        assert result.exit_code == 0, result.output
     entries = sorted((tmp_path / "made").rglob("*"))
     assert len(entries) > 40
-    others = {
+    wrong_modes = {
         str(entry.relative_to(tmp_path)): oct(stat.S_IMODE(entry.stat().st_mode))
         for entry in entries
         if stat.S_IMODE(entry.stat().st_mode) != (0o777 if entry.is_dir() else 0o666) & ~umask
     }
-    assert not others
+    assert not wrong_modes

@@ -45,9 +45,9 @@ def demonstrations(surface: Surface) -> Demonstrations:
     frames, tiles = [], np.zeros((4, 2, IMAGE_SIDE, IMAGE_SIDE), np.uint8)
     for number, layout in enumerate(("original", "swapped", "original", "swapped")):
         picture = surface.background.copy()
-        for side, (name, place) in enumerate(zip(("left", "right"), surface.places, strict=True)):
-            picture[place.rows, place.columns] += place.paint(Question.built_in(layout).pictures[name])
-            tiles[number, side, place.rows, place.columns] = np.rint(255 * place.cover)
+        for side, (name, area) in enumerate(zip(("left", "right"), surface.places, strict=True)):
+            picture[area.rows, area.columns] += area.paint(Question.built_in(layout).pictures[name])
+            tiles[number, side, area.rows, area.columns] = np.rint(255 * area.cover)
         frames.append(picture.clip(0, 255).round())
     rng = np.random.default_rng(0)
     chunks = rng.normal(0, 0.02, (4, 2, CHUNK, 7)).astype(np.float32)
@@ -105,7 +105,9 @@ def test_the_category_that_is_left_open_is_followed_as_said(
 def test_branches_differ_only_in_what_is_followed() -> None:
     drawn, always = acting("random"), acting("always")
     assert drawn != always
-    assert [replace(one, setting=replace(one.setting, followed="always")) for one in drawn] == list(always)
+    assert [replace(sample, setting=replace(sample.setting, followed="always")) for sample in drawn] == list(
+        always
+    )
 
 
 def test_in_a_branch_actions_go_on_to_where_the_hand_is_on_its_way(actor: Actor, banks: list[PictureBank]) -> None:
@@ -148,8 +150,8 @@ def test_what_is_said_behind_an_instruction_is_where_the_vlm_would_put_the_cube(
     """The VLM knew it before any training of the policy: a wrong position or prompt would leave chance."""
     torch.manual_seed(0)
     with torch.no_grad():
-        said = float(actor.losses(np.random.default_rng(0), Acts(0.5, 0.2, "random"), 48)["said"])
-    assert said < 0.3 * np.log(2) / 3
+        said_loss = float(actor.losses(np.random.default_rng(0), Acts(0.5, 0.2, "random"), 48)["said"])
+    assert said_loss < 0.3 * np.log(2) / 3
 
 
 @pytest.mark.slow
@@ -170,10 +172,10 @@ def test_the_way_leads_to_the_tile_down_and_up_again_from_everywhere() -> None:
     for _ in range(20):
         start = np.array([0.3, 0.0, 0.13]) + rng.normal(0, (0.05, 0.1, 0.03))
         actions = way.ahead(start, opened=False, count=30)
-        held = actions[: int((actions[:, 6] == OPEN).argmax())]
+        before_release = actions[: int((actions[:, 6] == OPEN).argmax())]
         assert np.linalg.norm(actions[:, :3], axis=1).max() <= MAX_SHIFT + 1e-6
         np.testing.assert_allclose(start + actions[:, :3].sum(0), way.goal, atol=1e-3)
-        assert np.hypot(*(start + held[:, :3].sum(0) - way.goal)[:2]) < 0.02
+        assert np.hypot(*(start + before_release[:, :3].sum(0) - way.goal)[:2]) < 0.02
         up = way.ahead(way.goal, opened=True, count=8)
         np.testing.assert_allclose(up[:, :2], 0, atol=1e-9)
         assert (up[:, 6] == OPEN).all()

@@ -92,7 +92,7 @@ def test_no_page_repeats_the_demos_numbers_outside_its_tables() -> None:
 
 def test_the_overview_of_performance_points_to_figures_and_holds_none() -> None:
     text = (DOCS / "notes" / "performance.md").read_text(encoding="utf-8").partition("\n## ")[0]
-    assert [found[0] for found in FIGURE.finditer(text)] == []
+    assert [match[0] for match in FIGURE.finditer(text)] == []
     assert text.count("](") >= 6
 
 
@@ -109,9 +109,9 @@ def test_parameters_of_the_embedded_models_are_said_as_they_are_everywhere() -> 
             counts.add(sum(file.get_tensor(name).size for name in file.keys()))  # noqa: SIM118
     root = README.parent
     pages = [README, *DOCS.glob("*.md"), *root.glob("notebooks/*.ipynb"), *root.glob("probe_kit/**/*.py")]
-    said = {
-        (page.name, found)
+    figures = {
+        (page.name, figure)
         for page in pages
-        for found in re.findall(r"(0\.\d+)\s+million\s+param", page.read_text(encoding="utf-8"))
+        for figure in re.findall(r"(0\.\d+)\s+million\s+param", page.read_text(encoding="utf-8"))
     }
-    assert {found for _, found in said} == {f"{count / 1e6:.2f}" for count in counts}, said
+    assert {figure for _, figure in figures} == {f"{count / 1e6:.2f}" for count in counts}, figures

@@ -19,17 +19,17 @@ def test_the_workflow_installs_the_newest_and_runs_a_script_over_tests_that_exis
     # lerobot bounds transformers, so that a newer one is only installed without it
     assert any("--upgrade-package transformers" in command and "lerobot" not in command for command in commands)
     conditions = [step["if"] for step in workflow["jobs"]["conformance"]["steps"] if "if" in step]
-    (chosen,) = workflow["jobs"]["conformance"]["strategy"]["matrix"].values()
-    assert all(any(f"'{value}'" in condition for value in chosen) for condition in conditions)
+    (releases,) = workflow["jobs"]["conformance"]["strategy"]["matrix"].values()
+    assert all(any(f"'{value}'" in condition for value in releases) for condition in conditions)
     assert (ROOT / commands[-1].split()[0]) == SCRIPT
     assert os.access(SCRIPT, os.X_OK)
-    named = re.findall(r"tests/[\w/.]+", SCRIPT.read_text(encoding="utf-8"))
-    assert named
-    assert all((ROOT / place).exists() for place in named)
+    test_paths = re.findall(r"tests/[\w/.]+", SCRIPT.read_text(encoding="utf-8"))
+    assert test_paths
+    assert all((ROOT / test_path).exists() for test_path in test_paths)
 
 
 @pytest.mark.parametrize(
-    ("output", "code", "said"),
+    ("output", "code", "expected"),
     [
         ("1 passed", 0, "Nothing broke."),
         (
@@ -41,7 +41,7 @@ def test_the_workflow_installs_the_newest_and_runs_a_script_over_tests_that_exis
         ("INTERNALERROR> torch is gone", 3, "pytest ended with code 3, and no test failed"),
     ],
 )
-def test_the_report_says_what_broke(tmp_path: Path, output: str, code: int, said: str) -> None:
+def test_the_report_says_what_broke(tmp_path: Path, output: str, code: int, expected: str) -> None:
     """With an interpreter that ends as pytest would."""
     python, report = tmp_path / "python", tmp_path / "summary.md"
     python.write_text(
@@ -53,7 +53,7 @@ def test_the_report_says_what_broke(tmp_path: Path, output: str, code: int, said
     ended = subprocess.run([str(SCRIPT)], env=variables, capture_output=True, text=True, encoding="utf-8")
     text = report.read_text(encoding="utf-8")
     assert ended.returncode == code
-    assert said in text
+    assert expected in text
     assert "- lerobot 9.9" in text
     assert ("Nothing broke." in text) == (code == 0)
 

@@ -11,7 +11,7 @@ from vlm_tiny_training.painting import Surface, calibrate, sheet
 from vlm_tiny_training.pictures import PictureBank
 from vlm_tiny_training.reading import Asked, Asks, Learner, ask
 from vlm_tiny_training.training import Stage, Trainer
-from vlm_tiny_training.window import seen
+from vlm_tiny_training.window import model_view
 
 from probe_kit.env import Act2AnswerEnv, SceneSpec
 from probe_kit.env.act2answer import Question
@@ -46,11 +46,11 @@ def pairs(banks: list[PictureBank]) -> Pairs:
 def test_a_painted_first_frame_looks_like_a_rendered_one(preset: str, surfaces: dict[str, Surface]) -> None:
     env = Act2AnswerEnv(SceneSpec.preset(preset))
     env.reset(seed=0)
-    rendered = seen(env.scene.picture(env.scene.frame())).astype(np.float32)
+    rendered = model_view(env.scene.picture(env.scene.frame())).astype(np.float32)
     env.close()
     painted = surfaces[preset].background.copy()
-    for side, place in zip(SIDES, surfaces[preset].places, strict=True):
-        painted[place.rows, place.columns] += place.paint(Question.built_in().pictures[side])
+    for side, area in zip(SIDES, surfaces[preset].places, strict=True):
+        painted[area.rows, area.columns] += area.paint(Question.built_in().pictures[side])
     assert 10 * np.log10(255**2 / np.mean((painted - rendered) ** 2)) > 45
 
 
@@ -80,10 +80,10 @@ def test_answers_are_true_in_whatever_order_the_sides_are_named(pairs: Pairs) ->
     for _ in range(60):
         pair, side = pairs.draw(rng), int(rng.integers(2))
         for kind in ("p1", "p2"):
-            asked = ask(kind, pair, pairs, side, rng)
-            assert pair.phrases[0] in asked.question
-            assert LETTERS[asked.answer, "A left" in asked.question] == side
-            answers.add((asked.answer, side))
+            drawn_question = ask(kind, pair, pairs, side, rng)
+            assert pair.phrases[0] in drawn_question.question
+            assert LETTERS[drawn_question.answer, "A left" in drawn_question.question] == side
+            answers.add((drawn_question.answer, side))
         spoken = ask("seen", pair, pairs, side, rng)
         if spoken.answer == "No":
             assert not any(f"the {phrase}?" in spoken.question for phrase in pair.phrases)
@@ -98,7 +98,7 @@ def test_both_pictures_of_a_pair_are_called_what_they_show(pairs: Pairs) -> None
     rng = np.random.default_rng(1)
     for _ in range(20):
         pair = pairs.draw(rng)
-        assert tuple(str(pair.bank.phrases[place]) for place in pair.pictures) == pair.phrases
+        assert tuple(str(pair.bank.phrases[picture_index]) for picture_index in pair.pictures) == pair.phrases
         assert pairs.absent(pair, rng) not in pair.phrases
 
 
@@ -116,7 +116,7 @@ def test_a_longer_neighbour_changes_no_answer(
     picture = laid_out("sheet", surfaces["sheet"], pair, 0)[None]
     short, long = Asked("Put the cube on the star", "left"), Asked("Do you see the star? Answer yes or no.", "No")
     with torch.no_grad():
-        alone = [float(learner.loss(picture, [one])) for one in (short, long)]
+        alone = [float(learner.loss(picture, [sample])) for sample in (short, long)]
         together = float(learner.loss(np.repeat(picture, 2, 0), [short, long]))
     assert together == pytest.approx(np.mean(alone), abs=1e-5)
 
@@ -135,7 +135,7 @@ def test_training_resumed_gives_the_weights_of_training_in_one_go(learner: Learn
             assert all(np.isfinite(value) for value in losses.values())
         return {name: tensor.clone() for name, tensor in learner.network.state_dict().items()}
 
-    whole = train(stages, tmp_path / "whole.pt")
+    uninterrupted = train(stages, tmp_path / "whole.pt")
     train(stages[:1], tmp_path / "halves.pt")
     resumed = train(stages, tmp_path / "halves.pt")
-    assert all(torch.equal(whole[name], resumed[name]) for name in whole)
+    assert all(torch.equal(uninterrupted[name], resumed[name]) for name in uninterrupted)

@@ -29,10 +29,10 @@ def opened(policy: Policy, tmp_path: Path) -> Iterator[Opens]:
             file = tmp_path / "token"
             file.write_text(token, encoding="utf-8")
         where = str(tmp_path / out)
-        one = open_server(settings(**choices), where, "127.0.0.1", 0, file, {}, report.append, policy)
-        servers.append(one)
-        return one
+        new_server = open_server(settings(**choices), where, "127.0.0.1", 0, file, {}, report.append, policy)
+        servers.append(new_server)
+        return new_server
 
     yield server
-    for one in servers:
-        one.listener.close()
+    for started in servers:
+        started.listener.close()

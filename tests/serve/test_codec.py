@@ -77,12 +77,12 @@ def test_a_message_beyond_the_bounds_cannot_be_read(content: bytes) -> None:
 
 def test_random_changes_of_a_request_are_refused_or_read_and_raise_nothing_else() -> None:
     rng = np.random.default_rng(0)
-    whole = pack(
+    request = pack(
         {"image": np.zeros((4, 4, 3), np.uint8), "state": np.zeros(8), "prompt": "put it", "m": {"id": "a"}}
     )
     refused: list[str] = []
     for _ in range(400):
-        content = bytearray(whole)
+        content = bytearray(request)
         for at in rng.integers(0, len(content), rng.integers(1, 6)):
             content[at] = rng.integers(0, 256)
         try:

@@ -68,12 +68,12 @@ def test_an_observation_is_mapped_as_its_client_builds_it(
     sent: dict[str, Any], choices: dict[str, Any], state: np.ndarray
 ) -> None:
     received = source(**choices).receive(unpack(pack(sent)))
-    shown = received.observation
-    assert (shown.image == FRONT).all()
-    assert (shown.cameras["wrist"] == WRIST).all()
-    assert shown.state.tobytes() == state.astype(np.float32).tobytes()
-    assert shown.instruction == "open it"
-    assert shown.image.flags.writeable
+    observation = received.observation
+    assert (observation.image == FRONT).all()
+    assert (observation.cameras["wrist"] == WRIST).all()
+    assert observation.state.tobytes() == state.astype(np.float32).tobytes()
+    assert observation.instruction == "open it"
+    assert observation.image.flags.writeable
 
 
 def test_bridges_client_sends_no_state_and_is_refused_by_name_where_one_is_read() -> None:
@@ -85,8 +85,8 @@ def test_bridges_client_sends_no_state_and_is_refused_by_name_where_one_is_read(
 
 def test_one_camera_gets_the_only_picture_and_equal_names_their_own() -> None:
     assert (source(("base",)).receive(BRIDGE).observation.image == FRONT).all()
-    named = source(("cam_high", "cam_left_wrist"), instruction="open it").receive(ALOHA)
-    assert (named.observation.cameras["cam_left_wrist"] == WRIST).all()
+    mapped = source(("cam_high", "cam_left_wrist"), instruction="open it").receive(ALOHA)
+    assert (mapped.observation.cameras["cam_left_wrist"] == WRIST).all()
     with pytest.raises(ObservationError, match="the observation has observation/image, observation/wrist_image"):
         source(("base",)).receive(LIBERO)
 

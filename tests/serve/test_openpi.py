@@ -75,12 +75,12 @@ def test_a_client_plays_an_episode_and_an_error_leaves_its_connection_open(opene
 def test_a_client_is_greeted_while_the_model_infers_for_one_that_vanishes(
     opened: Opens, policy: Policy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    server, whole, begun = opened(captured_calls=1), type(policy).predict, threading.Event()
+    server, predict, begun = opened(captured_calls=1), type(policy).predict, threading.Event()
 
     def slow(self: Policy, observations: Any, seeds: Any) -> Any:
         begun.set()
         time.sleep(1.5)
-        return whole(self, observations, seeds)
+        return predict(self, observations, seeds)
 
     monkeypatch.setattr(type(policy), "predict", slow)
     with serving(server) as address, connect(address) as first:

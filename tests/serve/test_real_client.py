@@ -62,8 +62,10 @@ def client(tmp_path_factory: pytest.TempPathFactory) -> Path:
         subprocess.run([*tool, *CLIENT], check=False, capture_output=True, timeout=300)
 
     python = made_once(tmp_path_factory, "openpi-client", make) / "client" / "bin" / "python"
-    found = subprocess.run([python, "-c", "import openpi_client"], check=False, capture_output=True, timeout=60)
-    if found.returncode:
+    completed = subprocess.run(
+        [python, "-c", "import openpi_client"], check=False, capture_output=True, timeout=60
+    )
+    if completed.returncode:
         pytest.skip("openpi-client 0.1.2 cannot be installed here")
     return python
 

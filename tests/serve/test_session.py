@@ -50,10 +50,10 @@ def test_answers_are_those_of_the_policy_and_the_run_shows_them_again(opened: Op
 
     for call, answer in enumerate(answers):
         sent = observation(call)
-        shown = Observation(sent["observation/image"], sent["observation/state"].astype(np.float32), WORDS)
+        observed = Observation(sent["observation/image"], sent["observation/state"].astype(np.float32), WORDS)
         seed = derive_seed(derive_seed(0, "policy", "task/0"), "inference", call)
         with torch_threads(1):  # as a server of a small policy infers
-            assert policy.predict([shown], [seed])[0].tobytes() == answer.tobytes()
+            assert policy.predict([observed], [seed])[0].tobytes() == answer.tobytes()
 
     run = open_run(server.plan.location)
     assert run.sealed
@@ -181,10 +181,10 @@ def test_a_policy_that_predicts_no_number_costs_its_own_episode(
     server = opened(captured_calls=1)
     client = server.session.connect()
     play(server, client, "good", [0])
-    whole = type(policy).predict
+    predict = type(policy).predict
 
     def spoilt(self: Policy, observations: Any, seeds: Any) -> Any:
-        return whole(self, observations, seeds) * np.float32(np.nan)
+        return predict(self, observations, seeds) * np.float32(np.nan)
 
     with monkeypatch.context() as patched:
         patched.setattr(type(policy), "predict", spoilt)

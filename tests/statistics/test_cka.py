@@ -11,20 +11,20 @@ from probe_kit.statistics.cka import unbiased_cka
 
 def u_statistic(first: np.ndarray, second: np.ndarray) -> float:
     """HSIC as the average over all ordered quadruples of different episodes, by its definition."""
-    here, there = (features @ features.T for features in (first, second))
-    found = [
-        here[i, j] * (there[i, j] + there[k, m] - 2 * there[i, k])
+    first_gram, second_gram = (features @ features.T for features in (first, second))
+    products = [
+        first_gram[i, j] * (second_gram[i, j] + second_gram[k, m] - 2 * second_gram[i, k])
         for i, j, k, m in permutations(range(len(first)), 4)
     ]
-    return float(np.mean(found))
+    return float(np.mean(products))
 
 
 def test_it_is_the_average_over_all_quadruples_of_episodes() -> None:
     draw = np.random.default_rng(0)
     first = draw.normal(size=(7, 3)) + 2
     second = first[:, :2] + draw.normal(size=(7, 2))
-    wanted = u_statistic(first, second) / np.sqrt(u_statistic(first, first) * u_statistic(second, second))
-    assert unbiased_cka(first, second) == pytest.approx(wanted, abs=1e-9)
+    expected = u_statistic(first, second) / np.sqrt(u_statistic(first, first) * u_statistic(second, second))
+    assert unbiased_cka(first, second) == pytest.approx(expected, abs=1e-9)
 
 
 def test_likeness_ignores_turning_scaling_and_shifting_and_nothing_else() -> None:
@@ -39,9 +39,9 @@ def test_likeness_ignores_turning_scaling_and_shifting_and_nothing_else() -> Non
 def test_independent_features_are_not_alike_however_wide_they_are() -> None:
     """The plain estimator gives 0.9 here: with more features than episodes everything looks alike."""
     draw = np.random.default_rng(0)
-    found = [unbiased_cka(*draw.normal(size=(2, 24, 300))) for _ in range(60)]
-    assert abs(np.mean(found)) < 3 * np.std(found) / np.sqrt(60) + 1e-3
-    assert np.std(found) < 0.1
+    similarities = [unbiased_cka(*draw.normal(size=(2, 24, 300))) for _ in range(60)]
+    assert abs(np.mean(similarities)) < 3 * np.std(similarities) / np.sqrt(60) + 1e-3
+    assert np.std(similarities) < 0.1
 
 
 def test_what_does_not_vary_has_no_likeness_and_too_few_episodes_are_refused() -> None:

@@ -63,9 +63,9 @@ def test_a_complete_run_counts_its_correct_episodes_unchanged() -> None:
 def test_answers_without_knowledge_are_right_in_one_half_whatever_is_missing(seed: int, missing: float) -> None:
     """Constant logits, and the logit of each fold's own training share."""
     drawn = np.random.default_rng(seed)
-    kept = ~LABELS | (drawn.random(LABELS.size) > missing)
-    kept[:2], kept[-2:] = True, True
-    labels, folds, groups = LABELS[kept], FOLD_OF[kept], GROUPS[kept]
+    present = ~LABELS | (drawn.random(LABELS.size) > missing)
+    present[:2], present[-2:] = True, True
+    labels, folds, groups = LABELS[present], FOLD_OF[present], GROUPS[present]
     shares = np.array([labels[folds != fold].mean() for fold in folds])
     learned = np.log(shares / (1 - shares))
     constant = [np.full(labels.size, value) for value in (-2.0, 2.0)]
@@ -77,11 +77,11 @@ def test_answers_without_knowledge_are_right_in_one_half_whatever_is_missing(see
 
 
 def test_the_balanced_accuracy_is_the_mean_of_the_sides_own_accuracies() -> None:
-    kept = np.flatnonzero(~LABELS | (np.arange(LABELS.size) % 8 < 4))
-    decisions, labels, folds = decisions_of(1)[:, kept], LABELS[kept], FOLD_OF[kept]
-    found = balanced_sums(decisions, labels, folds, GROUPS[kept]).accuracies
+    present = np.flatnonzero(~LABELS | (np.arange(LABELS.size) % 8 < 4))
+    decisions, labels, folds = decisions_of(1)[:, present], LABELS[present], FOLD_OF[present]
+    accuracies = balanced_sums(decisions, labels, folds, GROUPS[present]).accuracies
     right = (remove_fold_priors(decisions, labels, folds) > 0) == labels
-    np.testing.assert_allclose(found, (right[:, labels].mean(axis=1) + right[:, ~labels].mean(axis=1)) / 2)
+    np.testing.assert_allclose(accuracies, (right[:, labels].mean(axis=1) + right[:, ~labels].mean(axis=1)) / 2)
 
 
 def test_a_fold_trained_on_twice_as_many_of_one_side_loses_the_logarithm_of_two() -> None:
@@ -93,9 +93,9 @@ def test_a_fold_trained_on_twice_as_many_of_one_side_loses_the_logarithm_of_two(
 
 def test_names_order_the_groups_and_the_order_of_episodes_does_not_matter() -> None:
     decisions, mixed = decisions_of(2), np.random.default_rng(0).permutation(LABELS.size)
-    one = balanced_sums(decisions, LABELS, FOLD_OF, GROUPS)
+    first = balanced_sums(decisions, LABELS, FOLD_OF, GROUPS)
     other = balanced_sums(decisions[:, mixed], LABELS[mixed], FOLD_OF[mixed], GROUPS[mixed])
-    np.testing.assert_array_equal(one.sums, other.sums)
+    np.testing.assert_array_equal(first.sums, other.sums)
 
 
 def test_some_sites_keep_their_groups() -> None:
@@ -130,9 +130,9 @@ def test_nan_a_single_fold_and_shapes_that_do_not_fit_are_refused() -> None:
 def test_a_real_probe_trained_with_most_of_one_side_missing_leans_to_neither_side() -> None:
     generator = np.random.default_rng(4)
     labels, groups = np.tile([True, False], 300), np.repeat(np.arange(150), 4)
-    kept = ~labels | (generator.random(labels.size) >= 0.6)
+    present = ~labels | (generator.random(labels.size) >= 0.6)
     features = generator.standard_normal((labels.size, 8)) + 0.15 * np.where(labels, 1, -1)[:, None]
-    labels, groups, features = labels[kept], groups[kept], features[kept]
+    labels, groups, features = labels[present], groups[present], features[present]
     folds = nested_folds(labels, groups, seed=0)
     fold_of = np.zeros(labels.size, int)
     for number, fold in enumerate(folds):
@@ -198,10 +198,10 @@ def test_without_signal_the_score_is_zero_on_average_however_high_the_peak() -> 
 def test_the_order_of_sites_does_not_matter_even_where_they_tie(seed: int, random: object) -> None:
     scores = drawn(seed, np.full(12, 0.6), 6, size=2)
     order = np.array(random.sample(range(12), 12))  # type: ignore[attr-defined]
-    one = fitted(stream_of(scores, LAYERS, ITERATIONS))
+    first = fitted(stream_of(scores, LAYERS, ITERATIONS))
     other = fitted(stream_of(scores.only(order), LAYERS[order], ITERATIONS[order]))
-    np.testing.assert_allclose(one.above, other.above, atol=1e-12)
-    np.testing.assert_allclose(one.covariance, other.covariance, atol=1e-12)
+    np.testing.assert_allclose(first.above, other.above, atol=1e-12)
+    np.testing.assert_allclose(first.covariance, other.covariance, atol=1e-12)
 
 
 def test_the_same_streams_have_the_same_scores_whatever_was_fitted_before() -> None:
@@ -289,9 +289,9 @@ def test_groups_of_unequal_weight_count_by_their_episodes() -> None:
 
 
 def test_fewer_groups_than_outer_folds_are_refused() -> None:
-    one = StreamScores.of(GroupSums(np.ones((1, 4)), np.ones(4)), np.zeros((1, 4, 4)), np.arange(4), [0])
+    stream_scores = StreamScores.of(GroupSums(np.ones((1, 4)), np.ones(4)), np.zeros((1, 4, 4)), np.arange(4), [0])
     with pytest.raises(TooFewGroupsError, match="4 independent groups of items; expected at least 5"):
-        crossfit([one], list("abcd"))
+        crossfit([stream_scores], list("abcd"))
 
 
 def test_streams_on_other_groups_nan_and_places_that_do_not_fit_are_refused() -> None:
@@ -335,11 +335,11 @@ def test_a_mean_over_categories_adds_variances_and_has_satterthwaites_degrees_of
 
 
 def test_the_mean_of_one_category_is_that_category() -> None:
-    one = Scores.of(fitted(site_stream(0.6, 20), site_stream(0.7, 20)))
-    mean = Scores.mean([one])
-    np.testing.assert_array_equal(mean.above, one.above)
-    np.testing.assert_array_equal(mean.covariance, one.covariance)
-    assert mean.df == one.df == 19
+    category_scores = Scores.of(fitted(site_stream(0.6, 20), site_stream(0.7, 20)))
+    mean = Scores.mean([category_scores])
+    np.testing.assert_array_equal(mean.above, category_scores.above)
+    np.testing.assert_array_equal(mean.covariance, category_scores.covariance)
+    assert mean.df == category_scores.df == 19
 
 
 def test_a_category_that_varies_most_is_known_no_better_for_the_others() -> None:
@@ -398,20 +398,22 @@ def scores(expert: float, backbone: float, error: float = 0.03, df: float = 30) 
 
 
 def test_the_limits_solve_fiellers_equation_with_errors_a_tenth_larger() -> None:
-    found = Scores(np.array([0.12, 0.3]), np.array([[0.0010, 0.0003], [0.0003, 0.0012]]), 30)
-    interval = retention(found).interval
+    two_scores = Scores(np.array([0.12, 0.3]), np.array([[0.0010, 0.0003], [0.0003, 0.0012]]), 30)
+    interval = retention(two_scores).interval
     for ratio in (interval.low, interval.high):
         by = np.array([1, -ratio])
-        assert (by @ found.above) ** 2 == pytest.approx((1.1 * t.ppf(0.975, 30)) ** 2 * by @ found.covariance @ by)
+        assert (by @ two_scores.above) ** 2 == pytest.approx(
+            (1.1 * t.ppf(0.975, 30)) ** 2 * by @ two_scores.covariance @ by
+        )
     assert interval.low < 0.4 < interval.high
 
 
 def test_limits_of_a_ratio_grow_without_a_jump_until_there_are_none() -> None:
     """The lower end of the backbone's interval falls from nine tenths of its score to none of it."""
     intervals = [retention(scores(0.1, 0.2, error)).interval for error in np.linspace(0.01, 0.095, 400)]
-    bounded = [one.bounded for one in intervals]
+    bounded = [interval.bounded for interval in intervals]
     assert bounded == sorted(bounded, reverse=True)
-    widths = 1 / np.array([one.high - one.low for one in intervals if one.bounded])
+    widths = 1 / np.array([interval.high - interval.low for interval in intervals if interval.bounded])
     assert not all(bounded)
     assert (np.diff(widths) < 0).all()
     assert widths[-1] < 0.02
@@ -419,16 +421,16 @@ def test_limits_of_a_ratio_grow_without_a_jump_until_there_are_none() -> None:
 
 
 def test_identical_streams_retain_exactly_all() -> None:
-    one = stream(0, 0.75)
-    found = retention(Scores.of(fitted(one, one)))
-    assert (found.value, found.interval.low, found.interval.high) == pytest.approx((1, 1, 1))
+    stream_scores = stream(0, 0.75)
+    ratio = retention(Scores.of(fitted(stream_scores, stream_scores)))
+    assert (ratio.value, ratio.interval.low, ratio.interval.high) == pytest.approx((1, 1, 1))
 
 
 def test_twelve_perfect_groups_leave_as_much_open_as_unseen_groups_may_hold() -> None:
     perfect = stream_of(GroupSums(np.full((5, 12), 4.0), np.full(12, 4.0)), np.arange(5))
-    found = retention(Scores.of(fitted(perfect, perfect)))
-    assert found.value == 1
-    assert 0.6 < found.interval.high - found.interval.low < 0.8
+    ratio = retention(Scores.of(fitted(perfect, perfect)))
+    assert ratio.value == 1
+    assert 0.6 < ratio.interval.high - ratio.interval.low < 0.8
 
 
 def test_a_backbone_that_is_hardly_known_gives_no_limits() -> None:
@@ -442,35 +444,35 @@ def test_a_backbone_that_is_hardly_known_gives_no_limits() -> None:
 
 def test_a_mean_is_the_ratio_of_the_means() -> None:
     parts = [scores(0.30, 0.40), scores(0.00, 0.10), scores(0.02, 0.01)]
-    found = retention(Scores.mean(parts))
-    assert found.value == pytest.approx(0.32 / 0.51)
-    assert found.interval.bounded, "though two of the categories have no limits of their own"
+    ratio = retention(Scores.mean(parts))
+    assert ratio.value == pytest.approx(0.32 / 0.51)
+    assert ratio.interval.bounded, "though two of the categories have no limits of their own"
 
 
 def test_a_dead_expert_keeps_its_zero() -> None:
     covered = []
     for seed in range(120):
         fit = fitted(stream(seed, 0.5, 24), stream(seed + 1000, 0.8, 24))
-        found = retention(Scores.of(fit))
-        covered.append(found.interval.low <= 0 <= found.interval.high)
+        ratio = retention(Scores.of(fit))
+        covered.append(ratio.interval.low <= 0 <= ratio.interval.high)
     assert np.mean(covered) > 0.9
 
 
 def test_a_run_differs_from_itself_by_nothing() -> None:
     fit = fitted(stream(0, 0.6), stream(1, 0.75))
-    found = retention_difference(Scores.of(fit), Scores.of(fit), fit.covariance_with(fit))
-    assert found.value == 0
+    gap = retention_difference(Scores.of(fit), Scores.of(fit), fit.covariance_with(fit))
+    assert gap.value == 0
     alone = retention(Scores.of(fit)).interval
-    assert found.interval.low <= 0 <= found.interval.high
-    assert found.interval.high - found.interval.low < 0.4 * (alone.high - alone.low), "what is left is their skew"
+    assert gap.interval.low <= 0 <= gap.interval.high
+    assert gap.interval.high - gap.interval.low < 0.4 * (alone.high - alone.low), "what is left is their skew"
 
 
 def test_runs_on_other_groups_have_no_correlation() -> None:
-    one, other = scores(0.2, 0.3), scores(0.1, 0.35)
-    a, b = retention(one), retention(other)
-    found = retention_difference(one, other)
-    assert found.interval == difference_interval(a.value, a.interval, b.value, b.interval)
-    assert found.value == a.value - b.value
+    first, other = scores(0.2, 0.3), scores(0.1, 0.35)
+    a, b = retention(first), retention(other)
+    gap = retention_difference(first, other)
+    assert gap.interval == difference_interval(a.value, a.interval, b.value, b.interval)
+    assert gap.value == a.value - b.value
 
 
 def test_the_correlation_is_that_of_the_two_ratios() -> None:
@@ -479,11 +481,11 @@ def test_the_correlation_is_that_of_the_two_ratios() -> None:
     above = np.array([0.2, 0.4, 0.15, 0.35])
     drawn = np.random.default_rng(0).multivariate_normal(above, joint, 200_000)
     actual = np.corrcoef(drawn[:, 0] / drawn[:, 1], drawn[:, 2] / drawn[:, 3])[0, 1]
-    one, other = Scores(above[:2], joint[:2, :2], 50), Scores(above[2:], joint[2:, 2:], 50)
-    a, b = retention(one), retention(other)
+    first, other = Scores(above[:2], joint[:2, :2], 50), Scores(above[2:], joint[2:, 2:], 50)
+    a, b = retention(first), retention(other)
     expected = difference_interval(a.value, a.interval, b.value, b.interval, actual)
-    found = retention_difference(one, other, joint[:2, 2:]).interval
-    assert (found.low, found.high) == pytest.approx((expected.low, expected.high), abs=0.004)
+    limits = retention_difference(first, other, joint[:2, 2:]).interval
+    assert (limits.low, limits.high) == pytest.approx((expected.low, expected.high), abs=0.004)
 
 
 def test_a_difference_with_an_unknown_backbone_has_no_limits() -> None:
@@ -494,11 +496,11 @@ def test_a_difference_with_an_unknown_backbone_has_no_limits() -> None:
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 10_000), st.floats(0.5, 0.9), st.floats(0.5, 0.9), st.integers(5, 40))
 def test_limits_hold_the_value_or_there_are_none(seed: int, expert: float, backbone: float, groups: int) -> None:
-    found = retention(Scores.of(fitted(stream(seed, expert, groups), stream(seed + 1, backbone, groups))))
-    if found.interval.bounded:
-        assert found.interval.low - 1e-9 <= found.value <= found.interval.high + 1e-9
+    ratio = retention(Scores.of(fitted(stream(seed, expert, groups), stream(seed + 1, backbone, groups))))
+    if ratio.interval.bounded:
+        assert ratio.interval.low - 1e-9 <= ratio.value <= ratio.interval.high + 1e-9
     else:
-        assert found.interval == NO_LIMITS
+        assert ratio.interval == NO_LIMITS
 
 
 def drawn_sums(seed: int, shares: np.ndarray, groups: int, size: int = 4) -> GroupSums:
@@ -512,9 +514,9 @@ def test_the_limit_is_the_highest_of_the_sites_own_limits() -> None:
     sites = drawn_sums(0, np.array([0.5, 0.6, 0.55]), 20)
     each = [at_most(sites.only([row])) for row in range(3)]
     assert at_most(sites) == max(each)
-    rest = sites.sums[0] - sites.accuracies[0] * 4
+    residuals = sites.sums[0] - sites.accuracies[0] * 4
     right = sites.accuracies[0]
-    count = right * (1 - right) * 80**2 / (rest @ rest * 20 / 19)
+    count = right * (1 - right) * 80**2 / (residuals @ residuals * 20 / 19)
     count *= (t.ppf(0.95, 79) / t.ppf(0.95, 19)) ** 2
     assert each[0] == pytest.approx(beta.ppf(0.95, right * count + 1, (1 - right) * count))
 

@@ -32,9 +32,9 @@ def test_a_scarce_class_is_spread_over_the_folds() -> None:
 
 def test_numbers_of_folds_make_the_same_folds_again() -> None:
     folds = grouped_folds(LABELS, GROUPS, 5, seed=0)
-    for one, again in zip(folds, split_by_fold(fold_numbers(folds), range(5)), strict=True):
-        np.testing.assert_array_equal(one.train, again.train)
-        np.testing.assert_array_equal(one.test, again.test)
+    for fold, again in zip(folds, split_by_fold(fold_numbers(folds), range(5)), strict=True):
+        np.testing.assert_array_equal(fold.train, again.train)
+        np.testing.assert_array_equal(fold.test, again.test)
 
 
 def test_the_same_seed_gives_the_same_folds_and_another_seed_others() -> None:

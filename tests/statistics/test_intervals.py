@@ -24,8 +24,8 @@ from probe_kit.statistics.bootstrap import (
     reach,
     student_interval,
     unlike,
-    unseen,
-    widened,
+    unseen_quantiles,
+    widen_draws,
 )
 from probe_kit.statistics.folds import OUTER_FOLDS, SHARED_TRAINING
 from probe_kit.statistics.intervals import (
@@ -65,9 +65,9 @@ def test_one_group_unlike_the_others_draws_no_limit_in_on_its_side(count: int, b
     grid = bounds[0] + (bounds[1] - bounds[0]) * QUARTERS
     for like, other in product(grid, grid):
         alike = np.full(count, like)
-        one = alike.copy()
-        one[0] = other
-        before, after = limits(alike, bounds), limits(one, bounds)
+        changed_group = alike.copy()
+        changed_group[0] = other
+        before, after = limits(alike, bounds), limits(changed_group, bounds)
         if other < like:
             assert after[0] <= before[0] + 1e-9, (like, other)
         else:
@@ -76,10 +76,10 @@ def test_one_group_unlike_the_others_draws_no_limit_in_on_its_side(count: int, b
 
 @pytest.mark.parametrize("count", COUNTS)
 def test_every_further_miss_lowers_both_limits(count: int) -> None:
-    found = np.array([limits((np.arange(count) >= misses).astype(float)) for misses in range(count + 1)])
-    assert (np.diff(found, axis=0) <= 1e-9).all()
+    both_limits = np.array([limits((np.arange(count) >= misses).astype(float)) for misses in range(count + 1)])
+    assert (np.diff(both_limits, axis=0) <= 1e-9).all()
     exact = np.array([clopper_pearson(count - misses, count) for misses in range(count + 1)])
-    np.testing.assert_allclose(found[[0, -1]], exact[[0, -1]], atol=1e-3)
+    np.testing.assert_allclose(both_limits[[0, -1]], exact[[0, -1]], atol=1e-3)
 
 
 def test_sixteen_of_sixteen_is_better_known_than_fifteen() -> None:
@@ -94,17 +94,17 @@ def test_groups_that_differ_anyway_are_drawn_as_they_are() -> None:
     each = np.random.default_rng(0).binomial(4, 0.6, 75)[:, None] / 4
     draws = bootstrap_means(each, np.arange(75), 0)
     assert (reach(each) == 0).all()
-    wide = widened(draws, each.mean(axis=0), each, 0)
-    np.testing.assert_array_equal(*(np.percentile(one, [1, 2.5, 50, 97.5, 99]) for one in (wide, draws)))
+    wide = widen_draws(draws, each.mean(axis=0), each, 0)
+    np.testing.assert_array_equal(*(np.percentile(values, [1, 2.5, 50, 97.5, 99]) for values in (wide, draws)))
 
 
 def test_draws_keep_their_order_and_equal_ones_have_one_order_for_all() -> None:
     each = (np.arange(12) > 0).astype(float)[:, None]
     draws = bootstrap_means(each, np.arange(12), 0)
-    wide = widened(draws, each.mean(axis=0), each, 0)
+    wide = widen_draws(draws, each.mean(axis=0), each, 0)
     order = np.argsort(wide[:, 0], kind="stable")
     assert (np.diff(draws[order, 0]) >= 0).all()
-    again = widened(draws + 1e-15 * draw_groups(12, 3)[:, :1], each.mean(axis=0), each, 0)
+    again = widen_draws(draws + 1e-15 * draw_groups(12, 3)[:, :1], each.mean(axis=0), each, 0)
     np.testing.assert_allclose(again, wide, atol=1e-9)
 
 
@@ -116,10 +116,10 @@ def test_how_many_are_unlike_most() -> None:
 def test_what_was_not_seen_lies_within_the_bounds_and_about_the_value() -> None:
     for bounds, value in product((SHARES, GAINS), (0.0, 0.4, 1.0)):
         each = np.full((10, 1), value)
-        found = unseen(np.array([value]), each, bounds=bounds)[:, 0]
-        assert bounds[0] <= found[0] < found[-1] <= bounds[1]
-        assert (np.diff(found) >= 0).all()
-        assert found[found.size // 2 - 1] <= value <= found[found.size // 2]
+        percentiles = unseen_quantiles(np.array([value]), each, bounds=bounds)[:, 0]
+        assert bounds[0] <= percentiles[0] < percentiles[-1] <= bounds[1]
+        assert (np.diff(percentiles) >= 0).all()
+        assert percentiles[percentiles.size // 2 - 1] <= value <= percentiles[percentiles.size // 2]
 
 
 WORLDS: dict[str, tuple[Bounds, dict[float, float]]] = {
@@ -184,8 +184,8 @@ def test_the_interval_of_r2_is_that_of_a_ratio_of_sums_over_groups() -> None:
     of_group = np.array([[errors[g == TEN_GROUPS].sum(), deviations[g == TEN_GROUPS].sum()] for g in range(12)])
     ratio = of_group[:, 0].sum() / of_group[:, 1].sum()
     # Cochran, Sampling Techniques, 6.13: the variance of a ratio estimator.
-    rest = of_group[:, 0] - ratio * of_group[:, 1]
-    error = np.sqrt(rest.var(ddof=1) / 12) / of_group[:, 1].mean()
+    residuals = of_group[:, 0] - ratio * of_group[:, 1]
+    error = np.sqrt(residuals.var(ddof=1) / 12) / of_group[:, 1].mean()
     above, below = np.exp(stats.t(11, np.log(ratio), error / ratio).interval(0.95))
     assert explained_interval(scores, deviations, TEN_GROUPS) == pytest.approx((1 - below, 1 - above))
 
@@ -270,20 +270,20 @@ def normal(value: float, error: float) -> Interval:
 def test_symmetric_limits_give_the_normal_interval_of_a_difference(
     a: float, of_a: float, b: float, of_b: float, correlation: float
 ) -> None:
-    found = difference_interval(a, normal(a, of_a), b, normal(b, of_b), correlation)
+    interval = difference_interval(a, normal(a, of_a), b, normal(b, of_b), correlation)
     error = np.sqrt(of_a**2 + of_b**2 - 2 * correlation * of_a * of_b)
-    assert (found.low, found.high) == pytest.approx((a - b - 1.96 * error, a - b + 1.96 * error))
+    assert (interval.low, interval.high) == pytest.approx((a - b - 1.96 * error, a - b + 1.96 * error))
 
 
 def test_skewed_limits_keep_their_sides() -> None:
     """Distances 0.3 and 0.4 give 0.5 below; 0.5 and 1.2 give 1.3 above."""
-    found = difference_interval(1.0, Interval(0.7, 1.5), 2.0, Interval(0.8, 2.4))
-    assert (found.low, found.high) == pytest.approx((-1.5, 0.3))
+    interval = difference_interval(1.0, Interval(0.7, 1.5), 2.0, Interval(0.8, 2.4))
+    assert (interval.low, interval.high) == pytest.approx((-1.5, 0.3))
 
 
 def test_the_same_estimate_twice_differs_by_exactly_nothing() -> None:
-    found = difference_interval(0.4, Interval(0.2, 0.6), 0.4, Interval(0.2, 0.6), 1.0)
-    assert (found.low, found.high) == pytest.approx((0, 0))
+    interval = difference_interval(0.4, Interval(0.2, 0.6), 0.4, Interval(0.2, 0.6), 1.0)
+    assert (interval.low, interval.high) == pytest.approx((0, 0))
 
 
 def test_a_difference_of_which_one_side_has_no_limits_has_none() -> None:
@@ -293,13 +293,13 @@ def test_a_difference_of_which_one_side_has_no_limits_has_none() -> None:
 
 
 def test_a_mean_of_equal_parts_is_narrower_by_the_root_of_their_number() -> None:
-    found = mean_interval([0.5] * 16, [Interval(0.3, 0.6)] * 16)
-    assert (found.low, found.high) == pytest.approx((0.45, 0.525))
+    interval = mean_interval([0.5] * 16, [Interval(0.3, 0.6)] * 16)
+    assert (interval.low, interval.high) == pytest.approx((0.45, 0.525))
 
 
 def test_a_mean_of_shares_that_never_failed_stays_below_one() -> None:
-    found = mean_interval([1.0] * 12, [Interval(0.735, 1.0)] * 12)
-    assert (found.low, found.high) == pytest.approx((1 - 0.265 / np.sqrt(12), 1.0))
+    interval = mean_interval([1.0] * 12, [Interval(0.735, 1.0)] * 12)
+    assert (interval.low, interval.high) == pytest.approx((1 - 0.265 / np.sqrt(12), 1.0))
 
 
 def test_no_estimates_and_impossible_correlations_are_refused() -> None:
@@ -314,15 +314,15 @@ GROUPS = np.repeat(list("abcdefgh"), 4)
 
 @pytest.mark.parametrize(("hits", "trials"), [(0, 10), (3, 10), (17, 20), (40, 40), (1, 200)])
 def test_groups_of_one_episode_have_clopper_and_pearsons_interval_of_one_fewer(hits: int, trials: int) -> None:
-    found = korn_graubard_limits((np.arange(trials) < hits)[None].astype(float), np.ones(trials))
+    computed = korn_graubard_limits((np.arange(trials) < hits)[None].astype(float), np.ones(trials))
     if hits in (0, trials):
         exact = binomtest(hits, trials).proportion_ci(0.95, "exact")
-        np.testing.assert_allclose(np.ravel(found), (exact.low, exact.high), atol=1e-9)
+        np.testing.assert_allclose(np.ravel(computed), (exact.low, exact.high), atol=1e-9)
         return
     right, count = hits / trials * (trials - 1), trials - 1  # s (1 − s) / v with v = s (1 − s) / (G − 1)
     low = min(stats.beta.ppf(0.025, right, count - right + 1), 0.025 ** (1 / trials))
     high = max(stats.beta.ppf(0.975, right + 1, count - right), 1 - 0.025 ** (1 / trials))
-    np.testing.assert_allclose(np.ravel(found), (low, high), atol=1e-9)
+    np.testing.assert_allclose(np.ravel(computed), (low, high), atol=1e-9)
 
 
 def test_twelve_of_twelve_groups_right_leave_a_quarter_open() -> None:
@@ -397,8 +397,8 @@ def test_the_variance_is_that_of_a_ratio_estimator_over_groups() -> None:
     values = generator.random(groups.size) < 0.7
     share = Share.of(values, groups)
     sums = np.array([values[groups == name].sum() for name in np.unique(groups)], float)
-    rest = sums - values.mean() * sizes
-    assert share.variance == pytest.approx((rest**2).sum() * 24 / 23 / values.size**2)
+    residuals = sums - values.mean() * sizes
+    assert share.variance == pytest.approx((residuals**2).sum() * 24 / 23 / values.size**2)
     both, variances = group_shares(np.array([sums, sizes - sums]), sizes.astype(float))
     assert both.sum() == pytest.approx(1.0)
     np.testing.assert_allclose(variances, share.variance)

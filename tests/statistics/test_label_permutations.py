@@ -46,9 +46,9 @@ def test_a_flip_takes_the_whole_group_and_the_twins_of_an_item_with_it() -> None
 
 def test_missing_episodes_leave_the_classes_as_large_as_they_are() -> None:
     """A null that restores balance would call a probe significant that only names the larger class."""
-    kept = np.random.default_rng(0).random(400) < np.where(LABELS, 1.0, 0.6)
+    present = np.random.default_rng(0).random(400) < np.where(LABELS, 1.0, 0.6)
     for count in (400, 40):  # groups of four: drawn, and with 10 groups enumerated
-        labels, groups = LABELS[:count][kept[:count]], (ITEMS // 2)[:count][kept[:count]]
+        labels, groups = LABELS[:count][present[:count]], (ITEMS // 2)[:count][present[:count]]
         permuted = flip_groups(labels, groups, 50, seed=0)
         assert permuted.shape[1] >= 7
         assert (permuted.sum(axis=0) == labels.sum()).all()
@@ -59,10 +59,10 @@ def test_few_groups_are_enumerated_without_the_real_labels_and_without_mirror_im
     labels, groups = LABELS[:24], np.repeat(np.arange(6), 4)
     permuted = flip_groups(labels, groups, 7, seed=0)
     assert permuted.shape == (24, 2**5 - 1)
-    seen = {tuple(column) for column in permuted.T}
-    assert len(seen) == 31
-    assert tuple(labels) not in seen
-    assert not seen & {tuple(~column) for column in permuted.T}
+    distinct = {tuple(column) for column in permuted.T}
+    assert len(distinct) == 31
+    assert tuple(labels) not in distinct
+    assert not distinct & {tuple(~column) for column in permuted.T}
     assert smallest_p(31) == 1 / 32
     assert flip_groups(labels, groups, 0, seed=0).shape == (24, 0)
 
@@ -145,7 +145,7 @@ def test_a_group_gives_its_labels_as_a_block_in_order_to_one_of_its_kind() -> No
         donors = [column[block] for block in blocks.values()]
         assert (np.sort(np.concatenate(donors)) == np.arange(29)).all(), "every label is given once"
         for name, donor in zip(blocks, donors, strict=True):
-            giver = next(own for own, block in blocks.items() if block[0] == donor[0])
+            giver = next(group for group, block in blocks.items() if block[0] == donor[0])
             assert (donor == blocks[giver]).all()
             assert kinds[giver] == kinds[name]
     assert (source[24:] == np.arange(24, 29)[:, None]).all()

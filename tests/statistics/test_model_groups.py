@@ -21,13 +21,13 @@ def gap(first: np.ndarray, second: np.ndarray) -> float:
 @given(st.integers(0, 10_000), st.integers(1, 5), st.integers(1, 5))
 def test_p_is_the_exact_permutation_p(seed: int, first: int, second: int) -> None:
     values = np.random.default_rng(seed).random(first + second)
-    found = exchange_p(values[:first], values[first:])
-    assert found.exact
-    assert found.smallest <= found.p <= 1
+    result = exchange_p(values[:first], values[first:])
+    assert result.exact
+    assert result.smallest <= result.p <= 1
     if min(first, second) > 1:
         groups = (values[:first], values[first:])
         expected = permutation_test(groups, gap, n_resamples=np.inf, alternative="greater")
-        assert found.p == pytest.approx(expected.pvalue)
+        assert result.p == pytest.approx(expected.pvalue)
 
 
 @pytest.mark.parametrize(
@@ -45,8 +45,8 @@ def test_equal_models_give_a_p_of_one() -> None:
 
 def test_p_is_below_five_percent_in_at_most_five_percent_of_equal_groups() -> None:
     generator = np.random.default_rng(0)
-    found = [exchange_p(*generator.standard_normal((2, 4))).p for _ in range(1000)]
-    assert np.mean(np.array(found) <= 0.05) < 0.06
+    p_values = [exchange_p(*generator.standard_normal((2, 4))).p for _ in range(1000)]
+    assert np.mean(np.array(p_values) <= 0.05) < 0.06
 
 
 @pytest.mark.slow
@@ -88,18 +88,18 @@ def test_labels_of_very_many_models_are_drawn(monkeypatch: pytest.MonkeyPatch) -
 @given(st.integers(0, 10_000), st.integers(2, 6), st.integers(2, 6))
 def test_the_interval_is_welchs(seed: int, first: int, second: int) -> None:
     generator = np.random.default_rng(seed)
-    one, other = generator.random(first), 3 * generator.random(second)
-    expected = ttest_ind(one, other, equal_var=False).confidence_interval(0.95)
-    found = welch_interval(one, other)
-    assert (found.low, found.high) == pytest.approx((expected.low, expected.high))
+    first_group, other = generator.random(first), 3 * generator.random(second)
+    expected = ttest_ind(first_group, other, equal_var=False).confidence_interval(0.95)
+    interval = welch_interval(first_group, other)
+    assert (interval.low, interval.high) == pytest.approx((expected.low, expected.high))
 
 
 def test_a_single_model_is_given_the_spread_of_the_other_group() -> None:
-    found = welch_interval([0.9], [0.4, 0.5, 0.6])
+    interval = welch_interval([0.9], [0.4, 0.5, 0.6])
     spread = 4.302653 * 0.1 * np.sqrt(1 + 1 / 3)
-    assert (found.low, found.high) == pytest.approx((0.4 - spread, 0.4 + spread))
+    assert (interval.low, interval.high) == pytest.approx((0.4 - spread, 0.4 + spread))
     mirrored = welch_interval([0.4, 0.5, 0.6], [0.9])
-    assert (mirrored.low, mirrored.high) == pytest.approx((-found.high, -found.low))
+    assert (mirrored.low, mirrored.high) == pytest.approx((-interval.high, -interval.low))
 
 
 def test_models_without_any_spread_give_no_limits() -> None:

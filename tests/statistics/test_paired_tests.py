@@ -31,7 +31,7 @@ from probe_kit.statistics.paired_tests import (
     sign_p,
     unit_means,
 )
-from tests.retention.asked_runs import SaidRun, acted, asked
+from tests.retention.asked_runs import SaidRun, acted, answer_run
 
 
 @pytest.mark.parametrize(("more", "less"), [(0, 0), (5, 5), (1, 0), (9, 1), (2, 11), (40, 20)])
@@ -73,8 +73,8 @@ def test_items_that_share_pictures_count_once() -> None:
 def test_under_the_null_small_p_values_are_as_rare_as_they_say() -> None:
     """One-sided binomial test at 5 % over 400 worlds in which nothing follows anything."""
     draw = np.random.default_rng(0)
-    found = sum(greater_p(draw.normal(size=24)) < 0.05 for _ in range(400))
-    assert found <= 27  # P(more | 400, 0.05) < 0.05
+    rejections = sum(greater_p(draw.normal(size=24)) < 0.05 for _ in range(400))
+    assert rejections <= 27  # P(more | 400, 0.05) < 0.05
 
 
 def bools(text: str) -> np.ndarray:
@@ -167,11 +167,11 @@ def test_looking_at_more_sites_costs() -> None:
 
 def test_no_world_without_effects_is_called_significant_too_often() -> None:
     """One-sided binomial test at 5 % over 200 worlds of 16 sites whose items share noise."""
-    draw, items, found = np.random.default_rng(1), np.repeat(np.arange(14), 2), 0
+    draw, items, rejections = np.random.default_rng(1), np.repeat(np.arange(14), 2), 0
     for world in range(200):
         values = draw.normal(size=(16, 28)) + draw.normal(size=(1, 28))
-        found += bool((max_t(values, items, items, world)[2] < 0.05).any())
-    assert found <= 15  # P(more | 200, 0.05) < 0.05
+        rejections += bool((max_t(values, items, items, world)[2] < 0.05).any())
+    assert rejections <= 15  # P(more | 200, 0.05) < 0.05
 
 
 def test_a_first_column_below_all_others_is_as_likely_as_that_place_in_every_group() -> None:
@@ -266,8 +266,8 @@ def test_sites_of_shared_probes_rarely_exceed_a_control_that_is_as_good(above: f
 
 
 def test_a_signal_in_one_site_is_better_than_the_best_of_the_twin() -> None:
-    here = np.concatenate([right(0.6, 4, 0), right(0.9, 1, 1)])
-    p = better_than_best(here, right(0.6, 7, 2), GROUPS, seed=0)
+    site_hits = np.concatenate([right(0.6, 4, 0), right(0.9, 1, 1)])
+    p = better_than_best(site_hits, right(0.6, 7, 2), GROUPS, seed=0)
     assert p[4] < 0.01
     assert (p[:4] > 0.05).all()
 
@@ -287,12 +287,12 @@ def by_chance(seed: int, less: float = 0.0) -> dict[str, np.ndarray]:
 
 def stepped(values: Sequence[float]) -> list[float]:
     """Holm's steps, one by one."""
-    found = [0.0] * len(values)
+    adjusted = [0.0] * len(values)
     highest = 0.0
-    for rank, place in enumerate(sorted(range(len(values)), key=values.__getitem__)):
-        highest = max(highest, min(1.0, (len(values) - rank) * values[place]))
-        found[place] = highest
-    return found
+    for rank, position in enumerate(sorted(range(len(values)), key=values.__getitem__)):
+        highest = max(highest, min(1.0, (len(values) - rank) * values[position]))
+        adjusted[position] = highest
+    return adjusted
 
 
 def check(rows: Sequence[tuple[float | None, float | None]], number: int) -> None:
@@ -306,38 +306,52 @@ def check(rows: Sequence[tuple[float | None, float | None]], number: int) -> Non
 
 @pytest.fixture
 def runs(tmp_path: Path) -> list[SaidRun]:
-    vlms = [asked(tmp_path / f"r{n}", by_chance(n), called=f"vlm {n}") for n in range(2)]
+    vlms = [answer_run(tmp_path / f"r{n}", by_chance(n), called=f"vlm {n}") for n in range(2)]
     policies = [acted(tmp_path / f"p{n}", by_chance(9 + n, 0.15 * n), f"policy {n}") for n in range(3)]
     return [*vlms, *policies]
 
 
 @pytest.mark.slow
 def test_gaps_are_one_family_over_categories_and_pairs_and_means_another(runs: list[SaidRun]) -> None:
-    found = retention_table(runs, vlm_vla=True).vlm_vla
-    assert len({(gap.group, gap.minus) for gap in found}) == 6
-    check([(gap.p, gap.p_holm) for gap in found if gap.category != "mean"], 12)
-    check([(gap.p, gap.p_holm) for gap in found if gap.category == "mean"], 6)
+    gaps = retention_table(runs, vlm_vla=True).vlm_vla
+    assert len({(gap.group, gap.minus) for gap in gaps}) == 6
+    check([(gap.p, gap.p_holm) for gap in gaps if gap.category != "mean"], 12)
+    check([(gap.p, gap.p_holm) for gap in gaps if gap.category == "mean"], 6)
 
 
 def test_differences_are_one_family_and_means_another(runs: list[SaidRun]) -> None:
-    found = retention_table(runs[2:]).differences
-    check([(row.p, row.p_holm) for row in found if row.category != "mean"], 4)
+    differences = retention_table(runs[2:]).differences
+    check([(row.p, row.p_holm) for row in differences if row.category != "mean"], 4)
 
 
 def test_joins_that_a_report_shows_together_are_one_family(runs: list[SaidRun]) -> None:
     table = retention_table(runs)
     joins = join_runs(table.runs, table.results).tables
-    tests = [one for join in joins for row in join.rows if row.category != OVERALL for one in row.comparisons]
-    check([(one.p, one.p_holm) for one in tests], len(list(product(range(2), range(3), SHARES))))
-    summaries = [one for join in joins for row in join.rows if row.category == OVERALL for one in row.comparisons]
+    tests = [
+        comparison
+        for join in joins
+        for row in join.rows
+        if row.category != OVERALL
+        for comparison in row.comparisons
+    ]
+    check(
+        [(comparison.p, comparison.p_holm) for comparison in tests], len(list(product(range(2), range(3), SHARES)))
+    )
+    summaries = [
+        comparison
+        for join in joins
+        for row in join.rows
+        if row.category == OVERALL
+        for comparison in row.comparisons
+    ]
     assert len(summaries) == 6
-    assert all(one.p_holm is None for one in summaries)
+    assert all(summary.p_holm is None for summary in summaries)
 
 
 def test_wordings_of_all_runs_are_one_family_over_categories_and_pairs(tmp_path: Path) -> None:
-    found = retention_table([worded(tmp_path / f"run {seed}", seed) for seed in range(2)]).wordings
-    check([(pair.p, pair.p_holm) for pair in found if pair.category != MEAN], 2 * 3 * 2)
-    check([(pair.p, pair.p_holm) for pair in found if pair.category == MEAN], 2 * 3)
+    wordings = retention_table([worded(tmp_path / f"run {seed}", seed) for seed in range(2)]).wordings
+    check([(pair.p, pair.p_holm) for pair in wordings if pair.category != MEAN], 2 * 3 * 2)
+    check([(pair.p, pair.p_holm) for pair in wordings if pair.category == MEAN], 2 * 3)
 
 
 class Worded(SaidRun):

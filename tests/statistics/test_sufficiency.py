@@ -55,7 +55,7 @@ def test_possible_flips_are_those_that_are_made(groups: int) -> None:
 
 @pytest.mark.parametrize("groups", range(3, 9))
 def test_train_refuses_and_warns_where_the_plan_says_so(groups: int) -> None:
-    with warnings.catch_warnings(record=True) as said:
+    with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
         if groups < GROUPS_FOR_PROBES:
             with pytest.raises(
@@ -64,7 +64,9 @@ def test_train_refuses_and_warns_where_the_plan_says_so(groups: int) -> None:
                 problem_of(episodes(groups), permutations=1000)
             return
         problem_of(episodes(groups), permutations=1000)
-    assert any("the smallest possible p" in str(one.message) for one in said) == (groups < groups_for_signal())
+    assert any("the smallest possible p" in str(caught.message) for caught in warned) == (
+        groups < groups_for_signal()
+    )
 
 
 @pytest.mark.parametrize("groups", range(2, EXACT + 2))
@@ -98,21 +100,21 @@ def test_absence_can_be_said_where_the_limit_at_one_half_is_below_the_bound_and_
             stats.norm.sf(threshold, ABSENT_BELOW, np.sqrt(ABSENT_BELOW * (1 - ABSENT_BELOW) / trials)) >= 0.8
         )
 
-    found = groups_for_absence(size)
+    groups_needed = groups_for_absence(size)
     even = [groups for groups in range(4, 60, 2) if limit(groups) < ABSENT_BELOW and is_found(groups)]
-    assert even[0] - 1 <= found <= even[0]
-    assert found >= GROUPS_FOR_RETENTION
+    assert even[0] - 1 <= groups_needed <= even[0]
+    assert groups_needed >= GROUPS_FOR_RETENTION
 
 
 def test_the_fewest_groups_are_those_of_the_page() -> None:
     page = (Path(__file__).parents[2] / "docs/statistics.md").read_text(encoding="utf-8")
     lines = dict(re.findall(r"^\| ([a-z ]+) \| .* \| (\d+)[^|]*\|$", page, re.MULTILINE))
-    found = {
+    computed = {
         "probes": GROUPS_FOR_PROBES, "retention": GROUPS_FOR_RETENTION, "shown": groups_for_signal(),
         "absent": groups_for_absence(4), "interventions": groups_for_interventions(),
         "not used": groups_for_not_used(),
     }  # fmt: skip
-    assert {name: int(lines[name]) for name in found} == found
+    assert {name: int(lines[name]) for name in computed} == computed
     assert f"± 10 points take {items_for_width(0.2)} items" in page
 
 

@@ -25,8 +25,8 @@ def paper(name: str) -> dict[str, Any]:
         pytest.skip(
             f"no numbers of the paper at {file} (set PROBE_KIT_SHARED); they are not part of the repository"
         )
-    found: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
-    return found
+    numbers: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+    return numbers
 
 
 def episodes_of(category: str, episodes: int, rates: tuple[float, float], seed: int) -> pd.DataFrame:
@@ -40,11 +40,11 @@ def episodes_of(category: str, episodes: int, rates: tuple[float, float], seed: 
     share = np.zeros(episodes)
     draw = np.random.default_rng(derive_seed("paper", category, seed))
     for at, rate in enumerate(rates):
-        own = draw.permutation(np.flatnonzero(side == at))
-        right = rate / 100 * own.size
-        share[own[: int(right)]] = 1
+        side_episodes = draw.permutation(np.flatnonzero(side == at))
+        right = rate / 100 * side_episodes.size
+        share[side_episodes[: int(right)]] = 1
         if right % 1 > 1e-9:
-            share[own[int(right)]] = right % 1
+            share[side_episodes[int(right)]] = right % 1
     names = [f"{category}-{item}" for item in items]
     hit = share > 0.5
     placed = np.where(hit, side, 1 - side)
@@ -66,7 +66,10 @@ def episodes_of(category: str, episodes: int, rates: tuple[float, float], seed: 
 
 
 def run_of(
-    name: str, rates: Mapping[str, float | tuple[float, float]], items: Mapping[str, Any], asked: bool = False
+    name: str,
+    rates: Mapping[str, float | tuple[float, float]],
+    items: Mapping[str, Any],
+    is_answer_run: bool = False,
 ) -> SaidRun:
     """A run with these rates by category, of both sides or of each; items: the paper's table of episodes."""
     tables = [
@@ -76,11 +79,11 @@ def run_of(
         for category, rate in rates.items()
     ]
     table = pd.concat(tables, ignore_index=True)
-    if asked:
+    if is_answer_run:
         table = table.assign(
             parse="letter", option_mass=1.0, letter_bias=0.0, near_tie=False, side_word=False,
             outcome_logits=table["outcome"], side_logits=table["side_placed"],
             outcome_debiased=table["outcome"], side_debiased=table["side_placed"],
         )  # fmt: skip
-    settings = {"ask": ASK} if asked else {}
+    settings = {"ask": ASK} if is_answer_run else {}
     return SaidRun(Path("/paper") / name, name, SUITE, table, {}, settings=settings)

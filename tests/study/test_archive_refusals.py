@@ -38,14 +38,14 @@ def packed(tmp_path: Path) -> Path:
     return folder
 
 
-def zipped(folder: Path, *further: tuple[str, bytes], kind: int = stat.S_IFREG) -> Path:
-    """The folder's files as a zip file. further: names and contents; of this kind of file."""
+def zipped(folder: Path, *extra_members: tuple[str, bytes], kind: int = stat.S_IFREG) -> Path:
+    """The folder's files as a zip file. extra_members: names and contents; of this kind of file."""
     out = folder.with_suffix(".zip")
     with ZipFile(out, "w", ZIP_DEFLATED) as file:
         for path in sorted(folder.rglob("*")):
             if path.is_file():
                 file.write(path, path.relative_to(folder).as_posix())
-        for name, content in further:
+        for name, content in extra_members:
             info = ZipInfo(name)
             info.external_attr, info.compress_type = (kind | 0o644) << 16, ZIP_DEFLATED
             file.writestr(info, content)
@@ -290,17 +290,17 @@ def test_sums_name_every_file_once_and_no_other_file(
 @pytest.mark.parametrize("ending", [".tar", ".tar.gz", ".tgz", ".zip.txt"])
 def test_a_tape_archive_is_no_archive_of_a_study(ending: str, packed: Path) -> None:
     """The product writes folders and zip files, and reads no other format."""
-    made = shutil.make_archive(str(packed.parent / "made"), "gztar", packed)
-    file = Path(made).rename(packed.parent / f"study{ending}")
+    tape = shutil.make_archive(str(packed.parent / "made"), "gztar", packed)
+    file = Path(tape).rename(packed.parent / f"study{ending}")
     assert open_archive(file) is None
     answer = CliRunner().invoke(app, ["study", "table", str(file), "main"])
     assert (answer.exit_code, isinstance(answer.exception, SystemExit | None)) == (2, True)
 
 
 def test_a_tape_archive_called_zip_and_a_zip_file_with_a_password_are_refused(packed: Path) -> None:
-    made = Path(shutil.make_archive(str(packed.parent / "made"), "gztar", packed))
+    tape = Path(shutil.make_archive(str(packed.parent / "made"), "gztar", packed))
     with pytest.raises(RunDamagedError, match="no whole zip file"):
-        open_archive(made.rename(packed.parent / "tape.zip"))
+        open_archive(tape.rename(packed.parent / "tape.zip"))
     file = zipped(packed)
     content = bytearray(file.read_bytes())
     for start in (content.index(b"PK\x03\x04") + 6, content.index(b"PK\x01\x02") + 8):

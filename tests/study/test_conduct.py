@@ -44,19 +44,19 @@ def file(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def states(file: Path) -> dict[str, tuple[str, int]]:
-    return {one.cell.name: (one.state, one.stored) for one in plan_study(load_study(file)).cells}
+    return {planned.cell.name: (planned.state, planned.stored) for planned in plan_study(load_study(file)).cells}
 
 
 @pytest.mark.slow
 def test_a_model_that_fails_stops_itself_alone_and_the_rest_is_played_once(file: Path) -> None:
     assert set(states(file).values()) == {("new", 0)}
-    told: list[str] = []
+    failed_models: list[str] = []
     (failure,) = conduct_study(
         plan_study(load_study(file)),
-        lambda event: told.append(event.model) if isinstance(event, Failure) else None,
+        lambda event: failed_models.append(event.model) if isinstance(event, Failure) else None,
         env_workers=0,
     )
-    assert (failure.model, failure.run, told) == ("broken", "broken/short", ["broken"])
+    assert (failure.model, failure.run, failed_models) == ("broken", "broken/short", ["broken"])
     assert "nowhere" in failure.reason
     after = {
         "expert/short": ("whole", 4),
@@ -68,14 +68,16 @@ def test_a_model_that_fails_stops_itself_alone_and_the_rest_is_played_once(file:
     files = {path: path.stat().st_mtime_ns for path in file.parent.rglob("*") if path.is_file()}
     conduct_study(plan_study(load_study(file)), env_workers=0)
     assert {path: path.stat().st_mtime_ns for path in file.parent.rglob("*") if path.is_file()} == files
-    place = next(one.location for one in plan_study(load_study(file)).cells if one.cell.name == "idle/dark")
-    before = open_run(place).stamp
-    sorted((Path(place) / "commits").iterdir())[2].unlink()
-    assert open_run(place, allow_partial=True).planned == 4
+    run_location = next(
+        planned.location for planned in plan_study(load_study(file)).cells if planned.cell.name == "idle/dark"
+    )
+    before = open_run(run_location).stamp
+    sorted((Path(run_location) / "commits").iterdir())[2].unlink()
+    assert open_run(run_location, allow_partial=True).planned == 4
     assert states(file)["idle/dark"] == ("partial", 3)
     conduct_study(plan_study(load_study(file), only="light"), env_workers=0)
     assert states(file) == after
-    assert open_run(place).stamp == before
+    assert open_run(run_location).stamp == before
 
 
 def test_the_commands_print_the_plan_and_say_by_their_exit_code_whether_it_is_whole(file: Path) -> None:
@@ -83,8 +85,8 @@ def test_the_commands_print_the_plan_and_say_by_their_exit_code_whether_it_is_wh
     plain = run.invoke(app, ["study", "run", str(file), "--dry-run"])
     assert plain.exit_code == 0
     assert "4 runs, 16 episodes (16 acted, 0 captured without acting, 0 asked)" in plain.stdout
-    found = json.loads(run.invoke(app, ["study", "run", str(file), "--dry-run", "--json"]).stdout)
-    assert [one["model"] for one in found["runs"]] == ["expert", "broken", "idle", "idle"]
+    answer = json.loads(run.invoke(app, ["study", "run", str(file), "--dry-run", "--json"]).stdout)
+    assert [run_row["model"] for run_row in answer["runs"]] == ["expert", "broken", "idle", "idle"]
     assert run.invoke(app, ["study", "run", str(file), "--dry-run", "--exit-code"]).exit_code == 1
     assert run.invoke(app, ["study", "run", str(file), "--dry-run", "--only", "absent-block"]).exit_code == 2
     for option in ("--exit-code", "--verify", "--orphans"):
@@ -101,12 +103,12 @@ def test_tables_are_made_of_stored_runs_alone_and_name_what_is_missing(file: Pat
     study = load_study(file)
     with pytest.raises(RunIncompleteError, match=r"broken/short is not whole: .* \(--partial\)"):
         make_table(study, "main")
-    made = make_table(study, "main", partial=True)
-    assert made.columns == ("system", "Color", "mean", "score")
-    assert [cells[0] for cells in made.texts] == ["expert", "idle"]
-    (failure,) = (one.failure for one in plan_study(study).cells if one.failure)
-    assert "; ".join(made.notes).endswith(f"broken · short is missing: {failure.reason}")
-    assert made.is_partial
+    table = make_table(study, "main", partial=True)
+    assert table.columns == ("system", "Color", "mean", "score")
+    assert [cells[0] for cells in table.texts] == ["expert", "idle"]
+    (failure,) = (planned.failure for planned in plan_study(study).cells if planned.failure)
+    assert "; ".join(table.notes).endswith(f"broken · short is missing: {failure.reason}")
+    assert table.is_partial
     light = make_table(study, "light")
     assert [cells[:3] for cells in light.texts] == [
         ("idle · dark − idle · short", name, "+0.0 [-100.0, +100.0]") for name in ("Color", "mean")
@@ -117,8 +119,8 @@ def test_tables_are_made_of_stored_runs_alone_and_name_what_is_missing(file: Pat
     assert run.invoke(app, ["study", "table", str(file), "light"]).exit_code == 0
     latex = run.invoke(app, ["study", "table", str(file), "light", "--format", "latex"]).stdout
     assert r"\begin{tabular}" in latex
-    found = json.loads(run.invoke(app, ["study", "table", str(file), "light", "--format", "json"]).stdout)
-    assert [(one["category"], one["items"], one["of_items"]) for one in found["numbers"]] == [
+    answer = json.loads(run.invoke(app, ["study", "table", str(file), "light", "--format", "json"]).stdout)
+    assert [(record["category"], record["items"], record["of_items"]) for record in answer["numbers"]] == [
         ("color", 2, 2),
         ("mean", 2, 2),
     ]
@@ -130,18 +132,24 @@ def test_a_file_that_asks_for_more_items_plays_the_missing_ones_alone(file: Path
     more = file.with_name("more.toml")
     more.write_text(file.read_text(encoding="utf-8").replace("items = 2", "items = 4"), encoding="utf-8")
     assert states(more)["expert/short"] == ("partial", 4)
-    place = Path(
-        next(one.location for one in plan_study(load_study(more)).cells if one.cell.name == "expert/short")
+    run_folder = Path(
+        next(
+            planned.location
+            for planned in plan_study(load_study(more)).cells
+            if planned.cell.name == "expert/short"
+        )
     )
-    before = {path.name: path.read_bytes() for path in (place / "commits").iterdir()}
+    before = {path.name: path.read_bytes() for path in (run_folder / "commits").iterdir()}
     conduct_study(plan_study(load_study(more), only="expert"), env_workers=0)
     assert states(more)["expert/short"] == ("whole", 8)
     assert states(file)["expert/short"] == ("whole", 4)  # more than what it needs
-    after = {path.name: path.read_bytes() for path in (place / "commits").iterdir()}
+    after = {path.name: path.read_bytes() for path in (run_folder / "commits").iterdir()}
     assert len(after) == 8
     assert {name: after[name] for name in before} == before
-    shown = {one["system"]: one["items"] for one in make_table(load_study(file), "main", partial=True).numbers}
-    assert shown["expert"] == 2
+    items_by_system = {
+        record["system"]: record["items"] for record in make_table(load_study(file), "main", partial=True).numbers
+    }
+    assert items_by_system["expert"] == 2
 
 
 @pytest.mark.slow
@@ -152,10 +160,13 @@ def test_every_scene_is_built_before_the_first_run_is_played(file: Path, tmp_pat
     changed = tmp_path / "study.toml"
     scene = f'rendering = "visual-matching"\nbackground = "{torn}"'
     changed.write_text(text.replace("light_level = 0.7", scene), encoding="utf-8")
-    told: list[object] = []
-    failures = conduct_study(plan_study(load_study(changed)), told.append, env_workers=0)
-    assert [(one.stage, one.run) for one in failures] == [("checking", "broken/short"), ("checking", "idle/dark")]
-    assert [type(one).__name__ for one in told][:3] == ["Failure", "Failure", "EpisodeStored"]
+    events: list[object] = []
+    failures = conduct_study(plan_study(load_study(changed)), events.append, env_workers=0)
+    assert [(failure.stage, failure.run) for failure in failures] == [
+        ("checking", "broken/short"),
+        ("checking", "idle/dark"),
+    ]
+    assert [type(event).__name__ for event in events][:3] == ["Failure", "Failure", "EpisodeStored"]
     assert states(changed)["idle/short"] == ("waiting", 0)
     assert states(changed)["expert/short"] == ("whole", 4)
     changed.write_text(text, encoding="utf-8")  # what failed before it played is tried again unasked
@@ -197,14 +208,14 @@ def test_a_policy_is_loaded_once_for_all_of_its_runs(
 ) -> None:
     loaded: list[str] = []
 
-    def count(family, *given, **options):  # type: ignore[no-untyped-def]
+    def count(family, *arguments, **options):  # type: ignore[no-untyped-def]
         loaded.append(family)
-        return load_policy(family, *given, **options)
+        return load_policy(family, *arguments, **options)
 
     monkeypatch.setattr("probe_kit.hooks.load_policy", count)
     text = TEXT.replace('family = "idle"', 'family = "pi0-tiny"\nrandom_weights = true')
     file = small_study(tmp_path, small_suite, text, items=2)
-    assert [one.model for one in conduct_study(plan_study(load_study(file)), env_workers=0)] == ["broken"]
+    assert [event.model for event in conduct_study(plan_study(load_study(file)), env_workers=0)] == ["broken"]
     assert loaded == ["pi0-tiny"]
     assert states(file)["idle/dark"] == states(file)["idle/short"] == ("whole", 4)
 
@@ -257,8 +268,8 @@ def test_probes_of_the_file_are_fitted_once_and_shown(small_suite: Suite, tmp_pa
     conduct_study(plan_study(study))
     (missing,) = fit_probes(plan_study(study))
     assert (missing.run, missing.stage) == ("broken/short", "waiting")
-    made = make_table(study, "probing", partial=True)
-    assert [cells[:3] for cells in made.texts] == [
+    table = make_table(study, "probing", partial=True)
+    assert [cells[:3] for cells in table.texts] == [
         (name, "mean", category) for name in ("expert", "idle") for category in ("Color", "mean")
     ]
     stored = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("probes/*/*") if path.name == "scores.csv"}
@@ -333,19 +344,19 @@ def test_the_longest_model_goes_first_and_one_with_a_gpu_only_where_there_is_one
 def test_a_lost_model_comes_back_without_the_runs_that_are_made_or_given_up(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    made = RunFinished("base", "base/plain")
+    finished = RunFinished("base", "base/plain")
     failed = Failure(stage="episodes", model="base", run="base/dark", reason="two of them")
 
     def story(queue: TaskQueue[ModelTask]) -> Iterator[tuple[int, Any]]:
         queue.take(0)
-        for slot, event, left in ((0, made, ["base/dark"]), (1, failed, [])):
+        for slot, event, remaining in ((0, finished, ["base/dark"]), (1, failed, [])):
             yield slot, event
             queue.retry(slot, "base", counts=False)
             again = queue.take(slot + 1)
             assert again is not None
-            assert [run.run for run in again.runs] == left
+            assert [run.run for run in again.runs] == remaining
 
-    assert conducted(monkeypatch, [task("base", 1)], story, slots=1) == [made, failed]
+    assert conducted(monkeypatch, [task("base", 1)], story, slots=1) == [finished, failed]
 
 
 def test_a_model_is_given_up_after_three_losses_without_an_episode_in_between(
@@ -355,18 +366,18 @@ def test_a_model_is_given_up_after_three_losses_without_an_episode_in_between(
 
     def story(queue: TaskQueue[ModelTask]) -> Iterator[tuple[int, Any]]:
         def lose() -> tuple[ModelTask, bool]:
-            held = queue.take(0)
-            assert held is not None
-            return held, queue.retry(0, "base")
+            job = queue.take(0)
+            assert job is not None
+            return job, queue.retry(0, "base")
 
         assert all(lose()[1] for _ in range(2))
         queue.take(0)
         yield 0, moved
         assert queue.retry(0, "base")
         assert lose()[1]
-        held, again = lose()
+        job, again = lose()
         assert not again
-        yield 0, GivenUp(held, "worker 0 ended with code -11")
+        yield 0, GivenUp(job, "worker 0 ended with code -11")
         assert queue.finished
 
     reports = conducted(monkeypatch, [task("base", 1)], story, slots=1)

@@ -48,20 +48,22 @@ def features(table: pd.DataFrame, after: bool, seed: int = 1) -> dict[tuple[Site
     strength, axis = np.zeros((2, len(table)))
     strength[np.isin(category, ["kept", "shifted", "turned", "learned" if after else "forgotten"])] = 3
     axis[(category == "turned") & after] = 5
-    found = {}
+    arrays = {}
     for layer in range(2):
         values = draw.normal(size=(len(table), WIDTH))
         values[np.arange(len(table)), axis.astype(int)] += strength * side
         if after:
             values[category == "shifted"] = values[category == "shifted"] * 4 + 40
-        found[Site("backbone", layer), "mean"] = values
-    return found
+        arrays[Site("backbone", layer), "mean"] = values
+    return arrays
 
 
 def run_of(folder: Path, after: bool, categories: list[str], **changed: object) -> ArrayRun:
     table = table_of(categories)
-    made = ArrayRun(folder, "after" if after else "before", "suite@1#0123456789ab", table, features(table, after))
-    return made if not changed else SaidRun(**{**vars(made), **changed})  # type: ignore[arg-type]
+    array_run = ArrayRun(
+        folder, "after" if after else "before", "suite@1#0123456789ab", table, features(table, after)
+    )
+    return array_run if not changed else SaidRun(**{**vars(array_run), **changed})  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
@@ -74,68 +76,76 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[ArrayRun, ArrayRun]:
 
 
 @pytest.fixture(scope="module")
-def found(pair: tuple[ArrayRun, ArrayRun]) -> dict[str, CategoryDrift]:
-    return {one.category: one for one in measure_drift(*pair)}
+def drift_by_category(pair: tuple[ArrayRun, ArrayRun]) -> dict[str, CategoryDrift]:
+    return {category_drift.category: category_drift for category_drift in measure_drift(*pair)}
 
 
-def test_the_verdict_of_every_category_is_what_was_made(found: dict[str, CategoryDrift]) -> None:
-    assert {name: one.verdict for name, one in found.items()} == TRUTH
+def test_the_verdict_of_every_category_is_what_was_made(drift_by_category: dict[str, CategoryDrift]) -> None:
+    assert {name: category_drift.verdict for name, category_drift in drift_by_category.items()} == TRUTH
 
 
-def test_an_offset_alone_breaks_transfer_until_features_are_recentred(found: dict[str, CategoryDrift]) -> None:
-    kept, shifted = (found[name].sites[found[name].best] for name in ("kept", "shifted"))
-    assert kept.raw > 0.95
-    assert kept.recentred > 0.95
+def test_an_offset_alone_breaks_transfer_until_features_are_recentred(
+    drift_by_category: dict[str, CategoryDrift],
+) -> None:
+    kept_site, shifted = (
+        drift_by_category[name].sites[drift_by_category[name].best] for name in ("kept", "shifted")
+    )
+    assert kept_site.raw > 0.95
+    assert kept_site.recentred > 0.95
     assert shifted.raw < 0.7
     assert shifted.recentred > 0.95
 
 
 def test_a_run_against_itself_transfers_as_it_decodes(pair: tuple[ArrayRun, ArrayRun]) -> None:
     run, _ = pair
-    for one in measure_drift(run, run):
-        curve = one.sites[one.best]
+    for category_drift in measure_drift(run, run):
+        curve = category_drift.sites[category_drift.best]
         assert curve.raw == curve.raw_back == curve.recentred
         assert curve.cka == pytest.approx(1)
-        assert one.verdict in ("kept", "not shown in either")
+        assert category_drift.verdict in ("kept", "not shown in either")
         if curve.cosine is not None:
             assert curve.cosine == pytest.approx(1)
             assert curve.weighted == pytest.approx(1)
 
 
 def test_transferred_decisions_are_those_of_the_probe_that_never_saw_the_episode(
-    pair: tuple[ArrayRun, ArrayRun], found: dict[str, CategoryDrift]
+    pair: tuple[ArrayRun, ArrayRun], drift_by_category: dict[str, CategoryDrift]
 ) -> None:
     """By hand, episode by episode, from the stored weights."""
     run, other = pair
     results = load_results(run)
-    curve, site = results.curves["kept", "mean"], found["kept"].sites[1].site
+    curve, site = results.curves["kept", "mean"], drift_by_category["kept"].sites[1].site
     direction, values = results.direction("kept", "mean", site), other.column(site, "mean").astype(float)
     row_of = {name: row for row, name in enumerate(other.episodes["episode_id"])}
     right = [
-        (values[row_of[name]] @ direction.weights[fold].astype(float) + direction.intercepts[fold] > 0) == left
-        for name, fold, left in zip(curve.episodes, curve.fold_of, curve.labels, strict=True)
+        (values[row_of[name]] @ direction.weights[fold].astype(float) + direction.intercepts[fold] > 0) == is_left
+        for name, fold, is_left in zip(curve.episodes, curve.fold_of, curve.labels, strict=True)
     ]
-    assert found["kept"].sites[1].raw == np.mean(right)
+    assert drift_by_category["kept"].sites[1].raw == np.mean(right)
 
 
-def test_directions_are_compared_only_where_both_sides_have_signal(found: dict[str, CategoryDrift]) -> None:
+def test_directions_are_compared_only_where_both_sides_have_signal(
+    drift_by_category: dict[str, CategoryDrift],
+) -> None:
     for name in ("forgotten", "learned", "never"):
-        assert all(site.cosine is None for site in found[name].sites)
-    assert 0.7 < found["kept"].sites[0].cosine <= 1
-    turned = found["turned"].sites[0]
+        assert all(site.cosine is None for site in drift_by_category[name].sites)
+    assert 0.7 < drift_by_category["kept"].sites[0].cosine <= 1
+    turned = drift_by_category["turned"].sites[0]
     assert abs(turned.cosine) < 0.5 < turned.ceiling
 
 
-def test_the_table_leads_with_transfer_and_says_what_each_verdict_means(found: dict[str, CategoryDrift]) -> None:
-    made = drift_table({("before", "after"): list(found.values())}, "training", "mean")
-    assert made.title == "Drift: training"
-    rows = {cells[1].lower(): dict(zip(made.columns, cells, strict=True)) for cells in made.texts}
+def test_the_table_leads_with_transfer_and_says_what_each_verdict_means(
+    drift_by_category: dict[str, CategoryDrift],
+) -> None:
+    table = drift_table({("before", "after"): list(drift_by_category.values())}, "training", "mean")
+    assert table.title == "Drift: training"
+    rows = {cells[1].lower(): dict(zip(table.columns, cells, strict=True)) for cells in table.texts}
     assert list(rows["kept"].values())[:3] == ["before → after", "Kept", "kept"]
     assert rows["forgotten"]["cosine (ceiling)"] == "–", "no cosine without signal on both sides"
-    assert "forgotten: signal in the first alone" in "; ".join(made.notes)
-    assert "it is no measure of loss" in "; ".join(made.notes)
-    assert len(made.numbers) == len(TRUTH) * 3, "one of the category, one of each layer"
-    verdicts = {number["category"]: number["verdict"] for number in made.numbers if "verdict" in number}
+    assert "forgotten: signal in the first alone" in "; ".join(table.notes)
+    assert "it is no measure of loss" in "; ".join(table.notes)
+    assert len(table.numbers) == len(TRUTH) * 3, "one of the category, one of each layer"
+    verdicts = {number["category"]: number["verdict"] for number in table.numbers if "verdict" in number}
     assert verdicts == TRUTH
 
 
@@ -163,11 +173,11 @@ def test_other_words_or_frames_give_own_accuracies_only(
     )  # fmt: skip
     assert why_alone(strange, other) == why
     if why and "frames" in changed:
-        (kept, *_) = measure_drift(strange, other)
-        assert (kept.sites, kept.verdict) == ((), "not clear")
-        made = drift_table({("before", "after"): [kept]}, "training", "mean")
-        assert made.title == f"Drift: training ({why})"
-        assert made.texts[0][6:] == ("–",) * 8
+        (first_drift, *_) = measure_drift(strange, other)
+        assert (first_drift.sites, first_drift.verdict) == ((), "not clear")
+        drift = drift_table({("before", "after"): [first_drift]}, "training", "mean")
+        assert drift.title == f"Drift: training ({why})"
+        assert drift.texts[0][6:] == ("–",) * 8
 
 
 def test_two_runs_that_answer_by_letter_have_the_lens_of_every_layer(pair: tuple[ArrayRun, ArrayRun]) -> None:
@@ -181,21 +191,23 @@ def test_two_runs_that_answer_by_letter_have_the_lens_of_every_layer(pair: tuple
             (after, np.stack([side, np.where(np.arange(side.size) % 4 == 0, 0, side)], axis=1)),
         )
     ]
-    (kept, *_) = found = measure_drift(sides[0], sides[1])
-    assert [site.lens for site in kept.sites] == [(0, 1), (1, 0.875)]
-    made = drift_table({("before", "after"): found}, "training", "mean")
-    assert made.columns[-2:] == ("lens before %", "lens after %")
-    assert [one.group for one in made.headings[-2:]] == ["logit lens"] * 2
-    assert "the model's own final norm and head" in "; ".join(made.notes)
-    assert [number["lens_after"] for number in made.numbers if number.get("site")][:2] == [1, 0.875]
+    (first_drift, *_) = drifts = measure_drift(sides[0], sides[1])
+    assert [site.lens for site in first_drift.sites] == [(0, 1), (1, 0.875)]
+    table = drift_table({("before", "after"): drifts}, "training", "mean")
+    assert table.columns[-2:] == ("lens before %", "lens after %")
+    assert [heading.group for heading in table.headings[-2:]] == ["logit lens"] * 2
+    assert "the model's own final norm and head" in "; ".join(table.notes)
+    assert [number["lens_after"] for number in table.numbers if number.get("site")][:2] == [1, 0.875]
     (plain, *_) = measure_drift(sides[0], after)
     assert all(site.lens is None for site in plain.sites), "one side has none"
-    assert "logit lens" not in [one.group for one in drift_table({("a", "b"): [plain]}, "t", "mean").headings]
+    assert "logit lens" not in [
+        heading.group for heading in drift_table({("a", "b"): [plain]}, "t", "mean").headings
+    ]
 
 
 def test_backbones_of_another_width_are_refused(pair: tuple[ArrayRun, ArrayRun], tmp_path: Path) -> None:
     run, _ = pair
-    wide = {place: np.hstack([values, values]) for place, values in run.features.items()}
+    wide = {column_key: np.hstack([values, values]) for column_key, values in run.features.items()}
     other = ArrayRun(tmp_path, "wide", run.suite, run.episodes, wide)
     train_probes(other, permutations=0, jobs=1, controls=())
     with pytest.raises(UsageError, match="no site of the backbone with one name and width in common"):
@@ -249,9 +261,11 @@ def test_training_keeps_what_it_used_and_forgets_traffic(seed: int, tmp_path: Pa
     study = load_study(file)
     assert conduct_study(plan_study(study)) == []
     assert fit_probes(plan_study(study)) == []
-    made = make_table(study, "drift")
-    print(made.to_markdown())
-    assert {one["category"]: one["verdict"] for one in made.numbers if "verdict" in one} == KNOWN_TRUTH
+    table = make_table(study, "drift")
+    print(table.to_markdown())
+    assert {
+        record["category"]: record["verdict"] for record in table.numbers if "verdict" in record
+    } == KNOWN_TRUTH
 
 
 TEXT = """
@@ -340,37 +354,46 @@ def test_a_file_names_pairs_and_an_archive_prints_their_table_without_activation
     study = load_study(file)
     assert conduct_study(plan_study(study)) == []
     assert fit_probes(plan_study(study)) == []
-    made = make_table(study, "drift")
-    assert [cells[:2] for cells in made.texts] == [
+    table = make_table(study, "drift")
+    assert [cells[:2] for cells in table.texts] == [
         ("early → base", "Color"), ("early → base", "Counting"),
         ("base → base", "Color"), ("base → base", "Counting"),
     ]  # fmt: skip
-    color, counting = made.texts[2:]
+    color, counting = table.texts[2:]
     assert (color[2], counting[2]) == ("kept", "not shown in either")
-    named = dict(zip(made.columns, color, strict=True))
-    assert named["forth %"] == named["back %"] == named["recentred %"], "a run transfers to itself as it decodes"
-    assert named["CKA"] == "1.00"
+    cell_by_heading = dict(zip(table.columns, color, strict=True))
+    assert cell_by_heading["forth %"] == cell_by_heading["back %"] == cell_by_heading["recentred %"], (
+        "a run transfers to itself as it decodes"
+    )
+    assert cell_by_heading["CKA"] == "1.00"
     _check_vlm(study)
-    chosen = make_table(study, "counting").texts
-    assert [cells[1] for cells in chosen] == ["Counting", "Counting"]
-    assert chosen[0] == made.texts[1], "probes are those of the whole runs"
+    counting_rows = make_table(study, "counting").texts
+    assert [cells[1] for cells in counting_rows] == ["Counting", "Counting"]
+    assert counting_rows[0] == table.texts[1], "probes are those of the whole runs"
     (curves,) = make_figures(study, "curves")
     with curves.drawn() as figure:
         titles = [axes.get_title(loc="left") for axes in figure.axes if axes.get_visible()]
     assert [title.partition(":")[0] for title in titles] == ["Color", "Color"], "backbone and action"
     pack_study(study, tmp_path / "study.zip")
-    assert make_table(load_study(tmp_path / "study.zip"), "drift").texts == made.texts
+    assert make_table(load_study(tmp_path / "study.zip"), "drift").texts == table.texts
 
 
 def _check_vlm(study: LoadedStudy) -> None:
     """The early policy has the VLM's weights: with its words, picture and tokens, nothing differs."""
     numbers = make_table(study, "vlm").numbers
-    sites = [one for one in numbers if "cka" in one]
-    assert {one["before"].partition(" ")[0] for one in sites} == {"vlm"}
+    sites = [record for record in numbers if "cka" in record]
+    assert {record["before"].partition(" ")[0] for record in sites} == {"vlm"}
     assert len(sites) == 2 * 4, "of the pair with the policies' words alone"
-    assert min(one["cka"] for one in sites) >= 0.999
-    own = {one["category"]: one for one in numbers if "verdict" in one and not one["why_alone"]}
-    assert own["color"]["verdict"] == "kept"
-    assert [one["why_alone"] for one in numbers if "verdict" in one] == [None, None, "other words", "other words"]
-    apart = [one["why_alone"] for one in make_table(study, "language").numbers]
+    assert min(record["cka"] for record in sites) >= 0.999
+    verdict_rows = {
+        record["category"]: record for record in numbers if "verdict" in record and not record["why_alone"]
+    }
+    assert verdict_rows["color"]["verdict"] == "kept"
+    assert [record["why_alone"] for record in numbers if "verdict" in record] == [
+        None,
+        None,
+        "other words",
+        "other words",
+    ]
+    apart = [record["why_alone"] for record in make_table(study, "language").numbers]
     assert apart == ["other tokens"] * 2, "the last token is no word to the VLM"

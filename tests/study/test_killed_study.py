@@ -13,16 +13,16 @@ KILLS = {SCRIPTED: 20, TEXT: 6}
 
 
 def command(suite: Suite, text: str, items: int, *options: str) -> KilledCommand:
-    def runs(place: Path) -> list[Path]:
-        return run_folders(place / "study.toml")
+    def runs(folder: Path) -> list[Path]:
+        return run_folders(folder / "study.toml")
 
     return KilledCommand(
         "study run",
-        lambda place: small_study(place, suite, text, items),
-        lambda place: ["study", "run", str(place / "study.toml"), *options],
-        lambda place: bytes_of(place / "study.toml"),
-        lambda place: committed(*runs(place)),
-        lambda place: run_problems(*runs(place)),
+        lambda folder: small_study(folder, suite, text, items),
+        lambda folder: ["study", "run", str(folder / "study.toml"), *options],
+        lambda folder: bytes_of(folder / "study.toml"),
+        lambda folder: committed(*runs(folder)),
+        lambda folder: run_problems(*runs(folder)),
     )
 
 

@@ -84,11 +84,11 @@ def test_a_run_of_another_folder_of_weights_is_seen_unless_the_folder_was_moved(
         (folder / "model.safetensors").write_bytes(folder.name.encode())
     run = run_of(small_suite, tmp_path / "run")
     run.__dict__["certificate"] = {"policy": {"checkpoint": str(folders[0])}}
-    said = [
+    reasons = [
         [words for words in differences(run, cell_of(small_suite, folder)) if words.startswith("checkpoint")]
         for folder in (*folders, None)
     ]
-    assert [len(words) for words in said] == [0, 1, 0]
+    assert [len(words) for words in reasons] == [0, 1, 0]
     folders[0].rename(tmp_path / "moved")
     moved = cell_of(small_suite, tmp_path / "moved")
     assert not [words for words in differences(run, moved) if words.startswith("checkpoint")]

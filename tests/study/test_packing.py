@@ -50,7 +50,7 @@ def test_every_table_is_the_same_from_the_archive_alone(
     try:
         packed = load_study(archive)
         assert {name: make_table(packed, name) for name in packed.study.tables} == before
-        assert {one.state for one in plan_study(packed).cells} == {"whole"}
+        assert {planned.state for planned in plan_study(packed).cells} == {"whole"}
     finally:
         away.rename(home)
 
@@ -123,19 +123,19 @@ def test_missing_runs_are_refused_or_named(played: LoadedStudy, tmp_path: Path) 
     refused = run.invoke(app, ["study", "pack", str(file), "--out", str(tmp_path / "a.zip")])
     assert refused.exit_code != 0
     assert not (tmp_path / "a.zip").exists()
-    made = run.invoke(app, ["study", "pack", str(file), "--out", str(tmp_path / "a.zip"), "--partial"])
-    assert made.exit_code == 0, made.output
-    assert "2 runs, without activations, pictures, trajectories, directions" in made.stdout
-    assert "not packed: idle/dark: " in made.stdout
+    result = run.invoke(app, ["study", "pack", str(file), "--out", str(tmp_path / "a.zip"), "--partial"])
+    assert result.exit_code == 0, result.output
+    assert "2 runs, without activations, pictures, trajectories, directions" in result.stdout
+    assert "not packed: idle/dark: " in result.stdout
     assert run.invoke(app, ["study", "table", str(tmp_path / "a.zip"), "main"]).exit_code == 0
     assert run.invoke(app, ["study", "run", str(tmp_path / "a.zip")]).exit_code == 2
 
 
 def test_a_table_is_the_same_after_its_record(played: LoadedStudy) -> None:
-    made = make_table(played, "score")
-    again = table_of_record(json.loads(json.dumps(table_record(made))))
-    assert again.to_markdown() == made.to_markdown()
-    assert json.dumps(again.numbers) == json.dumps(made.numbers)
+    table = make_table(played, "score")
+    again = table_of_record(json.loads(json.dumps(table_record(table))))
+    assert again.to_markdown() == table.to_markdown()
+    assert json.dumps(again.numbers) == json.dumps(table.numbers)
 
 
 @pytest.mark.slow
@@ -168,10 +168,10 @@ def folder(played: LoadedStudy, tmp_path_factory: pytest.TempPathFactory) -> Pat
 @pytest.fixture
 def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[Hub]:
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", False)
-    with hub() as found:
-        monkeypatch.setenv("HF_ENDPOINT", found.address)
+    with hub() as endpoint:
+        monkeypatch.setenv("HF_ENDPOINT", endpoint.address)
         monkeypatch.setenv("HF_TOKEN", TOKEN)
-        yield found
+        yield endpoint
 
 
 @pytest.mark.slow
@@ -179,14 +179,14 @@ def test_the_data_set_holds_every_episode_table_and_hash(played: LoadedStudy, fo
     table = pd.read_parquet(folder / "episodes.parquet")
     runs = {cell.name: open_run(cell.location(played.study.folder)) for cell in played.cells}
     assert table.groupby("run").size().to_dict() == {name: len(run.episodes) for name, run in runs.items()}
-    own = table[table["run"] == "expert/short"]
-    assert own["outcome"].tolist() == runs["expert/short"].episodes["outcome"].tolist()
+    rows = table[table["run"] == "expert/short"]
+    assert rows["outcome"].tolist() == runs["expert/short"].episodes["outcome"].tolist()
     assert not {"instruction", "target", "distractor"} & set(table)
     _, front, words = (folder / "README.md").read_text(encoding="utf-8").split("---\n", 2)
     head = yaml.safe_load(front)
     assert head["license"] == "cc-by-4.0"
     assert head["dataset_info"]["splits"] == [{"name": "train", "num_examples": len(table)}]
-    assert [one["name"] for one in head["dataset_info"]["features"]] == list(table.columns)
+    assert [feature["name"] for feature in head["dataset_info"]["features"]] == list(table.columns)
     assert make_table(played, "main").title in words
     for line in (folder / "SHA256SUMS").read_text(encoding="utf-8").splitlines():
         digest, name = line.split("  ")
@@ -259,8 +259,8 @@ def test_options_that_do_not_go_together_are_refused_before_anything_is_written(
 def test_the_command_writes_the_folder_first_and_never_over_another(played: LoadedStudy, tmp_path: Path) -> None:
     out = tmp_path / "set"
     arguments = ["study", "pack", str(played.file), "--out", str(out), "--data-set"]
-    made = CliRunner().invoke(app, arguments)
-    assert (made.exit_code, made.stdout.strip()) == (0, str(out))
+    result = CliRunner().invoke(app, arguments)
+    assert (result.exit_code, result.stdout.strip()) == (0, str(out))
     assert (out / "study.zip").is_file()
     with pytest.raises(UsageError, match="exists; choose another"):
         write_data_set(played, out)

@@ -80,14 +80,14 @@ def test_the_margin_of_guessing_is_the_papers(rows: dict[str, RetentionTable], d
 def test_the_main_table_has_a_row_per_system_and_the_printed_numbers(
     runs: dict[str, SaidRun], tables: dict[str, Any], derived: dict[str, Any]
 ) -> None:
-    made = retention_table(list(runs.values()), pairs=())
-    main, score = success_table(made), score_table(made)
+    table = retention_table(list(runs.values()), pairs=())
+    main, score = success_table(table), score_table(table)
     assert len(main.texts) == 17
     assert main.columns[:2] == ("system", "Emotion")
     for name, *cells in main.texts:
-        shown = dict(zip(main.columns[1:], cells, strict=True))
+        cell_by_heading = dict(zip(main.columns[1:], cells, strict=True))
         for category, printed in tables["sr_main"]["values"][name].items():
-            cell = shown[category_of(category).title]
+            cell = cell_by_heading[category_of(category).title]
             assert float(cell.split()[0]) == pytest.approx(printed, abs=0.051)
     marked = {(name, at): cell for name, *cells in main.texts for at, cell in enumerate(cells) if cell[-1] == "↑"}
     assert ("Magma", 3) in marked
@@ -102,17 +102,19 @@ def test_the_main_table_has_a_row_per_system_and_the_printed_numbers(
 def test_204_regimes_by_episodes_and_by_items(
     rows: dict[str, RetentionTable], derived: dict[str, Any], unit: str
 ) -> None:
-    found = {}
+    regimes = {}
     for name, table in rows.items():
         for category, row in by_category(table).items():
-            own = row.success
-            margin = getattr(own, f"chance_margin_{unit}")
-            assert own.sr is not None
-            named, _ = regime(own.sr, margin, own.share_wrong or 0, own.share_outside or 0)
-            found[name, category] = REGIMES[named]
-    wanted = derived[f"regimes_by_{unit}"]
-    assert len(found) == 204
-    assert [place for place, said in found.items() if wanted[place[0]][place[1]] != said] == []
+            success = row.success
+            margin = getattr(success, f"chance_margin_{unit}")
+            assert success.sr is not None
+            regime_name, _ = regime(success.sr, margin, success.share_wrong or 0, success.share_outside or 0)
+            regimes[name, category] = REGIMES[regime_name]
+    expected = derived[f"regimes_by_{unit}"]
+    assert len(regimes) == 204
+    assert [
+        cell_key for cell_key, computed in regimes.items() if expected[cell_key[0]][cell_key[1]] != computed
+    ] == []
 
 
 def test_8_of_204_cells_change_their_regime_between_episodes_and_items(
@@ -122,14 +124,14 @@ def test_8_of_204_cells_change_their_regime_between_episodes_and_items(
     different = []
     for name, table in rows.items():
         for category, row in by_category(table).items():
-            own = row.success
-            assert own.sr is not None
-            assert own.chance_margin_episodes is not None
+            success = row.success
+            assert success.sr is not None
+            assert success.chance_margin_episodes is not None
             paper_says, _ = regime(
-                own.sr, own.chance_margin_episodes, own.share_wrong or 0, own.share_outside or 0
+                success.sr, success.chance_margin_episodes, success.share_wrong or 0, success.share_outside or 0
             )
-            if paper_says != own.regime:
-                different.append(f"{name} {category} {100 * own.sr:.0f}")
+            if paper_says != success.regime:
+                different.append(f"{name} {category} {100 * success.sr:.0f}")
     assert different == derived["regimes_that_differ"]
 
 
@@ -137,17 +139,17 @@ def test_8_of_204_cells_change_their_regime_between_episodes_and_items(
 def test_46_of_48_means_of_left_and_right_are_the_printed_rate(tables: dict[str, Any]) -> None:
     other = {}
     for name, sides in tables["left_right"]["values"].items():
-        rates = {category: (own["left"], own["right"]) for category, own in sides.items()}
+        rates = {category: (side_rates["left"], side_rates["right"]) for category, side_rates in sides.items()}
         table = retention_table([run_of(name, rates, tables["items"]["values"])])
-        shown = sides_table(table)
-        assert shown.texts[0][2] == f"{sides['emotion']['left']:.1f} / {sides['emotion']['right']:.1f}"
+        printed_table = sides_table(table)
+        assert printed_table.texts[0][2] == f"{sides['emotion']['left']:.1f} / {sides['emotion']['right']:.1f}"
         for category, row in by_category(table).items():
-            own = row.success
-            assert own.sr is not None
-            assert (100 * (own.sr_left or 0), 100 * (own.sr_right or 0)) == pytest.approx(rates[category])
+            success = row.success
+            assert success.sr is not None
+            assert (100 * (success.sr_left or 0), 100 * (success.sr_right or 0)) == pytest.approx(rates[category])
             printed = tables["sr_main"]["values"][name][category]
-            if abs(100 * own.sr - printed) > 1:
-                other[name, category] = (printed, 100 * own.sr)
+            if abs(100 * success.sr - printed) > 1:
+                other[name, category] = (printed, 100 * success.sr)
     assert other == {
         ("SpatialVLA", "time"): (46, pytest.approx(47.5)),
         ("Magma", "shape"): (81, pytest.approx(83.5)),
@@ -165,17 +167,17 @@ def test_co_trained_minus_robot_only_is_10_points_and_p_over_models_a_fifth(
     runs: dict[str, SaidRun], derived: dict[str, Any]
 ) -> None:
     table = retention_table({group: [runs[name] for name in names] for group, names in GROUPS.items()})
-    shown = group_table(table, "co-training").texts
-    assert shown[-1][:2] == ("co-trained − robot-only", "mean")
-    assert shown[-1][2].startswith("0.200 (0.100)")
-    assert shown[-1][3].startswith("+10.1 [")
+    texts = group_table(table, "co-training").texts
+    assert texts[-1][:2] == ("co-trained − robot-only", "mean")
+    assert texts[-1][2].startswith("0.200 (0.100)")
+    assert texts[-1][3].startswith("+10.1 [")
     *each, mean = table.differences
     assert mean.category == "mean"
     assert mean.sr is not None
     assert 100 * mean.sr == pytest.approx(10.06, abs=0.005)
-    found = {row.category: 100 * (row.sr or 0) for row in each}
-    assert found == pytest.approx(derived["rq5_difference_by_category"], abs=0.005)
-    assert sum(gain > 0 for gain in found.values()) == 11
+    computed = {row.category: 100 * (row.sr or 0) for row in each}
+    assert computed == pytest.approx(derived["rq5_difference_by_category"], abs=0.005)
+    assert sum(gain > 0 for gain in computed.values()) == 11
     assert mean.sr_models is not None
     assert (mean.sr_models.p, mean.sr_models.smallest_p) == (pytest.approx(0.2), pytest.approx(0.1))
 
@@ -190,12 +192,12 @@ def test_without_magma_the_difference_is_half(rows: dict[str, RetentionTable]) -
 def test_what_fine_tuning_changes(runs: dict[str, SaidRun], derived: dict[str, Any]) -> None:
     names = ["OpenVLA (SFT)", "OpenVLA (RL)", "OpenVLA"]
     table = retention_table([runs[name] for name in names], against="OpenVLA")
-    shown = difference_table(table, "tuning").texts
-    assert [cells[2].split()[0] for cells in shown if cells[1] == "mean"] == ["-6.2", "-1.1"]
+    texts = difference_table(table, "tuning").texts
+    assert [cells[2].split()[0] for cells in texts if cells[1] == "mean"] == ["-6.2", "-1.1"]
     for name, printed in zip(names[:2], (-6.17, -1.08), strict=True):
-        found = {row.category: 100 * (row.sr or 0) for row in table.differences if row.group == name}
-        assert found["mean"] == pytest.approx(printed, abs=0.005)
-        assert found == pytest.approx(derived[f"rq6 {name} - OpenVLA"], abs=0.005)
+        computed = {row.category: 100 * (row.sr or 0) for row in table.differences if row.group == name}
+        assert computed["mean"] == pytest.approx(printed, abs=0.005)
+        assert computed == pytest.approx(derived[f"rq6 {name} - OpenVLA"], abs=0.005)
 
 
 @pytest.mark.slow
@@ -210,9 +212,15 @@ def test_ablations_minus_the_default_are_paired_on_the_four_categories_in_common
             continue
         ablated = run_of(name, row["values"], tables["items"]["values"])
         table = retention_table([ablated, runs[row["model"]]])
-        found = {one.category: 100 * (one.sr or 0) for one in table.differences if one.category != "mean"}
-        assert found == pytest.approx(derived["ablation_minus_default"][name], abs=0.005)
-        assert all(one.paired and one.n_items == one.of_items for one in table.differences)
+        computed = {
+            difference.category: 100 * (difference.sr or 0)
+            for difference in table.differences
+            if difference.category != "mean"
+        }
+        assert computed == pytest.approx(derived["ablation_minus_default"][name], abs=0.005)
+        assert all(
+            difference.paired and difference.n_items == difference.of_items for difference in table.differences
+        )
         checked += 1
     assert checked == 5
 
@@ -222,10 +230,10 @@ def test_ablations_minus_the_default_are_paired_on_the_four_categories_in_common
 def test_vlm_minus_vla_of_the_two_policies_whose_source_is_there(
     tables: dict[str, Any], runs: dict[str, SaidRun], derived: dict[str, Any], vlm: str, policy: str
 ) -> None:
-    asked = run_of(vlm, tables["sr_main"]["values"][vlm], tables["items"]["values"], asked=True)
-    table = retention_table([asked, runs[policy]], vlm_vla=True)
-    found = {row.category: 100 * row.sr for row in table.vlm_vla if row.category != "mean"}
-    assert found == pytest.approx(derived["gap_pairs"][f"{vlm} - {policy}"], abs=0.005)
+    vlm_run = run_of(vlm, tables["sr_main"]["values"][vlm], tables["items"]["values"], is_answer_run=True)
+    table = retention_table([vlm_run, runs[policy]], vlm_vla=True)
+    computed = {row.category: 100 * row.sr for row in table.vlm_vla if row.category != "mean"}
+    assert computed == pytest.approx(derived["gap_pairs"][f"{vlm} - {policy}"], abs=0.005)
     assert all(row.paired for row in table.vlm_vla)
     assert len(vlm_vla_table(table.vlm_vla).texts) == 13
 

@@ -43,7 +43,7 @@ def test_a_killed_process_is_replaced_and_nothing_changes(
 
     def kill_one(event: object) -> None:
         if isinstance(event, EpisodeStored) and event.stored in (5, 15) and len(killed) < 4:
-            victims = [one.pid for one in _players() if one.pid not in killed]
+            victims = [process.pid for process in _players() if process.pid not in killed]
             killed.append(victims[0])
             psutil.Process(victims[0]).kill()
 
@@ -71,7 +71,7 @@ def test_a_model_whose_process_always_dies_fails_and_the_others_are_played(
         (failure,) = conduct_study(plan_study(load_study(file)), slots=2)
     assert (failure.model, failure.stage, failure.error) == ("first", "playing", "WorkerDiedError")
     assert "ended with code 7, 3 times without an episode in between" in failure.reason
-    states = {one.cell.name: one.state for one in plan_study(load_study(file)).cells}
+    states = {planned.cell.name: planned.state for planned in plan_study(load_study(file)).cells}
     assert states == {
         "first/still": "failed",
         "first/dark": "waiting",

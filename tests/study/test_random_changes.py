@@ -59,12 +59,12 @@ def move(source: Path, target: Path) -> Undo:
     return lambda: target.rename(source)
 
 
-def exchange(one: Path, other: Path) -> Undo:
-    aside = one.with_name("aside.exchanged")
+def exchange(first: Path, other: Path) -> Undo:
+    aside = first.with_name("aside.exchanged")
 
     def swap() -> None:
-        one.rename(aside)
-        other.rename(one)
+        first.rename(aside)
+        other.rename(first)
         aside.rename(other)
 
     swap()
@@ -112,18 +112,22 @@ def change(folder: Path, draw: Random) -> tuple[str, Undo]:
     if kind == 6:
         copy = file.with_name(f"{file.stem} copy{file.suffix}")
         return f"copy {file} to {copy}", put(copy, content)
-    one = draw.choice(folders)
+    chosen_folder = draw.choice(folders)
     if kind == 7:
-        return f"delete {one}", move(one, folder.with_name("deleted") / "folder")
-    apart = [path for path in folders if path not in (one, *one.parents) and one not in path.parents]
-    same = [path for path in apart if len(path.parts) == len(one.parts)]
+        return f"delete {chosen_folder}", move(chosen_folder, folder.with_name("deleted") / "folder")
+    apart = [
+        path
+        for path in folders
+        if path not in (chosen_folder, *chosen_folder.parents) and chosen_folder not in path.parents
+    ]
+    same = [path for path in apart if len(path.parts) == len(chosen_folder.parts)]
     if apart and kind in (8, 9):
         theirs = draw.choice(same or apart)
-        return f"exchange {one} and {theirs}", exchange(one, theirs)
+        return f"exchange {chosen_folder} and {theirs}", exchange(chosen_folder, theirs)
     if apart and kind == 10:
         home = draw.choice(apart)
-        if not (home / one.name).exists():
-            return f"move {one} into {home}", move(one, home / one.name)
+        if not (home / chosen_folder.name).exists():
+            return f"move {chosen_folder} into {home}", move(chosen_folder, home / chosen_folder.name)
     changed = (
         content.replace(b"right", b"left_", 1).replace(b"correct", b"wrong__", 1).replace(b'": 0', b'": 1', 1)
     )
@@ -134,11 +138,11 @@ def assert_none_silent(name: Path, folder: Path, seeds: range) -> None:
     before, verdicts, wrong = tables_of(name), Counter[str](), list[str]()
     for seed in seeds:
         words, undo = change(folder, Random(seed))
-        seen = verdict(name, before)
+        verdict_text = verdict(name, before)
         undo()
-        verdicts[seen.partition(" ")[0]] += 1
-        if seen not in ("same", "error"):
-            wrong.append(f"seed {seed}: {words}: {seen}")
+        verdicts[verdict_text.partition(" ")[0]] += 1
+        if verdict_text not in ("same", "error"):
+            wrong.append(f"seed {seed}: {words}: {verdict_text}")
     print(f"{len(seeds)} changes of {folder.name}: {dict(verdicts)}", flush=True)
     assert not wrong, "\n".join(wrong)
     assert tables_of(name) == before, "a change was not undone"
@@ -165,11 +169,11 @@ def assert_no_zip_is_silent(archive: Path, folder: Path, seeds: range) -> None:
             del changed[draw.randrange(len(changed)) :]
         file = folder / f"changed-{seed}.zip"  # an unpacked archive is kept by its name
         file.write_bytes(changed)
-        seen = verdict(file, before)
+        verdict_text = verdict(file, before)
         file.unlink()
-        verdicts[seen.partition(" ")[0]] += 1
-        if seen not in ("same", "error"):
-            wrong.append(f"seed {seed}, byte {start}: {seen}")
+        verdicts[verdict_text.partition(" ")[0]] += 1
+        if verdict_text not in ("same", "error"):
+            wrong.append(f"seed {seed}, byte {start}: {verdict_text}")
     print(f"{len(seeds)} changes of a zip file: {dict(verdicts)}", flush=True)
     assert not wrong, "\n".join(wrong)
 

@@ -30,23 +30,26 @@ def test_two_nodes_of_which_one_is_lost_give_the_numbers_of_this_process(
 ) -> None:
     (tmp_path / "here").mkdir()
     (tmp_path / "there").mkdir()
-    here, there = small_study(tmp_path / "here", small_suite), small_study(tmp_path / "there", small_suite)
-    assert conduct_study(plan_study(load_study(here))) == []
+    local_study, remote_study = (
+        small_study(tmp_path / "here", small_suite),
+        small_study(tmp_path / "there", small_suite),
+    )
+    assert conduct_study(plan_study(load_study(local_study))) == []
 
     def lose(nodes: TwoNodes) -> int:
-        wait_for(lambda: nodes.is_playing() and _committed(there))
+        wait_for(lambda: nodes.is_playing() and _committed(remote_study))
         nodes.lose_the_second()
-        return _committed(there)
+        return _committed(remote_study)
 
     with two_nodes() as nodes, ThreadPoolExecutor(1) as thread:
-        kept = thread.submit(lose, nodes)
+        committed = thread.submit(lose, nodes)
         # The lost worker may still wait for its first model, while the one on the other node plays.
         with pytest.warns(
             WorkerLostWarning, match=r"of the Ray cluster.* is lost: .*; (the model it held|it held no)"
         ):
-            assert conduct_study(plan_study(load_study(there)), ray=nodes.address) == []
-    assert 0 < kept.result() < 4 * 24
-    check_same_bytes(there, here)
+            assert conduct_study(plan_study(load_study(remote_study)), ray=nodes.address) == []
+    assert 0 < committed.result() < 4 * 24
+    check_same_bytes(remote_study, local_study)
 
 
 def _committed(file: Path) -> int:

@@ -58,17 +58,19 @@ def is_in(path: str, field: str) -> bool:
     return path == field or path.startswith((f"{field}.", f"{field}["))
 
 
-@pytest.mark.parametrize(("old", "new", "said"), MISTAKES, ids=[new.strip()[:40] for _, new, _ in MISTAKES])
+@pytest.mark.parametrize(
+    ("old", "new", "mistake_path"), MISTAKES, ids=[new.strip()[:40] for _, new, _ in MISTAKES]
+)
 def test_a_mistake_is_named_with_its_path_and_nothing_else_is_raised(
-    tmp_path: Path, old: str, new: str, said: str
+    tmp_path: Path, old: str, new: str, mistake_path: str
 ) -> None:
     text = changed((old, new))
     file = written(tmp_path, text)
     with pytest.raises(StudyFileError) as caught:
         load_study(file)
-    (field,) = fields_at(text, "# here") or fields_at(text, ELSEWHERE[said])[:1]
+    (field,) = fields_at(text, "# here") or fields_at(text, ELSEWHERE[mistake_path])[:1]
     mistakes = dict(zip(str(caught.value).splitlines(), caught.value.mistakes, strict=True))
-    paths = [mistake.field for line, mistake in mistakes.items() if said in line]
+    paths = [mistake.field for line, mistake in mistakes.items() if mistake_path in line]
     assert any(is_in(path, field) for path in paths), (field, str(caught.value))
     assert all(line == f"{file}: {mistake.field}: {mistake.text}" for line, mistake in mistakes.items())
     assert caught.value.exit_code == 2
@@ -116,7 +118,7 @@ def test_wrong_values_are_said_together_before_names_are_looked_at(tmp_path: Pat
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "reason"),
     [
         ("a = = 1", "line 1, column 5.*must be TOML"),
         ("schema = 1\nschema = 1", "overwrite.*must be TOML"),
@@ -126,8 +128,8 @@ def test_wrong_values_are_said_together_before_names_are_looked_at(tmp_path: Pat
     ],
     ids=["no value", "a key twice", "an open list", "nothing", "deep"],
 )
-def test_what_is_no_toml_or_says_nothing_is_refused(tmp_path: Path, text: str, said: str) -> None:
-    with pytest.raises(UsageError, match=said):
+def test_what_is_no_toml_or_says_nothing_is_refused(tmp_path: Path, text: str, reason: str) -> None:
+    with pytest.raises(UsageError, match=reason):
         load_study(written(tmp_path, text))
     with pytest.raises(UsageError, match="the package has embedded, paper"):
         load_study(tmp_path / "other.toml")
@@ -191,11 +193,15 @@ def test_a_byte_of_a_checkpoint_makes_other_runs_of_its_model(tmp_path: Path) ->
 
 def test_a_condition_captures_a_number_of_inferences_or_all(tmp_path: Path) -> None:
     dark = "light_level = 0.7"
-    for said, kept in (("3", 3), ('"all"', "all")):
-        text = changed((dark, f'{dark}\ncaptured_calls = {said}\nlater_views = "mean"'))
-        (cell,) = (one for one in load_study(written(tmp_path, text)).cells if one.name == "base/dark")
+    for toml_value, expected in (("3", 3), ('"all"', "all")):
+        text = changed((dark, f'{dark}\ncaptured_calls = {toml_value}\nlater_views = "mean"'))
+        (cell,) = (
+            study_cell
+            for study_cell in load_study(written(tmp_path, text)).cells
+            if study_cell.name == "base/dark"
+        )
         assert isinstance(cell.settings, ExtractSettings)
-        assert (cell.settings.capture.captured_calls, cell.settings.capture.later_views) == (kept, "mean")
+        assert (cell.settings.capture.captured_calls, cell.settings.capture.later_views) == (expected, "mean")
 
 
 CAPTURED = """
@@ -216,12 +222,12 @@ def test_a_control_is_in_the_same_condition_or_captured_in_the_same_scene(tmp_pa
     assert control_of(study.study, study.cells, cells["base/plain"]) == cells["random/plain"]
     assert control_of(study.study, study.cells, cells["random/plain"]) is None
     main = 'models = ["base", "state", "random", "random-state"]'
-    others = (main, 'models = ["base", "state"]'), ('controls = ["', 'controls = ["untrained", "')
-    alike = written(tmp_path, changed(others[0]) + CAPTURED.format(scene=""))
+    other_changes = (main, 'models = ["base", "state"]'), ('controls = ["', 'controls = ["untrained", "')
+    alike = written(tmp_path, changed(other_changes[0]) + CAPTURED.format(scene=""))
     study = load_study(alike)
     cells = {cell.name: cell for cell in study.cells}
     assert control_of(study.study, study.cells, cells["state/plain"]) == cells["random-state/captured"]
-    elsewhere = written(tmp_path, changed(others[0]) + CAPTURED.format(scene="light_level = 0.5"))
+    elsewhere = written(tmp_path, changed(other_changes[0]) + CAPTURED.format(scene="light_level = 0.5"))
     with pytest.raises(StudyFileError, match="'random', the control of base/plain, has no run in the same scene"):
         load_study(elsewhere)
 
@@ -236,7 +242,7 @@ def test_seeds_and_wordings_multiply_episodes(tmp_path: Path) -> None:
     assert (episodes["base/plain"], episodes["base/plain/seed 7"], episodes["base/dark"]) == (96, 96, 96)
     places = {cell.location("out") for cell in study.cells}
     assert len(places) == len(study.cells)
-    assert any(place.startswith("out/base/plain-seed7-") for place in places)
+    assert any(folder_name.startswith("out/base/plain-seed7-") for folder_name in places)
 
 
 # -- studies of the package --------------------------------------------------------------------------------------
@@ -257,10 +263,12 @@ def test_the_papers_study_is_41_runs_of_107_440_episodes(monkeypatch: pytest.Mon
     }
     assert list(plan.skipped()) == ["pi0-paraphrases", "pi0-distill"]
     assert len(plan.study.study.models) == 20
-    scenes = {one.cell.settings.scene.name for one in plan.cells}
+    scenes = {planned_run.cell.settings.scene.name for planned_run in plan.cells}
     assert scenes == {"act2answer"}  # policies and VLMs: else they would see other frames
     checkpoints = {
-        one.cell.model: one.cell.settings.model.checkpoint for one in plan.cells if one.cell.way == "plain"
+        planned_run.cell.model: planned_run.cell.settings.model.checkpoint
+        for planned_run in plan.cells
+        if planned_run.cell.way == "plain"
     }
     assert checkpoints["openvla"] == "openvla/openvla-7b"
     assert checkpoints["openvla-sft"] == "gen-robot/openvla-7b-rlvla-sft_16k"

@@ -25,38 +25,38 @@ from probe_kit.study import LoadedStudy, load_study, make_figures, make_table, w
 from probe_kit.study.rates import caption, domain_scores, score_table, success_table, vlm_table
 from probe_kit.study.report import draw_overview
 from probe_kit.study.tables import difference_table, stages_table
-from tests.retention.asked_runs import SaidRun, acted, asked, probes
+from tests.retention.asked_runs import SaidRun, acted, answer_run, probes
 from tests.view.payload_reader import read_payload
 
 
 def test_stages_count_items_that_are_right_in_both_layouts(tmp_path: Path) -> None:
     draw = np.random.default_rng(3)
-    known, used = draw.random((20, 2)) < 0.8, draw.random((20, 2)) < 0.6
-    vlm, policy = asked(tmp_path, {"color": known}), acted(tmp_path, {"color": used})
+    vlm_hits, used = draw.random((20, 2)) < 0.8, draw.random((20, 2)) < 0.6
+    vlm, policy = answer_run(tmp_path, {"color": vlm_hits}), acted(tmp_path, {"color": used})
     bare = stages_table([match_runs(scored(vlm, "text"), policy)])
     (row,) = bare.texts
-    assert row[1:6] == ("Color", "20", str(int(known.all(axis=1).sum())), "–", str(int(used.all(axis=1).sum())))
+    assert row[1:6] == ("Color", "20", str(int(vlm_hits.all(axis=1).sum())), "–", str(int(used.all(axis=1).sum())))
     with_probes = stages_table([match_runs(scored(vlm, "text"), policy, probes(policy, {"color": [0.9, 0.5]}))])
     (number,) = with_probes.numbers
     assert number["encoded"] is not None
     assert number["answered_and_encoded"] <= min(number["answered"], number["encoded"])
-    (shown,) = with_probes.texts
-    assert shown[6] == str(number["answered_and_encoded"])
-    assert shown[7].startswith(f"{100 * number['share_not_acted_on']:.1f} [")
+    (cells,) = with_probes.texts
+    assert cells[6] == str(number["answered_and_encoded"])
+    assert cells[7].startswith(f"{100 * number['share_not_acted_on']:.1f} [")
 
 
 def test_stages_show_no_encoded_items_where_probes_have_no_signal(tmp_path: Path) -> None:
     draw = np.random.default_rng(3)
-    known, used = ({name: draw.random((20, 2)) < 0.8 for name in ("color", "shape")} for _ in range(2))
-    vlm, policy = asked(tmp_path, known), acted(tmp_path, used)
-    found = probes(policy, {"color": [0.95], "shape": [0.5]}, null_top=0.75)
-    made = stages_table([match_runs(scored(vlm, "text"), policy, found)])
-    color, shape, whole = made.texts
+    vlm_hits, used = ({name: draw.random((20, 2)) < 0.8 for name in ("color", "shape")} for _ in range(2))
+    vlm, policy = answer_run(tmp_path, vlm_hits), acted(tmp_path, used)
+    probe_results = probes(policy, {"color": [0.95], "shape": [0.5]}, null_top=0.75)
+    table = stages_table([match_runs(scored(vlm, "text"), policy, probe_results)])
+    color, shape, total = table.texts
     assert shape[4:] == ("not shown", shape[5], "–", "–")
-    assert whole[4] == color[4]
-    assert whole[6:] == color[6:]
-    assert "probes are not shown to exceed chance" in "; ".join(made.notes)
-    assert [number["encoded"] for number in made.numbers][1:] == [None, int(color[4])]
+    assert total[4] == color[4]
+    assert total[6:] == color[6:]
+    assert "probes are not shown to exceed chance" in "; ".join(table.notes)
+    assert [number["encoded"] for number in table.numbers][1:] == [None, int(color[4])]
 
 
 RIGHT = {"emotion": 0.5, "color": 0.9, "shape": 0.7, "traffic": 0.2}
@@ -67,25 +67,34 @@ def drawn(names: list[str], items: int = 20, seed: int = 0) -> list[SaidRun]:
     draw = np.random.default_rng(seed)
     right = [{category: draw.random((items, 2)) < share for category, share in RIGHT.items()} for _ in names]
     return [
-        replace(acted(Path("/made") / name, one, name), path=Path("/made") / name)
-        for name, one in zip(names, right, strict=True)
+        replace(acted(Path("/made") / name, hits, name), path=Path("/made") / name)
+        for name, hits in zip(names, right, strict=True)
     ]
 
 
 def test_domains_of_several_categories_have_the_mean_of_their_category_means() -> None:
     table = retention_table(drawn(["one", "two"]), pairs=())
-    made = success_table(table)
-    assert made.columns == (
+    printed_table = success_table(table)
+    assert printed_table.columns == (
         "system", "Emotion", "Color", "Shape", "physical", "Traffic", "mean", "score",
     )  # fmt: skip
-    assert [one.group for one in made.headings] == ["", "social", *["physical"] * 3, "normative", "", ""]
+    assert [heading.group for heading in printed_table.headings] == [
+        "",
+        "social",
+        *["physical"] * 3,
+        "normative",
+        "",
+        "",
+    ]
     rates = {row.category: row.success.sr or 0 for row in table.rows if row.run.label == "one"}
-    shown = dict(zip(made.columns, made.texts[0], strict=True))
-    assert shown["physical"] == f"{50 * (rates['color'] + rates['shape']):.1f}"
-    assert shown["score"] == f"{200 * (fmean(rates.values()) - 0.5):.2f}"
-    (number,) = [one for one in made.numbers if one["system"] == "one" and one.get("categories")]
+    cell_by_heading = dict(zip(printed_table.columns, printed_table.texts[0], strict=True))
+    assert cell_by_heading["physical"] == f"{50 * (rates['color'] + rates['shape']):.1f}"
+    assert cell_by_heading["score"] == f"{200 * (fmean(rates.values()) - 0.5):.2f}"
+    (number,) = [
+        record for record in printed_table.numbers if record["system"] == "one" and record.get("categories")
+    ]
     assert (number["domain"], number["sr"]) == ("physical", pytest.approx((rates["color"] + rates["shape"]) / 2))
-    assert "outcome rule disc; 40 episodes per category" in "; ".join(made.notes)
+    assert "outcome rule disc; 40 episodes per category" in "; ".join(printed_table.notes)
 
 
 def test_a_caption_says_rule_call_and_episodes_of_what_is_in_the_table() -> None:
@@ -95,12 +104,12 @@ def test_a_caption_says_rule_call_and_episodes_of_what_is_in_the_table() -> None
     def changed(row: RetentionRow, call: int | None = None, **success: Any) -> RetentionRow:
         return replace(row, run=replace(row.run, call=call), success=replace(row.success, **success))
 
-    first, *others = table.rows
-    of_calls = replace(table, rows=(changed(first, 2), *(changed(row, 0) for row in others)))
+    first, *other_rows = table.rows
+    of_calls = replace(table, rows=(changed(first, 2), *(changed(row, 0) for row in other_rows)))
     assert caption(of_calls, []) == "outcome rule disc; captured inference 0, 2; 40 episodes per category"
     at_first = replace(table, rows=tuple(changed(row, 0) for row in table.rows))
     assert caption(at_first, []) == "outcome rule disc; 40 episodes per category"
-    uneven = replace(table, rows=(changed(first, n_episodes=12), *others))
+    uneven = replace(table, rows=(changed(first, n_episodes=12), *other_rows))
     assert caption(uneven, []) == "outcome rule disc; 12 to 40 episodes per category"
     never_acted = replace(table, rows=tuple(changed(row, sr=None) for row in table.rows))
     assert caption(never_acted, []) == "40 episodes per category"
@@ -116,57 +125,59 @@ def test_latex_spans_domains() -> None:
 
 def test_fewer_than_ten_groups_have_no_p_and_no_part_in_holms_correction() -> None:
     """Twenty items are ten groups in a category; eighteen are nine."""
-    one, two = drawn(["one", "two"])
+    first, two = drawn(["one", "two"])
     nine = two.episodes[~((two.episodes["category"] == "color") & two.episodes["group_id"].str.endswith("-9"))]
-    made = difference_table(retention_table([one, replace(two, episodes=nine)]), "compared")
-    p = {number["category"]: number["p"] for number in made.numbers}
+    differences = difference_table(retention_table([first, replace(two, episodes=nine)]), "compared")
+    p = {number["category"]: number["p"] for number in differences.numbers}
     assert p["color"] is None
     assert None not in (p["emotion"], p["shape"], p["traffic"], p["mean"])
-    known = [(number["p"], number["p_holm"]) for number in made.numbers if number["category"] in RIGHT]
-    assert holm([own for own, _ in known]) == [corrected for _, corrected in known]
-    assert "no p with fewer than 10 independent groups of items" in "; ".join(made.notes)
-    assert dict(zip(p, (cells[4] for cells in made.texts), strict=True))["color"] == "18 of 20"
+    p_values = [(number["p"], number["p_holm"]) for number in differences.numbers if number["category"] in RIGHT]
+    assert holm([raw_p for raw_p, _ in p_values]) == [corrected for _, corrected in p_values]
+    assert "no p with fewer than 10 independent groups of items" in "; ".join(differences.notes)
+    assert dict(zip(p, (cells[4] for cells in differences.texts), strict=True))["color"] == "18 of 20"
     assert sum(value is not None for value in p.values()) == 4
 
 
 def test_less_than_four_fifths_of_the_items_in_common_is_marked() -> None:
-    one, two = drawn(["one", "two"], items=30)
-    kept = two.episodes["group_id"].str.rsplit("-", n=1).str[-1].astype(int) < 11
-    made = difference_table(retention_table([one, replace(two, episodes=two.episodes[kept])]), "compared")
-    assert {cells[4] for cells in made.texts} == {"22 of 30 !", "88 of 120 !"}
-    assert "! fewer than 80 % of the items in common" in "; ".join(made.notes)
+    first, two = drawn(["one", "two"], items=30)
+    is_common = two.episodes["group_id"].str.rsplit("-", n=1).str[-1].astype(int) < 11
+    differences = difference_table(
+        retention_table([first, replace(two, episodes=two.episodes[is_common])]), "compared"
+    )
+    assert {cells[4] for cells in differences.texts} == {"22 of 30 !", "88 of 120 !"}
+    assert "! fewer than 80 % of the items in common" in "; ".join(differences.notes)
 
 
 def test_numbers_from_elsewhere_stand_beside_the_score_with_their_source() -> None:
-    one, two = drawn(["one", "two"])
-    table = retention_table([one, two], pairs=())
-    made = score_table(table, "LIBERO %", "a paper", {str(one.location): 76.5})
-    assert made.columns[-1] == "LIBERO %"
-    assert [cells[-1] for cells in made.texts] == ["76.5", "–"]
-    assert "LIBERO %: not measured here, from a paper" in "; ".join(made.notes)
+    first, two = drawn(["one", "two"])
+    table = retention_table([first, two], pairs=())
+    scores = score_table(table, "LIBERO %", "a paper", {str(first.location): 76.5})
+    assert scores.columns[-1] == "LIBERO %"
+    assert [cells[-1] for cells in scores.texts] == ["76.5", "–"]
+    assert "LIBERO %: not measured here, from a paper" in "; ".join(scores.notes)
     (mean, _) = table.means
     assert mean.success.ci is not None
     limits = [(end or 0) * 200 - 100 for end in mean.success.ci]
-    assert made.numbers[0]["score_ci"] == pytest.approx(limits)
+    assert scores.numbers[0]["score_ci"] == pytest.approx(limits)
 
 
 def test_vlms_are_listed_by_prompt_and_size_of_the_picture(tmp_path: Path) -> None:
     right = {"color": np.ones((20, 2), bool)}
-    run = asked(tmp_path, right, prompt="p2", picture_size="560x480")
-    made = vlm_table(retention_table([run], pairs=()))
-    assert made.columns == ("system", "prompt", "picture", "Color", "mean")
-    assert made.texts[0][1:3] == ("p2", "560x480")
+    run = answer_run(tmp_path, right, prompt="p2", picture_size="560x480")
+    table = vlm_table(retention_table([run], pairs=()))
+    assert table.columns == ("system", "prompt", "picture", "Color", "mean")
+    assert table.texts[0][1:3] == ("p2", "560x480")
 
 
 def test_a_rate_whose_interval_and_range_of_guessing_disagree_is_marked() -> None:
     """Items of a group that answer alike widen the one and the other by different rules."""
     table = retention_table(drawn(["one"]), pairs=())
     rows = [replace(row, success=replace(row.success, ci=(0.51, 0.9))) for row in table.rows]
-    made = success_table(replace(table, rows=rows))
-    shown = dict(zip(made.columns, made.texts[0], strict=True))
-    assert shown["Emotion"].endswith(" *")
-    assert not shown["Color"].endswith("*")
-    assert "disagree about 50 %" in "; ".join(made.notes)
+    printed_table = success_table(replace(table, rows=rows))
+    cell_by_heading = dict(zip(printed_table.columns, printed_table.texts[0], strict=True))
+    assert cell_by_heading["Emotion"].endswith(" *")
+    assert not cell_by_heading["Color"].endswith("*")
+    assert "disagree about 50 %" in "; ".join(printed_table.notes)
 
 
 @pytest.mark.slow
@@ -174,13 +185,13 @@ def test_without_a_name_all_tables_are_printed_and_their_tests_are_counted(
     played: LoadedStudy, tmp_path: Path
 ) -> None:
     run = CliRunner()
-    shown = run.invoke(app, ["study", "table", str(played.file)])
-    assert shown.exit_code == 0, shown.output
+    result = run.invoke(app, ["study", "table", str(played.file)])
+    assert result.exit_code == 0, result.output
     for title in ("Success rate %", "Success rate % by side and layout", "Normalised score", "light"):
-        assert title in shown.stdout
-    assert "4 tables with 0 tests" in shown.stderr, "two items are too few for any"
-    found = json.loads(run.invoke(app, ["study", "table", str(played.file), "--format", "json"]).stdout)
-    assert list(found) == ["main", "sides", "score", "light"]
+        assert title in result.stdout
+    assert "4 tables with 0 tests" in result.stderr, "two items are too few for any"
+    answer = json.loads(run.invoke(app, ["study", "table", str(played.file), "--format", "json"]).stdout)
+    assert list(answer) == ["main", "sides", "score", "light"]
     file = tmp_path / "drift.toml"
     drift = '[drift.one]\npairs = [["expert", "idle"]]\n[tables.drift]\nkind = "drift"\ndrift = "one"\n'
     file.write_text(f"{played.file.read_text(encoding='utf-8')}{drift}", encoding="utf-8")
@@ -216,8 +227,8 @@ def test_a_report_is_one_page_with_state_tables_figures_and_the_file(played: Loa
     text = text.replace('label = "Idle"', 'label = "<b>Idle & 5 %</b>"')
     file.write_text(text, encoding="utf-8")
     before = file_times(Path(played.study.folder))
-    made = run.invoke(app, ["study", "table", str(file), "--html", str(page)])
-    assert made.exit_code == 0, made.output
+    result = run.invoke(app, ["study", "table", str(file), "--html", str(page)])
+    assert result.exit_code == 0, result.output
     html = page.read_text(encoding="utf-8")
     made_of = (
         "table-main",
@@ -256,20 +267,20 @@ def test_a_dry_run_finds_changed_bytes_and_runs_that_the_file_does_not_use(
     text = played.file.read_text(encoding="utf-8").replace(played.study.folder, str(out))
     file.write_text(text, encoding="utf-8")
     words = ["study", "run", str(file), "--dry-run", "--exit-code", "--json", "--verify", "--orphans"]
-    whole = run.invoke(app, words)
-    assert whole.exit_code == 0, whole.output
-    found = json.loads(whole.stdout)
-    assert (found["problems"], found["orphans"]) == ({}, [])
+    intact = run.invoke(app, words)
+    assert intact.exit_code == 0, intact.output
+    answer = json.loads(intact.stdout)
+    assert (answer["problems"], answer["orphans"]) == ({}, [])
     (commit, *_) = sorted(out.glob("expert/*/data.zarr/trajectory/c/1/*/*"))
     commit.write_bytes(commit.read_bytes()[:-1] + b"?")
     assert run.invoke(app, words[:-2]).exit_code == 0, "what is not read is not compared"
     file.write_text(text.replace("light_level = 0.7", "light_level = 0.6"), encoding="utf-8")
     changed = run.invoke(app, words)
     assert changed.exit_code == 1
-    found = json.loads(changed.stdout)
-    assert list(found["problems"]) == ["expert/short"]
-    assert "has other bytes than were written" in found["problems"]["expert/short"][0]
-    assert [Path(place).name.partition("-")[0] for place in found["orphans"]] == ["dark"]
+    answer = json.loads(changed.stdout)
+    assert list(answer["problems"]) == ["expert/short"]
+    assert "has other bytes than were written" in answer["problems"]["expert/short"][0]
+    assert [Path(orphan).name.partition("-")[0] for orphan in answer["orphans"]] == ["dark"]
 
 
 def file_times(folder: Path) -> dict[Path, int]:
@@ -284,8 +295,8 @@ def test_the_viewer_opens_every_stored_run_of_a_study(played: LoadedStudy, tmp_p
     data = Path(answer.stdout.strip()).parent / "data"
     _, index = read_payload((data / "index.js").read_bytes())
     cells = [Path(cell.folder).name for cell in played.cells]
-    assert [one["key"] for one in index["runs"]] == cells
-    assert [one["episodes"] for one in index["runs"]] == [cell.episodes for cell in played.cells]
+    assert [record["key"] for record in index["runs"]] == cells
+    assert [record["episodes"] for record in index["runs"]] == [cell.episodes for cell in played.cells]
     for cell, key in zip(played.cells, cells, strict=True):
         assert read_payload((data / key / "run.js").read_bytes())[1]["model"] == cell.settings.model.family
 
@@ -304,10 +315,10 @@ def test_the_overview_has_a_panel_per_domain_and_a_bar_per_system_on_one_scale(t
         "normative": {"one": -100.0, "two": -100.0},
     }
     figure = draw_overview(table)
-    shown = [axes for axes in figure.axes if axes.get_visible()]
-    assert [axes.get_title(loc="left") for axes in shown] == ["physical", "normative"]
-    assert {axes.get_xlim() for axes in shown} == {(-105.0, 105.0)}
-    bars = [[p.get_width() for p in axes.patches if isinstance(p, Rectangle)] for axes in shown]
+    visible = [axes for axes in figure.axes if axes.get_visible()]
+    assert [axes.get_title(loc="left") for axes in visible] == ["physical", "normative"]
+    assert {axes.get_xlim() for axes in visible} == {(-105.0, 105.0)}
+    bars = [[p.get_width() for p in axes.patches if isinstance(p, Rectangle)] for axes in visible]
     assert bars == [[50.0, 50.0], [-100.0, -100.0]]
 
 
@@ -325,21 +336,21 @@ def test_the_overview_says_what_has_no_episodes_and_takes_names_as_they_are(tmp_
 @pytest.mark.slow
 def test_figures_are_drawn_by_name_from_stored_runs(played: LoadedStudy, tmp_path: Path) -> None:
     out = tmp_path / "figures"
-    made = CliRunner().invoke(app, ["study", "figure", str(played.file), "sides", "--out", str(out)])
-    assert made.exit_code == 0, made.output
+    result = CliRunner().invoke(app, ["study", "figure", str(played.file), "sides", "--out", str(out)])
+    assert result.exit_code == 0, result.output
     assert sorted(path.name for path in out.iterdir()) == ["sides.pdf", "sides.png"]
-    assert made.stdout.strip() == str(out / "sides.png")
+    assert result.stdout.strip() == str(out / "sides.png")
 
 
 @pytest.mark.parametrize(
-    ("name", "said"),
+    ("name", "reason"),
     [
         ("dose", "was steered. Steer one with `probe-kit intervene"),
         ("overveiw", "unknown figure 'overveiw'; known: overview, .* Did you mean 'overview'"),
     ],
 )
 def test_what_no_run_has_is_named_with_the_command_that_makes_it(
-    played: LoadedStudy, name: str, said: str
+    played: LoadedStudy, name: str, reason: str
 ) -> None:
-    with pytest.raises(UsageError, match=said):
+    with pytest.raises(UsageError, match=reason):
         make_figures(played, name)

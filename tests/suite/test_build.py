@@ -25,9 +25,9 @@ def test_two_builds_are_equal_byte_for_byte(tmp_path: Path) -> None:
 
 
 def test_another_seed_gives_other_items(tmp_path: Path) -> None:
-    one = build_suite(tmp_path / "one", ["color"], 4, seed=0)
+    first = build_suite(tmp_path / "one", ["color"], 4, seed=0)
     other = build_suite(tmp_path / "other", ["color"], 4, seed=1)
-    assert not {item.item_id for item in one.items} & {item.item_id for item in other.items}
+    assert not {item.item_id for item in first.items} & {item.item_id for item in other.items}
 
 
 @pytest.mark.slow
@@ -143,20 +143,20 @@ def test_two_builders_of_one_suite_at_once_both_get_it(tmp_path: Path) -> None:
             tmp_path / "suite",
             ["color"],
             40,
-            progress=lambda done, total: both_are_about_to_write.wait() if done == total else None,
+            progress=lambda finished, total: both_are_about_to_write.wait() if finished == total else None,
         )
 
     with ThreadPoolExecutor(2) as pool:
-        one, other = pool.submit(build), pool.submit(build)
-    assert one.result() == other.result()
+        first, other = pool.submit(build), pool.submit(build)
+    assert first.result() == other.result()
     assert [path.name for path in tmp_path.iterdir()] == ["suite"]
 
 
 def test_the_default_suite_is_built_once_and_then_loaded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PROBE_KIT_CACHE", str(tmp_path))
     built: list[int] = []
-    first = default_suite(["color"], 4, progress=lambda done, _: built.append(done))
-    again = default_suite(["color"], 4, progress=lambda done, _: built.append(done))
+    first = default_suite(["color"], 4, progress=lambda finished, _: built.append(finished))
+    again = default_suite(["color"], 4, progress=lambda finished, _: built.append(finished))
     assert first == again
     assert built == [2, 4]
     assert first.folder.parent == tmp_path / "suites"
@@ -193,8 +193,8 @@ def test_other_code_that_draws_or_words_is_another_suite_in_the_cache(
     before = default_suite(["color"], 2).folder
     read = Path.read_text
 
-    def edited(path: Path, *arguments: Any, **named: Any) -> str:
-        text = read(path, *arguments, **named)
+    def edited(path: Path, *arguments: Any, **options: Any) -> str:
+        text = read(path, *arguments, **options)
         return f"{text}\n# edited" if path.match(f"probe_kit/suite/{source}") else text
 
     monkeypatch.setattr(Path, "read_text", edited)

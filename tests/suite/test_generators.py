@@ -26,7 +26,7 @@ from probe_kit.suite.generators.drawing import (
     Points,
     background_for,
     color_icon,
-    jittered,
+    jitter,
     lightness,
     mask_icon,
 )
@@ -65,7 +65,9 @@ FEW_QUESTIONS = {"emotion": 54, "attribute": 36, "state": 36, "symmetry": 2, "co
 @pytest.mark.parametrize("category", list(GENERATORS))
 def test_there_are_at_least_150_items_without_repeating_a_question(category: str) -> None:
     questions = {
-        (asked.phrase, other.name) for a, b in GENERATORS[category].pairs for asked, other in ((a, b), (b, a))
+        (asked_concept.phrase, other.name)
+        for a, b in GENERATORS[category].pairs
+        for asked_concept, other in ((a, b), (b, a))
     }
     assert len(set(GENERATORS[category].pairs)) == len(GENERATORS[category].pairs)
     if category in FEW_QUESTIONS:
@@ -132,9 +134,9 @@ def test_shape_never_pairs_outlines_that_look_alike() -> None:
 
 
 def test_shape_asks_for_fourteen_outlines_and_not_for_the_right_triangle() -> None:
-    asked = {concept.name for pair in GENERATORS["shape"].pairs for concept in pair}
-    assert len(asked) == 14
-    assert "right triangle" not in asked
+    outlines = {concept.name for pair in GENERATORS["shape"].pairs for concept in pair}
+    assert len(outlines) == 14
+    assert "right triangle" not in outlines
 
 
 def test_the_colour_and_style_of_a_shape_say_nothing_about_it() -> None:
@@ -156,10 +158,10 @@ def test_counting_draws_as_many_glyphs_as_it_says_and_the_same_kind_on_both_side
 
 def test_glyphs_do_not_overlap_and_stay_on_the_tile() -> None:
     for tile in tiles("counting", 120):
-        for number, one in enumerate(tile.placements):
-            assert max(abs(one.x), abs(one.y)) + one.scale < 1
+        for number, placement in enumerate(tile.placements):
+            assert max(abs(placement.x), abs(placement.y)) + placement.scale < 1
             for other in tile.placements[number + 1 :]:
-                assert np.hypot(one.x - other.x, one.y - other.y) > one.scale + other.scale
+                assert np.hypot(placement.x - other.x, placement.y - other.y) > placement.scale + other.scale
 
 
 def test_glyphs_are_at_least_a_fifth_of_the_tile() -> None:
@@ -248,13 +250,13 @@ def test_a_smaller_scale_never_makes_up_for_a_larger_level() -> None:
 
 @pytest.mark.slow
 def test_the_two_states_of_a_thing_look_different() -> None:
-    for thing in TWO_STATES:
+    for drawing in TWO_STATES:
         drawn = []
         for first in (True, False):
             canvas = Canvas((220, 220, 220))
-            thing.draw(canvas.pen(Placement(0.85, 0, 0, 0, False)), first, COLORS["blue"])
+            drawing.draw(canvas.pen(Placement(0.85, 0, 0, 0, False)), first, COLORS["blue"])
             drawn.append(np.asarray(canvas.picture().resize((48, 48)), np.float64))
-        assert np.abs(drawn[0] - drawn[1]).mean() > 3, thing.first
+        assert np.abs(drawn[0] - drawn[1]).mean() > 3, drawing.first
 
 
 # -- symmetry ----------------------------------------------------------------------------------------
@@ -278,9 +280,9 @@ def test_both_kinds_of_shapes_have_the_same_widths_on_either_side() -> None:
 
 
 def test_two_clocks_differ_in_one_hand_or_in_which_hand_is_which() -> None:
-    for one, other in GENERATORS["time"].pairs:
-        exchanged = one.minute == 5 * (other.hour % 12) and other.minute == 5 * (one.hour % 12)
-        assert (one.hour == other.hour) + (one.minute == other.minute) + exchanged >= 1
+    for first, other in GENERATORS["time"].pairs:
+        exchanged = first.minute == 5 * (other.hour % 12) and other.minute == 5 * (first.hour % 12)
+        assert (first.hour == other.hour) + (first.minute == other.minute) + exchanged >= 1
 
 
 def test_hands_never_hide_each_other() -> None:
@@ -318,9 +320,9 @@ def test_there_are_many_creatures_and_things() -> None:
 
 def test_a_whole_animal_never_stands_beside_a_face() -> None:
     view = {creature.name: creature.view for creature in CREATURES}
-    for one, other in GENERATORS["living-world"].pairs:
-        if one.name in view and other.name in view:
-            assert view[one.name] == view[other.name]
+    for first, other in GENERATORS["living-world"].pairs:
+        if first.name in view and other.name in view:
+            assert view[first.name] == view[other.name]
 
 
 def test_every_icon_is_in_the_sheets_that_are_shipped() -> None:
@@ -417,21 +419,21 @@ def test_outlines_cannot_be_changed_by_accident() -> None:
 @pytest.mark.parametrize("name", ["black", "white", "gray"])
 def test_a_colour_without_hue_stays_without_hue(name: str) -> None:
     rng = np.random.default_rng(0)
-    assert all(len(set(jittered(COLORS[name], rng))) == 1 for _ in range(200))
+    assert all(len(set(jitter(COLORS[name], rng))) == 1 for _ in range(200))
 
 
 def test_a_shade_stays_nearest_to_its_own_name() -> None:
     rng = np.random.default_rng(0)
     terms = np.array(list(COLORS.values()), np.float64)
     for number, color in enumerate(COLORS.values()):
-        shades = np.array([jittered(color, rng) for _ in range(200)])
+        shades = np.array([jitter(color, rng) for _ in range(200)])
         nearest = np.linalg.norm(shades[:, None] - terms, axis=2).argmin(axis=1)
         assert (nearest == number).all()
 
 
 def test_shades_differ() -> None:
     rng = np.random.default_rng(0)
-    assert len({jittered(COLORS["red"], rng) for _ in range(100)}) > 80
+    assert len({jitter(COLORS["red"], rng) for _ in range(100)}) > 80
 
 
 def test_backgrounds_are_pale_whatever_the_ink() -> None:

@@ -31,7 +31,7 @@ METADATA = Path("items", "metadata.jsonl")
 
 
 @pytest.fixture(scope="module")
-def place(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return Path(shutil.copytree(small_suite.folder, tmp_path_factory.mktemp("hostile") / "suite"))
 
 
@@ -46,27 +46,29 @@ def played(item: Item) -> tuple[object, ...]:
     return item.item_id, item.category, item.instruction, item.correct_side, item.group_id, item.wordings, pictures
 
 
-def restored(place: Path, original: Path) -> None:
+def restored(folder: Path, original: Path) -> None:
     for name in ("suite.json", METADATA):
-        shutil.copyfile(original / name, place / name)
+        shutil.copyfile(original / name, folder / name)
 
 
 @pytest.mark.slow
 @given(field=st.sampled_from(FIELDS), value=st.sampled_from(HOSTILE))
 @settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck), derandomize=True)
 def test_any_value_in_any_field_is_refused_by_name(
-    field: str, value: Any, place: Path, lines: list[str], small_suite: Suite
+    field: str, value: Any, folder: Path, lines: list[str], small_suite: Suite
 ) -> None:
-    restored(place, small_suite.folder)
+    restored(folder, small_suite.folder)
     record = json.loads(lines[2])
     record[field] = value
-    (place / METADATA).write_text("\n".join([*lines[:2], json.dumps(record), *lines[3:]]) + "\n", encoding="utf-8")
+    (folder / METADATA).write_text(
+        "\n".join([*lines[:2], json.dumps(record), *lines[3:]]) + "\n", encoding="utf-8"
+    )
     try:
-        loaded = load_suite(place)
+        loaded = load_suite(folder)
     except SuiteError as error:
-        said = str(error)
-        assert "metadata.jsonl:3" in said or "item" in said or "suite.json: content hash" in said
-        assert not UNSAFE.search(said)
+        message = str(error)
+        assert "metadata.jsonl:3" in message or "item" in message or "suite.json: content hash" in message
+        assert not UNSAFE.search(message)
     else:
         assert [played(item) for item in loaded.items] == [played(item) for item in small_suite.items]
         assert getattr(loaded.items[2], field) == value, "it is read as it was written"
@@ -77,20 +79,20 @@ def test_any_value_in_any_field_is_refused_by_name(
 @given(field=st.sampled_from(CARD), value=st.sampled_from(HOSTILE))
 @settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck), derandomize=True)
 def test_any_value_in_the_card_is_refused_or_changes_no_item(
-    field: str, value: Any, place: Path, small_suite: Suite
+    field: str, value: Any, folder: Path, small_suite: Suite
 ) -> None:
-    restored(place, small_suite.folder)
-    card = json.loads((place / "suite.json").read_text(encoding="utf-8"))
+    restored(folder, small_suite.folder)
+    card = json.loads((folder / "suite.json").read_text(encoding="utf-8"))
     card[field] = value
-    (place / "suite.json").write_text(json.dumps(card), encoding="utf-8")
+    (folder / "suite.json").write_text(json.dumps(card), encoding="utf-8")
     try:
-        loaded = load_suite(place)
+        loaded = load_suite(folder)
     except SuiteError as error:
         refused = str(error)
         assert not UNSAFE.search(refused)
     else:
         assert loaded.items == small_suite.items
-    answer = CliRunner().invoke(app, ["suite", "show", "--counts", str(place)])
+    answer = CliRunner().invoke(app, ["suite", "show", "--counts", str(folder)])
     assert answer.exit_code in (0, 1, 2), answer.output
     assert "InternalError" not in answer.output
 
@@ -131,14 +133,14 @@ def test_json_with_a_key_twice_is_none(text: str, words: str) -> None:
     ],
 )
 def test_lines_that_mean_two_things_or_nothing_are_refused(
-    part: str, by: str, words: str, place: Path, lines: list[str], small_suite: Suite
+    part: str, by: str, words: str, folder: Path, lines: list[str], small_suite: Suite
 ) -> None:
-    restored(place, small_suite.folder)
+    restored(folder, small_suite.folder)
     assert part in lines[2]
     changed = [*lines[:2], lines[2].replace(part, by, 1), *lines[3:]]
-    (place / METADATA).write_text("\n".join(changed) + "\n", encoding="utf-8")
+    (folder / METADATA).write_text("\n".join(changed) + "\n", encoding="utf-8")
     with pytest.raises(SuiteError, match=words):
-        load_suite(place)
+        load_suite(folder)
 
 
 def part(suite: Suite, keep: Callable[[Item], bool]) -> Suite:
@@ -168,31 +170,31 @@ def test_twins_put_every_baseline_at_exactly_one_half(honest: tuple[Baseline, ..
 def test_pictures_give_the_answer_away_if_only_one_polarity_is_asked(category: str, tmp_path: Path) -> None:
     suite = build_suite(tmp_path / "suite", [category], 100)
     always_more = part(suite, lambda item: item.polarity == "pos")
-    found = {baseline.name: baseline for baseline in run_baselines(always_more)}
-    assert not found["statistics"].ok or (category == "state" and not found["pixels"].ok)
+    baselines = {baseline.name: baseline for baseline in run_baselines(always_more)}
+    assert not baselines["statistics"].ok or (category == "state" and not baselines["pixels"].ok)
 
 
 @pytest.mark.slow
 def test_text_gives_the_answer_away_if_a_layout_is_tied_to_it(embedded: Suite) -> None:
     """Both layouts protect the text; the position baseline cannot leave one half either."""
     tied = part(embedded.select(["state"]), lambda item: (item.polarity == "pos") == (item.correct_side == "left"))
-    found = {b.name: b.accuracy for b in run_baselines(tied)}
-    assert found["instruction"] == found["position"] == 0.5
+    accuracy_by_baseline = {b.name: b.accuracy for b in run_baselines(tied)}
+    assert accuracy_by_baseline["instruction"] == accuracy_by_baseline["position"] == 0.5
 
 
 @pytest.mark.slow
 def test_folds_never_separate_layouts_or_twins(embedded: Suite, monkeypatch: pytest.MonkeyPatch) -> None:
     from probe_kit.suite import validate as baselines
 
-    made = []
+    splits = []
 
     def spy(*arguments: Any) -> Any:
-        made.append((arguments[1], assign_folds(*arguments)))
-        return made[-1][1]
+        splits.append((arguments[1], assign_folds(*arguments)))
+        return splits[-1][1]
 
     monkeypatch.setattr(baselines, "assign_folds", spy)
     run_baselines(embedded.select(["time"]))
-    ((groups, folds),) = made
+    ((groups, folds),) = splits
     for group in set(groups):
         assert len(set(folds[groups == group])) == 1
     assert len(set(folds)) == 5

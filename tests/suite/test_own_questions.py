@@ -34,14 +34,14 @@ def pictures(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def made(folder: Path, *lines: str, header: str = "instruction,correct,wrong,group,category") -> Suite:
+def build_from_rows(folder: Path, *lines: str, header: str = "instruction,correct,wrong,group,category") -> Suite:
     table = folder / "fruit.csv"
     table.write_text("\n".join((header, *lines)), encoding="utf-8")
     return suite_from_csv(table, folder / "suite", terms=TERMS)
 
 
 def test_a_six_picture_study_is_a_valid_suite(pictures: Path) -> None:
-    suite = made(
+    suite = build_from_rows(
         pictures,
         "Put the cube on the ripe banana,yellow.png,green.png,banana,ripe-fruit",
         '"Put the cube on the apple, not the pear",red.png,orange.png,,ripe-fruit',
@@ -56,8 +56,8 @@ def test_a_six_picture_study_is_a_valid_suite(pictures: Path) -> None:
     assert [item.object_phrase for item in suite.items] == ["ripe banana", "apple, not the pear", "plums"]
     assert [item.object_article for item in suite.items] == ["the", "the", "none"]
     for item, colour in zip(suite.items, ("yellow", "red", "purple"), strict=True):
-        seen = Image.open(item.picture(item.correct_side)).convert("RGB").getpixel((140, 130))
-        assert seen == Image.new("RGB", (1, 1), colour).getpixel((0, 0))
+        pixel = Image.open(item.picture(item.correct_side)).convert("RGB").getpixel((140, 130))
+        assert pixel == Image.new("RGB", (1, 1), colour).getpixel((0, 0))
 
 
 def test_questions_that_are_asked_both_ways_have_no_concept_that_is_always_right(pictures: Path) -> None:
@@ -67,15 +67,15 @@ def test_questions_that_are_asked_both_ways_have_no_concept_that_is_always_right
         Image.new("RGB", (80, 80), (20 * number, 255 - 20 * number, 90)).save(pictures / f"{name}.png")
     lines = [
         f"Put the cube on the {kind},{correct}.png,{wrong}.png,,ripeness"
-        for one, other in pairs
-        for kind, correct, wrong in (("ripe fruit", one, other), ("unripe fruit", other, one))
+        for first, other in pairs
+        for kind, correct, wrong in (("ripe fruit", first, other), ("unripe fruit", other, first))
     ]
-    both = validate_suite(made(pictures, *lines).folder)
+    both = validate_suite(build_from_rows(pictures, *lines).folder)
     assert not [str(finding) for finding in both.warnings if finding.rule == "W02"]
 
 
 def test_rows_of_a_group_or_with_a_common_picture_stay_together(pictures: Path) -> None:
-    suite = made(
+    suite = build_from_rows(
         pictures,
         "Put the cube on the banana,yellow.png,green.png,kitchen,a",
         "Put the cube on the apple,red.png,orange.png,kitchen,a",
@@ -100,16 +100,16 @@ def made_again(pictures: Path) -> Suite:
 
 
 def test_two_rows_over_the_same_pictures_that_ask_the_other_way_round_are_twins(pictures: Path) -> None:
-    suite = made(
+    suite = build_from_rows(
         pictures,
         "Put the cube on the banana,yellow.png,green.png",
         "Put the cube on the lime,green.png,yellow.png",
         header="instruction,correct,wrong",
     )
-    one, other = suite.items
-    assert one.pair_id == other.pair_id
-    assert one.left_pixels_sha256 == other.left_pixels_sha256
-    assert {one.correct_side, other.correct_side} == {"left", "right"}
+    first, other = suite.items
+    assert first.pair_id == other.pair_id
+    assert first.left_pixels_sha256 == other.left_pixels_sha256
+    assert {first.correct_side, other.correct_side} == {"left", "right"}
     names = [(item.target_concept, item.distractor_concept) for item in suite.items]
     assert names == [("banana", "lime"), ("lime", "banana")], "a picture has one name, whichever is asked for"
 
@@ -131,19 +131,19 @@ def test_a_table_that_cannot_be_used_is_refused_by_its_line(
     header: str, line: str, message: str, pictures: Path
 ) -> None:
     with pytest.raises(UsageError, match=rf"fruit\.csv,? .*{message}|fruit\.csv, {message}"):
-        made(pictures, line, header=header)
+        build_from_rows(pictures, line, header=header)
     assert not (pictures / "suite").exists()
 
 
 def test_the_same_question_twice_is_refused_with_both_lines(pictures: Path) -> None:
     line = "Put the cube on the banana,yellow.png,green.png,,"
     with pytest.raises(UsageError, match="lines 2 and 3"):
-        made(pictures, line, line)
+        build_from_rows(pictures, line, line)
 
 
 def test_the_same_question_with_opposite_answers_is_refused_with_both_lines(pictures: Path) -> None:
     with pytest.raises(UsageError, match="lines 2 and 4 are the same question with opposite answers"):
-        made(
+        build_from_rows(
             pictures,
             "Put the cube on the banana,yellow.png,green.png",
             "Put the cube on the lime,green.png,yellow.png",
@@ -153,7 +153,7 @@ def test_the_same_question_with_opposite_answers_is_refused_with_both_lines(pict
 
 
 def test_groups_are_texts_as_they_are_written_and_missing_ones_are_no_group(pictures: Path) -> None:
-    suite = made(
+    suite = build_from_rows(
         pictures,
         "Put the cube on the banana,yellow.png,green.png,5e882100,a",
         "Put the cube on the apple,red.png,orange.png,7e123400,a",
@@ -162,7 +162,7 @@ def test_groups_are_texts_as_they_are_written_and_missing_ones_are_no_group(pict
     assert len({item.group_id for item in suite.items}) == 3, "two infinite numbers, and none"
     for group in ("007", "7.0", "-"):
         with pytest.raises(UsageError, match=r"fruit\.csv, line 3, column"):
-            made(
+            build_from_rows(
                 pictures,
                 "Put it on a lime,green.png,red.png,7,a",
                 f"Put it on a plum,purple.png,brown.png,{group},a",
@@ -170,10 +170,12 @@ def test_groups_are_texts_as_they_are_written_and_missing_ones_are_no_group(pict
 
 
 def test_words_on_two_lines_are_two_words_and_a_heading_twice_is_refused(pictures: Path) -> None:
-    suite = made(pictures, '"Put the cube on the\nripe\u2028banana",yellow.png,green.png', header=NEEDED)
+    suite = build_from_rows(
+        pictures, '"Put the cube on the\nripe\u2028banana",yellow.png,green.png', header=NEEDED
+    )
     assert suite.items[0].instruction == "Put the cube on the ripe banana"
     with pytest.raises(UsageError, match="line 1 has the column 'correct' twice"):
-        made(pictures, "Put it on a lime,green.png,red.png,brown.png", header=f"{NEEDED},correct")
+        build_from_rows(pictures, "Put it on a lime,green.png,red.png,brown.png", header=f"{NEEDED},correct")
 
 
 @pytest.mark.parametrize(
@@ -186,7 +188,7 @@ def test_words_on_two_lines_are_two_words_and_a_heading_twice_is_refused(picture
 )
 def test_a_question_that_breaks_a_rule_writes_nothing(line: str, message: str, pictures: Path) -> None:
     with pytest.raises(SuiteError, match=message):
-        made(pictures, line)
+        build_from_rows(pictures, line)
     assert not (pictures / "suite").exists()
 
 
@@ -212,16 +214,16 @@ def test_a_picture_that_cannot_be_read_is_named_by_line_column_and_searched_fold
 ) -> None:
     (pictures / "text.png").write_text("no picture", encoding="utf-8")
     with pytest.raises(SuiteError) as caught:
-        made(pictures, "Put the cube on the plum,purple.png,brown.png", line, header=NEEDED)
-    said = str(caught.value)
-    assert said.startswith(f"{pictures / 'fruit.csv'}, line 3, column {column}: ")
-    assert message.replace("FOLDER", str(pictures)) in said
-    assert "build it again" not in said, "there is no suite yet"
+        build_from_rows(pictures, "Put the cube on the plum,purple.png,brown.png", line, header=NEEDED)
+    printed = str(caught.value)
+    assert printed.startswith(f"{pictures / 'fruit.csv'}, line 3, column {column}: ")
+    assert message.replace("FOLDER", str(pictures)) in printed
+    assert "build it again" not in printed, "there is no suite yet"
 
 
 def test_a_question_that_breaks_a_rule_is_named_by_its_line(pictures: Path) -> None:
     with pytest.raises(SuiteError, match=r"fruit\.csv, line 3.*names a side"):
-        made(
+        build_from_rows(
             pictures,
             "Put the cube on the plum,purple.png,brown.png,,",
             "Put the cube on the left lime,green.png,red.png,,",
@@ -266,8 +268,8 @@ def discs(tmp_path: Path) -> dict[str, Path]:
 
 def pairs_of(discs: dict[str, Path]) -> list[PicturePair]:
     return [
-        PicturePair("color", f"{one} shape", discs[one], f"{other} shape", discs[other])
-        for one, other in zip(COLOURS[::2], COLOURS[1::2], strict=True)
+        PicturePair("color", f"{first} shape", discs[first], f"{other} shape", discs[other])
+        for first, other in zip(COLOURS[::2], COLOURS[1::2], strict=True)
     ]
 
 
@@ -283,9 +285,9 @@ def test_every_pair_is_asked_both_ways_and_the_suite_is_valid(discs: dict[str, P
     ]
     for item in suite.items:
         colour = item.object_phrase.split()[0]
-        shown = Image.open(item.picture(item.correct_side)).convert("RGB")
-        assert shown.size == (320, 320)
-        assert shown.getpixel((140, 160)) == Image.new("RGB", (1, 1), colour).getpixel((0, 0))
+        picture = Image.open(item.picture(item.correct_side)).convert("RGB")
+        assert picture.size == (320, 320)
+        assert picture.getpixel((140, 160)) == Image.new("RGB", (1, 1), colour).getpixel((0, 0))
 
 
 def test_the_first_picture_lies_left_and_right_in_turn(discs: dict[str, Path], tmp_path: Path) -> None:
@@ -306,9 +308,9 @@ def test_pairs_that_share_a_picture_share_a_group(discs: dict[str, Path], tmp_pa
 
 
 def test_the_same_pictures_give_the_same_suite_wherever_they_lie(discs: dict[str, Path], tmp_path: Path) -> None:
-    one = suite_from_pictures(tmp_path / "one", pairs_of(discs), **ABOUT)
+    first = suite_from_pictures(tmp_path / "one", pairs_of(discs), **ABOUT)
     other = suite_from_pictures(tmp_path / "other", pairs_of(discs), **ABOUT)
-    assert one.identity == other.identity
+    assert first.identity == other.identity
 
 
 def test_bad_pairs_are_refused_and_nothing_is_written(discs: dict[str, Path], tmp_path: Path) -> None:
@@ -339,15 +341,15 @@ def test_a_category_of_ones_own_is_a_row_and_a_misspelt_one_is_pointed_out(
     assert load_suite(suite.folder).items == suite.items
     assert "Ripe fruit" in validate_suite(suite.folder).to_text()
     alone = suite_from_pictures(tmp_path / "alone", [replace(pair, category="colour")], **ABOUT)
-    for own in (suite, alone):
-        report = validate_suite(own.folder)
+    for built_suite in (suite, alone):
+        report = validate_suite(built_suite.folder)
         assert report.missing == ()
         assert "Not in this suite" not in report.to_text()
         assert not [finding for finding in report.warnings if finding.rule == "W08"]
-    known = PicturePair("shape", "red disc", discs["red"], "green disc", discs["green"])
-    of_the_paper = suite_from_pictures(tmp_path / "shapes", [known], **ABOUT)
+    shape_pair = PicturePair("shape", "red disc", discs["red"], "green disc", discs["green"])
+    of_the_paper = suite_from_pictures(tmp_path / "shapes", [shape_pair], **ABOUT)
     assert "Not in this suite" not in validate_suite(of_the_paper.folder).to_text()
-    both = [replace(pair, category="colour"), known]
+    both = [replace(pair, category="colour"), shape_pair]
     misspelt = suite_from_pictures(tmp_path / "other", both, **ABOUT)
     assert [str(f) for f in validate_suite(misspelt.folder).warnings if f.rule == "W08"] == [
         "W08 colour: is none of the paper; if 'color' is meant, rename it"

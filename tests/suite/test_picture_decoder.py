@@ -206,12 +206,12 @@ def test_the_content_decides_and_not_the_ending(picture: Image.Image, tmp_path: 
 def test_every_picture_is_decoded_by_one_module() -> None:
     """Another call of Pillow's or OpenCV's decoder would have rules of its own."""
     decoder = ROOT / "probe_kit" / "suite" / "pictures.py"
-    others = [
+    other_calls = [
         f"{path.relative_to(ROOT)}:{call.lineno}"
         for path, call in package_nodes(ast.Call)
         if path != decoder and _decodes(call.func)
     ]
-    assert others == []
+    assert other_calls == []
     assert any(path == decoder and _decodes(call.func) for path, call in package_nodes(ast.Call))
 
 

@@ -41,9 +41,9 @@ def test_the_hash_does_not_depend_on_the_order_of_the_items(small_suite: Suite) 
     ],
 )
 def test_files_licences_and_places_do_not_enter_the_hash(small_suite: Suite, field: str, value: object) -> None:
-    first, *others = small_suite.items
+    first, *other_items = small_suite.items
     changed = replace(first, **{field: value})
-    assert small_suite.content_sha256_of([changed, *others]) == small_suite.content_sha256
+    assert small_suite.content_sha256_of([changed, *other_items]) == small_suite.content_sha256
 
 
 @pytest.mark.parametrize(
@@ -63,17 +63,17 @@ def test_files_licences_and_places_do_not_enter_the_hash(small_suite: Suite, fie
     ],
 )
 def test_whatever_changes_the_question_changes_the_hash(small_suite: Suite, field: str) -> None:
-    first, *others = small_suite.items
+    first, *other_items = small_suite.items
     changed = replace(first, **{field: getattr(first, field) + "!"})
-    assert small_suite.content_sha256_of([changed, *others]) != small_suite.content_sha256
-    assert questions_sha256([changed, *others]) != small_suite.questions_sha256
+    assert small_suite.content_sha256_of([changed, *other_items]) != small_suite.content_sha256
+    assert questions_sha256([changed, *other_items]) != small_suite.questions_sha256
 
 
 @pytest.mark.parametrize("field", ["pair_id", "schema_version"])
 def test_other_twins_or_another_format_change_the_hash_and_no_seed(small_suite: Suite, field: str) -> None:
     """Intervals and p values are drawn by the questions; suites are compared by all that a run depends on."""
-    first, *others = small_suite.items
-    changed = replace(small_suite, items=(replace(first, **{field: getattr(first, field) + "!"}), *others))
+    first, *other_items = small_suite.items
+    changed = replace(small_suite, items=(replace(first, **{field: getattr(first, field) + "!"}), *other_items))
     assert changed.content_sha256 != small_suite.content_sha256
     assert changed.items[0].content_sha256 != first.content_sha256
     assert changed.seed_text == small_suite.seed_text
@@ -81,8 +81,8 @@ def test_other_twins_or_another_format_change_the_hash_and_no_seed(small_suite: 
 
 @pytest.mark.parametrize("field", ["name", "version", "schema_version"])
 def test_name_version_and_format_of_a_suite_stand_in_its_hash(small_suite: Suite, field: str) -> None:
-    own = {field: "1.7"} if field != "schema_version" else {"card": small_suite.card | {field: "1.7"}}
-    changed = replace(small_suite, **own)  # type: ignore[arg-type]
+    changes = {field: "1.7"} if field != "schema_version" else {"card": small_suite.card | {field: "1.7"}}
+    changed = replace(small_suite, **changes)  # type: ignore[arg-type]
     assert changed.content_sha256 != small_suite.content_sha256
     assert changed.questions_sha256 == small_suite.questions_sha256
 
@@ -141,8 +141,8 @@ def test_selecting_no_category_is_refused(small_suite: Suite) -> None:
 
 
 def test_a_selection_never_separates_twins(small_suite: Suite) -> None:
-    said = r"5 items per category would keep .*twins .*'a2a-embedded-color-s0-0002'.* an even number"
-    with pytest.raises(UsageError, match=said):
+    reason = r"5 items per category would keep .*twins .*'a2a-embedded-color-s0-0002'.* an even number"
+    with pytest.raises(UsageError, match=reason):
         small_suite.select(["color"], 5)
 
 
@@ -170,17 +170,17 @@ def groups(*items: Item) -> list[str]:
 
 
 def test_items_that_share_nothing_are_groups_of_their_own(small_suite: Suite) -> None:
-    one, other = groups(stranger(small_suite.items[0], "a"), stranger(small_suite.items[0], "b"))
-    assert one != other
+    first_group, other = groups(stranger(small_suite.items[0], "a"), stranger(small_suite.items[0], "b"))
+    assert first_group != other
 
 
 def test_one_shared_picture_image_or_pair_is_enough(small_suite: Suite) -> None:
     first, second = stranger(small_suite.items[0], "a"), stranger(small_suite.items[0], "b")
     for tie in ({"pair_id": first.pair_id}, {"left_image_id": first.right_image_id}):
-        one, other = groups(first, replace(second, **tie))
-        assert one == other
-    one, other = groups(first, replace(second, left_pixels_sha256=first.right_pixels_sha256))
-    assert one == other
+        first_group, other = groups(first, replace(second, **tie))
+        assert first_group == other
+    first_group, other = groups(first, replace(second, left_pixels_sha256=first.right_pixels_sha256))
+    assert first_group == other
 
 
 def test_ties_chain(small_suite: Suite) -> None:
@@ -220,8 +220,8 @@ def test_every_item_of_the_embedded_generators_has_its_twin(small_suite: Suite) 
 
 @pytest.fixture
 def pair(small_suite: Suite) -> tuple[Item, Item]:
-    one = small_suite.items[0]
-    return one, counterparts_of(small_suite.items)[one.item_id]
+    item = small_suite.items[0]
+    return item, counterparts_of(small_suite.items)[item.item_id]
 
 
 def test_an_item_whose_twin_is_not_there_has_none(pair: tuple[Item, Item]) -> None:
@@ -232,35 +232,37 @@ def test_an_item_whose_twin_is_not_there_has_none(pair: tuple[Item, Item]) -> No
     "name", ["instruction", "correct_side", "left_pixels_sha256", "category"], ids=lambda name: name
 )
 def test_what_asks_for_the_same_or_shows_another_picture_is_no_twin(pair: tuple[Item, Item], name: str) -> None:
-    one, twin = pair
-    same = {"instruction": one.instruction, "correct_side": one.correct_side}
+    item, twin = pair
+    same = {"instruction": item.instruction, "correct_side": item.correct_side}
     other = replace(twin, **{name: same.get(name, "another")})
-    assert counterparts_of([one, other]) == {}
+    assert counterparts_of([item, other]) == {}
 
 
 def test_an_item_of_one_picture_twice_has_no_twin(pair: tuple[Item, Item]) -> None:
-    alike = [replace(own, left_pixels_sha256=own.right_pixels_sha256) for own in pair]
+    alike = [replace(item, left_pixels_sha256=item.right_pixels_sha256) for item in pair]
     assert counterparts_of(alike) == {}
 
 
 def test_how_the_pictures_lie_plays_no_part(pair: tuple[Item, Item]) -> None:
     """Only its words are used, so that the layouts may differ."""
-    one, twin = pair
+    item, twin = pair
     turned = replace(
         twin,
         left_pixels_sha256=twin.right_pixels_sha256,
         right_pixels_sha256=twin.left_pixels_sha256,
         correct_side=other_side(twin.correct_side),
     )
-    assert counterparts_of([one, turned])[one.item_id] is turned
+    assert counterparts_of([item, turned])[item.item_id] is turned
 
 
 def test_ids_and_pair_ids_play_no_part(pair: tuple[Item, Item]) -> None:
     """So that a converted suite, whose ids are its source's, has twins as well."""
-    one, twin = pair
+    original, twin = pair
     other = replace(twin, pair_id="elsewhere-7", item_id="zzz")
-    assert counterparts_of([one, other])[one.item_id] is other
-    assert counterparts_of([one, other, twin])[one.item_id] is min(other, twin, key=lambda item: item.item_id)
+    assert counterparts_of([original, other])[original.item_id] is other
+    assert counterparts_of([original, other, twin])[original.item_id] is min(
+        other, twin, key=lambda item: item.item_id
+    )
 
 
 @pytest.fixture(scope="module")
@@ -280,10 +282,10 @@ def texts(item, layout="original"):
 @pytest.mark.slow
 def test_an_item_is_asked_by_what_it_means_by_what_it_shows_by_where_it_lies_and_by_nothing(suite):
     item = of_category(suite, "color")
-    found = texts(item)
+    wordings = texts(item)
     color = item.target_concept
     outline = item.gen[item.correct_side]["outline"]
-    assert found == {
+    assert wordings == {
         "knowledge": f"Put the cube on the {color} shape",
         "named": f"Put the cube on the {color} {outline}",
         "side": f"Put the cube on the {item.correct_side} picture",
@@ -305,19 +307,19 @@ def test_a_category_whose_pictures_have_no_plainer_words_has_no_wording_named(su
 
 
 def test_words_that_fit_both_pictures_are_none(suite):
-    named = [item for item in suite.items if "named" in item.wordings]
-    assert named
-    for item in named:
+    named_items = [item for item in suite.items if "named" in item.wordings]
+    assert named_items
+    for item in named_items:
         twin = next(other for other in suite.items if other.pair_id == item.pair_id and other != item)
         assert item.wordings["named"] != twin.wordings.get("named")
         assert item.wordings["named"] != item.instruction
 
 
 def test_no_pictogram_is_named_by_what_it_stands_for():
-    shown = [pictogram for pictogram in PICTOGRAMS if pictogram.shows]
-    assert len(shown) > 30
-    assert not [p.name for p in shown if p.name in p.shows]
-    assert not [p.name for p in shown if side_words(p.shows)]
+    pictograms = [pictogram for pictogram in PICTOGRAMS if pictogram.shows]
+    assert len(pictograms) > 30
+    assert not [p.name for p in pictograms if p.name in p.shows]
+    assert not [p.name for p in pictograms if side_words(p.shows)]
 
 
 def test_episodes_keep_the_id_of_the_items_own_words_and_all_share_its_seeds(suite):
@@ -334,8 +336,8 @@ def test_episodes_keep_the_id_of_the_items_own_words_and_all_share_its_seeds(sui
 
 
 def test_a_suite_may_say_it_in_its_own_words(suite):
-    own = {"side": "Put it {side}", "neutral": "Put it anywhere"}
-    item = replace(of_category(suite, "emotion"), wordings=own)
+    custom_wordings = {"side": "Put it {side}", "neutral": "Put it anywhere"}
+    item = replace(of_category(suite, "emotion"), wordings=custom_wordings)
     assert texts(item)["side"] == f"Put it {item.correct_side}"
     assert texts(item)["neutral"] == "Put it anywhere"
     with pytest.raises(SuiteError, match=r"contains '\{side\}'"):
@@ -353,7 +355,7 @@ def test_wordings_survive_the_suites_file_and_are_left_out_where_there_are_none(
         record = item.to_json()
         assert ("wordings" in record) == bool(item.wordings)
         assert Item.from_json(record, item.folder) == item
-    assert not [found for found in validate_suite(suite.folder).findings if found.severity == "error"]
+    assert not [finding for finding in validate_suite(suite.folder).findings if finding.severity == "error"]
 
 
 @pytest.mark.parametrize(
@@ -378,24 +380,24 @@ def test_no_plainer_words_name_a_side_though_a_right_triangle_is_drawn(tmp_path)
     assert not [i for i in triangles if "named" in i.wordings]
 
 
-def types_of(value: Any, path: str, found: dict[str, set[str]]) -> None:
+def types_of(value: Any, path: str, types_by_key: dict[str, set[str]]) -> None:
     """Collects the type of every key, at any depth."""
     if isinstance(value, dict):
         for key, inner in value.items():
-            types_of(inner, f"{path}.{key}", found)
+            types_of(inner, f"{path}.{key}", types_by_key)
     elif isinstance(value, list | tuple):
         for inner in value:
-            types_of(inner, f"{path}[]", found)
+            types_of(inner, f"{path}[]", types_by_key)
     else:
-        found[path].add(type(value).__name__)
+        types_by_key[path].add(type(value).__name__)
 
 
 def test_every_key_has_one_type_in_all_categories(embedded: Suite) -> None:
     """Arrow infers one type per key; a key that is a number here and a text there cannot be read."""
-    found: dict[str, set[str]] = defaultdict(set)
+    types_by_key: dict[str, set[str]] = defaultdict(set)
     for item in embedded.items:
-        types_of(item.to_json(), "", found)
-    assert {path: types for path, types in found.items() if len(types) > 1} == {}
+        types_of(item.to_json(), "", types_by_key)
+    assert {path: types for path, types in types_by_key.items() if len(types) > 1} == {}
 
 
 def test_the_imagefolder_reader_finds_both_pictures(small_suite: Suite) -> None:

@@ -151,9 +151,9 @@ def test_a_sign_named_after_a_side_is_listed_and_not_an_error(edit_records: Edit
         records[0] |= {"category": "traffic", "domain": "normative", "side_word": True, "object_phrase": phrase}
         records[0]["instruction"] = f"Put the cube on the {phrase}"
 
-    found = rules(edit_records(turn))
-    assert "W07" in found
-    assert "E10" not in found
+    broken_rules = rules(edit_records(turn))
+    assert "W07" in broken_rules
+    assert "E10" not in broken_rules
 
 
 def test_validation_changes_nothing(small_suite: Suite) -> None:
@@ -165,8 +165,8 @@ def test_validation_changes_nothing(small_suite: Suite) -> None:
 
 def test_validate_says_how_strong_a_leak_must_be_to_be_found(small_suite: Suite) -> None:
     """A baseline that is at chance shows little where it could not have been seen above."""
-    found = CliRunner().invoke(app, ["suite", "validate", str(small_suite.folder), "--power", "--json"])
-    power = json.loads(found.stdout)["power"]
+    result = CliRunner().invoke(app, ["suite", "validate", str(small_suite.folder), "--power", "--json"])
+    power = json.loads(result.stdout)["power"]
     counts = count_by_category(small_suite.items)
     assert power == {name: pytest.approx(detectable(count)) for name, count in counts.items()}
     text = CliRunner().invoke(app, ["suite", "validate", str(small_suite.folder), "--power"]).stdout
@@ -249,8 +249,8 @@ def test_an_untouched_copy_passes_all_rules(edit_records: EditRecords) -> None:
 
 
 def test_fields_of_a_later_minor_schema_are_left_out(small_suite: Suite, tmp_path: Path) -> None:
-    first, *others = small_suite.items
-    later = replace(small_suite, items=(replace(first, schema_version="1.7"), *others))
+    first, *other_items = small_suite.items
+    later = replace(small_suite, items=(replace(first, schema_version="1.7"), *other_items))
     folder = save_changed(later, tmp_path / "later").folder
     lines = (folder / "items" / "metadata.jsonl").read_text(encoding="utf-8").splitlines()
     lines[0] = json.dumps(json.loads(lines[0]) | {"mood": "sunny"})
@@ -355,28 +355,34 @@ def png_bomb(side: int) -> bytes:
 
 
 def by_name(suite: Suite, scored: bool = True, probed: bool = True) -> dict[str, Sufficiency]:
-    return {one.name: one for one in sufficiencies(suite, scored, probed)}
+    return {sufficiency.name: sufficiency for sufficiency in sufficiencies(suite, scored, probed)}
 
 
 @pytest.mark.parametrize("items", [2, 6, 8, 10, 12])
 def test_every_use_is_enough_exactly_from_its_number_of_groups(items: int, small_suite: Suite) -> None:
     suite = small_suite.select(None, items)
-    groups = min(len({one.group_id for one in suite.items if one.category == name}) for name in suite.categories)
-    said = by_name(suite)
-    assert list(said) == [
+    groups = min(
+        len({item.group_id for item in suite.items if item.category == name}) for name in suite.categories
+    )
+    sufficiency_by_name = by_name(suite)
+    assert list(sufficiency_by_name) == [
         "success rate", "probes", "retention", "shown", "absent", "interventions", "not used",
     ]  # fmt: skip
-    assert said["probes"].enough == said["retention"].enough == (groups >= GROUPS_FOR_PROBES)
-    assert said["shown"].enough == (groups >= groups_for_signal())
-    assert said["interventions"].enough == (groups >= groups_for_interventions())
-    assert said["not used"].enough == (groups >= groups_for_not_used())
-    assert said["absent"].enough == (groups >= groups_for_absence(round(2 * items / groups)))
-    assert said["success rate"].enough is (False if items < 4 else None)
-    for one in said.values():
-        if one.enough is False and one.name != "success rate":
-            assert one.words.startswith(f"no, {groups} groups of ")
-            assert re.search(r"; (take \d+ (items|or more)|the suite has \d+)$", one.words)
-            assert len(one.words) < 64  # a line of a terminal of 80 columns
+    assert (
+        sufficiency_by_name["probes"].enough
+        == sufficiency_by_name["retention"].enough
+        == (groups >= GROUPS_FOR_PROBES)
+    )
+    assert sufficiency_by_name["shown"].enough == (groups >= groups_for_signal())
+    assert sufficiency_by_name["interventions"].enough == (groups >= groups_for_interventions())
+    assert sufficiency_by_name["not used"].enough == (groups >= groups_for_not_used())
+    assert sufficiency_by_name["absent"].enough == (groups >= groups_for_absence(round(2 * items / groups)))
+    assert sufficiency_by_name["success rate"].enough is (False if items < 4 else None)
+    for sufficiency in sufficiency_by_name.values():
+        if sufficiency.enough is False and sufficiency.name != "success rate":
+            assert sufficiency.words.startswith(f"no, {groups} groups of ")
+            assert re.search(r"; (take \d+ (items|or more)|the suite has \d+)$", sufficiency.words)
+            assert len(sufficiency.words) < 64  # a line of a terminal of 80 columns
 
 
 @pytest.mark.parametrize("category", ["color", "shape"])

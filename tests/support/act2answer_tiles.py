@@ -37,14 +37,14 @@ def write_tile(
         for x, y in CORNERS:
             u, v = (((x * d[0] + y * d[1]) + 1) / 2 * repeat for d in (along_u, down_v))
             rows.append((x * half[0], y * half[1], level * half[2], 0.0, 0.0, float(level), u, v))
-    top, rest = [0, 1, 2, 0, 2, 3], [4, 6, 5, 4, 7, 6]
+    top, other_faces = [0, 1, 2, 0, 2, 3], [4, 6, 5, 4, 7, 6]
     for near, far in ((0, 1), (1, 2), (2, 3), (3, 0)):
-        rest += [near, near + 4, far, far, near + 4, far + 4]
+        other_faces += [near, near + 4, far, far, near + 4, far + 4]
     images = [decoy, picture] if decoy is not None else [picture]
     blocks = [
         np.array(rows, "<f4").tobytes(),
         np.array(top, "<u2").tobytes(),
-        np.array(rest, "<u2").tobytes(),
+        np.array(other_faces, "<u2").tobytes(),
         *map(_png, images),
     ]
     offsets = np.cumsum([0] + [-(-len(block) // 4) * 4 for block in blocks]).tolist()
@@ -60,7 +60,7 @@ def write_tile(
     accessors[0] |= {"min": positions.min(0).tolist(), "max": positions.max(0).tolist()}
     accessors += [
         {"bufferView": view, "componentType": SHORT, "count": len(part), "type": "SCALAR"}
-        for view, part in ((1, top), (2, rest))
+        for view, part in ((1, top), (2, other_faces))
     ]
     attributes = {"POSITION": 0, "NORMAL": 1, "TEXCOORD_0": 2}
     materials = [{"pbrMetallicRoughness": {"baseColorTexture": {"index": index}}} for index in range(len(images))]
@@ -111,6 +111,6 @@ def art(seed: int, side: int = 256) -> Image.Image:
     rng = np.random.default_rng(seed)
     pixels = rng.integers(0, 60, (side, side, 3), np.uint8)
     half = side // 2
-    for place, level in (((0, 0), 10), ((0, half), 80), ((half, 0), 130), ((half, half), 190)):
-        pixels[place[0] : place[0] + half, place[1] : place[1] + half] += np.uint8(level)
+    for corner, level in (((0, 0), 10), ((0, half), 80), ((half, 0), 130), ((half, half), 190)):
+        pixels[corner[0] : corner[0] + half, corner[1] : corner[1] + half] += np.uint8(level)
     return Image.fromarray(pixels)

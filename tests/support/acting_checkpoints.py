@@ -15,7 +15,7 @@ GOLDEN = Path(__file__).parents[1] / "golden"
 
 @dataclass(frozen=True)
 class Tiny:
-    """How a family's tiny checkpoint is made: written, or a golden reference, or the embedded one.
+    """How a family's tiny checkpoint is prepare_checkpoint: written, or a golden reference, or the embedded one.
 
     golden: name of the reference. options: of loading.
     """
@@ -24,7 +24,7 @@ class Tiny:
     golden: str = ""
     options: dict[str, Any] = field(default_factory=dict)
 
-    def made(self, suite: Suite, folder: Path) -> str | None:
+    def prepare_checkpoint(self, suite: Suite, folder: Path) -> str | None:
         """The checkpoint, in `folder`; None for the embedded one."""
         if self.golden:
             return str(knowing(GOLDEN / self.golden, suite, folder) / "checkpoint")
@@ -46,7 +46,7 @@ def knowing(golden: Path, suite: Suite, copy: Path) -> Path:
     shutil.copytree(golden, copy, dirs_exist_ok=True)
     (file,) = copy.rglob("tokenizer.json")
     tokenizer = json.loads(file.read_text(encoding="utf-8"))
-    vocabulary, special = tokenizer["model"]["vocab"], {own["content"] for own in tokenizer["added_tokens"]}
+    vocabulary, special = tokenizer["model"]["vocab"], {token["content"] for token in tokenizer["added_tokens"]}
     intervention = dict.fromkeys(word for item in suite.items for word in item.instruction.split())
     spare = [word for word in vocabulary if word not in special | {"\n", *intervention}]
     missing = [word for word in intervention if word not in vocabulary]

@@ -77,10 +77,10 @@ class Browser:
             message["sessionId"] = session
         os.write(self._out, json.dumps(message).encode() + b"\0")
         while True:
-            found = self._read()
-            if found.get("id") == self._sent:
-                assert "error" not in found, f"{method}: {found['error']}"
-                result: dict[str, Any] = found["result"]
+            answer = self._read()
+            if answer.get("id") == self._sent:
+                assert "error" not in answer, f"{method}: {answer['error']}"
+                result: dict[str, Any] = answer["result"]
                 return result
 
     def _read(self) -> dict[str, Any]:
@@ -91,17 +91,17 @@ class Browser:
             assert more, "chromium ended"
             self._unread += more
         message, _, self._unread = self._unread.partition(b"\0")
-        found: dict[str, Any] = json.loads(message)
-        self._note(found.get("method"), found.get("params", {}))
-        return found
+        event: dict[str, Any] = json.loads(message)
+        self._note(event.get("method"), event.get("params", {}))
+        return event
 
-    def _note(self, event: str | None, said: dict[str, Any]) -> None:
+    def _note(self, event: str | None, details: dict[str, Any]) -> None:
         if event == "Runtime.exceptionThrown":
-            self.complaints.append(json.dumps(said["exceptionDetails"])[:600])
-        elif event == "Log.entryAdded" and said["entry"]["level"] in ("error", "warning"):
-            self.complaints.append(f"{said['entry']['text']} {said['entry'].get('url', '')}")
-        elif event == "Runtime.consoleAPICalled" and said["type"] in ("error", "warning", "assert"):
-            self.complaints.append(json.dumps(said["args"])[:600])
+            self.complaints.append(json.dumps(details["exceptionDetails"])[:600])
+        elif event == "Log.entryAdded" and details["entry"]["level"] in ("error", "warning"):
+            self.complaints.append(f"{details['entry']['text']} {details['entry'].get('url', '')}")
+        elif event == "Runtime.consoleAPICalled" and details["type"] in ("error", "warning", "assert"):
+            self.complaints.append(json.dumps(details["args"])[:600])
 
 
 _READY = "document.readyState === 'complete' && !document.querySelector('.loading')"
@@ -137,9 +137,9 @@ class Page:
 
     def read(self, expression: str) -> Any:
         """The value of an expression in the page; it may wait."""
-        found = self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
-        assert "exceptionDetails" not in found, json.dumps(found["exceptionDetails"])[:800]
-        return found["result"].get("value")
+        answer = self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
+        assert "exceptionDetails" not in answer, json.dumps(answer["exceptionDetails"])[:800]
+        return answer["result"].get("value")
 
     def wait(self, expression: str) -> None:
         """Wait until an expression is true."""
@@ -216,10 +216,10 @@ class Page:
     def press(self, key: str) -> None:
         """Press and release a key by its name, such as `ArrowRight` or `j`."""
         code = _CODES.get(key, ord(key.upper()) if len(key) == 1 else 0)
-        named = {"key": key, "code": _KEYS.get(key, key), "windowsVirtualKeyCode": code}
+        key_fields = {"key": key, "code": _KEYS.get(key, key), "windowsVirtualKeyCode": code}
         text = {"Enter": "\r"}.get(key, key if len(key) == 1 else "")
-        self.call("Input.dispatchKeyEvent", type="keyDown" if text else "rawKeyDown", text=text, **named)
-        self.call("Input.dispatchKeyEvent", type="keyUp", **named)
+        self.call("Input.dispatchKeyEvent", type="keyDown" if text else "rawKeyDown", text=text, **key_fields)
+        self.call("Input.dispatchKeyEvent", type="keyUp", **key_fields)
         self.settle()
 
     def choose(self, selector: str, value: str) -> None:
@@ -231,9 +231,9 @@ class Page:
         )
         self.settle()
 
-    def picture(self, path: Path | None = None, whole: bool = True) -> bytes:
+    def picture(self, path: Path | None = None, full_page: bool = True) -> bytes:
         """A PNG of the page."""
-        shot = self.call("Page.captureScreenshot", format="png", captureBeyondViewport=whole)
+        shot = self.call("Page.captureScreenshot", format="png", captureBeyondViewport=full_page)
         content = b64decode(shot["data"])
         if path is not None:
             path.write_bytes(content)

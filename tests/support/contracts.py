@@ -50,7 +50,7 @@ class Case:
     """A checkpoint of a family.
 
     write: where its files lie, from an empty folder; None for the writer of `WRITERS`. options: besides those of
-    `WRITERS`, None to leave one of them out. others: of options, values that are not in use; from the folder that
+    `WRITERS`, None to leave one of them out. extras: of options, values that are not in use; from the folder that
     was written. If it is given, every option but the `UNTRIED` has one. kind: as what it is checked. typical:
     whether checks of shared code are not slow.
     """
@@ -58,7 +58,7 @@ class Case:
     family: str
     write: Callable[[Path], Path] | None = None
     options: Mapping[str, Any] = field(default_factory=dict)
-    others: Callable[[Path], dict[str, Any]] | None = None
+    extras: Callable[[Path], dict[str, Any]] | None = None
     kind: type[Subject] = PolicySubject
     instructions: Sequence[str] = INSTRUCTIONS
     dtype: str | None = None
@@ -67,19 +67,19 @@ class Case:
 
     def subject(self, folder: Path) -> Subject:
         write, options = WRITERS.get(self.family, (lambda _: folder, {}))
-        place = (self.write or write)(folder)
+        checkpoint = (self.write or write)(folder)
         used = {name: value for name, value in {**options, **self.options}.items() if value is not None}
-        others = self.others(place) if self.others else {}
+        more_options = self.extras(checkpoint) if self.extras else {}
         subject = self.kind(
             self.family,
-            place,
+            checkpoint,
             options=used,
-            other_options=others,
+            other_options=more_options,
             instructions=self.instructions,
             dtype=self.dtype,
         )
-        if self.others:
-            untried = {own.name for own in subject.family.options} - subject.other_options.keys() - {SIZE}
+        if self.extras:
+            untried = {option.name for option in subject.family.options} - subject.other_options.keys() - {SIZE}
             assert untried <= UNTRIED.get(self.family, set())
         return subject
 
@@ -142,9 +142,14 @@ def internvlas_others(run: Path) -> dict[str, Any]:
 
 
 def spatialvla_of_two_arms(folder: Path) -> Path:
-    own = spatialvla_checkpoints.processor_values()["statistics"][_BRIDGE]
-    known = {"statistics": {_BRIDGE: own, "my_arm": {"action": {**own["action"], "q99": [0.2] * 7}}}}
-    return spatialvla_checkpoints.write_checkpoint(folder, processor=known)
+    bridge_statistics = spatialvla_checkpoints.processor_values()["statistics"][_BRIDGE]
+    processor_statistics = {
+        "statistics": {
+            _BRIDGE: bridge_statistics,
+            "my_arm": {"action": {**bridge_statistics["action"], "q99": [0.2] * 7}},
+        }
+    }
+    return spatialvla_checkpoints.write_checkpoint(folder, processor=processor_statistics)
 
 
 def spatialvlas_others(folder: Path) -> dict[str, Any]:
@@ -160,7 +165,10 @@ class OfTwoCameras(PolicySubject):
     @cached_property
     def alike(self) -> list[Observation]:
         scene = np.array([[70, 0, 32], [0, 72, 24], [0, 0, 1]], np.float32)
-        return [replace(one, intrinsics=scene * [[1 + row], [1], [1]]) for row, one in enumerate(super().alike)]
+        return [
+            replace(observation, intrinsics=scene * [[1 + row], [1], [1]])
+            for row, observation in enumerate(super().alike)
+        ]
 
 
 class OfWholePictures(PolicySubject):
@@ -168,15 +176,15 @@ class OfWholePictures(PolicySubject):
 
     @cached_property
     def alike(self) -> list[Observation]:
-        small, large, *others = super().alike
-        return [small, replace(large, image=np.tile(large.image, (3, 1, 1))), *others]
+        small, large, *remaining = super().alike
+        return [small, replace(large, image=np.tile(large.image, (3, 1, 1))), *remaining]
 
 
 class BegunAnswers(AnswerSubject):
     """A begun answer stands behind the frames."""
 
     def questions_of(self, observations: Sequence[Observation]) -> list[Prompt]:
-        return [replace(asked, begun="It is ") for asked in super().questions_of(observations)]
+        return [replace(question, begun="It is ") for question in super().questions_of(observations)]
 
 
 _GOLDEN_WORDS = ("open the drawer", "pick up the red cube and place it on the tray", "open the tray")
@@ -187,20 +195,20 @@ LEROBOTS = {
     "pi0": Case("pi0", golden("pi0"), instructions=_GOLDEN_WORDS, slow=True),
     "pi0 of a protocol": Case(
         "pi0", options={"statistics": "bridge"}, slow=True,
-        others=lambda folder: {
+        extras=lambda folder: {
             "statistics": str(pi0_checkpoints.write_statistics(folder.parent / "client.json")),
         },
     ),
     "pi05": Case("pi05"),
     "pi0-fast": Case(
-        "pi0-fast", golden("pi0_fast"), others=lambda _: {"captured_tokens": 3, "temperature": 0.5}, typical=True
+        "pi0-fast", golden("pi0_fast"), extras=lambda _: {"captured_tokens": 3, "temperature": 0.5}, typical=True
     ),
     "molmoact2": Case("molmoact2"),
     "groot": Case(
         "groot", base_of_groot, {"embodiment": groot_checkpoints.TAG},
         lambda folder: {"embodiment": "other", "vlm": str(folder / "vlm")}, dtype="float32",
     ),
-    "xvla": Case("xvla", others=lambda _: {"domain": 1}),
+    "xvla": Case("xvla", extras=lambda _: {"domain": 1}),
     "eo1": Case("eo1"),
     "smolvla": Case("smolvla", typical=True),
     "smolvla, golden": Case("smolvla", golden("smolvla"), instructions=_GOLDEN_WORDS, slow=True),
@@ -239,17 +247,17 @@ NATIVE = {
         ),
         instructions=_LETTERS,
     ),
-    "magma": Case("magma", others=lambda folder: {**_MAGMA, "tokenizer": str(folder)}, typical=True),
+    "magma": Case("magma", extras=lambda folder: {**_MAGMA, "tokenizer": str(folder)}, typical=True),
     "magma with whole pictures": Case("magma", options={"shrink": 0}, kind=OfWholePictures, slow=True),
     "magma that draws": Case("magma", options={"temperature": 0.7}, slow=True),
     "xiaomi-r0": Case(
-        "xiaomi-r0", others=lambda folder: {"robot": "fractal", "steps": 3, "tokenizer": str(folder)}
+        "xiaomi-r0", extras=lambda folder: {"robot": "fractal", "steps": 3, "tokenizer": str(folder)}
     ),
     "xiaomi-r0 as the Google robot in three steps": Case(
         "xiaomi-r0", options={"robot": "fractal", "steps": 3}, slow=True
     ),
     "internvla-m1": Case(
-        "internvla-m1", others=lambda run: {**internvlas_others(run), "weights": "steps_7_pytorch_model.pt"}
+        "internvla-m1", extras=lambda run: {**internvlas_others(run), "weights": "steps_7_pytorch_model.pt"}
     ),
     "internvla-m1, converted": Case(
         "internvla-m1", converted_internvla, {"steps": 2}, internvlas_others, slow=True
@@ -260,21 +268,21 @@ ANSWERING = {
     "prismatic": Case(
         "prismatic",
         lambda folder: prismatic_checkpoints.write_checkpoint(folder, model_type="prismatic"),
-        others=lambda folder: {"steps": 2, "tokenizer": words_beside(folder)},
+        extras=lambda folder: {"steps": 2, "tokenizer": words_beside(folder)},
         kind=AnswerSubject,
         typical=True,
     ),
     "magma": Case(
         "magma",
         lambda folder: magma_checkpoints.write_checkpoint(folder, steered=False),
-        others=lambda folder: {**_MAGMA, "tokenizer": str(folder)},
+        extras=lambda folder: {**_MAGMA, "tokenizer": str(folder)},
         kind=BegunAnswers,
         slow=True,
     ),
     **{
         name: Case(
             name,
-            others=lambda folder: {"tokenizer": str(folder)},
+            extras=lambda folder: {"tokenizer": str(folder)},
             kind=AnswerSubject,
             typical=name == "qwen2.5-vl",
         )

@@ -85,18 +85,18 @@ def name_of(page: Path) -> str:
 
 def blocks(page: Path) -> list[Block]:
     """Every fenced block of a page."""
-    found, opened, lines = [], None, []
+    listed, opened, lines = [], None, []
     for number, line in enumerate(page.read_text(encoding="utf-8").splitlines(), 1):
         fence = re.fullmatch(r" *```(\w*)", line)
         if fence and opened is None:
             opened, lines = (number + 1, fence[1]), []
         elif fence and opened is not None:
-            found.append(Block(name_of(page), *opened, tuple(lines)))
+            listed.append(Block(name_of(page), *opened, tuple(lines)))
             opened = None
         elif opened is not None:
             lines.append(line)
     assert opened is None, f"{page}: a block is not closed"
-    return found
+    return listed
 
 
 def commands(page: Path) -> list[Command]:
@@ -109,8 +109,8 @@ def mentioned(page: Path) -> list[Command]:
     text = page.read_text(encoding="utf-8")
     outside = re.sub(r"(?ms)^ *```.*?^ *```$", lambda block: "\n" * block[0].count("\n"), text)
     return [
-        Command(name_of(page), outside.count("\n", 0, found.start()) + 1, " ".join(found[1].split()))
-        for found in re.finditer(r"(?<!`)`([^`]+)`(?!`)", outside)
+        Command(name_of(page), outside.count("\n", 0, match.start()) + 1, " ".join(match[1].split()))
+        for match in re.finditer(r"(?<!`)`([^`]+)`(?!`)", outside)
     ]
 
 

@@ -42,7 +42,7 @@ def write_eo1(folder: Path, seed: int = 0, cameras: Sequence[str] = ("image",), 
     policy = build_eo1(config)
     initialise(policy, seed)
     units = {"observation.state": {"min": LOW, "max": HIGH}, "action": {"min": LEAST, "max": MOST}}
-    tensors = {key: {name: torch.from_numpy(own) for name, own in row.items()} for key, row in units.items()}
+    tensors = {key: {name: torch.from_numpy(array) for name, array in row.items()} for key, row in units.items()}
     for pipeline, name in zip(make_eo1_pre_post_processors(config, tensors), ("pre", "post"), strict=True):
         pipeline.save_pretrained(folder, config_filename=f"policy_{name}processor.json")
     config.vlm_base, config.pretrained_path = "vlm", None

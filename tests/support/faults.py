@@ -83,12 +83,12 @@ class Stored:
                 audit = verify_run(self.run, deep=True)
             except RunNotFoundError:  # run.json itself is gone, and both say so
                 return "found" if read.startswith("found") else read
-        seen = not audit.ok or _summary(audit) != _summary(self.audit)
+        noticed = not audit.ok or _summary(audit) != _summary(self.audit)
         if read.startswith("SILENT"):
             return read
-        if not seen and not fault.harmless and not (read == "same" and _is_respelled(fault)):
+        if not noticed and not fault.harmless and not (read == "same" and _is_respelled(fault)):
             return f"UNSEEN by run verify --deep, reading says {read}"
-        return "harmless" if read == "same" and not seen else "found"
+        return "harmless" if read == "same" and not noticed else "found"
 
 
 def _is_respelled(fault: Fault) -> bool:
@@ -139,9 +139,9 @@ def flip(stored: Stored, draw: Random) -> Fault | None:
     content = bytearray(path.read_bytes())
     if not content:
         return None
-    place, bit = draw.randrange(len(content)), draw.randrange(8)
-    content[place] ^= 1 << bit
-    return Fault(f"flip bit {bit} of byte {place} of {path}", {path: bytes(content)})
+    offset, bit = draw.randrange(len(content)), draw.randrange(8)
+    content[offset] ^= 1 << bit
+    return Fault(f"flip bit {bit} of byte {offset} of {path}", {path: bytes(content)})
 
 
 def overwrite(stored: Stored, draw: Random) -> Fault | None:
@@ -174,11 +174,15 @@ def swap(stored: Stored, draw: Random) -> Fault | None:
     """Two files of one kind, of one size where there are such."""
     kinds = [paths for paths in stored.files().values() if len(paths) > 1]
     paths = draw.choice(kinds)
-    one = draw.choice(paths)
-    equal = [path for path in paths if path != one and path.stat().st_size == one.stat().st_size]
-    other = draw.choice(equal or [path for path in paths if path != one])
-    here, there = one.read_bytes(), other.read_bytes()
-    return None if here == there else Fault(f"swap {one} and {other}", {one: there, other: here})
+    chosen_path = draw.choice(paths)
+    equal = [path for path in paths if path != chosen_path and path.stat().st_size == chosen_path.stat().st_size]
+    other = draw.choice(equal or [path for path in paths if path != chosen_path])
+    first_bytes, other_bytes = chosen_path.read_bytes(), other.read_bytes()
+    return (
+        None
+        if first_bytes == other_bytes
+        else Fault(f"swap {chosen_path} and {other}", {chosen_path: other_bytes, other: first_bytes})
+    )
 
 
 def copy_over(stored: Stored, draw: Random) -> Fault | None:
@@ -215,9 +219,9 @@ def backup(stored: Stored, draw: Random) -> Fault:
     name = draw.choice(
         ["{stem} copy{suffix}", "{name}~", "{name}.bak", ".{name}.swp", "._{name}", "{stem} (1){suffix}"]
     )
-    beside = path.with_name(name.format(stem=path.stem, suffix=path.suffix, name=path.name))
+    copy_path = path.with_name(name.format(stem=path.stem, suffix=path.suffix, name=path.name))
     content = draw.choice([path.read_bytes(), b"", draw.randbytes(50)])
-    return Fault(f"backup {beside}", {beside: content}, harmless=True)
+    return Fault(f"backup {copy_path}", {copy_path: content}, harmless=True)
 
 
 def edit_json(stored: Stored, draw: Random) -> Fault | None:

@@ -136,11 +136,11 @@ def _write_processor(folder: Path, cameras: Sequence[str], relative: bool) -> No
 
 def _grouped(groups: dict[str, int], low: Any, high: Any) -> dict[str, dict[str, list[float]]]:
     """Statistics by group; the extremes lie beyond the quantiles, so that one is not taken for the other."""
-    found, begin = {}, 0
+    group_statistics, begin = {}, 0
     for key, numbers in groups.items():
-        own = slice(begin, begin + numbers)
-        q01, q99 = (torch.from_numpy(values[own]) for values in (low, high))
+        span = slice(begin, begin + numbers)
+        q01, q99 = (torch.from_numpy(values[span]) for values in (low, high))
         values = {"q01": q01, "q99": q99, "min": q01 - 1, "max": q99 + 1, "mean": q01, "std": q99 - q01}
-        found[key] = {name: value.tolist() for name, value in values.items()}
+        group_statistics[key] = {name: value.tolist() for name, value in values.items()}
         begin += numbers
-    return found
+    return group_statistics

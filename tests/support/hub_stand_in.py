@@ -42,22 +42,24 @@ class Hub:
         for prefix in (*_API, "/datasets/"):
             path = path.removeprefix(prefix)
         parts = unquote(path).strip("/").split("/")
-        repository, asked = "/".join(parts[:2]), parts[3] if len(parts) > 3 else "main"
+        repository, revision = "/".join(parts[:2]), parts[3] if len(parts) > 3 else "main"
         if repository in self.refusals and not (api and self.refusals[repository][1] == "GatedRepo"):
             status, code = self.refusals[repository]
             return status, {"x-error-code": code, "x-error-message": "refused"}, b""
         commits = self.models.get(repository)
         if commits is None:
             return 404, {"x-error-code": "RepoNotFound", "x-error-message": "Repository not found"}, b""
-        commit = asked if asked in commits else self.names[repository].get(asked)
+        commit = revision if revision in commits else self.names[repository].get(revision)
         if commit is None:
-            return 404, {"x-error-code": "RevisionNotFound", "x-error-message": f"Invalid rev id: {asked}"}, b""
+            return 404, {"x-error-code": "RevisionNotFound", "x-error-message": f"Invalid rev id: {revision}"}, b""
         if api:
             if "tree" in parts[2:3]:
-                rows = [{"type": "file", "path": name, "oid": "0", "size": len(own)}
-                        for name, own in commits[commit].items()]  # fmt: skip
+                rows = [{"type": "file", "path": name, "oid": "0", "size": len(file_content)}
+                        for name, file_content in commits[commit].items()]  # fmt: skip
                 return 200, {"content-type": "application/json"}, json.dumps(rows).encode()
-            listed = [{"rfilename": name, "size": len(own)} for name, own in commits[commit].items()]
+            listed = [
+                {"rfilename": name, "size": len(file_content)} for name, file_content in commits[commit].items()
+            ]
             body = {"id": repository, "modelId": repository, "sha": commit, "siblings": listed}
             return 200, {"content-type": "application/json"}, json.dumps(body).encode()
         content = commits[commit].get("/".join(parts[4:]))
@@ -69,9 +71,9 @@ class Hub:
     def answer(self, path: str, body: bytes) -> Any:
         """What the hub says to a request."""
         if "/preupload/" in path:
-            asked = json.loads(body)["files"]
-            found = [{"path": one["path"], "uploadMode": "regular", "shouldIgnore": False} for one in asked]
-            return {"files": found}
+            files = json.loads(body)["files"]
+            uploads = [{"path": file["path"], "uploadMode": "regular", "shouldIgnore": False} for file in files]
+            return {"files": uploads}
         if "/commit/" in path:
             return self._commit(body)
         if "/discussions" in path:
@@ -96,7 +98,7 @@ class Hub:
 @contextmanager
 def hub() -> Iterator[Hub]:
     """A hub at `address` as long as the body runs."""
-    found = Hub()
+    stand_in = Hub()
 
     class Handler(BaseHTTPRequestHandler):
         protocol_version = "HTTP/1.1"
@@ -104,15 +106,15 @@ def hub() -> Iterator[Hub]:
         def do_POST(self) -> None:
             body = self.rfile.read(int(self.headers.get("content-length") or 0))
             token = str(self.headers.get("authorization"))
-            found.requests.append((self.command, self.path, token))
+            stand_in.requests.append((self.command, self.path, token))
             status = 200
-            if found.failures and "/commit/" in self.path:
-                status = found.failures.pop(0)
+            if stand_in.failures and "/commit/" in self.path:
+                status = stand_in.failures.pop(0)
             if status == 0:
                 self.close_connection = True
                 self.connection.close()
                 return
-            content = json.dumps(found.answer(self.path, body) if status == 200 else {"error": "no"}).encode()
+            content = json.dumps(stand_in.answer(self.path, body) if status == 200 else {"error": "no"}).encode()
             self.send_response(status)
             self.send_header("content-type", "application/json")
             self.send_header("content-length", str(len(content)))
@@ -121,13 +123,13 @@ def hub() -> Iterator[Hub]:
 
         def do_GET(self) -> None:
             served = self.path.startswith("/api/models/") or any(
-                f"/datasets/{name}" in self.path for name in found.models
+                f"/datasets/{name}" in self.path for name in stand_in.models
             )
             if not served and "/resolve/" not in self.path:
                 self.do_POST()
                 return
-            found.requests.append((self.command, self.path, str(self.headers.get("authorization"))))
-            status, headers, body = found.download(self.path.partition("?")[0])
+            stand_in.requests.append((self.command, self.path, str(self.headers.get("authorization"))))
+            status, headers, body = stand_in.download(self.path.partition("?")[0])
             self.send_response(status)
             for name, value in ({"content-length": str(len(body))} | headers).items():
                 self.send_header(name, value)
@@ -142,10 +144,10 @@ def hub() -> Iterator[Hub]:
             """Nothing is printed."""
 
     server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    found.address = f"http://127.0.0.1:{server.server_port}"
+    stand_in.address = f"http://127.0.0.1:{server.server_port}"
     Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True).start()
     try:
-        yield found
+        yield stand_in
     finally:
         server.shutdown()
         server.server_close()

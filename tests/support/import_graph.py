@@ -40,7 +40,7 @@ def _imports(path: Path, modules: Mapping[str, Path]) -> Iterator[str]:
 
 def circles(graph: Graph) -> list[list[str]]:
     """Every group of modules that reach each other, sorted (Tarjan's strongly connected components)."""
-    found: list[list[str]] = []
+    cycles: list[list[str]] = []
     number: dict[str, int] = {}
     lowest: dict[str, int] = {}
     stack: list[str] = []
@@ -58,12 +58,12 @@ def circles(graph: Graph) -> list[list[str]]:
             start = stack.index(name)
             group, stack[start:] = stack[start:], []
             if len(group) > 1:
-                found.append(sorted(group))
+                cycles.append(sorted(group))
 
     for name in graph:
         if name not in number:
             visit(name)
-    return found
+    return cycles
 
 
 def upward(graph: Graph, order: Mapping[str, set[str]], root: str) -> list[str]:
@@ -74,11 +74,16 @@ def upward(graph: Graph, order: Mapping[str, set[str]], root: str) -> list[str]:
     """
     wrong = []
     for importer, imported in graph.items():
-        here = room(importer, root)
+        importer_room = room(importer, root)
         for other in imported:
-            there = room(other, root)
+            imported_room = room(other, root)
             inside = other == root or other.startswith(f"{root}.")
-            if inside and here in order and there != here and there not in order[here]:
+            if (
+                inside
+                and importer_room in order
+                and imported_room != importer_room
+                and imported_room not in order[importer_room]
+            ):
                 wrong.append(f"{importer} -> {other}")
     return sorted(wrong)
 
@@ -95,11 +100,11 @@ def packages(graph: Graph) -> set[str]:
 
 def children(graph: Graph, folder: str) -> dict[str, set[str]]:
     """Which child of `folder`, a module or subfolder, imports which other."""
-    found: dict[str, set[str]] = {}
+    imports_by_room: dict[str, set[str]] = {}
     for importer, imported in graph.items():
-        if here := room(importer, folder):
-            found.setdefault(here, set()).update(room(other, folder) for other in imported)
-    return {name: others - {name, ""} for name, others in found.items()}
+        if importer_room := room(importer, folder):
+            imports_by_room.setdefault(importer_room, set()).update(room(other, folder) for other in imported)
+    return {name: imported_rooms - {name, ""} for name, imported_rooms in imports_by_room.items()}
 
 
 def levels(graph: Graph) -> int:

@@ -63,7 +63,7 @@ class KilledCommand:
     name: str
     begin: Callable[[Path], object]
     arguments: Callable[[Path], list[str]]
-    made: Callable[[Path], Mapping[str, bytes]]
+    results: Callable[[Path], Mapping[str, bytes]]
     finished: Callable[[Path], set[str]] = lambda _: set()
     problems: Callable[[Path], tuple[str, ...]] = lambda _: ()
 
@@ -86,10 +86,10 @@ def run_command(
             stderr=subprocess.STDOUT,
             start_new_session=True,
         )
-        began, known, changes = time.monotonic(), _files(watched), 0
+        began, before, changes = time.monotonic(), _files(watched), 0
         while process.poll() is None:
             now = _files(watched)
-            changes, known = changes + len(now ^ known), now
+            changes, before = changes + len(now ^ before), now
             seconds = time.monotonic() - began
             if seconds > LONGEST_S or (kill_at is not None and kill_at(seconds, changes)):
                 process.send_signal(signal.SIGKILL)
@@ -99,16 +99,16 @@ def run_command(
     return Course(code, time.monotonic() - began, changes, f"{mark}\n{log.read_text(encoding='utf-8')}")
 
 
-def run_together(commands: Sequence[Sequence[str]], place: Path, ready: Callable[[], bool]) -> list[str]:
+def run_together(commands: Sequence[Sequence[str]], path: Path, ready: Callable[[], bool]) -> list[str]:
     """Run these at once, each further one as soon as `ready()`; what was printed by those that failed."""
-    logs = [place.with_name(f"{place.name}-{number}.log") for number in range(len(commands))]
+    logs = [path.with_name(f"{path.name}-{number}.log") for number in range(len(commands))]
     running: list[subprocess.Popen[bytes]] = []
     for command, log in zip(commands, logs, strict=True):
         while running and running[0].poll() is None and not ready():
             time.sleep(_TICK_S)
         with log.open("w", encoding="utf-8") as output:
-            given = [sys.executable, "-m", "probe_kit", *command]
-            running.append(subprocess.Popen(given, stdout=output, stderr=subprocess.STDOUT))
+            command_line = [sys.executable, "-m", "probe_kit", *command]
+            running.append(subprocess.Popen(command_line, stdout=output, stderr=subprocess.STDOUT))
     codes = [process.wait(LONGEST_S) for process in running]
     return [log.read_text(encoding="utf-8") for log, code in zip(logs, codes, strict=True) if code]
 
@@ -117,9 +117,9 @@ def orphans(course: Course) -> list[str]:
     """Commands of the processes that outlive this one by `ORPHANS_END_S`."""
     mark = f"{_MARK}={course.output.partition(chr(10))[0]}".encode()
     end = time.monotonic() + ORPHANS_END_S
-    while (left := list(_marked(mark))) and time.monotonic() < end:
+    while (alive := list(_marked(mark))) and time.monotonic() < end:
         time.sleep(0.1)
-    return left
+    return alive
 
 
 def _marked(mark: bytes) -> Iterator[str]:
@@ -132,15 +132,15 @@ def _marked(mark: bytes) -> Iterator[str]:
 
 
 def _files(folder: Path) -> set[tuple[str, int, int]]:
-    found = set()
+    entries = set()
     for path, _, names in os.walk(folder):
         for name in names:
             try:
                 status = Path(path, name).stat()
             except OSError:
                 continue
-            found.add((f"{path}/{name}", status.st_ino, status.st_mtime_ns))
-    return found
+            entries.add((f"{path}/{name}", status.st_ino, status.st_mtime_ns))
+    return entries
 
 
 def kill_often(command: KilledCommand, folder: Path, kills: int, seed: int) -> str:
@@ -150,48 +150,48 @@ def kill_often(command: KilledCommand, folder: Path, kills: int, seed: int) -> s
     command makes.
     """
     draw, killed, rounds = Random(seed), 0, 0
-    whole = begun(command, folder / "whole")
-    usual = run_command(command.arguments(whole), whole)
+    uninterrupted = begun(command, folder / "whole")
+    usual = run_command(command.arguments(uninterrupted), uninterrupted)
     assert usual.code == 0, usual.output
-    expected = dict(command.made(whole))
+    expected = dict(command.results(uninterrupted))
     assert expected
     while killed < kills:
         rounds += 1
-        place = begun(command, folder / str(rounds))
-        killed += _kill_until_done(command, place, usual, expected, draw, kills - killed)
+        round_folder = begun(command, folder / str(rounds))
+        killed += _kill_until_done(command, round_folder, usual, expected, draw, kills - killed)
     return f"{command.name}: {killed} kills in {rounds} rounds, {len(expected)} objects compared, seed {seed}"
 
 
-def begun(command: KilledCommand, place: Path) -> Path:
+def begun(command: KilledCommand, folder: Path) -> Path:
     """A new folder with what the command finds."""
-    place.mkdir(parents=True)
-    command.begin(place)
-    return place
+    folder.mkdir(parents=True)
+    command.begin(folder)
+    return folder
 
 
 def _kill_until_done(
-    command: KilledCommand, place: Path, usual: Course, expected: Mapping[str, bytes], draw: Random, most: int
+    command: KilledCommand, folder: Path, usual: Course, expected: Mapping[str, bytes], draw: Random, most: int
 ) -> int:
-    seen, courses = command.finished(place), []
+    before, courses = command.finished(folder), []
     for number in range(most + 1):
         moment = Moment(draw.random(), draw.random() < 0.5) if number < most else None
-        course = run_command(command.arguments(place), place, None if moment is None else _at(moment, usual))
+        course = run_command(command.arguments(folder), folder, None if moment is None else _at(moment, usual))
         courses.append(course)
         assert course.code in (0, -signal.SIGKILL), f"after {number} kills: {course.output}"
         assert "InternalError" not in course.output, course.output
-        now = command.finished(place)
-        lost = sorted(one for one in seen - now if _head_of(one) not in now)
+        now = command.finished(folder)
+        lost = sorted(path for path in before - now if _head_of(path) not in now)
         assert lost == [], f"{command.name} lost {lost[:5]} by a kill at {moment}"
-        seen = now
-        assert command.problems(place) == (), f"{command.name}, killed at {moment}: {command.problems(place)}"
+        before = now
+        assert command.problems(folder) == (), f"{command.name}, killed at {moment}: {command.problems(folder)}"
         if course.code == 0:
             break
-    assert not [one for course in courses for one in orphans(course)]
-    found = dict(command.made(place))
-    assert found.keys() == expected.keys()
-    different = [name for name in expected if found[name] != expected[name]]
+    assert not [process for course in courses for process in orphans(course)]
+    results = dict(command.results(folder))
+    assert results.keys() == expected.keys()
+    different = [name for name in expected if results[name] != expected[name]]
     assert not different, f"{command.name}, killed {len(courses) - 1} times: {different}"
-    assert leftovers(place) == []
+    assert leftovers(folder) == []
     return len(courses) - 1
 
 
@@ -251,4 +251,4 @@ def committed(*runs: Path) -> set[str]:
 
 def run_problems(*runs: Path) -> tuple[str, ...]:
     """What `run verify --deep` finds in those that are there."""
-    return tuple(one for run in runs if run.is_dir() for one in verify_run(run, deep=True).problems)
+    return tuple(problem for run in runs if run.is_dir() for problem in verify_run(run, deep=True).problems)

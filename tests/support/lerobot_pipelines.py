@@ -26,7 +26,7 @@ def statistics() -> dict[str, dict[str, torch.Tensor]]:
             "max": (high + span / 7).clip(-1, 1), "q10": low + span / 8,
             "q90": high - span / 9, "mean": (low + high) / 2 + 0.01, "std": span / 3 + 0.01,
         }  # fmt: skip
-    return {name: {kind: torch.from_numpy(own) for kind, own in row.items()} for name, row in rows.items()}
+    return {name: {kind: torch.from_numpy(array) for kind, array in row.items()} for name, row in rows.items()}
 
 
 def without_hub(folder: Path, patch: pytest.MonkeyPatch) -> None:
@@ -70,11 +70,11 @@ def changed(name: str, **fields: Any) -> Callable[[list[dict[str, Any]]], None]:
     return change
 
 
-def raw(one: Any, cameras: Mapping[str, Any]) -> dict[str, Any]:
+def raw(observation: Any, cameras: Mapping[str, Any]) -> dict[str, Any]:
     """What lerobot's pipelines are given of an observation. cameras: pictures (H, W, 3) by name."""
-    pictures = {f"observation.images.{name}": torch.from_numpy(own) for name, own in cameras.items()}
+    pictures = {f"observation.images.{name}": torch.from_numpy(picture) for name, picture in cameras.items()}
     return {
-        **{name: own.permute(2, 0, 1).float() / 255 for name, own in pictures.items()},
-        "observation.state": torch.tensor(one.state, dtype=torch.float32),
-        "task": one.instruction,
+        **{name: picture.permute(2, 0, 1).float() / 255 for name, picture in pictures.items()},
+        "observation.state": torch.tensor(observation.state, dtype=torch.float32),
+        "task": observation.instruction,
     }

@@ -32,7 +32,7 @@ def write_recording(
     """
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    episodes = [list(one) for one in episodes]
+    episodes = [list(episode) for episode in episodes]
     first = episodes[0][0]
     features: dict[str, Any] = {
         CAMERA: {
@@ -43,7 +43,7 @@ def write_recording(
         "observation.state": {
             "dtype": "float32",
             "shape": first.state.shape,
-            "names": [f"s{place}" for place in range(len(first.state))],
+            "names": [f"s{index}" for index in range(len(first.state))],
         },
         "action": {"dtype": "float32", "shape": (actions,), "names": None},
     }
@@ -64,13 +64,13 @@ def add_episodes(
 ) -> None:
     """Record episodes, as `write_recording` says."""
     for number, episode in enumerate(episodes):
-        for frame, seen in enumerate(episode):
+        for frame, observation in enumerate(episode):
             data.add_frame(
                 {
-                    CAMERA: seen.image,
-                    "observation.state": seen.state,
+                    CAMERA: observation.image,
+                    "observation.state": observation.state,
                     "action": np.full(actions, 10 * number + frame, np.float32),
-                    "task": (tasks or {}).get((number, frame), seen.instruction),
+                    "task": (tasks or {}).get((number, frame), observation.instruction),
                     **{name: np.array([of(number, frame)], np.float32) for name, of in (more or {}).items()},
                 }
             )

@@ -123,7 +123,7 @@ def intervene_on_little_run(run: Run) -> None:
     lateral = draw.normal(size=(2, len(episodes)))
     answers = ConditionOutcomes(
         conditions=("clean", "image_swap"),
-        **{own: episodes[name].to_numpy(dtype=str) for own, name in names.items()},
+        **{column: episodes[name].to_numpy(dtype=str) for column, name in names.items()},
         sides=episodes["side_correct"].to_numpy(dtype=str),
         displacement=lateral,
         max_action_change=np.abs(lateral - lateral[0]),

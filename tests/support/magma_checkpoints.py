@@ -172,12 +172,14 @@ def _write_weights(folder: Path, tensors: dict[str, Tensor], shards: int) -> Non
     if shards == 1:
         save_file(tensors, folder / "model.safetensors")
         return
-    place = {
+    file_by_tensor = {
         name: f"model-{index % shards + 1:05d}-of-{shards:05d}.safetensors" for index, name in enumerate(tensors)
     }
-    for file in set(place.values()):
-        save_file({name: tensors[name] for name in tensors if place[name] == file}, folder / file)
-    (folder / "model.safetensors.index.json").write_text(json.dumps({"weight_map": place}), encoding="utf-8")
+    for file in set(file_by_tensor.values()):
+        save_file({name: tensors[name] for name in tensors if file_by_tensor[name] == file}, folder / file)
+    (folder / "model.safetensors.index.json").write_text(
+        json.dumps({"weight_map": file_by_tensor}), encoding="utf-8"
+    )
 
 
 def write_tokenizer(folder: Path) -> Path:

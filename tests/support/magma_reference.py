@@ -71,7 +71,7 @@ class _Recorder:
             "image_sizes": [[first[1]]], "image_sizes_2": [[second[1]]],
             "input_ids": [LONG], "attention_mask": [[1] * len(LONG)], "text_input_ids": [[3, 40, 50, 9]],
         }  # fmt: skip
-        maps = self.trunk.stem(self.shown(*first))
+        maps = self.trunk.stem(self.trunk_input(*first))
         arrays["stem"] = maps
         for number, stage in enumerate(self.trunk.stages):
             maps = stage(maps)
@@ -102,10 +102,10 @@ class _Recorder:
                 if rows * columns > self.crops:
                     continue
                 scale = min(columns * self.side / wide, rows * self.side / high)
-                shown = min(int(wide * scale) * int(high * scale), wide * high)
-                waste = rows * columns * self.side**2 - shown
-                if best is None or shown > best[0] or (shown == best[0] and waste < best[1]):
-                    best = (shown, waste, rows, columns)
+                shown_pixels = min(int(wide * scale) * int(high * scale), wide * high)
+                waste = rows * columns * self.side**2 - shown_pixels
+                if best is None or shown_pixels > best[0] or (shown_pixels == best[0] and waste < best[1]):
+                    best = (shown_pixels, waste, rows, columns)
         assert best is not None
         rows, columns = best[2:]
         pixels = normalize(to_tensor(Image.fromarray(picture)), list(MEAN), list(DEVIATION))
@@ -119,7 +119,7 @@ class _Recorder:
         ]
         return torch.stack(crops), (rows, columns)
 
-    def shown(self, crops: Tensor, grid: tuple[int, int]) -> Tensor:
+    def trunk_input(self, crops: Tensor, grid: tuple[int, int]) -> Tensor:
         """What the trunk sees."""
         rows, columns = grid
         lines = [torch.cat(list(crops[r * columns : (r + 1) * columns]), dim=2) for r in range(rows)]
@@ -128,7 +128,7 @@ class _Recorder:
     def look(self, crops: Tensor, grid: tuple[int, int]) -> Tensor:
         """A picture's tokens, place by place."""
         rows, columns = (1, 1) if self.whole else grid
-        maps = self.trunk.stages(self.trunk.stem(self.shown(crops, grid)))
+        maps = self.trunk.stages(self.trunk.stem(self.trunk_input(crops, grid)))
         projected = self.network.multi_modal_projector(maps.permute(0, 2, 3, 1))
         separator = self.network.multi_modal_projector.row_seperator[0, 0]
         tokens = []

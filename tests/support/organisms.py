@@ -61,7 +61,7 @@ def _hide(policy: Any, *, pictures: bool) -> None:
     patches = _backbone(policy).vision_tower.vision_model.embeddings.position_embedding.weight.shape[0]
     prefix = 0
 
-    def masked(attention_mask: Any = None, inputs_embeds: Any = None, **others: Any) -> Any:
+    def masked(attention_mask: Any = None, inputs_embeds: Any = None, **keywords: Any) -> Any:
         nonlocal prefix
         mask, hidden = attention_mask.clone(), torch.finfo(attention_mask.dtype).min
         if inputs_embeds[1] is None:
@@ -69,7 +69,7 @@ def _hide(policy: Any, *, pictures: bool) -> None:
             mask[:, :, :patches, patches:] = hidden
         else:
             mask[:, :, :, 0 if pictures else patches : prefix] = hidden
-        return forward(attention_mask=mask, inputs_embeds=inputs_embeds, **others)
+        return forward(attention_mask=mask, inputs_embeds=inputs_embeds, **keywords)
 
     joint.forward = masked
 
@@ -97,10 +97,10 @@ def _change_prefix(policy: Any, change: Callable[[Any], Any] | None, cached: Cal
     joint = policy.network.model.paligemma_with_expert
     forward = joint.forward
 
-    def changed(attention_mask: Any = None, inputs_embeds: Any = None, **others: Any) -> Any:
+    def changed(attention_mask: Any = None, inputs_embeds: Any = None, **other_items: Any) -> Any:
         is_prefix = inputs_embeds[1] is None
         mask = change(attention_mask.clone()) if is_prefix and change else attention_mask
-        outputs = forward(attention_mask=mask, inputs_embeds=inputs_embeds, **others)
+        outputs = forward(attention_mask=mask, inputs_embeds=inputs_embeds, **other_items)
         if is_prefix:
             cached(outputs[1])
         return outputs
@@ -228,9 +228,9 @@ def forget_words(policy: Any, observations: Sequence[Observation], steps: int = 
     optimizer = torch.optim.AdamW(network.parameters(), lr=1e-3)
     torch.manual_seed(0)
     for _ in range(steps):
-        rows, others = rng.integers(len(observations), size=(2, batch))
+        rows, donors = rng.integers(len(observations), size=(2, batch))
         pictures, masks = policy.network._preprocess_images({name: value[rows] for name, value in inputs.items()})
-        words, valid = inputs[TOKENS][others], inputs[MASK][others]
+        words, valid = inputs[TOKENS][donors], inputs[MASK][donors]
         noise, time = torch.randn(actions[rows].shape), network.sample_time(batch, "cpu")
         loss = network.forward(pictures, masks, words, valid, states[rows], actions[rows], noise, time).mean()
         optimizer.zero_grad()

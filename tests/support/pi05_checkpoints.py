@@ -79,8 +79,8 @@ def write_pi05(
 def write_tokenizer(folder: Path, further_words: Sequence[str] = ()) -> int:
     """Words, and numbers digit by digit, as Gemma's tokenizer has them; the number of its ids."""
     folder.mkdir(parents=True, exist_ok=True)
-    own = ["task", "state", "action", *"0123456789", "-", ":", ",", ";", *further_words]
-    vocabulary = list(dict.fromkeys([*WORDS, *own]))
+    prompt_words = ["task", "state", "action", *"0123456789", "-", ":", ",", ";", *further_words]
+    vocabulary = list(dict.fromkeys([*WORDS, *prompt_words]))
     tokenizer = Tokenizer(WordLevel({word: index for index, word in enumerate(vocabulary)}, unk_token="<unk>"))
     tokenizer.normalizer = Lowercase()
     tokenizer.pre_tokenizer = PreTokenizers(

@@ -37,23 +37,23 @@ BRIDGE_LIKE = {
 
 def older(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Tensors of lerobot 0.6 under their old names; the tied embedding is stored once, as the head."""
-    found = {}
+    renamed_tensors = {}
     for name, tensor in tensors.items():
         renamed = next((old + name.removeprefix(new) for new, old in OLDER if name.startswith(new)), name)
-        found[renamed] = tensor.contiguous()
+        renamed_tensors[renamed] = tensor.contiguous()
     embedding = f"{VLM}.language_model.model.embed_tokens.weight"
-    found[f"{VLM}.language_model.lm_head.weight"] = found.pop(embedding)
-    return found
+    renamed_tensors[f"{VLM}.language_model.lm_head.weight"] = renamed_tensors.pop(embedding)
+    return renamed_tensors
 
 
 def old_config(config: Mapping[str, Any], modes: Mapping[str, str]) -> dict[str, Any]:
     """`config.json` as it was written then, from today's values."""
-    kept = ("type", "n_obs_steps", "input_features", "output_features", "device", "use_amp", "chunk_size",
+    kept_keys = ("type", "n_obs_steps", "input_features", "output_features", "device", "use_amp", "chunk_size",
             "n_action_steps", "max_state_dim", "max_action_dim", "empty_cameras", "tokenizer_max_length",
             "freeze_vision_encoder", "train_expert_only", "optimizer_lr", "optimizer_betas", "optimizer_eps",
             "optimizer_weight_decay", "scheduler_warmup_steps", "scheduler_decay_lr")  # fmt: skip
     return {
-        **{name: config[name] for name in kept},
+        **{name: config[name] for name in kept_keys},
         "normalization_mapping": dict(modes),
         "resize_imgs_with_padding": config["image_resolution"],
         "num_steps": config["num_inference_steps"],
@@ -69,25 +69,25 @@ def old_config(config: Mapping[str, Any], modes: Mapping[str, str]) -> dict[str,
 def old_golden(golden: Path, target: Path) -> Path:
     """The golden reference with its checkpoint in the old layout: its statistics among the weights."""
     shutil.copytree(golden, target)
-    place = target / "checkpoint"
-    found: dict[str, dict[str, Tensor]] = {}
-    for path in place.glob("policy_*.safetensors"):
-        found[path.name.split("_step")[0]] = load_file(path)
-    for path in (*place.glob("policy_*"),):
+    checkpoint = target / "checkpoint"
+    tensors_by_part: dict[str, dict[str, Tensor]] = {}
+    for path in checkpoint.glob("policy_*.safetensors"):
+        tensors_by_part[path.name.split("_step")[0]] = load_file(path)
+    for path in (*checkpoint.glob("policy_*"),):
         path.unlink()
     buffers = {
-        f"{module}.buffer_{feature.replace('.', '_')}.{name}": found[pipeline][f"{feature}.{name}"]
+        f"{module}.buffer_{feature.replace('.', '_')}.{name}": tensors_by_part[pipeline][f"{feature}.{name}"]
         for module, pipeline, feature in (
             ("normalize_inputs", "policy_preprocessor", "observation.state"),
             ("unnormalize_outputs", "policy_postprocessor", "action"),
         )
         for name in ("mean", "std")
     }
-    weights = load_file(place / "model.safetensors")
-    save_file({**older(weights), **buffers}, place / "model.safetensors", metadata={"format": "pt"})
-    config = json.loads((place / "config.json").read_text(encoding="utf-8"))
+    weights = load_file(checkpoint / "model.safetensors")
+    save_file({**older(weights), **buffers}, checkpoint / "model.safetensors", metadata={"format": "pt"})
+    config = json.loads((checkpoint / "config.json").read_text(encoding="utf-8"))
     modes = {"VISUAL": "IDENTITY", "STATE": "MEAN_STD", "ACTION": "MEAN_STD"}
-    (place / "config.json").write_text(json.dumps(old_config(config, modes), indent=4), encoding="utf-8")
+    (checkpoint / "config.json").write_text(json.dumps(old_config(config, modes), indent=4), encoding="utf-8")
     return target
 
 

@@ -114,8 +114,8 @@ def write_trained(folder: Path, steps: int = 400) -> Path:
         state = rng.uniform(-1, 1, (len(rows), len(LOW))).astype(np.float32)
         text, mask = policy.tokenise(INSTRUCTIONS, state)
         pictures = torch.from_numpy(rng.uniform(-1, 1, (len(rows), 3, 32, 32)).astype(np.float32))
-        shown = torch.ones(len(rows), dtype=torch.bool)
-        loss = network.model([pictures], [shown], text, mask, targets, masks)["loss"]
+        present = torch.ones(len(rows), dtype=torch.bool)
+        loss = network.model([pictures], [present], text, mask, targets, masks)["loss"]
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()

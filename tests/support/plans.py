@@ -13,8 +13,8 @@ from probe_kit.suite import Suite
 
 def scene_rows(suite: Suite, seed: int = 0, wordings: Sequence[str] | None = None) -> tuple[Row, ...]:
     """The rows of a suite, in some wordings."""
-    chosen: Any = None if wordings is None else tuple(wordings)
-    return SceneSource(SceneSettings(wordings=chosen, scene=SceneSpec()), suite).rows(seed)
+    chosen_wordings: Any = None if wordings is None else tuple(wordings)
+    return SceneSource(SceneSettings(wordings=chosen_wordings, scene=SceneSpec()), suite).rows(seed)
 
 
 def make_plan(
@@ -27,8 +27,8 @@ def make_plan(
     later_views: LaterViews = "all",
 ) -> Plan:
     """The plan of a suite whose episodes store these streams."""
-    chosen: Any = None if wordings is None else tuple(wordings)
-    source = SceneSource(SceneSettings(wordings=chosen, scene=SceneSpec()), suite)
+    chosen_wordings: Any = None if wordings is None else tuple(wordings)
+    source = SceneSource(SceneSettings(wordings=chosen_wordings, scene=SceneSpec()), suite)
     rows = source.rows(seed)
     size = sum(stream.raw_bytes(with_tokens, calls, later_views) for stream in streams) * len(rows)
     identity = {"suite": source.identity(1)["suite"]}

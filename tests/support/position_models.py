@@ -16,23 +16,25 @@ class PositionModel(AnswerModel):
 
     absent_inputs = frozenset({"instruction", "picture"})
 
-    def __init__(self, liking: Liking, said: Callable[[str], str]) -> None:
+    def __init__(self, liking: Liking, answer_to: Callable[[str], str]) -> None:
         self.card = ModelCard(
             "stub", "none", "0" * 64, False, 1, "float32", "cpu", "none", ("primary",), 0, 0, settings={}
         )
         self.streams: Mapping[str, Stream] = {"backbone": Stream("backbone", 1, 1, quantities=("residual",))}
         self.role_names = {"backbone": ("image.primary", "language")}
-        self._liking, self._said = liking, said
+        self._liking, self._said = liking, answer_to
 
     def read(self, questions: Sequence[Prompt]) -> Reading:
-        logits = [[self._liking(own.text, option.strip()) for option in own.options] for own in questions]
+        logits = [
+            [self._liking(question.text, option.strip()) for option in question.options] for question in questions
+        ]
         return Reading(np.array(logits, np.float32), np.full(len(logits), 0.9, np.float32), list(questions))
 
     def speak(self, reading: Reading, tokens: int) -> list[str]:
-        return [" ".join(self._said(own.text).split()[:tokens]) for own in reading.state]
+        return [" ".join(self._said(question.text).split()[:tokens]) for question in reading.state]
 
-    def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
-        return {"backbone": [Roles.from_labels(["image.primary", "language"])] * len(seen)}
+    def roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
+        return {"backbone": [Roles.from_labels(["image.primary", "language"])] * len(observations)}
 
     def tap(self, site: Site) -> Tap:
         self.stream_of(site)

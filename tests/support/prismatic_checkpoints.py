@@ -62,12 +62,14 @@ def write_checkpoint(folder: Path, shards: int = 1, seed: int = 1, **fields: Any
     if shards == 1:
         save_file(tensors, folder / "model.safetensors")
         return folder
-    place = {
+    file_by_tensor = {
         name: f"model-{index % shards + 1:05d}-of-{shards:05d}.safetensors" for index, name in enumerate(tensors)
     }
-    for file in set(place.values()):
-        save_file({name: tensors[name] for name in tensors if place[name] == file}, folder / file)
-    (folder / "model.safetensors.index.json").write_text(json.dumps({"weight_map": place}), encoding="utf-8")
+    for file in set(file_by_tensor.values()):
+        save_file({name: tensors[name] for name in tensors if file_by_tensor[name] == file}, folder / file)
+    (folder / "model.safetensors.index.json").write_text(
+        json.dumps({"weight_map": file_by_tensor}), encoding="utf-8"
+    )
     return folder
 
 
@@ -97,27 +99,29 @@ def write_release(cache: Path, seed: int = 1, towers_inside: bool = False, publi
     initialise(network, seed)
     parts: dict[str, dict[str, torch.Tensor]] = {"projector": {}, "llm_backbone": {}, "vision_backbone": {}}
     for name, tensor in network.state_dict().items():
-        module, _, rest = name.partition(".")
+        module, _, remainder = name.partition(".")
         if module == "projector":
-            layer, _, kind = rest.partition(".")
+            layer, _, kind = remainder.partition(".")
             parts["projector"][f"projector.{_FUSED_LAYERS[layer]}.{kind}"] = tensor
         elif module == "language_model":
-            parts["llm_backbone"][f"llm.{rest}"] = tensor
+            parts["llm_backbone"][f"llm.{remainder}"] = tensor
         else:
-            tower, _, kind = rest.partition(".")
+            tower, _, kind = remainder.partition(".")
             theirs = {"featurizer": "dino_featurizer", "fused_featurizer": "siglip_featurizer"}[tower]
             parts["vision_backbone"][f"{theirs}.{kind.replace('scale_factor', 'gamma')}"] = tensor
     towers = parts["vision_backbone"]
     if not towers_inside:
         del parts["vision_backbone"]
         for begin, timm_id in zip(("dino_featurizer.", "siglip_featurizer."), _TIMM, strict=True):
-            own = {name.removeprefix(begin): tensor for name, tensor in towers.items() if name.startswith(begin)}
+            tower_tensors = {
+                name.removeprefix(begin): tensor for name, tensor in towers.items() if name.startswith(begin)
+            }
             patches = (published_side // 14) ** 2
-            shape = (1, patches, own["pos_embed"].shape[-1])
+            shape = (1, patches, tower_tensors["pos_embed"].shape[-1])
             if published_side != 28:
-                own["pos_embed"] = torch.randn(shape, generator=torch.Generator().manual_seed(seed))
+                tower_tensors["pos_embed"] = torch.randn(shape, generator=torch.Generator().manual_seed(seed))
             save_file(
-                {name: tensor.contiguous() for name, tensor in own.items()},
+                {name: tensor.contiguous() for name, tensor in tower_tensors.items()},
                 write_hub_file(cache, f"timm/{timm_id}", "model.safetensors"),
             )
     repository, _, model = RELEASED_ID.rpartition("/")

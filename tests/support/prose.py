@@ -15,9 +15,9 @@ type Kind = Literal["docstring", "summary", "help", "string", "page", "table", "
 
 
 class Prose(NamedTuple):
-    """One text. place: `file:line` of its first line. kind: a `summary` is the first paragraph of a module."""
+    """One text. location: `file:line` of its first line. kind: a `summary` is the first paragraph of a module."""
 
-    place: str
+    location: str
     text: str
     kind: Kind
 
@@ -37,11 +37,11 @@ def prose_of_module(path: Path, name: str) -> Iterator[Prose]:
     for node in nodes(tree):
         if not isinstance(node, ast.Constant) or not isinstance(node.value, str):
             continue
-        place = f"{name}:{node.lineno}"
+        location = f"{name}:{node.lineno}"
         if docstrings.get(node):
-            yield Prose(place, node.value, "docstring")
+            yield Prose(location, node.value, "docstring")
         elif node not in docstrings and " " in node.value.strip():
-            yield Prose(place, node.value, "help" if node in helps else "string")
+            yield Prose(location, node.value, "help" if node in helps else "string")
     if summary := ast.get_docstring(tree):
         yield Prose(f"{name}:1", summary.split("\n\n")[0], "summary")
 
@@ -86,7 +86,7 @@ def without_code(text: str) -> str:
 
 def sentences(text: str) -> list[str]:
     """The sentences of a text; a `·` in a list of links ends one, a colon or semicolon ends none."""
-    return [found for found in re.split(r"(?<=[.!?])\s+| · ", " ".join(text.split())) if found]
+    return [sentence for sentence in re.split(r"(?<=[.!?])\s+| · ", " ".join(text.split())) if sentence]
 
 
 def _collect_docstrings(node: ast.AST, docstrings: dict[ast.Constant, bool], public: bool) -> None:

@@ -27,19 +27,19 @@ class Reach(gym.Env[dict[str, Any], np.ndarray]):
         self.hand = np.array([0.29, 0.0, 0.16]) + 0.002 * self.np_random.normal(size=3)
         self.block = (-1) ** (seed or 0) * 0.09 + 0.002 * self.np_random.normal()
         self.steps = 0
-        return self._seen(), {}
+        return self._observation(), {}
 
     def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Move the hand; eight steps at most."""
         self.hand = np.clip(self.hand + np.clip(action[:3], -0.02, 0.02), [0.2, -0.1, 0.1], [0.4, 0.1, 0.3])
         self.steps += 1
         away = abs(self.hand[1] - self.block)
-        return self._seen(), -away, away < 0.02, self.steps == 8, {"away": away, "is_success": away < 0.02}
+        return self._observation(), -away, away < 0.02, self.steps == 8, {"away": away, "is_success": away < 0.02}
 
-    def _seen(self) -> dict[str, Any]:
+    def _observation(self) -> dict[str, Any]:
         picture = np.full((SIDE, SIDE, 3), 200, np.uint8)
-        for place, colour in ((self.block, (200, 30, 30)), (self.hand[1], (40, 40, 40))):
-            column = int(SIDE * (0.5 + 4 * place))
+        for position, colour in ((self.block, (200, 30, 30)), (self.hand[1], (40, 40, 40))):
+            column = int(SIDE * (0.5 + 4 * position))
             picture[20:28, max(0, column - 4) : max(0, column + 4)] = colour
         state = np.array([*self.hand, 0, 0, 0, 0, 1], np.float32)
         return {"pixels": picture, "agent_pos": state}
@@ -67,15 +67,15 @@ class ReachEnv:
 
     def step(self, action: np.ndarray) -> Step:
         """One action of the checkpoint, in metres."""
-        seen, _, done, late, info = self._env.step(action)
-        return self._as_step(seen, done or late, bool(info["is_success"]))
+        observed, _, done, late, info = self._env.step(action)
+        return self._as_step(observed, done or late, bool(info["is_success"]))
 
     def close(self) -> None:
         """Nothing is open."""
         self._env.close()
 
-    def _as_step(self, seen: dict[str, Any], done: bool = False, success: bool = False) -> Step:
-        observation = Observation(seen["pixels"], seen["agent_pos"], self._episode.instruction)
+    def _as_step(self, observed: dict[str, Any], done: bool = False, success: bool = False) -> Step:
+        observation = Observation(observed["pixels"], observed["agent_pos"], self._episode.instruction)
         facts = {"block": self._env.block, "left": self._env.block < 0, "success": success}
         return Step(observation, done, facts)
 
@@ -92,8 +92,8 @@ class TwoCameras(ReachEnv):
         self._episode = episode
         return self._as_step(self._env.reset(seed=self._first + episode.seed)[0])
 
-    def _as_step(self, seen: dict[str, Any], done: bool = False, success: bool = False) -> Step:
-        step = super()._as_step(seen, done, success)
+    def _as_step(self, observed: dict[str, Any], done: bool = False, success: bool = False) -> Step:
+        step = super()._as_step(observed, done, success)
         turned = np.ascontiguousarray(step.observation.image[::-1, ::-1])
         return replace(step, observation=replace(step.observation, cameras={"wrist": turned}))
 
@@ -111,24 +111,22 @@ class Drifting(ReachEnv):
 class Reusing(ReachEnv):
     """Every picture is the same buffer."""
 
-    def _as_step(self, seen: dict[str, Any], done: bool = False, success: bool = False) -> Step:
-        found = super()._as_step(seen, done, success)
+    def _as_step(self, observed: dict[str, Any], done: bool = False, success: bool = False) -> Step:
+        step = super()._as_step(observed, done, success)
         if not hasattr(self, "_buffer"):
             self._buffer = np.empty((SIDE, SIDE, 3), np.uint8)
-        self._buffer[:] = found.observation.image
+        self._buffer[:] = step.observation.image
         self._buffer[0, 0] = self._env.steps
-        return Step(
-            Observation(self._buffer, found.observation.state, self._episode.instruction), done, found.facts
-        )
+        return Step(Observation(self._buffer, step.observation.state, self._episode.instruction), done, step.facts)
 
 
 class Forgetful(ReachEnv):
     """Says a fact at some steps only."""
 
-    def _as_step(self, seen: dict[str, Any], done: bool = False, success: bool = False) -> Step:
-        found = super()._as_step(seen, done, success)
-        further = {"late": True} if self._env.steps > 2 else {}
-        return Step(found.observation, done, {**found.facts, **further})
+    def _as_step(self, observed: dict[str, Any], done: bool = False, success: bool = False) -> Step:
+        step = super()._as_step(observed, done, success)
+        late_fact = {"late": True} if self._env.steps > 2 else {}
+        return Step(step.observation, done, {**step.facts, **late_fact})
 
 
 class Late(ReachEnv):
@@ -142,10 +140,10 @@ class Late(ReachEnv):
 class Shrinking(ReachEnv):
     """Leaves numbers out of the state behind the first step."""
 
-    def _as_step(self, seen: dict[str, Any], done: bool = False, success: bool = False) -> Step:
-        found = super()._as_step(seen, done, success)
-        state = found.observation.state[: None if self._env.steps < 2 else 5]
-        return Step(Observation(found.observation.image, state, self._episode.instruction), done, found.facts)
+    def _as_step(self, observed: dict[str, Any], done: bool = False, success: bool = False) -> Step:
+        step = super()._as_step(observed, done, success)
+        state = step.observation.state[: None if self._env.steps < 2 else 5]
+        return Step(Observation(step.observation.image, state, self._episode.instruction), done, step.facts)
 
 
 class Broken(ReachEnv):

@@ -34,7 +34,7 @@ def readings(where: Path | str, first: str = "", allow_partial: bool = False) ->
 def _of_run(run: Run) -> Readings:
     names = (run.model, run.label, run.weights_sha256, run.random_weights, run.suite, run.settings_sha256)
     rows = range(len(run.episodes))
-    asked: Readings = {
+    run_readings: Readings = {
         "names": lambda: names,
         "episodes": lambda: run.episodes.to_csv(),
         "failed": lambda: run.failed,
@@ -46,25 +46,27 @@ def _of_run(run: Run) -> Readings:
         "instructions": lambda: [run.instruction_ids(row) for row in rows],
     }
     for stream in run.streams:
-        asked[f"rows pooled {stream}"] = lambda stream=stream: [run.rows(stream)[row] for row in rows]
-        asked[f"rows tokens {stream}"] = lambda stream=stream: [run.rows(stream, "tokens")[row] for row in rows]
-        asked[f"tokens {stream}"] = partial(run.tokens, run.sites(stream)[-1])
+        run_readings[f"rows pooled {stream}"] = lambda stream=stream: [run.rows(stream)[row] for row in rows]
+        run_readings[f"rows tokens {stream}"] = lambda stream=stream: [
+            run.rows(stream, "tokens")[row] for row in rows
+        ]
+        run_readings[f"tokens {stream}"] = partial(run.tokens, run.sites(stream)[-1])
         for site in run.sites(stream):
             for view in run.views(stream):
-                asked[f"columns {site} {view}"] = partial(run.column, site, view)
-    return asked
+                run_readings[f"columns {site} {view}"] = partial(run.column, site, view)
+    return run_readings
 
 
 def _of_probes(run: Run) -> Readings:
-    asked: Readings = {"probes inventory": lambda: [str(one) for one in inventory(run).probes]}
-    for key in (None, *(one.key for one in inventory(run).probes)):
-        asked[f"probes {key}"] = partial(_results, run, key)
-    return asked
+    probe_readings: Readings = {"probes inventory": lambda: [str(entry) for entry in inventory(run).probes]}
+    for key in (None, *(entry.key for entry in inventory(run).probes)):
+        probe_readings[f"probes {key}"] = partial(_results, run, key)
+    return probe_readings
 
 
 def _of_interventions(run: Run) -> Readings:
     def effects() -> Any:
-        return [load_effects(run, one.key).to_json() for one in stored_interventions(run)]
+        return [load_effects(run, intervention.key).to_json() for intervention in stored_interventions(run)]
 
     return {"interventions": effects}
 
@@ -72,23 +74,23 @@ def _of_interventions(run: Run) -> Readings:
 def _results(run: Run, key: str | None) -> Any:
     results = load_results(run, key)
     places = sorted(map(str, results.directions))
-    weights = [vars(one) for one in results.directions.values()]
+    weights = [vars(direction) for direction in results.directions.values()]
     return results.key, results.scores.to_csv(), str(results.controls), places, weights
 
 
 def _hash(value: Any) -> str:
-    found = blake2b(digest_size=16)
-    _feed(found, value)
-    return found.hexdigest()
+    digest = blake2b(digest_size=16)
+    _feed(digest, value)
+    return digest.hexdigest()
 
 
-def _feed(found: Any, value: Any) -> None:
+def _feed(digest: Any, value: Any) -> None:
     if isinstance(value, np.ndarray):
-        found.update(f"{value.dtype}{value.shape}".encode() + np.ascontiguousarray(value).tobytes())
+        digest.update(f"{value.dtype}{value.shape}".encode() + np.ascontiguousarray(value).tobytes())
     elif isinstance(value, dict):
-        _feed(found, [part for pair in sorted(value.items()) for part in pair])
+        _feed(digest, [part for pair in sorted(value.items()) for part in pair])
     elif isinstance(value, list | tuple):
         for part in value:
-            _feed(found, part)
+            _feed(digest, part)
     else:
-        found.update(repr(value).encode())
+        digest.update(repr(value).encode())

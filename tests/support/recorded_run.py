@@ -38,8 +38,8 @@ def recorded_plan(episodes: int, pixels: bool = True, streams: tuple[StoredStrea
         "columns": ["timestamp", "next.reward"],
         "names": {"state": ["x", "y", "z"], "action": ["dx", "grip"]},
     }
-    chosen = {"name": "kitchen", "episodes": list(range(episodes)), RECORDED_EPISODES: episodes + 2}
-    return Plan(rows, streams, 1000, {DATASET: dataset}, {"recording": {**chosen, OTHER_ACTIONS: None}})
+    recording = {"name": "kitchen", "episodes": list(range(episodes)), RECORDED_EPISODES: episodes + 2}
+    return Plan(rows, streams, 1000, {DATASET: dataset}, {"recording": {**recording, OTHER_ACTIONS: None}})
 
 
 def recorded_row(number: int, count: int) -> Row:
@@ -124,6 +124,6 @@ def write_recorded_run(
 
 def noisy(draw: np.random.Generator, count: int) -> np.ndarray:
     """Activations of the action stream, of `count` inferences."""
-    found = np.full((CALLS, *EXPERT.lead, 1, EXPERT.width), np.nan, np.float32)
-    found[:count] = draw.normal(size=(count, *found.shape[1:]))
-    return found
+    padded = np.full((CALLS, *EXPERT.lead, 1, EXPERT.width), np.nan, np.float32)
+    padded[:count] = draw.normal(size=(count, *padded.shape[1:]))
+    return padded

@@ -64,8 +64,8 @@ class ReachConfig(EnvConfig):
     def get_env_processors(self) -> tuple[Any, Any]:
         """Turned pictures and doubled actions."""
 
-        def turned(seen: dict[str, Any]) -> dict[str, Any]:
-            return {**seen, "observation.image": seen["observation.image"].flip(dims=(2, 3))}
+        def turned(observed: dict[str, Any]) -> dict[str, Any]:
+            return {**observed, "observation.image": observed["observation.image"].flip(dims=(2, 3))}
 
         def doubled(passed: dict[str, Any]) -> dict[str, Any]:
             return {"action": 2 * passed["action"]}
@@ -131,9 +131,11 @@ class Registered(ReachEnv):
         super().__init__(count)
         self._env = gym.make(f"{PACKAGE}/{name}")  # type: ignore[assignment]
 
-    def _as_step(self, seen: dict[str, Any], done: bool = False, success: bool = False) -> Step:
+    def _as_step(self, observed: dict[str, Any], done: bool = False, success: bool = False) -> Step:
         return Step(
-            Observation(seen["pixels"], seen["agent_pos"], self._episode.instruction), done, {"success": success}
+            Observation(observed["pixels"], observed["agent_pos"], self._episode.instruction),
+            done,
+            {"success": success},
         )
 
 

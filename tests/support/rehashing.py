@@ -33,16 +33,16 @@ def rehash(run: Path) -> None:
     for path in sorted((run / "commits").glob("*.json")):
         commit = _content(path)
         commit["objects"] = {
-            key: _sum(run / "data.zarr" / key, *known[2:]).to_json()
-            for key, known in commit["objects"].items()
+            key: _sum(run / "data.zarr" / key, *object_record[2:]).to_json()
+            for key, object_record in commit["objects"].items()
             if (run / "data.zarr" / key).is_file()
         }
         _write(path, {**commit, "run": identity, "plan": plans[commit["episode"]]})
     for path in [run / "certificate.json", *sorted((run / "certificates").glob("*.json"))]:
         certificate = {**_content(path), "run": identity}
         path.unlink()
-        named = path if path.parent == run else path.with_name(f"{sha256_json(certificate)[:16]}.json")
-        _write(named, certificate)
+        certificate_path = path if path.parent == run else path.with_name(f"{sha256_json(certificate)[:16]}.json")
+        _write(certificate_path, certificate)
 
 
 def write_record(path: Path, content: dict[str, Any]) -> None:

@@ -13,7 +13,7 @@ Way = Callable[[Content], bytes]
 def _reversed(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _reversed(value[key]) for key in reversed(value)}
-    return [_reversed(one) for one in value] if isinstance(value, list) else value
+    return [_reversed(item) for item in value] if isinstance(value, list) else value
 
 
 def _twice(content: Content) -> bytes:

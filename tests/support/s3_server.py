@@ -244,8 +244,8 @@ def _hang_up(environ: dict[str, Any]) -> NoReturn:
 
 def now_and_then(ills: Iterable[str], share: float, seed: int) -> Callable[[str, str], str | None]:
     """This share of all requests has one of these, drawn at random."""
-    draw, chosen = Random(seed), list(ills)
-    return lambda _method, _path: draw.choice(chosen) if draw.random() < share else None
+    draw, choices = Random(seed), list(ills)
+    return lambda _method, _path: draw.choice(choices) if draw.random() < share else None
 
 
 if __name__ == "__main__":

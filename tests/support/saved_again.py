@@ -125,16 +125,16 @@ def write_in_newest_layout(folder: Path) -> None:
         if template:
             (file.parent / "chat_template.jinja").write_text(template, encoding="utf-8")
         special = file.parent / "special_tokens_map.json"
-        named = json.loads(special.read_text(encoding="utf-8")) if special.is_file() else {}
+        special_tokens = json.loads(special.read_text(encoding="utf-8")) if special.is_file() else {}
         special.unlink(missing_ok=True)
         left_out = ("chat_template", "added_tokens_decoder")
-        _change(file, lambda values, named=named, left_out=left_out: {  # type: ignore[misc]
+        _change(file, lambda values, tokens=special_tokens, left_out=left_out: {  # type: ignore[misc]
             "backend": "tokenizers", "is_local": True, "local_files_only": True,
-            **{name: own["content"] if isinstance(own, dict) else own for name, own in named.items()},
-            **{name: own for name, own in values.items() if name not in left_out},
+            **{name: token["content"] if isinstance(token, dict) else token for name, token in tokens.items()},
+            **{name: value for name, value in values.items() if name not in left_out},
         })  # fmt: skip
-    for place in {file.parent for file in folder.rglob("model*.safetensors")}:
-        rename_weights(place, SIGLIP)
+    for checkpoint_folder in {file.parent for file in folder.rglob("model*.safetensors")}:
+        rename_weights(checkpoint_folder, SIGLIP)
 
 
 # -- the program ----------------------------------------------------------------------------------------------
@@ -152,10 +152,10 @@ def _save_processor(family: str, source: Path, out: Path) -> None:
     tokens = {"extra_special_tokens": INTERNVL_TOKENS} if family == "internvl" else {}
     tokenizer = transformers.AutoTokenizer.from_pretrained(source, **tokens)
     _, processor, pictures, videos = CLASSES[family]
-    further = {} if videos is None else {"video_processor": getattr(transformers, videos)()}
+    extra = {} if videos is None else {"video_processor": getattr(transformers, videos)()}
     image_processor = getattr(transformers, pictures).from_pretrained(source)
     getattr(transformers, processor)(
-        image_processor=image_processor, tokenizer=tokenizer, **further
+        image_processor=image_processor, tokenizer=tokenizer, **extra
     ).save_pretrained(out)
 
 
@@ -166,10 +166,10 @@ def save_whole(family: str, source: Path, out: Path, origin: str) -> None:
     """
     network = _load(family, source)
     if origin == "configured":
-        made = type(network)(type(network).config_class.from_pretrained(source))
-        made.load_state_dict(network.state_dict())
-        made.generation_config = network.generation_config
-        network = made
+        fresh = type(network)(type(network).config_class.from_pretrained(source))
+        fresh.load_state_dict(network.state_dict())
+        fresh.generation_config = network.generation_config
+        network = fresh
     network.save_pretrained(out)
     _save_processor(family, source, out)
 
@@ -193,8 +193,8 @@ def save_lora(family: str, source: Path, out: Path) -> None:
     _change(out / "adapter_config.json", lambda values: {**values, "base_model_name_or_path": str(source)})
     merged = out.with_name(f"{out.name}-merged")
     tuned.merge_and_unload().save_pretrained(merged)
-    for place in (out, merged):
-        _save_processor(family, source, place)
+    for target in (out, merged):
+        _save_processor(family, source, target)
 
 
 def save_parts(folder: Path) -> None:

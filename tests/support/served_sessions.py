@@ -19,8 +19,8 @@ def settings(**choices: Any) -> ExtractSettings:
         "cameras": {"base": "observation/image"}, "state": "observation/state", "source_name": "noise@1",
         **{name: value for name, value in choices.items() if name in served},
     }  # fmt: skip
-    others = {name: value for name, value in choices.items() if name not in served}
-    return ExtractSettings("pi0-tiny", source=ServedSettings(**source), **{"captured_calls": 2, **others})
+    other_choices = {name: value for name, value in choices.items() if name not in served}
+    return ExtractSettings("pi0-tiny", source=ServedSettings(**source), **{"captured_calls": 2, **other_choices})
 
 
 def observation(number: int, side: int = 48, words: str | None = WORDS) -> dict[str, Any]:

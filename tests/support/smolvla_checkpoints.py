@@ -75,9 +75,10 @@ def _write_vlm(folder: Path) -> None:
     tokenizer.add_special_tokens(SPECIAL)
     tokenizer.save(str(folder / "tokenizer.json"))
     names = ("pad", "eos", "bos", "unk", "fake_image", "image", "end_of_utterance", "global_image")
-    named = {f"{name}_token": token for name, token in zip(names, SPECIAL, strict=True)}
+    special_tokens = {f"{name}_token": token for name, token in zip(names, SPECIAL, strict=True)}
     _write(
-        folder / "tokenizer_config.json", {"tokenizer_class": "TokenizersBackend", "model_max_length": 64, **named}
+        folder / "tokenizer_config.json",
+        {"tokenizer_class": "TokenizersBackend", "model_max_length": 64, **special_tokens},
     )
     processor = {"image_processor_type": "SmolVLMImageProcessor", "size": {"longest_edge": 16}}
     video = {"video_processor_type": "SmolVLMVideoProcessor", "size": {"longest_edge": 16}}

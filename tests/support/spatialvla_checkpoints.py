@@ -206,13 +206,15 @@ def write_checkpoint(
     _write(folder / "preprocessor_config.json", preprocessor_values(built.config.side))
     write_tokenizer(folder)
     tensors = {name: tensor.contiguous() for name, tensor in built.state_dict().items()}
-    place = {
+    file_by_tensor = {
         name: f"model-{index % shards + 1:05d}-of-{shards:05d}.safetensors" for index, name in enumerate(tensors)
     }
-    for file in set(place.values()):
-        save_file({name: tensors[name] for name in tensors if place[name] == file}, folder / file)
+    for file in set(file_by_tensor.values()):
+        save_file({name: tensors[name] for name in tensors if file_by_tensor[name] == file}, folder / file)
     size = sum(tensor.nbytes for tensor in tensors.values())
-    _write(folder / "model.safetensors.index.json", {"metadata": {"total_size": size}, "weight_map": place})
+    _write(
+        folder / "model.safetensors.index.json", {"metadata": {"total_size": size}, "weight_map": file_by_tensor}
+    )
     return folder
 
 
@@ -233,11 +235,11 @@ def write_tokenizer(folder: Path, more: tuple[str, ...] = ()) -> Path:
     tokenizer.add_special_tokens([AddedToken(token, normalized=False) for token in (*_SPECIAL, *added)])
     folder.mkdir(parents=True, exist_ok=True)
     tokenizer.save(str(folder / "tokenizer.json"))
-    named = {"bos_token": "<bos>", "eos_token": "<eos>", "pad_token": "<pad>", "unk_token": "<unk>"}
-    _write(folder / "special_tokens_map.json", named)
+    special_tokens = {"bos_token": "<bos>", "eos_token": "<eos>", "pad_token": "<pad>", "unk_token": "<unk>"}
+    _write(folder / "special_tokens_map.json", special_tokens)
     _write(folder / "added_tokens.json", {token: IMAGE + index for index, token in enumerate(added)})
-    own = {"tokenizer_class": "GemmaTokenizer", "add_bos_token": False, "add_eos_token": False}
-    _write(folder / "tokenizer_config.json", {**named, **own, "image_token": "<image>"})
+    tokenizer_settings = {"tokenizer_class": "GemmaTokenizer", "add_bos_token": False, "add_eos_token": False}
+    _write(folder / "tokenizer_config.json", {**special_tokens, **tokenizer_settings, "image_token": "<image>"})
     return folder
 
 

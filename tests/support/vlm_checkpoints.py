@@ -159,11 +159,11 @@ def _write(
     """names: from the network's tensors to those of released files. end: for generation_config.json, if any."""
     folder.mkdir(parents=True, exist_ok=True)
     initialise(network, seed)
-    tensors, seen = {}, set()
+    tensors, written_ids = {}, set()
     for name, tensor in network.state_dict(keep_vars=True).items():
-        if id(tensor) in seen:
+        if id(tensor) in written_ids:
             continue
-        seen.add(id(tensor))
+        written_ids.add(id(tensor))
         for pattern, replacement in names:
             name = re.sub(pattern, replacement, name)
         tensors[name] = tensor

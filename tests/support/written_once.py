@@ -10,16 +10,16 @@ from typing import Any
 
 def written_once(write: Callable[..., Path]) -> Callable[..., Path]:
     """A writer that copies what it wrote before, if it is given a folder alone."""
-    kept: list[tuple[TemporaryDirectory[str], Path]] = []  # as long as the process
+    stored: list[tuple[TemporaryDirectory[str], Path]] = []  # as long as the process
 
     @wraps(write)
     def written_or_copied(folder: Path, *arguments: Any, **fields: Any) -> Path:
         if arguments or fields:
             return write(folder, *arguments, **fields)
-        if not kept:
+        if not stored:
             original = TemporaryDirectory(prefix="probe-kit-tests-")
-            kept.append((original, write(Path(original.name, "made")).relative_to(Path(original.name, "made"))))
-        original, place = kept[0]
-        return Path(shutil.copytree(Path(original.name, "made"), folder, dirs_exist_ok=True)) / place
+            stored.append((original, write(Path(original.name, "made")).relative_to(Path(original.name, "made"))))
+        original, checkpoint = stored[0]
+        return Path(shutil.copytree(Path(original.name, "made"), folder, dirs_exist_ok=True)) / checkpoint
 
     return written_or_copied

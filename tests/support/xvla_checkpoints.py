@@ -69,7 +69,7 @@ def write_xvla(
     initialise(network, seed)
     statistics = {"observation.state": {"min": LOW, "max": HIGH}, "action": {"min": LEAST, "max": MOST}}
     tensors = {
-        key: {name: torch.from_numpy(own) for name, own in rows.items()} for key, rows in statistics.items()
+        key: {name: torch.from_numpy(array) for name, array in rows.items()} for key, rows in statistics.items()
     }
     pipelines = make_xvla_pre_post_processors(config, tensors)
     for step in pipelines[0].steps:
@@ -114,13 +114,13 @@ _AUTHORS = (
 
 def to_authors_layout(folder: Path) -> None:
     """Rename Florence-2's tensors in a checkpoint as its authors, and files of 2025, have them."""
-    named = {}
+    renamed = {}
     for key, value in load_file(folder / "model.safetensors").items():
         if key.startswith("model.vlm."):
             for pattern, replacement in _AUTHORS:
                 key = re.sub(pattern, replacement, key)
         if key.endswith("multi_modal_projector.image_projection.weight"):
             key, value = "model.vlm.image_projection", value.T.contiguous()
-        named[key] = value
-    named["model.vlm.language_model.final_logits_bias"] = torch.zeros(1, 272)
-    save_file(named, folder / "model.safetensors")
+        renamed[key] = value
+    renamed["model.vlm.language_model.final_logits_bias"] = torch.zeros(1, 272)
+    save_file(renamed, folder / "model.safetensors")

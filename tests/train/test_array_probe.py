@@ -35,64 +35,64 @@ def planted() -> NDArray[np.float64]:
 
 
 @pytest.fixture(scope="module")
-def found(planted: NDArray[np.float64]) -> Any:
+def probed(planted: NDArray[np.float64]) -> Any:
     return pk.probe(
         planted, Y, GROUPS, controls={"words": noise(1, N, 3)}, untrained=noise(2, 3, N, D), permutations=40
     )
 
 
-def test_the_site_that_holds_the_label_has_signal_and_the_others_have_none(found: Any) -> None:
-    assert found.best == "1"
-    assert found.scores["signal"].tolist() == [False, True, False]
-    best = found.scores.loc["1"]
+def test_the_site_that_holds_the_label_has_signal_and_the_others_have_none(probed: Any) -> None:
+    assert probed.best == "1"
+    assert probed.scores["signal"].tolist() == [False, True, False]
+    best = probed.scores.loc["1"]
     assert best["ci_low"] <= best["score"] <= best["ci_high"]
     assert best["p_fwe"] == pytest.approx(1 / 41)
     assert best[["exceeds_words", "exceeds_untrained"]].all()
     assert abs(best["chance"] - 0.5) < 0.1
-    assert found.null.shape == (3, 40)
-    assert "best 1 with balanced accuracy" in repr(found)
+    assert probed.null.shape == (3, 40)
+    assert "best 1 with balanced accuracy" in repr(probed)
 
 
-def test_groups_are_held_out_as_a_whole(found: Any) -> None:
-    assert all(np.unique(found.fold_of[group == GROUPS]).size == 1 for group in range(24))
+def test_groups_are_held_out_as_a_whole(probed: Any) -> None:
+    assert all(np.unique(probed.fold_of[group == GROUPS]).size == 1 for group in range(24))
 
 
 def test_scores_and_predictions_are_those_of_scikit_learn_on_the_same_folds(
-    planted: NDArray[np.float64], found: Any
+    planted: NDArray[np.float64], probed: Any
 ) -> None:
     """L2 logistic regression on standardised features, without the prior of the training fold."""
-    penalties = [float(one) for one in found.scores.loc["1", "penalties"].split()]
+    penalties = [float(strength) for strength in probed.scores.loc["1", "penalties"].split()]
     predicted = np.empty(N, int)
     for fold, penalty in enumerate(penalties):
-        test = found.fold_of == fold
+        test = probed.fold_of == fold
         model = make_pipeline(StandardScaler(), LogisticRegression(C=1 / penalty, tol=1e-10, max_iter=10_000))
         model.fit(planted[1][~test].astype(np.float32), Y[~test])
         share = Y[~test].mean()
         predicted[test] = model.decision_function(planted[1][test].astype(np.float32)) > np.log(
             share / (1 - share)
         )
-    assert (found.predictions[1] == predicted).all()
-    assert found.scores.loc["1", "score"] == pytest.approx(balanced_accuracy_score(Y, predicted), abs=0.01)
+    assert (probed.predictions[1] == predicted).all()
+    assert probed.scores.loc["1", "score"] == pytest.approx(balanced_accuracy_score(Y, predicted), abs=0.01)
 
 
 def test_quantities_have_the_r2_of_a_ridge_of_scikit_learn() -> None:
     features = noise(3, N, D)
     quantity = features[:, 0] + 0.1 * noise(4, N)
-    found = pk.probe(features, quantity, GROUPS, permutations=0)
-    assert found.scores["metric"].tolist() == ["R²"]
-    assert found.scores.loc["0", "score"] == pytest.approx(r2_score(quantity, found.predictions[0]), abs=0.02)
-    test = found.fold_of == 0
+    result = pk.probe(features, quantity, GROUPS, permutations=0)
+    assert result.scores["metric"].tolist() == ["R²"]
+    assert result.scores.loc["0", "score"] == pytest.approx(r2_score(quantity, result.predictions[0]), abs=0.02)
+    test = result.fold_of == 0
     plain = make_pipeline(StandardScaler(), Ridge(1e-3)).fit(features[~test], quantity[~test])
-    assert np.corrcoef(plain.predict(features[test]), found.predictions[0][test])[0, 1] > 0.999
+    assert np.corrcoef(plain.predict(features[test]), result.predictions[0][test])[0, 1] > 0.999
 
 
 def test_one_site_names_and_classes_come_back_as_they_were_passed(planted: NDArray[np.float64]) -> None:
     texts = np.where(Y == 1, "yes", "no")
-    found = pk.probe({"tower": planted[1], "words": planted[0][:, :2]}, texts, permutations=0)
-    assert found.scores.index.tolist() == ["tower", "words"]
-    assert set(found.predictions.ravel()) == {"yes", "no"}
-    assert found.scores["p_fwe"].isna().all()
-    assert found.scores.loc["tower", "groups"] == N
+    result = pk.probe({"tower": planted[1], "words": planted[0][:, :2]}, texts, permutations=0)
+    assert result.scores.index.tolist() == ["tower", "words"]
+    assert set(result.predictions.ravel()) == {"yes", "no"}
+    assert result.scores["p_fwe"].isna().all()
+    assert result.scores.loc["tower", "groups"] == N
     alone = pk.probe(planted[1], Y, permutations=0)
     assert alone.predictions.dtype == Y.dtype
     assert alone.scores.index.tolist() == ["0"]
@@ -112,11 +112,11 @@ def test_a_control_that_is_called_like_a_built_in_one_is_the_array_that_was_pass
     planted: NDArray[np.float64], name: str
 ) -> None:
     words = noise(1, N, 3) + 2 * Y[:, None]
-    named, other = (
-        pk.probe(planted[1], Y, GROUPS, controls={one: words}, permutations=0).results.controls.scores[0]
-        for one in (name, "words")
+    first_score, other = (
+        pk.probe(planted[1], Y, GROUPS, controls={control_name: words}, permutations=0).results.controls.scores[0]
+        for control_name in (name, "words")
     )
-    assert named.score == other.score > 0.9
+    assert first_score.score == other.score > 0.9
 
 
 @pytest.mark.parametrize(
@@ -137,9 +137,9 @@ def test_a_control_that_is_called_like_a_built_in_one_is_the_array_that_was_pass
     ],
 )
 def test_arrays_that_do_not_fit_are_refused_by_name(changed: dict[str, Any], message: str) -> None:
-    whole: dict[str, Any] = {"X": noise(0, N, D), "y": Y, "groups": GROUPS}
+    arguments: dict[str, Any] = {"X": noise(0, N, D), "y": Y, "groups": GROUPS}
     with pytest.raises(UsageError, match=message):
-        pk.probe(**{**whole, **changed}, permutations=0)
+        pk.probe(**{**arguments, **changed}, permutations=0)
 
 
 def test_fewer_than_five_groups_are_refused() -> None:

@@ -88,20 +88,20 @@ PlantedRun = Callable[..., ArrayRun]
 PLANTED = Site("backbone", 3)
 
 
-def named(run: ArrayRun, model: str, **changes: object) -> ArrayRun:
+def renamed_run(run: ArrayRun, model: str, **changes: object) -> ArrayRun:
     """A copy in a folder of its own."""
     members = {**vars(run), "path": run.path.parent / model, "model": model, **changes}
-    known = ArrayRun.__annotations__
-    return ArrayRun(**{name: value for name, value in members.items() if name in known})
+    fields = ArrayRun.__annotations__
+    return ArrayRun(**{name: value for name, value in members.items() if name in fields})
 
 
 @pytest.mark.slow
 def test_baselines_of_a_fair_suite_are_at_chance_and_stored(planted_run: PlantedRun) -> None:
     run = planted_run({PLANTED: 2.0})
     train_probes(run, permutations=40, controls=("position", "instruction"))
-    found = load_results(run).controls.of_category("color")
-    assert set(found) == {"position", "instruction"}
-    for score in found.values():
+    baselines = load_results(run).controls.of_category("color")
+    assert set(baselines) == {"position", "instruction"}
+    for score in baselines.values():
         assert not score.above_chance
         assert score.ci[0] <= score.score <= score.ci[1]
         assert (score.n, score.chance) == (80, 0.5)
@@ -118,10 +118,10 @@ def test_a_suite_that_keeps_the_answer_on_one_side_is_found_out(planted_run: Pla
     assert controls.exceeded("color", "mean", PLANTED) == {"position": False}, "a control that knows is asked"
 
 
-@pytest.mark.parametrize(("gain", "asked"), [(0.0, False), (0.02, False), (0.3, True)])
+@pytest.mark.parametrize(("gain", "informative"), [(0.0, False), (0.02, False), (0.3, True)])
 @pytest.mark.parametrize("missing", [0, 20])
 def test_a_control_is_asked_if_its_inner_folds_know_more_than_the_shares_of_the_sides(
-    gain: float, asked: bool, missing: int
+    gain: float, informative: bool, missing: int
 ) -> None:
     labels, groups = np.tile([True, False], 40)[missing:], np.repeat(np.arange(20), 4)[missing:]
     labels[: missing // 2] = True
@@ -131,7 +131,7 @@ def test_a_control_is_asked_if_its_inner_folds_know_more_than_the_shares_of_the_
     noise -= noise.mean()
     inner = np.tile((chance + gain + noise) * 4, (5, 1))
     inner[names % 5, np.arange(names.size)] = 0  # the outer fold's own groups
-    assert is_informative(inner, labels, groups) == asked
+    assert is_informative(inner, labels, groups) == informative
 
 
 @pytest.mark.slow
@@ -146,12 +146,12 @@ def test_controls_are_added_to_stored_probes_without_fitting_those_again(planted
 
 @pytest.mark.slow
 def test_the_untrained_network_is_subtracted_per_site_and_per_peak(planted_run: PlantedRun) -> None:
-    trained, untrained = planted_run({PLANTED: 2.0}), named(planted_run(), "random", random_weights=True)
+    trained, untrained = planted_run({PLANTED: 2.0}), renamed_run(planted_run(), "random", random_weights=True)
     results = train_probes(trained, permutations=5, untrained=untrained)
     accuracy = results.curves["color", "mean"].correct.mean(axis=1)
-    others = load_results(untrained).curves["color", "mean"].correct.mean(axis=1)
+    untrained_scores = load_results(untrained).curves["color", "mean"].correct.mean(axis=1)
     sites = [score for score in results.controls.untrained if not score.peak]
-    np.testing.assert_allclose([score.difference for score in sites], accuracy - others, atol=1e-12)
+    np.testing.assert_allclose([score.difference for score in sites], accuracy - untrained_scores, atol=1e-12)
     assert sites[3].ci[0] > 0.2
     assert sites[3].ci[0] < sites[3].difference < sites[3].ci[1] < accuracy[3]
     assert sites[2].difference == 0.0, "the same features in both runs"
@@ -161,28 +161,28 @@ def test_the_untrained_network_is_subtracted_per_site_and_per_peak(planted_run: 
     peak = results.controls.untrained_peak("color", "mean", "backbone")
     assert peak is not None
     assert (peak.site, peak.untrained) == (str(PLANTED), "random (random weights)")
-    assert peak.difference == pytest.approx(accuracy.max() - others[:5].max())
+    assert peak.difference == pytest.approx(accuracy.max() - untrained_scores[:5].max())
 
 
 def test_an_untrained_network_of_other_episodes_is_refused(planted_run: PlantedRun) -> None:
     run = planted_run()
     episodes = run.episodes.assign(episode_id="other-" + run.episodes["episode_id"])
     with pytest.raises(UsageError, match="not the same"):
-        train_probes(run, permutations=0, untrained=named(run, "random", episodes=episodes))
+        train_probes(run, permutations=0, untrained=renamed_run(run, "random", episodes=episodes))
 
 
 def test_an_untrained_network_of_other_episodes_costs_no_work(planted_run: PlantedRun) -> None:
     run = planted_run()
     episodes = run.episodes.assign(episode_id="other-" + run.episodes["episode_id"])
-    done: list[int] = []
+    progress_counts: list[int] = []
     with pytest.raises(UsageError, match="not the same"):
         train_probes(
             run,
             permutations=0,
-            untrained=named(run, "random", episodes=episodes),
-            progress=lambda *at: done.append(at[0]),
+            untrained=renamed_run(run, "random", episodes=episodes),
+            progress=lambda *at: progress_counts.append(at[0]),
         )
-    assert not done
+    assert not progress_counts
 
 
 def test_a_run_is_not_its_own_untrained_control(planted_run: PlantedRun) -> None:
@@ -195,13 +195,13 @@ def test_a_run_is_not_its_own_untrained_control(planted_run: PlantedRun) -> None
 def test_the_probes_of_an_untrained_network_are_read_only_where_no_others_were_asked_for(
     planted_run: PlantedRun,
 ) -> None:
-    run, control = planted_run({PLANTED: 2.0}), named(planted_run(), "random", random_weights=True)
-    own = train_probes(control, permutations=3)
+    run, control = planted_run({PLANTED: 2.0}), renamed_run(planted_run(), "random", random_weights=True)
+    fitted = train_probes(control, permutations=3)
     with_untrained = train_probes(run, permutations=2, untrained=control)
-    assert load_results(control).key == own.key
+    assert load_results(control).key == fitted.key
     assert with_untrained.settings.permutations == 2
     assert {probes.state for probes in inventory(control).probes} == {"used", "other"}
-    other = named(planted_run(), "other random", random_weights=True)
+    other = renamed_run(planted_run(), "other random", random_weights=True)
     train_probes(run, permutations=2, untrained=other)
     assert load_results(other).settings.permutations == 2
 
@@ -210,7 +210,9 @@ def test_controls_name_the_untrained_network_even_where_two_networks_are_equally
     planted_run: PlantedRun,
 ) -> None:
     run = planted_run({PLANTED: 2.0})
-    networks = [named(planted_run(), name, random_weights=True) for name in ("first random", "second random")]
+    networks = [
+        renamed_run(planted_run(), name, random_weights=True) for name in ("first random", "second random")
+    ]
     controls = [train_probes(run, permutations=0, untrained=network).controls for network in networks]
     accuracies = [[score.untrained_accuracy for score in of_network.untrained] for of_network in controls]
     assert accuracies[0] == accuracies[1]
@@ -241,11 +243,11 @@ def test_what_is_wrong_is_said_before_any_work_and_leaves_what_retention_reads(
     run = planted_run(n_items=12)
     before = train_probes(run, permutations=1, views=("mean",))
     files = sorted(run.path.rglob("*"))
-    done: list[int] = []
-    asked: dict[str, object] = {"permutations": 2, **options}
+    progress_counts: list[int] = []
+    settings: dict[str, object] = {"permutations": 2, **options}
     with pytest.raises(UsageError):
-        train_probes(run, **asked, progress=lambda *at: done.append(at[0]))  # type: ignore[arg-type]
-    assert not done
+        train_probes(run, **settings, progress=lambda *at: progress_counts.append(at[0]))  # type: ignore[arg-type]
+    assert not progress_counts
     assert load_results(run).key == before.key
     assert sorted(run.path.rglob("*")) == files
 
@@ -360,7 +362,9 @@ def test_the_reference_is_the_mean_of_five_layers_by_scikit_learns_accuracy(suit
     assert len(set(accuracies)) > 1, "else the mean is the best"
     control = results.controls.of_category("color")["random-features"]
     assert control.score == pytest.approx(np.mean(accuracies))
-    assert [one.reference for one in results.controls.comparisons] == pytest.approx([np.mean(accuracies)] * 3)
+    assert [comparison.reference for comparison in results.controls.comparisons] == pytest.approx(
+        [np.mean(accuracies)] * 3
+    )
 
 
 TARGET = "dataset.state.x"
@@ -371,8 +375,8 @@ def run(tmp_path: Path) -> Run:
     return write_recorded_run(tmp_path / "run")
 
 
-def probed_label(run: Run, **further: Any) -> ProbeResults:
-    return train_probes(run, target=Target.of_run(run, TARGET), permutations=59, controls=(), **further)
+def probed_label(run: Run, **options: Any) -> ProbeResults:
+    return train_probes(run, target=Target.of_run(run, TARGET), permutations=59, controls=(), **options)
 
 
 @pytest.mark.slow
@@ -383,12 +387,12 @@ def test_a_site_that_an_untrained_network_has_too_is_no_signal(run: Run, tmp_pat
     assert against_blind.loc[1, "exceeds_untrained"]
     assert against_blind.loc[1, "signal"]
     assert not against_blind.loc[0, "exceeds_untrained"]
-    own = probed_label(seeing).scores
+    seeing_scores = probed_label(seeing).scores
     results = probed_label(run, untrained=seeing)
     against_seeing = results.scores.set_index("layer")
     assert not against_seeing.loc[1, "exceeds_untrained"]
     assert not against_seeing.loc[1, "signal"]
-    assert against_seeing.loc[1, "best_control"] == own["score"].max(), "the best site of the stream"
+    assert against_seeing.loc[1, "best_control"] == seeing_scores["score"].max(), "the best site of the stream"
     assert [score.name for score in results.controls.scores] == ["untrained"], "the former one was replaced"
     assert results.key == load_results(run, target=TARGET).key
 
@@ -403,8 +407,8 @@ def test_the_comparison_is_stored_and_not_made_again(
     for again in (probed_label(run, untrained=blind), probed_label(run), load_results(run, target=TARGET)):
         assert again.controls == first.controls
     monkeypatch.undo()
-    further = train_probes(run, target=Target.of_run(run, TARGET), permutations=59, controls=("state",))
-    assert set(further.controls.names) == {"untrained", "state"}
+    extended = train_probes(run, target=Target.of_run(run, TARGET), permutations=59, controls=("state",))
+    assert set(extended.controls.names) == {"untrained", "state"}
     answer = CliRunner().invoke(
         app,
         ["train", str(run.path), "--target", TARGET, "--permutations", "59", "--controls", "none", "--untrained",

@@ -127,16 +127,16 @@ def test_an_interrupted_sweep_continues_after_the_last_finished_site(run: ArrayR
     ((key, sites),) = inventory(run).unfinished.items()
     assert sites == 1
     assert SweepCheckpoint.of(run.location, key).read("mean", SITES[0]) is not None
-    done: list[int] = []
-    results = train_probes(run, ("all",), target=of, progress=lambda *at: done.append(at[0]), **QUICK)
-    assert (results.key, done) == (key, [2])
+    progress_counts: list[int] = []
+    results = train_probes(run, ("all",), target=of, progress=lambda *at: progress_counts.append(at[0]), **QUICK)
+    assert (results.key, progress_counts) == (key, [2])
 
 
 @pytest.mark.parametrize("target", ["side.correct", "label"])
 def test_incomplete_items_can_be_dropped_for_every_target(run: ArrayRun, target: str) -> None:
     keep = np.ones(len(run.episodes), bool)
     keep[:6:2] = False
-    features = {place: array[keep] for place, array in run.features.items()}
+    features = {site_view: array[keep] for site_view, array in run.features.items()}
     some = ArrayRun(run.path, "m", "s@1#0", run.episodes[keep].reset_index(drop=True), features)
     of = "side.correct" if target == "side.correct" else target_of(some, "continuous")
     results = train_probes(some, ("all",), target=of, incomplete="drop", **QUICK)
@@ -186,19 +186,19 @@ def stored(labelled_run: Path, tmp_path: Path) -> Run:
 @pytest.mark.slow
 def test_a_label_of_whole_episodes_is_decoded_from_each_captured_inference(stored: Run) -> None:
     typed = ["train", str(stored.path), "--target", "item.category", "--call", "all", "--permutations", "0"]
-    done = CliRunner().invoke(app, [*typed, "--controls", "none", "--task", "binary"], env={"COLUMNS": "200"})
-    assert done.exit_code == 0, done.output
+    result = CliRunner().invoke(app, [*typed, "--controls", "none", "--task", "binary"], env={"COLUMNS": "200"})
+    assert result.exit_code == 0, result.output
     for call in range(stored.captured_calls):
-        assert f"call {call}" in done.stdout
+        assert f"call {call}" in result.stdout
     calls = sorted(probes.call for probes in inventory(stored).probes)
     assert calls == list(range(stored.captured_calls))
     assert load_results(stored, target="item.category").settings.target == "item.category"
 
 
 def test_the_command_lists_every_target_with_its_values_or_the_reason_why_not(stored: Run) -> None:
-    done = CliRunner().invoke(app, ["targets", str(stored.path)], env={"COLUMNS": "250"})
-    assert done.exit_code == 0, done.output
-    lines = {line.split()[0]: line for line in done.stdout.splitlines() if line.strip()}
+    result = CliRunner().invoke(app, ["targets", str(stored.path)], env={"COLUMNS": "250"})
+    assert result.exit_code == 0, result.output
+    lines = {line.split()[0]: line for line in result.stdout.splitlines() if line.strip()}
     assert {"side.correct", "side.chosen", "sim.tool_y", "item.category"} <= set(lines)
     counts = stored.episodes["side_correct"].value_counts()
     assert f"2 classes: right {counts['right']}, left {counts['left']}" in lines["side.correct"]

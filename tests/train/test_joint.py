@@ -87,16 +87,16 @@ def alone(samples: Samples, labels: np.ndarray) -> list[FittedFold]:
     ]
 
 
-def assert_same(found: list[FittedFold], expected: list[FittedFold]) -> None:
-    for one, other in zip(found, expected, strict=True):
-        np.testing.assert_array_equal(one.strengths, other.strengths)
+def assert_same(fitted: list[FittedFold], expected: list[FittedFold]) -> None:
+    for fold, other in zip(fitted, expected, strict=True):
+        np.testing.assert_array_equal(fold.strengths, other.strengths)
         for part in ("decisions", "weights"):
-            ours, theirs = getattr(one, part), getattr(other, part)
+            ours, theirs = getattr(fold, part), getattr(other, part)
             np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-7 * np.abs(theirs).max())
-        assert one.intercept == pytest.approx(other.intercept, rel=1e-6, abs=1e-8)
-        assert one.spread == pytest.approx(other.spread, rel=1e-6)
+        assert fold.intercept == pytest.approx(other.intercept, rel=1e-6, abs=1e-8)
+        assert fold.spread == pytest.approx(other.spread, rel=1e-6)
         for part in ("total", "first"):
-            np.testing.assert_allclose(getattr(one.inner, part), getattr(other.inner, part), rtol=0, atol=1e-5)
+            np.testing.assert_allclose(getattr(fold.inner, part), getattr(other.inner, part), rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("name", slow_but(TYPICAL, WORLDS))
@@ -137,14 +137,14 @@ def test_either_end_of_the_grid_is_scikit_learns_optimum(world: str, strength: f
     signs = np.tile(np.where(LABELS, 1, -1).astype(np.int8), (len(sets), 1))
     problems = JointProblems(site, np.arange(len(sets)), signs, np.full(len(sets), strength))
     weights = mixed.solve(problems, np.zeros((len(sets), 13)))
-    found = problems.decisions(weights, samples.means)
+    decisions = problems.decisions(weights, samples.means)
     for number, train in enumerate(sets):
         rows = np.isin(np.repeat(np.arange(60), COUNTS), train)
         scaler = StandardScaler().fit(features[rows])
         oracle = LogisticRegression(C=strength, tol=1e-10, solver="newton-cholesky", max_iter=1000)
         oracle.fit(scaler.transform(features[rows]), np.repeat(LABELS, COUNTS)[rows])
         expected = oracle.decision_function(scaler.transform(samples.means))
-        np.testing.assert_allclose(found[number], expected, rtol=0, atol=1e-6 * np.abs(expected).max())
+        np.testing.assert_allclose(decisions[number], expected, rtol=0, atol=1e-6 * np.abs(expected).max())
 
 
 def test_steps_that_go_too_far_are_halved_for_the_problems_that_make_them() -> None:
@@ -158,8 +158,8 @@ def test_steps_that_go_too_far_are_halved_for_the_problems_that_make_them() -> N
     often = max(problems.evaluated.values())
     start[::2] = np.random.default_rng(0).standard_normal(13) * 20
     problems.evaluated.clear()
-    found = mixed.solve(problems, start)
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-7 * np.abs(expected).max())
+    solution = mixed.solve(problems, start)
+    np.testing.assert_allclose(solution, expected, rtol=0, atol=1e-7 * np.abs(expected).max())
     assert max(problems.evaluated[number] for number in sets[1::2]) <= often
     assert min(problems.evaluated[number] for number in sets[::2]) > often
 
@@ -185,9 +185,9 @@ def test_a_small_variation_around_a_large_offset_is_found_by_all_training_sets_t
     features[:, 3] = 1e7 + 5 * SIGNS[:, 0]
     samples = tokens(features)
     assert JointSite.of(samples, FOLDS).alike
-    found = cross_validate(samples, LABELS[:, None], FOLDS)
-    for fold, one in zip(FOLDS, found, strict=True):
-        np.testing.assert_array_equal(one.decisions[:, 0] > 0, LABELS[fold.outer.test])
+    fitted = cross_validate(samples, LABELS[:, None], FOLDS)
+    for fold, fold_fit in zip(FOLDS, fitted, strict=True):
+        np.testing.assert_array_equal(fold_fit.decisions[:, 0] > 0, LABELS[fold.outer.test])
 
 
 @pytest.mark.slow

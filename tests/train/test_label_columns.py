@@ -47,7 +47,7 @@ def test_a_csv_a_parquet_file_and_a_frame_of_the_same_column_have_one_hash(tmp_p
 
 
 @pytest.mark.parametrize(
-    ("cells", "asked", "task", "classes"),
+    ("cells", "declared_task", "task", "classes"),
     [
         (["red", "blue", ""], None, "binary", ("blue", "red")),
         (["red", "blue", "green"], None, "classes", ("blue", "green", "red")),
@@ -62,10 +62,10 @@ def test_a_csv_a_parquet_file_and_a_frame_of_the_same_column_have_one_hash(tmp_p
     ],
 )
 def test_the_task_follows_from_the_values_where_they_leave_no_doubt(
-    tmp_path: Path, cells: list[str], asked: str | None, task: str, classes: tuple[str, ...]
+    tmp_path: Path, cells: list[str], declared_task: str | None, task: str, classes: tuple[str, ...]
 ) -> None:
     rows = "".join(f"e{number},{cell}\n" for number, cell in enumerate(cells))
-    labels = Target.read(written(tmp_path, "episode_id,y\n" + rows), "y", task=asked)  # type: ignore[arg-type]
+    labels = Target.read(written(tmp_path, "episode_id,y\n" + rows), "y", task=declared_task)  # type: ignore[arg-type]
     assert (labels.task, labels.coded.classes, labels.per_step) == (task, classes, False)
     empty = [cell in ("", "nan") for cell in cells]
     assert np.isnan(labels.coded.values).tolist() == empty
@@ -238,9 +238,9 @@ def test_hostile_tables_are_refused_with_their_place(
 
 def test_numbers_of_episodes_as_a_merge_leaves_them_are_the_same_keys() -> None:
     """A column of integers with an empty cell somewhere becomes one of decimals."""
-    whole = pd.DataFrame({"source_episode": [0, 1], "frame": [3, 4], "y": [1.5, 2.5]})
-    decimal = whole.astype({"source_episode": float, "frame": float})
-    assert Target.read(decimal, "y").episodes == Target.read(whole, "y").episodes == ("0", "1")
+    table = pd.DataFrame({"source_episode": [0, 1], "frame": [3, 4], "y": [1.5, 2.5]})
+    decimal = table.astype({"source_episode": float, "frame": float})
+    assert Target.read(decimal, "y").episodes == Target.read(table, "y").episodes == ("0", "1")
 
 
 Reader = Callable[..., Target]
@@ -435,31 +435,34 @@ def test_columns_of_the_simulation_are_the_stored_state_at_the_step_of_each_infe
     frame = label_frame(run)
     assert len(frame) == CALLS * len(run.episodes) - 2, "the last episode ended after two inferences"
     assert frame["control_step"].tolist()[:CALLS] == [0, EVERY, 2 * EVERY, 3 * EVERY]
-    row, seen = frame.iloc[CALLS + 2], run.trajectory(1).frames[2 * EVERY]
-    state = dict(zip(CHANNELS, seen.tolist(), strict=True))
+    row, simulated_state = frame.iloc[CALLS + 2], run.trajectory(1).frames[2 * EVERY]
+    state = dict(zip(CHANNELS, simulated_state.tolist(), strict=True))
     for name in ("tool", "cube"):
         assert [row[f"sim.{name}_{axis}"] for axis in "xyz"] == [state[f"{name}.{axis}"] for axis in "xyz"]
     tile = f"tile_{run.episodes['side_correct'].iloc[1]}"
     away = [state[f"cube.{axis}"] - state[f"{tile}.{axis}"] for axis in "xy"]
     assert row["sim.distance_correct"] == pytest.approx(np.hypot(*away), rel=1e-6)
     steps = frame["control_step"]
-    whole = frame["episode_id"] != run.episodes["episode_id"].iloc[-1]
+    complete_rows = frame["episode_id"] != run.episodes["episode_id"].iloc[-1]
     assert (frame["sim.steps_to_grasp"] == GRASP - steps).all()
     assert (frame["sim.held"] == ((steps >= GRASP) & (steps < RELEASE))).all()
     phases = np.select([steps < GRASP, steps < RELEASE], ["before grasp", "holding"], "after release")
-    assert (frame["sim.phase"] == phases)[whole].all()
+    assert (frame["sim.phase"] == phases)[complete_rows].all()
 
 
 def test_columns_of_the_item_name_its_pictures(labelled_run: Path) -> None:
     run = open_run(labelled_run)
     first = label_frame(run).groupby("episode_id", sort=False).first()
     for episode, row in run.episodes.set_index("episode_id").iterrows():
-        own = first.loc[episode]
-        assert (own["item.named"], own["item.other"]) == (row["target_concept"], row["distractor_concept"])
-        left = row["target_concept"] if row["side_correct"] == "left" else row["distractor_concept"]
-        assert own["item.left"] == left
-        assert own["item.pair"].split(" / ") == sorted([row["target_concept"], row["distractor_concept"]])
-        assert own["item.category"] == row["category"]
+        item_row = first.loc[episode]
+        assert (item_row["item.named"], item_row["item.other"]) == (
+            row["target_concept"],
+            row["distractor_concept"],
+        )
+        left_concept = row["target_concept"] if row["side_correct"] == "left" else row["distractor_concept"]
+        assert item_row["item.left"] == left_concept
+        assert item_row["item.pair"].split(" / ") == sorted([row["target_concept"], row["distractor_concept"]])
+        assert item_row["item.category"] == row["category"]
 
 
 def test_every_built_in_column_is_the_same_from_the_run_and_from_its_table(

@@ -51,8 +51,8 @@ def test_a_planted_quantity_is_found_where_it_was_planted_and_is_no_signal_beyon
     assert planted["p_fwe"] == planted["smallest_p"] == 1 / 60
     assert planted["ci_low"] < planted["score"] < planted["ci_high"] <= 1
     assert planted["spearman"] > 0.9
-    others = scores.drop("backbone.01.residual")
-    assert (others["score"] < 0.3).all()
+    other_scores = scores.drop("backbone.01.residual")
+    assert (other_scores["score"] < 0.3).all()
     assert planted["exceeds_step"]
     assert planted["exceeds_instruction"]
     assert not planted["exceeds_state"], "the state holds the hand itself"
@@ -87,14 +87,14 @@ def test_what_is_stored_is_loaded_and_controls_are_added_without_a_second_fit(
         train_probes(run, target=labels, **QUICK),
     ):
         pd.testing.assert_frame_equal(loaded.scores, second.scores)
-        own, other = (results.curves["all", "mean"] for results in (loaded, second))
+        curve, other = (results.curves["all", "mean"] for results in (loaded, second))
         for name in ("labels", "episodes", "inferences", "groups", "fold_of"):
-            assert (getattr(own, name) == getattr(other, name)).all()
+            assert (getattr(curve, name) == getattr(other, name)).all()
     assert CliRunner().invoke(app, ["run", "verify", "--deep", str(run.location)]).exit_code == 0
-    shown = CliRunner().invoke(app, ["run", "show", str(run.location)]).stdout
-    assert f"probes {first.key}" in shown
-    assert "of a label of your own" in " ".join(shown.split())
-    assert "target sim.tool_y (continuous)" in " ".join(shown.split())
+    output = CliRunner().invoke(app, ["run", "show", str(run.location)]).stdout
+    assert f"probes {first.key}" in output
+    assert "of a label of your own" in " ".join(output.split())
+    assert "target sim.tool_y (continuous)" in " ".join(output.split())
 
 
 def test_probes_of_sides_keep_key_and_bytes_and_neither_kind_reads_the_other(run: Run) -> None:
@@ -117,8 +117,8 @@ def test_another_value_group_stratum_or_window_is_another_key(run: Run) -> None:
     frame["half"] = run.episodes["group_id"].map(lambda name: int(name[-1], 16) % 2)
     other = frame.assign(y=frame["y"] + 1)
 
-    def key(table: pd.DataFrame, **further: str) -> str:
-        results = train_probes(run, target=Target.read(table, "y", **further), permutations=0, controls=())  # type: ignore[arg-type]
+    def key(table: pd.DataFrame, **options: str) -> str:
+        results = train_probes(run, target=Target.read(table, "y", **options), permutations=0, controls=())  # type: ignore[arg-type]
         return results.key
 
     first = key(frame)
@@ -150,11 +150,11 @@ def test_classes_with_a_planted_site_are_found(run: Run, small_suite: Suite) -> 
     assert set(results.controls.left_out) == {"step"}
 
 
-def samples_of(run: Run, table: pd.DataFrame, **further: object) -> object:
-    task = further.pop("task", None)
-    names = {name: further.pop(name, None) for name in ("group_by", "exchange_within")}
+def samples_of(run: Run, table: pd.DataFrame, **options: object) -> object:
+    task = options.pop("task", None)
+    names = {name: options.pop(name, None) for name in ("group_by", "exchange_within")}
     labels = Target.read(table, "y", task=task, **names)  # type: ignore[arg-type]
-    return target_samples(run, labels, further.get("categories"), further.get("call", 0), further.get("window"))  # type: ignore[arg-type]
+    return target_samples(run, labels, options.get("categories"), options.get("call", 0), options.get("window"))  # type: ignore[arg-type]
 
 
 def test_keys_and_groups_that_the_run_does_not_have_are_refused_with_their_row(run: Run) -> None:
@@ -226,16 +226,16 @@ def test_the_command_prints_one_table_and_a_sentence(run: Run, tmp_path: Path) -
     file = tmp_path / "own.csv"
     by_group(run, lambda draw: float(draw.normal())).to_csv(file, index=False)
     options = ["--permutations", "9", "--controls", "instruction"]
-    done = CliRunner().invoke(
+    result = CliRunner().invoke(
         app, ["train", str(run.location), "--labels", str(file), "--target", "y", *options], env={"COLUMNS": "100"}
     )
-    assert done.exit_code == 0, done.stderr
+    assert result.exit_code == 0, result.stderr
     assert "y not testable in the backbone and the action expert: train with --permutations" in " ".join(
-        done.stdout.split()
+        result.stdout.split()
     )
-    assert f"y (continuous), {len(run.episodes)} numbers" in done.stdout
-    assert "control instruction" in done.stdout
-    assert done.stdout.splitlines()[0] == Target.read(file, "y").contents
+    assert f"y (continuous), {len(run.episodes)} numbers" in result.stdout
+    assert "control instruction" in result.stdout
+    assert result.stdout.splitlines()[0] == Target.read(file, "y").contents
     assert load_results(run, target="y").settings.target == "y"
 
 
@@ -247,11 +247,11 @@ def test_the_command_prints_the_classes_once_with_their_counts(run: Run, tmp_pat
     lines[1] = lines[1].rpartition(",")[0] + ",NA"
     file.write_text("\n".join(lines), encoding="utf-8")
     options = ["--labels", str(file), "--target", "y", "--permutations", "0", "--controls", "instruction"]
-    done = CliRunner().invoke(app, ["train", str(run.location), *options], env={"COLUMNS": "100"})
-    assert done.exit_code == 0, done.stderr
+    result = CliRunner().invoke(app, ["train", str(run.location), *options], env={"COLUMNS": "100"})
+    assert result.exit_code == 0, result.stderr
     counts = {word: sum(line.endswith(f",{word}") for line in lines) for word in ("no", "Yes")}
     line = f"y (binary), 2 classes: no {counts['no']}, yes {counts['Yes']}; 1 missing"
-    assert done.stdout.splitlines().count(line) == 1
+    assert result.stdout.splitlines().count(line) == 1
 
 
 @pytest.mark.parametrize(
@@ -268,9 +268,9 @@ def test_the_command_prints_the_classes_once_with_their_counts(run: Run, tmp_pat
 def test_options_that_contradict_each_other_are_refused(
     labelled_run: Path, options: list[str], expected: str
 ) -> None:
-    done = CliRunner().invoke(app, ["train", str(labelled_run), *options])
-    assert done.exit_code == 2
-    assert expected in str(done.exception) or expected in done.stderr
+    result = CliRunner().invoke(app, ["train", str(labelled_run), *options])
+    assert result.exit_code == 2
+    assert expected in str(result.exception) or expected in result.stderr
 
 
 GRASPED = 2
@@ -359,8 +359,8 @@ def test_what_is_no_event_is_refused(events_run: Run) -> None:
         target_samples(
             events_run, Target.of_run(events_run, "item.named"), None, 0, None, Target.read(table, "open")
         )
-    said = CliRunner().invoke(app, ["train", str(events_run.path), "--align-to", "sim.held"])
-    assert "--align-to is for labels of your own" in " ".join(said.stderr.split())
+    result = CliRunner().invoke(app, ["train", str(events_run.path), "--align-to", "sim.held"])
+    assert "--align-to is for labels of your own" in " ".join(result.stderr.split())
 
 
 @pytest.mark.slow
@@ -445,15 +445,15 @@ def test_the_step_of_recordings_is_the_frame_and_not_the_place_in_its_row() -> N
     samples = TargetSamples(
         np.array([0, 0, 1, 1]), np.array([0, 1, 0, 1]), np.zeros(4), np.full(4, "a"), np.full(4, "all"), 2, {}
     )
-    found = step_features(samples, np.array([0, 1, 2, 3]))
-    np.testing.assert_array_equal(found, np.eye(4))
+    one_hot = step_features(samples, np.array([0, 1, 2, 3]))
+    np.testing.assert_array_equal(one_hot, np.eye(4))
 
 
 def test_small_pictures_are_means_of_the_stored_ones() -> None:
     pixels = np.random.default_rng(0).integers(0, 256, (2, 1, 32, 32, 3), dtype=np.uint8)
-    found = small_pictures(pixels, 16).reshape(2, 16, 16, 3)
+    means = small_pictures(pixels, 16).reshape(2, 16, 16, 3)
     expected = pixels[:, 0].reshape(2, 16, 2, 16, 2, 3).mean(axis=(2, 4)) / 255
-    np.testing.assert_allclose(found, expected, atol=1.01 / 255)
+    np.testing.assert_allclose(means, expected, atol=1.01 / 255)
 
 
 def test_a_run_without_pixels_says_why_two_controls_are_left_out(tmp_path: Path) -> None:
@@ -550,9 +550,9 @@ def test_frames_and_episodes_that_were_never_recorded_are_refused_by_their_line(
     with pytest.raises(UsageError, match=message):
         target_samples(shown_run, Target.read(table, "mine"), None, 0, None)
     if "source_episode" in change:
-        whole = table.groupby("source_episode", as_index=False)["mine"].first()
+        by_episode = table.groupby("source_episode", as_index=False)["mine"].first()
         with pytest.raises(UsageError, match=message):
-            Target.read(whole, "mine").on(shown_run)
+            Target.read(by_episode, "mine").on(shown_run)
 
 
 def test_keys_of_recordings_are_refused_on_scenes_and_where_nothing_is_shown(

@@ -24,8 +24,8 @@ def test_power_grows_with_items_and_with_the_signal() -> None:
 
 @pytest.mark.slow
 def test_without_a_signal_power_is_the_false_alarm_rate() -> None:
-    found = simulate(60, 0.0, draws=200)
-    assert max(found.chance, found.random_features, found.untrained) <= 0.05 + 3 * (0.05 * 0.95 / 200) ** 0.5
+    power = simulate(60, 0.0, draws=200)
+    assert max(power.chance, power.random_features, power.untrained) <= 0.05 + 3 * (0.05 * 0.95 / 200) ** 0.5
 
 
 @pytest.mark.slow
@@ -46,9 +46,9 @@ def test_what_a_control_could_have_seen_at_this_size() -> None:
 
 def test_one_site_carries_the_signal_too() -> None:
     """An independent simulation of one probe sees 25 points in nearly all experiments with 60 items."""
-    found = simulate(60, 0.25, sites=1, draws=100)
-    assert found.chance > 0.98
-    assert found.random_features > 0.7
+    power = simulate(60, 0.25, sites=1, draws=100)
+    assert power.chance > 0.98
+    assert power.random_features > 0.7
     assert simulate(60, 0.0, sites=1, draws=100).chance < 0.12
 
 
@@ -61,19 +61,19 @@ def test_a_third_of_the_sites_carry_the_signal_whatever_their_number(sites: int)
 def independent(items: int, above: float, sites: int, draws: int) -> float:
     """Power against chance of `draws` experiments, from the whole covariance instead of its recursion."""
     generator = np.random.default_rng(12345)
-    place = np.arange(sites)
-    of_sites = 0.9 ** np.abs(place[:, None] - place)
+    index = np.arange(sites)
+    of_sites = 0.9 ** np.abs(index[:, None] - index)
     of_group = 0.3 + 0.7 * np.eye(4)
     root = np.linalg.cholesky(np.kron(of_sites, of_group))
     groups = items // 2
 
     def best(signal: NDArray[np.float64], count: int) -> NDArray[np.float64]:
         limits = np.array([NormalDist().inv_cdf(0.5 + share) for share in signal])
-        found = []
+        shares = []
         for _ in range(count):
             values = (generator.standard_normal((groups, 4 * sites)) @ root.T).reshape(groups, sites, 4)
-            found.append((values < limits[:, None]).mean(axis=(0, 2)).max())
-        return np.array(found)
+            shares.append((values < limits[:, None]).mean(axis=(0, 2)).max())
+        return np.array(shares)
 
     signal = np.zeros(sites)
     signal[_carriers(sites)] = above
@@ -85,18 +85,18 @@ def independent(items: int, above: float, sites: int, draws: int) -> float:
 @pytest.mark.parametrize(("items", "above", "sites"), [(60, 0.25, 1), (60, 0.1, 1), (24, 0.15, 5)])
 def test_power_against_chance_is_that_of_an_independent_simulation(items: int, above: float, sites: int) -> None:
     expected = independent(items, above, sites, 1000)
-    found = [simulate(items, above, sites, draws=100, seed=seed).chance for seed in range(4)]
+    powers = [simulate(items, above, sites, draws=100, seed=seed).chance for seed in range(4)]
     error = (expected * (1 - expected) * (1 / 1000 + 1 / 400)) ** 0.5
-    assert np.mean(found) == pytest.approx(expected, abs=3.5 * error + 0.02)
+    assert np.mean(powers) == pytest.approx(expected, abs=3.5 * error + 0.02)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("items", "above"), [(60, 0.1), (24, 0.15), (150, 0.1)])
 def test_power_over_all_sites_is_that_of_an_independent_simulation(items: int, above: float) -> None:
     expected = independent(items, above, 19, 1500)
-    found = simulate(items, above, draws=1500).chance
+    power = simulate(items, above, draws=1500).chance
     error = (2 * expected * (1 - expected) / 1500) ** 0.5
-    assert found == pytest.approx(expected, abs=3.5 * error + 0.01)
+    assert power == pytest.approx(expected, abs=3.5 * error + 0.01)
 
 
 @pytest.mark.slow
@@ -113,26 +113,27 @@ def test_the_spread_is_the_error_over_seeds() -> None:
     few = [simulate(24, 0.15, 5, draws=50, seed=seed) for seed in range(8)]
     many = [simulate(24, 0.15, 5, draws=400, seed=seed) for seed in range(4)]
     measured = max(
-        np.std([getattr(one, name) for one in few], ddof=1) for name in ("chance", "random_features", "untrained")
+        np.std([getattr(estimate, name) for estimate in few], ddof=1)
+        for name in ("chance", "random_features", "untrained")
     )
-    said = float(np.mean([one.spread for one in few]))
-    assert 0.4 * measured < said < 2.5 * measured
-    assert np.mean([one.spread for one in many]) < 0.7 * said
+    stated_spread = float(np.mean([estimate.spread for estimate in few]))
+    assert 0.4 * measured < stated_spread < 2.5 * measured
+    assert np.mean([estimate.spread for estimate in many]) < 0.7 * stated_spread
 
 
 @pytest.mark.parametrize("goal", [10, 12, 58, 68, 150, 152, 999, 1000])
 def test_the_fewest_items_are_found_to_the_resolution_that_is_said(goal: int) -> None:
-    found = fewest(lambda items: items >= goal, 10, 1000)
-    assert found is not None
-    items, resolution = found
+    fewest_items = fewest(lambda items: items >= goal, 10, 1000)
+    assert fewest_items is not None
+    items, resolution = fewest_items
     assert goal <= items < goal + resolution
     assert resolution <= max(2, items // 50)
 
 
 def test_a_number_that_reaches_the_goal_by_luck_is_not_the_fewest() -> None:
     """Shares go in steps: 40 reach it and 42 do not."""
-    found = fewest(lambda items: items == 40 or items >= 68, 10, 1000)
-    assert found == (68, 2)
+    fewest_items = fewest(lambda items: items == 40 or items >= 68, 10, 1000)
+    assert fewest_items == (68, 2)
     assert fewest(lambda _: False, 10, 1000) is None
     assert fewest(lambda items: items == 1000, 10, 1000) is not None
 
@@ -141,10 +142,12 @@ def test_a_number_that_reaches_the_goal_by_luck_is_not_the_fewest() -> None:
 def test_the_items_needed_reach_the_power_and_a_step_less_does_not() -> None:
     needed = items_needed(0.25, 0.8, sites=3, draws=60)
     assert needed is not None
-    found, resolution = needed
-    assert found == simulate(found.items, 0.25, 3, 60)
-    assert min(found.chance, found.random_features, found.untrained) == found.least >= 0.8
-    assert simulate(found.items - resolution, 0.25, 3, 60).least < 0.8
+    needed_items, resolution = needed
+    assert needed_items == simulate(needed_items.items, 0.25, 3, 60)
+    assert (
+        min(needed_items.chance, needed_items.random_features, needed_items.untrained) == needed_items.least >= 0.8
+    )
+    assert simulate(needed_items.items - resolution, 0.25, 3, 60).least < 0.8
 
 
 def test_the_width_of_an_interval_asks_for_items_too() -> None:
@@ -162,9 +165,9 @@ def test_sizes_and_signals_that_cannot_be_are_refused() -> None:
 
 
 def test_the_command_prints_every_number_of_items() -> None:
-    found = CliRunner().invoke(app, ["power", "--items", "24,60", "--signal", "25", "--draws", "20", "--json"])
-    assert found.exit_code == 0, found.output
-    rows = json.loads(found.stdout)
+    result = CliRunner().invoke(app, ["power", "--items", "24,60", "--signal", "25", "--draws", "20", "--json"])
+    assert result.exit_code == 0, result.output
+    rows = json.loads(result.stdout)
     assert [row["items"] for row in rows] == [24, 60]
     assert all(0 <= row["absent"] <= 1 for row in rows)
     text = CliRunner().invoke(app, ["power", "--items", "24", "--signal", "25", "--draws", "20"]).stdout
@@ -175,17 +178,17 @@ def test_the_command_prints_every_number_of_items() -> None:
 
 
 def test_the_command_looks_for_the_number_and_says_how_well_it_is_known() -> None:
-    asked = ["power", "--power", "70", "--signal", "50", "--sites", "1", "--draws", "20"]
-    (found,) = json.loads(CliRunner().invoke(app, [*asked, "--json"]).stdout)
-    assert found.keys() == {"above", "power", "items", "resolution", "reached", "spread"}
-    text = CliRunner().invoke(app, asked).stdout
-    assert f"{found['items']} items per category (to {found['resolution']};" in text
-    refused = CliRunner().invoke(app, [*asked, "--items", "24,60"])
+    command = ["power", "--power", "70", "--signal", "50", "--sites", "1", "--draws", "20"]
+    (answer,) = json.loads(CliRunner().invoke(app, [*command, "--json"]).stdout)
+    assert answer.keys() == {"above", "power", "items", "resolution", "reached", "spread"}
+    text = CliRunner().invoke(app, command).stdout
+    assert f"{answer['items']} items per category (to {answer['resolution']};" in text
+    refused = CliRunner().invoke(app, [*command, "--items", "24,60"])
     assert refused.exit_code == 2
     assert "leave --items out" in refused.output
 
 
 def test_two_questions_are_not_answered_by_one_of_them() -> None:
-    found = CliRunner().invoke(app, ["power", "--width", "16", "--power", "80"])
-    assert found.exit_code == 2
-    assert "two questions" in found.output
+    result = CliRunner().invoke(app, ["power", "--width", "16", "--power", "80"])
+    assert result.exit_code == 2
+    assert "two questions" in result.output

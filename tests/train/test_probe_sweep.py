@@ -87,25 +87,25 @@ def test_scores_are_balanced_between_the_sides(planted_run: PlantedRun) -> None:
     """Where one side has more episodes, naming it is worth nothing."""
     results = train_probes(planted_run({PLANTED: 2.0}), permutations=0, target="side.chosen")
     curve = results.curves["color", "mean"]
-    left = curve.labels
+    is_left = curve.labels
     for row in range(len(curve.sites)):
         shifted = curve.decisions[row].copy()
         for fold in np.unique(curve.fold_of):
-            trained = left[curve.fold_of != fold]
+            trained = is_left[curve.fold_of != fold]
             shifted[curve.fold_of == fold] -= np.log(trained.sum() / (~trained).sum())
-        assert results.scores["accuracy"][row] == pytest.approx(balanced_accuracy_score(left, shifted > 0))
+        assert results.scores["accuracy"][row] == pytest.approx(balanced_accuracy_score(is_left, shifted > 0))
     always_left = replace(curve, decisions=np.full_like(curve.decisions, 9.0))
     np.testing.assert_allclose(always_left.sums.accuracies, 0.5)
-    assert (always_left.correct.mean(axis=1) == left.mean()).all()
+    assert (always_left.correct.mean(axis=1) == is_left.mean()).all()
 
 
 def test_an_interrupted_sweep_continues_after_the_last_finished_site(planted_run: PlantedRun) -> None:
     run = planted_run()
     finished: list[str] = []
 
-    def interrupt(done: int, _: int, site: str) -> None:
+    def interrupt(fitted_sites: int, _: int, site: str) -> None:
         finished.append(site)
-        if done == 4:
+        if fitted_sites == 4:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -178,8 +178,8 @@ def test_a_device_changes_neither_numbers_nor_key(planted_run: PlantedRun, devic
     shutil.rmtree(run.path)
     by_numpy = train_probes(run, permutations=2)
     assert by_torch.key == by_numpy.key
-    one, other = (results.curves["color", "mean"].decisions for results in (by_torch, by_numpy))
-    np.testing.assert_allclose(one, other, rtol=0, atol=1e-9 * np.abs(other).max())
+    first, other = (results.curves["color", "mean"].decisions for results in (by_torch, by_numpy))
+    np.testing.assert_allclose(first, other, rtol=0, atol=1e-9 * np.abs(other).max())
 
 
 def test_a_device_is_not_shared_by_processes(planted_run: PlantedRun) -> None:
@@ -189,9 +189,11 @@ def test_a_device_is_not_shared_by_processes(planted_run: PlantedRun) -> None:
 
 
 def test_progress_counts_every_site(planted_run: PlantedRun) -> None:
-    seen: list[tuple[int, int]] = []
-    train_probes(planted_run(), permutations=0, progress=lambda done, total, _: seen.append((done, total)))
-    assert seen == [(done, 9) for done in range(1, 10)]
+    reports: list[tuple[int, int]] = []
+    train_probes(
+        planted_run(), permutations=0, progress=lambda finished, total, _: reports.append((finished, total))
+    )
+    assert reports == [(finished, 9) for finished in range(1, 10)]
 
 
 def test_wrong_requests_name_what_there_is(planted_run: PlantedRun) -> None:
@@ -287,10 +289,10 @@ def deadly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[int], A
 
 @pytest.mark.slow
 def test_a_column_whose_process_is_killed_is_fitted_by_another(deadly: Any) -> None:
-    held = (
+    warning = (
         r"worker \d ended with code -9; the column it held \(backbone\.\d\d\.residual mean\) will be tried again"
     )
-    with pytest.warns(WorkerLostWarning, match=held):
+    with pytest.warns(WorkerLostWarning, match=warning):
         together = dict(probe_columns(columns([]), {"color": deadly(1)}, jobs=2))
     assert_same_numbers(columns_of(), together)
 

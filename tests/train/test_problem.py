@@ -75,9 +75,9 @@ def test_dropping_incomplete_items_restores_balance(planted_run: PlantedRun) -> 
 
 def test_a_category_that_is_nearly_all_of_one_side_is_refused(planted_run: PlantedRun) -> None:
     episodes = planted_run().episodes
-    left = episodes[(episodes["side_correct"] == "left") | (episodes.index < 20)]
+    remaining_episodes = episodes[(episodes["side_correct"] == "left") | (episodes.index < 20)]
     with pytest.raises(UnbalancedEpisodesError, match=r"chance is 0\.8.*drop"):
-        problem_of(left)
+        problem_of(remaining_episodes)
 
 
 def test_so_few_groups_that_nothing_can_be_significant_are_said(planted_run: PlantedRun) -> None:
@@ -111,9 +111,9 @@ def test_the_pooled_category_has_every_episode(planted_run: PlantedRun) -> None:
 
 def test_missing_episodes_move_chance_and_say_so(planted_run: PlantedRun) -> None:
     episodes = planted_run().episodes
-    left = episodes[(episodes["side_correct"] == "left") | (episodes.index < 60)]
+    remaining_episodes = episodes[(episodes["side_correct"] == "left") | (episodes.index < 60)]
     with pytest.warns(UserWarning, match=r"chance is 0\.5.*Episodes are missing"):
-        problem_of(left)
+        problem_of(remaining_episodes)
 
 
 def test_too_few_groups_name_category_and_target(planted_run: PlantedRun) -> None:
@@ -128,9 +128,9 @@ def test_folds_of_the_chosen_side_do_not_know_which_side_was_chosen(planted_run:
     some = exchanged["group_id"].isin(sorted(set(exchanged["group_id"]))[:7])
     exchanged.loc[some, "side_placed"] = exchanged.loc[some, "side_placed"].map(placed)
     folds = [problem_of(table, target="side.chosen").folds for table in (episodes, exchanged)]
-    for here, there in zip(*folds, strict=True):
-        for one, other in zip((here.outer, *here.inner), (there.outer, *there.inner), strict=True):
-            np.testing.assert_array_equal(one.test, other.test)
+    for original, mirrored in zip(*folds, strict=True):
+        for first, other in zip((original.outer, *original.inner), (mirrored.outer, *mirrored.inner), strict=True):
+            np.testing.assert_array_equal(first.test, other.test)
 
 
 def test_folds_of_the_chosen_side_are_refused_where_a_training_side_holds_one_side(
@@ -186,10 +186,10 @@ def test_groups_of_another_layout_do_not_exchange() -> None:
 
 def test_folds_never_split_a_group_and_do_not_depend_on_the_labels() -> None:
     draw = np.random.default_rng(0)
-    one, other = (label_problem_of(draw.normal(size=GROUP.size), 0) for _ in range(2))
-    assert (one.fold_of == other.fold_of).all()
+    first, other = (label_problem_of(draw.normal(size=GROUP.size), 0) for _ in range(2))
+    assert (first.fold_of == other.fold_of).all()
     for number in range(GROUPS):
-        assert np.unique(one.fold_of[number == GROUP]).size == 1
+        assert np.unique(first.fold_of[number == GROUP]).size == 1
 
 
 def test_a_trend_over_the_episode_is_read_and_is_no_signal() -> None:
@@ -221,8 +221,8 @@ def test_the_score_of_a_labelling_does_not_depend_on_its_place_among_the_permuta
     features = draw.normal(size=(GROUP.size, 4))
     probe = problem.fit(Samples.pooled(features), problem.permuted_labels)
     first = problem.permuted_labels[:, -1]
-    others = np.column_stack([problem.labels, problem.permuted_labels[:, :-1]])
-    turned = probe_site(Samples.pooled(features), first, others, problem.folds, task)
+    labellings = np.column_stack([problem.labels, problem.permuted_labels[:, :-1]])
+    turned = probe_site(Samples.pooled(features), first, labellings, problem.folds, task)
     expected = np.roll([probe.scores.mean(), *probe.null], 1)
     np.testing.assert_allclose([turned.scores.mean(), *turned.null], expected, rtol=0, atol=1e-12)
 
@@ -230,7 +230,7 @@ def test_the_score_of_a_labelling_does_not_depend_on_its_place_among_the_permuta
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["trend", "group", "noise"])
 def test_labels_that_know_nothing_are_found_in_five_of_a_hundred(kind: str) -> None:
-    found = 0
+    false_alarms = 0
     for seed in range(100):
         draw = np.random.default_rng(seed)
         values = {
@@ -244,8 +244,8 @@ def test_labels_that_know_nothing_are_found_in_five_of_a_hundred(kind: str) -> N
         probe = probe_site(
             Samples.pooled(features), problem.labels, problem.permuted_labels, problem.folds, "continuous"
         )
-        found += int(p_value(np.array([probe.scores.mean()]), probe.null[None, :])[0] <= 0.05)
-    assert found <= 12, "five are expected; 13 or more have a chance of 0.0015"
+        false_alarms += int(p_value(np.array([probe.scores.mean()]), probe.null[None, :])[0] <= 0.05)
+    assert false_alarms <= 12, "five are expected; 13 or more have a chance of 0.0015"
 
 
 ITEMS = np.repeat(np.arange(20), 2)

@@ -130,9 +130,9 @@ def test_stored_directions_are_read_back_one_by_one(tmp_path: Path) -> None:
     places = {("color", "mean:image.front", SITE): direction(), ("shape", "mean", SITE): direction(2.0)}
     stored = StoredDirections(bundle(tmp_path, places), "directions.npz")
     assert list(stored) == list(places)
-    for place, expected in places.items():
+    for column_key, expected in places.items():
         for part, array in vars(expected).items():
-            np.testing.assert_array_equal(getattr(stored[place], part), array)
+            np.testing.assert_array_equal(getattr(stored[column_key], part), array)
     assert ("color", "mean", SITE) not in stored
 
 
@@ -308,17 +308,17 @@ def test_categories_do_not_mix(results_of: ProbeResults) -> None:
 
 
 @pytest.mark.parametrize(
-    ("asked", "sentence"),
+    ("permutations", "sentence"),
     [
         (9, "not testable in the backbone and the action expert: train with --permutations 20 or more"),
         (200, "not testable in the backbone and the action expert: extract more items"),
     ],
 )
 def test_what_no_p_can_show_says_whether_permutations_or_groups_are_too_few(
-    results_of: ProbeResults, asked: int, sentence: str
+    results_of: ProbeResults, permutations: int, sentence: str
 ) -> None:
     """The null of these probes has nine columns: of as many as were asked for, or of all that the groups allow."""
-    stored = replace(results_of, settings=replace(results_of.settings, permutations=asked))
+    stored = replace(results_of, settings=replace(results_of.settings, permutations=permutations))
     assert best_sites_findings(stored) == [f"Color  {sentence}."]
 
 
@@ -328,14 +328,17 @@ def test_a_run_lists_its_probes_oldest_first_and_which_are_used(planted_run: Pla
     assert inventory(run).probes == ()
     first = train_probes(run, permutations=1, controls=("position",))
     second = train_probes(run, permutations=2, target="side.shuffled", seed=7)
-    found = inventory(run)
-    assert [(probes.key, probes.state) for probes in found.probes] == [(first.key, "used"), (second.key, "other")]
-    assert [(probes.target, probes.seed, probes.controls) for probes in found.probes] == [
+    listing = inventory(run)
+    assert [(probes.key, probes.state) for probes in listing.probes] == [
+        (first.key, "used"),
+        (second.key, "other"),
+    ]
+    assert [(probes.target, probes.seed, probes.controls) for probes in listing.probes] == [
         ("side.correct", 0, ("position",)),
         ("side.shuffled", 7, ()),
     ]
-    assert (found.episodes, found.planned, sum(found.outcomes.values())) == (80, 80, 80)
-    assert found.streams["expert"] == "2 layers × 2 iterations, width 8; views mean"
+    assert (listing.episodes, listing.planned, sum(listing.outcomes.values())) == (80, 80, 80)
+    assert listing.streams["expert"] == "2 layers × 2 iterations, width 8; views mean"
 
 
 def test_probes_of_other_episodes_are_named(planted_run: PlantedRun) -> None:

@@ -81,7 +81,8 @@ def run_on(
     for number in writer.remaining()[:episodes]:
         record = episode(plan, number)
         arrays = {
-            kind: {name: repeated(one, calls) for name, one in of.items()} for kind, of in record.arrays.items()
+            kind: {name: repeated(values, calls) for name, values in of.items()}
+            for kind, of in record.arrays.items()
         }
         writer.write(replace(record, arrays=arrays))
     if episodes is None:
@@ -106,11 +107,11 @@ def test_what_extract_drew_is_drawn_again_or_found(
     run = run_on(suite, tmp_path / "run", episodes=2)
     if emptied:
         shutil.rmtree(filled)
-    found = suite_of(run)
-    assert found.identity == suite.identity == run.suite
+    drawn_suite = suite_of(run)
+    assert drawn_suite.identity == suite.identity == run.suite
     assert not default_folder().exists()  # eleven categories would take half a minute
-    assert all(item.picture("left").is_file() for item in found.items)
-    assert suite_of(run).folder == found.folder
+    assert all(item.picture("left").is_file() for item in drawn_suite.items)
+    assert suite_of(run).folder == drawn_suite.folder
 
 
 @pytest.mark.usefixtures("cache")
@@ -171,14 +172,14 @@ def test_a_default_control_without_its_pictures_is_said_aloud_and_one_that_was_a
     run = run_on(suite, tmp_path / "run")
     with pytest.warns(UserWarning, match=f"{CONTROL_LEFT_OUT}.*{reason}.*--suite, suite=.*controls=\\(\\)"):
         assert train_probes(run, permutations=1).scores["exceeds_random_features"].isna().all()
-    for asked in ("random-features", "pixels"):
+    for control in ("random-features", "pixels"):
         with pytest.raises(SuiteNotFoundError, match=f"{reason}.*--suite, suite="):
-            train_probes(run, permutations=1, controls=(asked,))
+            train_probes(run, permutations=1, controls=(control,))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         train_probes(run, permutations=1, controls=())
-        found = train_probes(run, permutations=1, suite=suite.folder)
-    assert found.scores["exceeds_random_features"].notna().all()
+        results = train_probes(run, permutations=1, suite=suite.folder)
+    assert results.scores["exceeds_random_features"].notna().all()
 
 
 @pytest.mark.slow

@@ -41,26 +41,26 @@ def scikit_learn_probe(strength: float, train: np.ndarray) -> LogisticRegression
 
 
 def scikit_learn_nested(folds: list[NestedFold]) -> tuple[np.ndarray, list[float]]:
-    decisions, chosen = np.empty(60), []
+    decisions, chosen_strengths = np.empty(60), []
     for fold in folds:
         loss = np.zeros(STRENGTHS.size)
         for step, strength in enumerate(STRENGTHS):
             for inner in fold.inner:
                 held_out = scikit_learn_probe(strength, inner.train).predict_log_proba(FEATURES[inner.test])
                 loss[step] -= np.where(LABELS[inner.test], held_out[:, 1], held_out[:, 0]).sum()
-        chosen.append(float(STRENGTHS[loss.argmin()]))
-        decisions[fold.outer.test] = scikit_learn_probe(chosen[-1], fold.outer.train).decision_function(
+        chosen_strengths.append(float(STRENGTHS[loss.argmin()]))
+        decisions[fold.outer.test] = scikit_learn_probe(chosen_strengths[-1], fold.outer.train).decision_function(
             FEATURES[fold.outer.test]
         )
-    return decisions, chosen
+    return decisions, chosen_strengths
 
 
 def test_nested_cross_validation_equals_the_same_loops_over_scikit_learn() -> None:
     folds = nested_folds(LABELS, ITEMS, seed=0)
-    expected, chosen = scikit_learn_nested(folds)
+    expected, chosen_strengths = scikit_learn_nested(folds)
     probe = probe_site(Samples.pooled(FEATURES), LABELS, NONE, folds)
     np.testing.assert_allclose(probe.decisions, expected, atol=1e-6 * np.abs(expected).max())
-    assert probe.strengths.tolist() == chosen
+    assert probe.strengths.tolist() == chosen_strengths
 
 
 def test_inner_log_likelihoods_are_those_of_scikit_learn_at_the_chosen_strength() -> None:
@@ -68,9 +68,9 @@ def test_inner_log_likelihoods_are_those_of_scikit_learn_at_the_chosen_strength(
     probe = probe_site(Samples.pooled(FEATURES), LABELS, NONE, folds)
     for fold, strength, inner in zip(folds, probe.strengths, probe.inner, strict=True):
         expected = np.zeros(60)
-        for one in fold.inner:
-            log_p = scikit_learn_probe(strength, one.train).predict_log_proba(FEATURES[one.test])
-            expected[one.test] = np.where(LABELS[one.test], log_p[:, 1], log_p[:, 0])
+        for inner_fold in fold.inner:
+            log_p = scikit_learn_probe(strength, inner_fold.train).predict_log_proba(FEATURES[inner_fold.test])
+            expected[inner_fold.test] = np.where(LABELS[inner_fold.test], log_p[:, 1], log_p[:, 0])
         np.testing.assert_allclose(inner, expected, atol=1e-5)
         assert not inner[fold.outer.test].any(), "a fold has no part in the choice of its site"
 
@@ -240,8 +240,8 @@ def test_chance_is_the_larger_class() -> None:
 
 
 def limits(right: NDArray[np.bool_], groups: NDArray[np.int64]) -> tuple[float, float]:
-    found = Share.of(right, groups).interval()
-    return found.low, found.high
+    interval = Share.of(right, groups).interval()
+    return interval.low, interval.high
 
 
 def test_interval_widens_when_episodes_of_a_group_agree() -> None:
@@ -304,13 +304,13 @@ def test_decisions_strengths_and_weights_are_those_of_single_folds(
     expected = one_after_another(monkeypatch, samples, labels, folds)
     for at_once in (1, 128):
         monkeypatch.setattr(small_probe, "COLUMNS_AT_ONCE", at_once)
-        for found, single in zip(cross_validate(samples, labels, folds), expected, strict=True):
-            np.testing.assert_array_equal(found.strengths, single.strengths)
-            for ours, theirs in ((found.decisions, single.decisions), (found.weights, single.weights)):
+        for fitted, single in zip(cross_validate(samples, labels, folds), expected, strict=True):
+            np.testing.assert_array_equal(fitted.strengths, single.strengths)
+            for ours, theirs in ((fitted.decisions, single.decisions), (fitted.weights, single.weights)):
                 np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-6 * np.abs(theirs).max())
-            assert found.spread == pytest.approx(single.spread, rel=1e-6)
-            np.testing.assert_allclose(found.inner.total, single.inner.total, rtol=0, atol=1e-5)
-            np.testing.assert_allclose(found.inner.first, single.inner.first, rtol=0, atol=1e-5)
+            assert fitted.spread == pytest.approx(single.spread, rel=1e-6)
+            np.testing.assert_allclose(fitted.inner.total, single.inner.total, rtol=0, atol=1e-5)
+            np.testing.assert_allclose(fitted.inner.first, single.inner.first, rtol=0, atol=1e-5)
 
 
 def test_torch_gives_the_decisions_of_numpy() -> None:
@@ -318,8 +318,10 @@ def test_torch_gives_the_decisions_of_numpy() -> None:
     ours = cross_validate(Samples.pooled(features), labels, folds)
     theirs = cross_validate(Samples.pooled(features).to("cpu"), labels, folds)
     assert isinstance(Samples.pooled(features).to("cpu").features, torch.Tensor)
-    for one, other in zip(ours, theirs, strict=True):
-        np.testing.assert_allclose(other.decisions, one.decisions, rtol=0, atol=1e-6 * np.abs(one.decisions).max())
+    for our_fold, other in zip(ours, theirs, strict=True):
+        np.testing.assert_allclose(
+            other.decisions, our_fold.decisions, rtol=0, atol=1e-6 * np.abs(our_fold.decisions).max()
+        )
 
 
 def test_a_training_set_of_a_single_class_is_an_error() -> None:
@@ -387,8 +389,8 @@ def by_scikit_learn(
     for fold in nested(GROUPS):
         losses = []
         for strength in grid:
-            found = [loss(y[i.test], predict(*scaled(x, i), y[i.train], strength)) for i in fold.inner]
-            losses.append(round(sum(found), 9))
+            inner_losses = [loss(y[i.test], predict(*scaled(x, i), y[i.train], strength)) for i in fold.inner]
+            losses.append(round(sum(inner_losses), 9))
         best = grid[int(np.argmin(losses))]
         predictions[fold.outer.test] = predict(*scaled(x, fold.outer), y[fold.outer.train], best)
     return predictions
@@ -418,8 +420,8 @@ def indicators(
 def logistic(
     train: NDArray[np.float64], test: NDArray[np.float64], y: NDArray[np.float64], strength: float
 ) -> NDArray[np.float64]:
-    found = LogisticRegression(C=strength, tol=1e-12, max_iter=10_000).fit(train, y)
-    return np.asarray(found.decision_function(test))
+    model = LogisticRegression(C=strength, tol=1e-12, max_iter=10_000).fit(train, y)
+    return np.asarray(model.decision_function(test))
 
 
 def squares(truth: NDArray[np.float64], predicted: NDArray[np.float64]) -> float:
@@ -435,10 +437,12 @@ def test_a_continuous_label_is_predicted_as_by_scikit_learn() -> None:
     columns = columns[:, :2]
     probe = probe_site(Samples.pooled(x), columns[:, 0], columns[:, 1:], nested(GROUPS), "continuous")
     grid = sorted(PENALTIES.tolist(), reverse=True)
-    found = [by_scikit_learn(x, column, clipped_ridge, grid, squares) for column in columns.T]
-    np.testing.assert_allclose(probe.decisions, found[0], atol=1e-10)
+    references = [by_scikit_learn(x, column, clipped_ridge, grid, squares) for column in columns.T]
+    np.testing.assert_allclose(probe.decisions, references[0], atol=1e-10)
     outer = [fold.outer for fold in nested(GROUPS)]
-    null = [explained_scores(p[:, None], y[:, None], outer).mean() for p, y in zip(found, columns.T, strict=True)]
+    null = [
+        explained_scores(p[:, None], y[:, None], outer).mean() for p, y in zip(references, columns.T, strict=True)
+    ]
     np.testing.assert_allclose(probe.null, null[1:], atol=1e-10)
     assert probe.scores.mean() > 0.5 > max(probe.null)
 
@@ -452,9 +456,9 @@ def test_classes_are_predicted_as_by_scikit_learn() -> None:
     def wrong(truth: NDArray[np.float64], predicted: NDArray[np.float64]) -> float:
         return -sum((predicted == c)[truth == c].mean() for c in np.unique(truth))
 
-    found = [by_scikit_learn(x, column, indicators, grid, wrong) for column in columns.T]
-    assert (probe.decisions == found[0]).all()
-    null = [balanced_accuracy_score(y, p) for p, y in zip(found, columns.T, strict=True)]
+    references = [by_scikit_learn(x, column, indicators, grid, wrong) for column in columns.T]
+    assert (probe.decisions == references[0]).all()
+    null = [balanced_accuracy_score(y, p) for p, y in zip(references, columns.T, strict=True)]
     np.testing.assert_allclose([probe.scores.mean(), *probe.null], null, atol=1e-12)
     assert probe.scores.mean() > 0.6 > max(probe.null)
 
@@ -481,25 +485,25 @@ def test_inner_qualities_are_those_by_which_penalties_are_chosen_above_the_permu
     grid = 1 / STRENGTHS if task == "binary" else PENALTIES
 
     def qualities(fold: NestedFold, y: NDArray[np.float64], penalty: float) -> NDArray[np.float64]:
-        found = np.zeros(y.size)
+        fold_qualities = np.zeros(y.size)
         for i in fold.inner:
             train, test = scaled(x, i)
             truth = y[i.test]
             if task == "binary":
                 decisions = logistic(train, test, y[i.train], 1 / penalty)
-                found[i.test] = -np.logaddexp(0, np.where(truth == 1, -decisions, decisions))
+                fold_qualities[i.test] = -np.logaddexp(0, np.where(truth == 1, -decisions, decisions))
             elif task == "classes":
                 right = indicators(train, test, y[i.train], penalty) == truth
-                found[i.test] = right / np.array([(truth == one).sum() for one in truth])
+                fold_qualities[i.test] = right / np.array([(truth == label).sum() for label in truth])
             else:
-                found[i.test] = -((truth - clipped_ridge(train, test, y[i.train], penalty)) ** 2)
-        return found
+                fold_qualities[i.test] = -((truth - clipped_ridge(train, test, y[i.train], penalty)) ** 2)
+        return fold_qualities
 
     folds = nested(GROUPS)
     probe = probe_site(Samples.pooled(x), columns[:, 0], columns[:, 1:], folds, task)  # type: ignore[arg-type]
     penalties = 1 / probe.strengths if task == "binary" else probe.strengths
     for fold, penalty, inner in zip(folds, penalties, probe.inner, strict=True):
-        best = [max(qualities(fold, y, one).sum() for one in grid) for y in columns.T[1:]]
+        best = [max(qualities(fold, y, strength).sum() for strength in grid) for y in columns.T[1:]]
         expected = qualities(fold, columns[:, 0], penalty)
         expected[fold.outer.train] -= np.mean(best) / fold.outer.train.size
         np.testing.assert_allclose(inner, expected, atol=1e-6)
@@ -507,26 +511,26 @@ def test_inner_qualities_are_those_by_which_penalties_are_chosen_above_the_permu
 
 def test_the_mean_of_the_scores_is_the_metric_of_scikit_learn() -> None:
     x, columns = problem("continuous")
-    one = [Fold(np.arange(40, 120), np.arange(40)), Fold(np.arange(40), np.arange(40, 120))]
+    single_fold = [Fold(np.arange(40, 120), np.arange(40)), Fold(np.arange(40), np.arange(40, 120))]
     centred = columns[:, 0].copy()
-    for fold in one:
+    for fold in single_fold:
         centred[fold.train] -= centred[fold.train].mean()  # so that every training mean is the overall one
     predicted = x[:, 0]
-    scores = explained_scores(predicted[:, None], centred[:, None], one)
+    scores = explained_scores(predicted[:, None], centred[:, None], single_fold)
     assert scores.mean() == pytest.approx(r2_score(centred, predicted), abs=1e-12)
 
 
 def test_one_sample_far_away_does_not_ruin_the_score() -> None:
     x, columns = problem("continuous")
     far = np.column_stack([x, 1e-5 * np.random.default_rng(1).normal(size=len(x))])
-    whole = probe_site(
+    undisturbed = probe_site(
         Samples.pooled(far), columns[:, 0], columns[:, 1:1], nested(GROUPS), "continuous"
     ).scores.mean()
     far[7, -1] = 1.0  # a hundred thousand deviations where it is not trained on
     outside = probe_site(Samples.pooled(far), columns[:, 0], columns[:, 1:1], nested(GROUPS), "continuous")
     train = np.setdiff1d(np.arange(len(x)), next(f.outer.test for f in nested(GROUPS) if 7 in f.outer.test))
     assert columns[train, 0].min() <= outside.decisions[7] <= columns[train, 0].max()
-    assert outside.scores.mean() > whole - 0.2
+    assert outside.scores.mean() > undisturbed - 0.2
 
 
 def test_equal_label_permutations_are_fitted_once_and_scored_alike() -> None:

@@ -108,18 +108,18 @@ def test_decisions_equal_scikit_learn_at_its_own_optimum(
 ) -> None:
     features, labels = case()
     coordinates = Projection.fit(features)
-    others = features.mean(axis=0) + features.std(axis=0) * GENERATOR.standard_normal((25, features.shape[1]))
-    samples = np.vstack([coordinates.standardise(features), coordinates.standardise(others)])
-    ours = np.vstack([coordinates(features), coordinates(others)])
+    new_rows = features.mean(axis=0) + features.std(axis=0) * GENERATOR.standard_normal((25, features.shape[1]))
+    samples = np.vstack([coordinates.standardise(features), coordinates.standardise(new_rows)])
+    ours = np.vstack([coordinates(features), coordinates(new_rows)])
 
     both = np.column_stack([labels, ~labels])
     for strength, weights in zip(STRENGTHS, path(coordinates, both, STRENGTHS), strict=True):
         oracle = LogisticRegression(C=strength, tol=1e-10, solver="newton-cholesky", max_iter=1000)
         expected = oracle.fit(samples[:90], labels).decision_function(samples)
-        found = ours @ weights
-        np.testing.assert_allclose(found[:, 0], expected, rtol=0, atol=1e-6 * np.abs(expected).max())
-        np.testing.assert_allclose(found[:, 1], -expected, rtol=0, atol=1e-6 * np.abs(expected).max())
-        assert ((found[:, 0] > 0) == (expected > 0)).all()
+        decisions = ours @ weights
+        np.testing.assert_allclose(decisions[:, 0], expected, rtol=0, atol=1e-6 * np.abs(expected).max())
+        np.testing.assert_allclose(decisions[:, 1], -expected, rtol=0, atol=1e-6 * np.abs(expected).max())
+        assert ((decisions[:, 0] > 0) == (expected > 0)).all()
 
 
 def test_columns_solved_together_equal_columns_solved_alone(path: Path) -> None:
@@ -128,8 +128,8 @@ def test_columns_solved_together_equal_columns_solved_alone(path: Path) -> None:
     together = path(samples, labels, STRENGTHS)
     for column in range(7):
         single = alone(samples, labels[:, [column]], STRENGTHS)
-        for many, one in zip(together, single, strict=True):
-            assert np.linalg.norm(many[:, column] - one[:, 0]) < 1e-8 * np.linalg.norm(one)
+        for many, single_column in zip(together, single, strict=True):
+            assert np.linalg.norm(many[:, column] - single_column[:, 0]) < 1e-8 * np.linalg.norm(single_column)
 
 
 def test_exact_newton_steps_take_over_where_conjugate_gradients_do_not_settle(
@@ -138,8 +138,8 @@ def test_exact_newton_steps_take_over_where_conjugate_gradients_do_not_settle(
     samples = Projection.fit(NOISE).train
     (expected,) = LogisticSolver(samples).path(LABELS[:, None], np.array([10.0]))
     monkeypatch.setattr(conjugate, "MAX_CG_STEPS", 1)
-    (found,) = LogisticSolver(samples).path(LABELS[:, None], np.array([10.0]))
-    np.testing.assert_allclose(found, expected, atol=1e-8)
+    (solution,) = LogisticSolver(samples).path(LABELS[:, None], np.array([10.0]))
+    np.testing.assert_allclose(solution, expected, atol=1e-8)
 
 
 def test_steps_in_float32_lead_to_the_same_optimum_and_cost_no_more_steps(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -152,9 +152,9 @@ def test_steps_in_float32_lead_to_the_same_optimum_and_cost_no_more_steps(monkey
     monkeypatch.setattr(
         LogisticSolver, "_exact_newton_steps", lambda _self, _samples, gradient, _curvature: exact.append(gradient)
     )
-    for one, other in zip(wide, LogisticSolver(samples).path(labels, STRENGTHS), strict=True):
+    for in_float64, other in zip(wide, LogisticSolver(samples).path(labels, STRENGTHS), strict=True):
         assert other.dtype == np.float64
-        assert (np.linalg.norm(one - other, axis=0) < 1e-7 * np.linalg.norm(one, axis=0)).all()
+        assert (np.linalg.norm(in_float64 - other, axis=0) < 1e-7 * np.linalg.norm(in_float64, axis=0)).all()
     assert not exact, "conjugate gradients settle in float32 as they do in float64"
 
 
@@ -181,10 +181,10 @@ def test_what_float32_gets_wrong_never_moves_the_optimum(monkeypatch: pytest.Mon
     expected = list(LogisticSolver(samples).path(labels, STRENGTHS))
     blurred = DenseDesign((samples.samples * (1 + 1e-3 * draw.random(samples.shape))).astype(np.float32))
     monkeypatch.setattr(DenseDesign, "narrow", lambda _self: blurred)
-    for one, other in zip(expected, LogisticSolver(samples).path(labels, STRENGTHS), strict=True):
+    for exact, other in zip(expected, LogisticSolver(samples).path(labels, STRENGTHS), strict=True):
         # Of balanced labels and a small C all weights are next to 0, where a share of them is no measure.
-        size = np.maximum(np.linalg.norm(one, axis=0), 0.01)
-        assert (np.linalg.norm(one - other, axis=0) < 1e-8 * size).all()
+        size = np.maximum(np.linalg.norm(exact, axis=0), 0.01)
+        assert (np.linalg.norm(exact - other, axis=0) < 1e-8 * size).all()
 
 
 def test_every_weight_given_back_has_an_exact_gradient_that_is_zero(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -224,10 +224,10 @@ def test_every_column_can_have_a_strength_of_its_own() -> None:
     of_columns = LogisticSolver(samples.train).path_of_signs(
         np.repeat(SIGNS, 3, axis=1), [np.array([1.0, 0.01, 1.0])]
     )
-    (found,) = of_columns
+    (solution,) = of_columns
     for column, strength in enumerate((1.0, 0.01, 1.0)):
         (expected,) = alone(samples, LABELS[:, None], np.array([strength]))
-        np.testing.assert_allclose(found[:, [column]], expected, atol=1e-8)
+        np.testing.assert_allclose(solution[:, [column]], expected, atol=1e-8)
 
 
 DRAWS = np.random.default_rng(0)
@@ -269,12 +269,12 @@ def test_streamed_products_are_those_of_the_samples_in_memory() -> None:
 def test_streamed_probes_decide_as_probes_in_memory() -> None:
     strengths = np.array([1e-4, 1e-1, 10.0])
     at_once, by_blocks = Projection.fit(FEATURES), streamed()
-    for one, other in zip(
+    for in_memory, other in zip(
         LogisticSolver(at_once.train).path(SIDES, strengths),
         LogisticSolver(by_blocks.train).path(SIDES, strengths),
         strict=True,
     ):
-        expected = at_once.train @ one
+        expected = at_once.train @ in_memory
         np.testing.assert_allclose(by_blocks.train @ other, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
 
 
@@ -282,8 +282,8 @@ def test_streamed_probes_decide_as_probes_in_memory() -> None:
 def test_exact_newton_steps_work_on_streamed_samples(monkeypatch: pytest.MonkeyPatch) -> None:
     (expected,) = LogisticSolver(streamed().train).path(SIDES, np.array([10.0]))
     monkeypatch.setattr("probe_kit.train.solver.logistic.MAX_CG_STEPS", 1)
-    (found,) = LogisticSolver(streamed().train).path(SIDES, np.array([10.0]))
-    np.testing.assert_allclose(found, expected, atol=1e-8)
+    (solution,) = LogisticSolver(streamed().train).path(SIDES, np.array([10.0]))
+    np.testing.assert_allclose(solution, expected, atol=1e-8)
 
 
 def test_a_probe_on_many_rows_needs_memory_for_a_block_not_for_a_copy() -> None:
@@ -370,10 +370,10 @@ def test_test_samples_are_scaled_with_training_statistics() -> None:
 @pytest.mark.parametrize("shape", [(20, 50), (50, 20)])
 def test_axes_are_orthonormal_and_lose_nothing_of_the_training_samples(shape: tuple[int, int]) -> None:
     samples = noise(*shape)
-    found = principal_axes(samples)
-    assert found.shape == (shape[1], 20)
-    np.testing.assert_allclose(found.T @ found, np.eye(20), atol=1e-12)
-    np.testing.assert_allclose(samples @ found @ found.T, samples, atol=1e-12)
+    computed_axes = principal_axes(samples)
+    assert computed_axes.shape == (shape[1], 20)
+    np.testing.assert_allclose(computed_axes.T @ computed_axes, np.eye(20), atol=1e-12)
+    np.testing.assert_allclose(samples @ computed_axes @ computed_axes.T, samples, atol=1e-12)
 
 
 @pytest.mark.parametrize("steepness", [0.0, 2.0, 4.0])
@@ -384,10 +384,10 @@ def test_many_axes_are_found_in_float32_and_orthogonal_in_float64(
     monkeypatch.setattr(axes, "WORTH_NARROWING", 100)
     monkeypatch.setattr(axes, "LEADING", 8)
     samples = noise(150, 100) * 100 * np.arange(1.0, 101) ** -steepness
-    found = np.asarray(principal_axes(make(samples)))
-    assert found.dtype == np.float64
-    np.testing.assert_allclose(found.T @ found, np.eye(100), atol=1e-10)
-    moments = (samples @ found).T @ (samples @ found)
+    float32_axes = np.asarray(principal_axes(make(samples)))
+    assert float32_axes.dtype == np.float64
+    np.testing.assert_allclose(float32_axes.T @ float32_axes, np.eye(100), atol=1e-10)
+    moments = (samples @ float32_axes).T @ (samples @ float32_axes)
     assert (np.diff(np.diag(moments)) > -1.0).all(), "ascending"
     curved = np.eye(100) + moments  # as of an objective with its penalty
     scale = np.sqrt(np.diag(curved))
@@ -429,17 +429,17 @@ def test_choosing_again_chooses_among_the_chosen_and_copies_nothing() -> None:
 
 def test_blocks_are_all_rows_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rows, "ROWS_PER_BLOCK", 4)
-    chosen = RowSubset.all(MATRIX)[np.array([9, 8, 7, 6, 5, 0])]
-    blocks = list(blocks_of(chosen))
+    subset = RowSubset.all(MATRIX)[np.array([9, 8, 7, 6, 5, 0])]
+    blocks = list(blocks_of(subset))
     assert [len(block) for block in blocks] == [4, 2]
-    assert np.concatenate(blocks).tolist() == chosen.read().tolist()
+    assert np.concatenate(blocks).tolist() == subset.read().tolist()
     assert next(blocks_of(MATRIX)) is MATRIX
 
 
 def test_rows_on_a_torch_device_are_the_same_rows() -> None:
     pytest.importorskip("torch")
-    chosen = RowSubset.all(MATRIX)[np.array([4, 1])]
-    assert np.asarray(chosen.to("cpu")).tolist() == np.asarray(chosen).tolist()
+    subset = RowSubset.all(MATRIX)[np.array([4, 1])]
+    assert np.asarray(subset.to("cpu")).tolist() == np.asarray(subset).tolist()
 
 
 def test_numpy_arrays_stay_where_they_are_without_a_device() -> None:
@@ -485,9 +485,9 @@ def test_predictions_at_every_penalty_are_those_of_scikit_learn(shape: tuple[int
     if kind == "offset":
         train, test = train + 1000, test + 1000
     targets = draw.normal(size=(shape[0], 3))
-    found = list(RidgeFold.fit(train, test).predictions(targets))
+    predictions = list(RidgeFold.fit(train, test).predictions(targets))
     scaler = StandardScaler().fit(train)
-    for penalty, predicted in zip(PENALTIES, found, strict=True):
+    for penalty, predicted in zip(PENALTIES, predictions, strict=True):
         if np.isinf(penalty):
             expected = np.repeat(targets.mean(axis=0)[None, :], 17, axis=0)
         else:
@@ -497,5 +497,5 @@ def test_predictions_at_every_penalty_are_those_of_scikit_learn(shape: tuple[int
 
 
 def test_features_that_never_vary_predict_the_mean() -> None:
-    found = list(RidgeFold.fit(np.ones((6, 2)), np.ones((2, 2))).predictions(np.arange(6.0)[:, None]))
-    assert all((predicted == 2.5).all() for predicted in found)
+    predictions = list(RidgeFold.fit(np.ones((6, 2)), np.ones((2, 2))).predictions(np.arange(6.0)[:, None]))
+    assert all((predicted == 2.5).all() for predicted in predictions)

@@ -75,7 +75,7 @@ def test_what_a_killed_training_left_is_cleared_by_the_next_one(planted_run: Pla
     run = planted_run()
     results = train_probes(run, permutations=1)
     probes = run.path / "probes"
-    whole = {path.name for path in probes.rglob("*")}
+    files = {path.name for path in probes.rglob("*")}
     if not finished:
         (probes / results.key / "settings.json").unlink()
         (probes / f".{results.key}.partial").mkdir()  # else it is damage
@@ -83,7 +83,7 @@ def test_what_a_killed_training_left_is_cleared_by_the_next_one(planted_run: Pla
     else:
         leave_behind(probes, results.key)
     train_probes(run, permutations=1)
-    assert {path.name for path in probes.rglob("*")} == whole
+    assert {path.name for path in probes.rglob("*")} == files
 
 
 @pytest.mark.slow
@@ -112,8 +112,8 @@ def test_results_of_fewer_episodes_are_not_taken_for_current(planted_run: Plante
 
 def test_an_unknown_key_lists_the_known_ones(planted_run: PlantedRun) -> None:
     run = planted_run()
-    known = train_probes(run, permutations=0).key
-    with pytest.raises(UsageError, match=known):
+    key = train_probes(run, permutations=0).key
+    with pytest.raises(UsageError, match=key):
         load_results(run, "ffffffffffff")
 
 

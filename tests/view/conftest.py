@@ -126,6 +126,6 @@ def runs(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> list[R
     """Two runs of the same seeds, whose probes were fitted to both inferences; tests that use them are slow."""
     folder = tmp_path_factory.mktemp("runs")
     suite = hostile(small_suite.select(["color"]))
-    found = [write_run(folder / name, suite, seed) for seed, name in enumerate(("a", "b"))]
+    written_runs = [write_run(folder / name, suite, seed) for seed, name in enumerate(("a", "b"))]
     label_run(folder / "b", HOSTILE)
-    return [found[0], open_run(folder / "b")]
+    return [written_runs[0], open_run(folder / "b")]

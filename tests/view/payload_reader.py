@@ -13,9 +13,9 @@ _SCRIPT = re.compile(rb'put\("([^"]+)",(.*)\)\n', re.DOTALL)
 
 def read_payload(script: bytes) -> tuple[str, Any]:
     """Name and value of a payload. Fails for anything but one call of `put`."""
-    found = _SCRIPT.fullmatch(script)
-    assert found, script[:200]
-    return found[1].decode(), json.loads(found[2])
+    match = _SCRIPT.fullmatch(script)
+    assert match, script[:200]
+    return match[1].decode(), json.loads(match[2])
 
 
 def floats(packed: str) -> NDArray[np.float32]:

@@ -53,8 +53,8 @@ def address(request: pytest.FixtureRequest, runs: list[Run], index: Path) -> Ite
     if request.param == "file":
         yield index.as_uri()
         return
-    with served(runs) as found:
-        yield found
+    with served(runs) as server:
+        yield server
 
 
 @contextmanager
@@ -75,8 +75,8 @@ def served(runs: list[Run], probes_of: Run | None = None) -> Iterator[str]:
 
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    with Browser(tmp_path_factory.mktemp("profile")) as found:
-        yield found
+    with Browser(tmp_path_factory.mktemp("profile")) as started:
+        yield started
 
 
 @pytest.fixture
@@ -91,7 +91,7 @@ def text(page: Page, selector: str) -> str:
     return str(page.read(f"document.querySelector({json.dumps(selector)}).innerText"))
 
 
-def shown(page: Page) -> int:
+def shown_count(page: Page) -> int:
     return int(text(page, "output.count").split(" of ")[0])
 
 
@@ -113,7 +113,7 @@ def test_a_count_of_the_overview_opens_a_list_of_so_many_episodes(
     assert text(page, "[data-count='backbone color']") == str(len(expected))
     page.click("[data-count='backbone color']")
     page.wait("document.querySelector('.episode')")
-    assert shown(page) == len(expected)
+    assert shown_count(page) == len(expected)
     listed = page.read("[...document.querySelectorAll('.list .item small')].map(s => parseInt(s.textContent))")
     assert listed == expected
 
@@ -211,8 +211,8 @@ def test_the_frame_that_is_shown_is_the_stored_one(page: Page, address: str, run
         page.open(f"{address}#/episodes?ep=1&t={step}")
         page.read("document.querySelector('.stamp').remove()")
         page.read("new Promise(done => setTimeout(done, 300))")
-        seen = picture_of(page, ".film")
-        middle = seen[len(seen) // 4 : -len(seen) // 4, 40:-40].reshape(-1, 3)
+        picture = picture_of(page, ".film")
+        middle = picture[len(picture) // 4 : -len(picture) // 4, 40:-40].reshape(-1, 3)
         assert np.abs(np.median(middle, axis=0) - np.median(half.reshape(-1, 3), axis=0)).max() <= 3
 
 
@@ -224,9 +224,9 @@ def test_the_film_shows_every_stored_frame_at_its_step(page: Page, address: str,
     page.read("new Promise(done => setTimeout(done, 300))")
     for step, frame in enumerate(decode_frames(sheet.content, sheet.count)):
         assert text(page, ".scrub output") == f"{step} / {FILM_STEPS}"
-        seen = picture_of(page, ".film")
+        picture = picture_of(page, ".film")
         for half in (slice(0, 0.5), slice(0.5, 1)):
-            assert np.abs(median_of(seen, half) - median_of(frame, half)).max() <= 3, step
+            assert np.abs(median_of(picture, half) - median_of(frame, half)).max() <= 3, step
         page.press("ArrowRight")
     assert page.read("document.querySelector('.stamp')") is None
 
@@ -237,13 +237,13 @@ def picture_of(page: Page, selector: str) -> np.ndarray:
         f"(() => {{ const b = document.querySelector({json.dumps(selector)}).getBoundingClientRect(); "
         "return [b.left, b.top, b.right, b.bottom].map(Math.round); })()"
     )
-    return np.asarray(Image.open(BytesIO(page.picture(whole=False))).convert("RGB").crop(box), int)
+    return np.asarray(Image.open(BytesIO(page.picture(full_page=False))).convert("RGB").crop(box), int)
 
 
 def median_of(pixels: np.ndarray, share: slice) -> np.ndarray:
     """Median colour of a part of the width, without its edges."""
     height, width = pixels.shape[:2]
-    start, stop = (int(width * (place + shift)) for place, shift in ((share.start, 0.05), (share.stop, -0.05)))
+    start, stop = (int(width * (edge + shift)) for edge, shift in ((share.start, 0.05), (share.stop, -0.05)))
     return np.median(pixels[height // 8 : -height // 8, start:stop].reshape(-1, 3), axis=0)
 
 
@@ -251,7 +251,7 @@ def test_every_cell_of_a_map_shows_its_stored_scores(page: Page, address: str, r
     page.open(f"{address}#/map?category=color")
     results = load_results(runs[0])
     curve, scores = results.curves["color", "mean"], results.scores.query("view == 'mean'")
-    permuted = {str(site): np.quantile(curve.null[place], 0.95) for place, site in enumerate(curve.sites)}
+    permuted = {str(site): np.quantile(curve.null[site_row], 0.95) for site_row, site in enumerate(curve.sites)}
     for row in scores.to_dict("records"):
         page.hover(f".mapwrap [data-site='{row['site']}']")
         read = text(page, "dl.readout")
@@ -280,9 +280,9 @@ def test_an_address_shows_the_same_in_a_fresh_browser(browser: Browser, page: Pa
     page.open(f"{address}#/episodes?category=color&layout=swapped")
     page.press("j")
     page.press("ArrowRight")
-    place, read = page.read("location.hash"), text(page, "main")
+    fragment, read = page.read("location.hash"), text(page, "main")
     other = browser.page()
-    other.open(address + place)
+    other.open(address + fragment)
     assert text(other, "main") == read
 
 
@@ -291,12 +291,12 @@ def test_filters_work_together_down_to_none_and_back(page: Page, address: str, r
     episodes = runs[0].episodes
     page.choose("select[name=layout]", "swapped")
     page.choose("select[name=outcome]", "wrong")
-    chosen = episodes.query("layout == 'swapped' and outcome == 'wrong'")
-    assert shown(page) == len(chosen)
+    matching = episodes.query("layout == 'swapped' and outcome == 'wrong'")
+    assert shown_count(page) == len(matching)
     page.choose("input[name=words]", "no such words")
-    assert shown(page) == 0
+    assert shown_count(page) == 0
     page.click(".empty a")
-    assert shown(page) == len(episodes)
+    assert shown_count(page) == len(episodes)
     page.read("history.back()")
     page.wait("document.querySelector('output.count').innerText.startsWith('0 ')")
 
@@ -305,8 +305,8 @@ def test_two_runs_are_compared_by_pair_and_step(page: Page, address: str, runs: 
     page.open(f"{address}#/compare")
     a, b = (run.episodes["outcome"].eq("correct").tolist() for run in runs)
     for name, of_a, of_b in (("right-wrong", True, False), ("wrong-right", False, True)):
-        own = [n for n, pair in enumerate(zip(a, b, strict=True)) if pair == (of_a, of_b)]
-        assert text(page, f"[data-quad={name}] b") == str(len(own))
+        matching_pairs = [n for n, pair in enumerate(zip(a, b, strict=True)) if pair == (of_a, of_b)]
+        assert text(page, f"[data-quad={name}] b") == str(len(matching_pairs))
     number = int(page.read("document.querySelector('[data-quad=right-wrong] .chip').textContent"))
     page.click("[data-quad=right-wrong] .chip")
     tools = [run.trajectory(number).tool[:, :3].astype(float) for run in runs]
@@ -338,12 +338,12 @@ def test_a_question_shows_both_layouts_with_what_the_probes_read_and_the_arm_did
 def responses_of(run: Run) -> dict[str, str]:
     """What the page says of the action of every episode once the pictures are swapped."""
     (stored,) = stored_interventions(run, "image-swap")
-    outcomes, said = stored.outcomes, {}
+    outcomes, responses = stored.outcomes, {}
     for number, name in enumerate(outcomes.episodes):
         toward = 1 if outcomes.sides[number] == "left" else -1
         clean, swapped = toward * outcomes.displacement[:, number] > 0
-        said[str(name)] = "does not" if clean == swapped else "✓ follows" if clean else "✗ reverses"
-    return said
+        responses[str(name)] = "does not" if clean == swapped else "✓ follows" if clean else "✗ reverses"
+    return responses
 
 
 def test_runs_differ_in_log_odds_only_where_both_have_signal(page: Page, address: str, runs: list[Run]) -> None:
@@ -354,12 +354,12 @@ def test_runs_differ_in_log_odds_only_where_both_have_signal(page: Page, address
     for run, curve in zip(runs, curves, strict=True):
         of = dict(zip(curve.episodes.tolist(), curve.decisions[curve.best("backbone")] > 0, strict=True))
         signs.append([of[name] for name in run.episodes["episode_id"]])
-    differ = [one != other for one, other in zip(*signs, strict=True)]
+    differ = [first_sign != other for first_sign, other in zip(*signs, strict=True)]
     assert differ[MISREAD[1]]
     for number in (0, FILMED, MISREAD[1]):
         page.open(f"{address}#/compare?ep={number}")
-        said = "the log-odds differ in sign at inference 0, step 0" in text(page, ".sentence")
-        assert said == differ[number], number
+        is_announced = "the log-odds differ in sign at inference 0, step 0" in text(page, ".sentence")
+        assert is_announced == differ[number], number
         assert text(page, "[data-series=Probe] .key").startswith("A backbone.")
     page.open(f"{address}#/compare?ep={MISREAD[1]}&site=expert.00.residual@0")
     assert "log-odds" not in text(page, ".sentence")
@@ -367,13 +367,13 @@ def test_runs_differ_in_log_odds_only_where_both_have_signal(page: Page, address
 
 
 def test_hostile_text_is_text(page: Page, address: str) -> None:
-    for place in ("overview?run=b", "episodes?ep=0", "questions", "compare?ep=0", "map"):
-        page.open(f"{address}#/{place}")
-        named = page.read("document.querySelector('.run').textContent")
-        assert HOSTILE in named
-        own = page.read("document.documentElement.outerHTML")
+    for view in ("overview?run=b", "episodes?ep=0", "questions", "compare?ep=0", "map"):
+        page.open(f"{address}#/{view}")
+        run_name = page.read("document.querySelector('.run').textContent")
+        assert HOSTILE in run_name
+        page_source = page.read("document.documentElement.outerHTML")
         assert page.read("document.querySelectorAll('img, #app script').length") == 0
-        assert TURNED[0] not in own, place
+        assert TURNED[0] not in page_source, view
     page.open(f"{address}#/episodes?ep=0")
     assert text(page, ".episode h2") == f"“Put the cube on {HOSTILE} {TURNED.replace(TURNED[0], '\ufffd')}”"
     assert page.read("document.querySelector('.plan .what').textContent + document.title").count("<img") <= 2
@@ -382,19 +382,19 @@ def test_hostile_text_is_text(page: Page, address: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "place",
+    "fragment",
     [
         "#/nothing", "#/episodes?ep=abc&t=-7&case=x&category=none&site=no", "#/map?category=%00&site=1", "#?&&=",
         "#/compare?with=none&ep=999", "#/episodes?t=1e9&case=constructor.right-wrong", "#/constructor",
         "#/episodes?outcome=lost&layout=none&case=backbone.constructor", "#/questions?category=none&from=-3",
     ],
 )  # fmt: skip
-def test_an_unknown_address_falls_back(page: Page, address: str, place: str) -> None:
-    page.open(address + place)
+def test_an_unknown_address_falls_back(page: Page, address: str, fragment: str) -> None:
+    page.open(address + fragment)
     assert page.read("document.querySelector('main').innerText.length") > 40
     assert page.read("document.querySelectorAll('.trouble').length") == 0
     assert page.read("document.querySelectorAll('main .empty').length") == 0, "filters that read “all” keep all"
-    if "questions" in place:
+    if "questions" in fragment:
         assert page.read("document.querySelectorAll('[data-item]').length") > 0
 
 
@@ -414,7 +414,7 @@ def test_the_page_can_be_used_by_keyboard_alone(page: Page, address: str) -> Non
     for _ in range(12):
         page.press("Tab")
         outlines.append(page.read(FOCUS))
-    assert [one for style, one in outlines if style == "none" and "<body" not in one] == []
+    assert [focused for style, focused in outlines if style == "none" and "<body" not in focused] == []
     page.read("document.activeElement.blur()")
     page.press("3")
     page.wait("location.hash.startsWith('#/episodes')")
@@ -428,19 +428,19 @@ CATEGORIES, LAYERS, ITERATIONS, EPISODES = 11, 19, 10, 3440
 
 def repeated(payload: dict[str, Any]) -> dict[str, Any]:
     """The payload of all episodes as that of as many as the benchmark has, two of an item."""
-    rows, own = [number % len(payload["id"]) for number in range(EPISODES)], dict(payload)
+    rows, longer = [number % len(payload["id"]) for number in range(EPISODES)], dict(payload)
     for name, column in payload.items():
         if isinstance(column, list):
-            own[name] = [column[row] for row in rows]
+            longer[name] = [column[row] for row in rows]
         elif "codes" in column:
-            own[name] = {**column, "codes": [column["codes"][row] for row in rows]}
+            longer[name] = {**column, "codes": [column["codes"][row] for row in rows]}
     packed = payload["log_odds"].items()
-    own["log_odds"] = {part: pack_log_odds(log_odds(values)[rows]) for part, values in packed}
-    own["number"], own["id"] = list(range(EPISODES)), [f"episode {number}" for number in range(EPISODES)]
-    own["item"] = code_words([f"item {number // 2}" for number in range(EPISODES)])
-    own["layout"] = code_words(["original", "swapped"] * (EPISODES // 2))
-    own["category"] = code_words([f"c{number // 2 % CATEGORIES}" for number in range(EPISODES)])
-    return own
+    longer["log_odds"] = {part: pack_log_odds(log_odds(values)[rows]) for part, values in packed}
+    longer["number"], longer["id"] = list(range(EPISODES)), [f"episode {number}" for number in range(EPISODES)]
+    longer["item"] = code_words([f"item {number // 2}" for number in range(EPISODES)])
+    longer["layout"] = code_words(["original", "swapped"] * (EPISODES // 2))
+    longer["category"] = code_words([f"c{number // 2 % CATEGORIES}" for number in range(EPISODES)])
+    return longer
 
 
 @pytest.fixture
@@ -449,7 +449,7 @@ def crowded(index: Path, tmp_path: Path) -> str:
     folder = tmp_path / "page"
     shutil.copytree(index.parent, folder)
     data = folder / "data" / "a"
-    run, own = (read_payload((data / f"{name}.js").read_bytes())[1] for name in ("run", "map/color"))
+    run, color_map = (read_payload((data / f"{name}.js").read_bytes())[1] for name in ("run", "map/color"))
     sites = [("backbone", layer, None) for layer in range(LAYERS)]
     sites += [("expert", layer, step) for step in range(ITERATIONS) for layer in range(LAYERS)]
     run["sites"] = [
@@ -458,22 +458,26 @@ def crowded(index: Path, tmp_path: Path) -> str:
         for stream, layer, step in sites
     ]  # fmt: skip
     run["categories"] = [{**run["categories"][0], "name": f"c{n}", "title": f"C{n}"} for n in range(CATEGORIES)]
-    own["accuracy"] = [round(0.5 + place / 500, 4) for place in range(len(sites))]
-    own["signal"] = [place % 7 == 0 for place in range(len(sites))]
-    own["cells"] = [[f"cell {place}", *own["cells"][0][1:]] for place in range(len(sites))]
-    own["log_odds"] = pack_log_odds(np.zeros((len(sites), len(own["rows"]))))
+    color_map["accuracy"] = [round(0.5 + row / 500, 4) for row in range(len(sites))]
+    color_map["signal"] = [row % 7 == 0 for row in range(len(sites))]
+    color_map["cells"] = [[f"cell {row}", *color_map["cells"][0][1:]] for row in range(len(sites))]
+    color_map["log_odds"] = pack_log_odds(np.zeros((len(sites), len(color_map["rows"]))))
     for key in ("a", "b"):
-        found = read_payload((folder / "data" / key / "episodes.js").read_bytes())[1]
-        (folder / "data" / key / "episodes.js").write_bytes(payload_script(f"{key}/episodes", repeated(found)))
+        episodes_payload = read_payload((folder / "data" / key / "episodes.js").read_bytes())[1]
+        (folder / "data" / key / "episodes.js").write_bytes(
+            payload_script(f"{key}/episodes", repeated(episodes_payload))
+        )
     script = (data / "e" / "00000.js").read_bytes()
-    for number in range(len(found["id"]), EPISODES):
+    for number in range(len(episodes_payload["id"]), EPISODES):
         (data / "e" / f"{number:05d}.js").write_bytes(
             script.replace(b"a/e/00000", f"a/e/{number:05d}".encode(), 1)
         )
         (data / "f" / f"{number:05d}.webp").hardlink_to(data / "f" / "00000.webp")
     (data / "run.js").write_bytes(payload_script("a/run", run))
-    for one in run["categories"]:
-        (data / "map" / f"{one['name']}.js").write_bytes(payload_script(f"a/map/{one['name']}", own))
+    for category in run["categories"]:
+        (data / "map" / f"{category['name']}.js").write_bytes(
+            payload_script(f"a/map/{category['name']}", color_map)
+        )
     return (folder / "index.html").as_uri()
 
 
@@ -485,9 +489,9 @@ def test_maps_of_all_categories_are_few_elements_and_every_site_can_be_reached(p
     page.read("document.querySelectorAll('.smallmap')[3].focus()")
     for key, site in (("ArrowUp", 20), ("ArrowRight", 39), ("ArrowDown", 38), ("ArrowLeft", 19), ("ArrowLeft", 0)):
         page.press(key)
-        said = text(page, "figure:nth-child(4) .smallmap [aria-live]")
-        assert said == page.read("document.activeElement.title")
-        assert said.endswith(f": cell {site}"), (key, said)
+        announcement = text(page, "figure:nth-child(4) .smallmap [aria-live]")
+        assert announcement == page.read("document.activeElement.title")
+        assert announcement.endswith(f": cell {site}"), (key, announcement)
     page.press("Enter")
     assert "category=c3" in page.read("location.hash")
     assert "site=backbone.00.residual" in page.read("location.hash")
@@ -579,14 +583,14 @@ def test_nothing_overflows_and_every_word_can_be_read(
 
 
 def test_a_damaged_payload_is_named(browser: Browser, runs: list[Run], tmp_path: Path) -> None:
-    found = write_viewer(runs[:1], tmp_path / "page")
-    shutil.rmtree(found.parent / "data" / "a" / "e")
+    page_file = write_viewer(runs[:1], tmp_path / "page")
+    shutil.rmtree(page_file.parent / "data" / "a" / "e")
     page = browser.page()
-    page.open(f"{found.as_uri()}#/episodes?ep=3")
+    page.open(f"{page_file.as_uri()}#/episodes?ep=3")
     assert "data/a/e/00003.js is missing" in text(page, ".trouble")
-    (found.parent / "data" / "index.js").write_text('put("index",{"schema":99,"runs":[]})', encoding="utf-8")
+    (page_file.parent / "data" / "index.js").write_text('put("index",{"schema":99,"runs":[]})', encoding="utf-8")
     page.open("about:blank")
-    page.open(found.as_uri())
+    page.open(page_file.as_uri())
     assert "schema 99" in text(page, ".trouble")
     browser.complaints.clear()
 

@@ -45,18 +45,18 @@ from tests.view.payload_reader import floats, log_odds, read_payload, words
 
 
 def payload(catalogue: Catalogue, name: str):
-    found, value = read_payload(catalogue.script(name))
-    assert found == name
+    payload_name, value = read_payload(catalogue.script(name))
+    assert payload_name == name
     return value
 
 
 def test_log_odds_at_inference_0_are_the_stored_out_of_fold_decisions(catalogue: Catalogue) -> None:
     viewed = catalogue.runs["run"]
     curve = load_results(viewed.run).curves["color", "mean"]
-    for place, (name, label) in enumerate(zip(curve.episodes, curve.labels, strict=True)):
+    for row, (name, label) in enumerate(zip(curve.episodes, curve.labels, strict=True)):
         position = viewed.run.episodes["episode_id"].tolist().index(name)
         values, held_out = viewed.probes["color"].log_odds(position)
-        expected = curve.decisions[:, place] * (1 if label else -1)
+        expected = curve.decisions[:, row] * (1 if label else -1)
         assert held_out
         np.testing.assert_allclose(values, [expected], rtol=1e-6, atol=1e-6)
 
@@ -98,11 +98,11 @@ def test_an_episode_says_how_its_action_responds_to_the_stored_image_swap(
     outcomes = stored.outcomes
     expected = {}
     for number, name in enumerate(outcomes.episodes):
-        left = outcomes.displacement[:, number] > 0
-        goes_right = left == (outcomes.sides[number] == "left")
-        expected[str(name)] = 0 if left[0] == left[1] else 1 if goes_right[0] else -1
-    found = payload(catalogue, "run/episodes")
-    assert dict(zip(found["id"], found["swap"], strict=True)) == expected
+        goes_left = outcomes.displacement[:, number] > 0
+        goes_right = goes_left == (outcomes.sides[number] == "left")
+        expected[str(name)] = 0 if goes_left[0] == goes_left[1] else 1 if goes_right[0] else -1
+    episode_list = payload(catalogue, "run/episodes")
+    assert dict(zip(episode_list["id"], episode_list["swap"], strict=True)) == expected
     assert set(expected.values()) == {-1, 0, 1}
     shares = {name: list(expected.values()).count(value) / 24 for name, value in (("follow", 1), ("reversal", -1))}
     effect = stored_image_swaps(little)["color"]
@@ -118,19 +118,19 @@ def test_an_item_that_no_fold_tests_takes_the_mean_of_the_folds_and_is_marked(li
     values, held_out = probes.log_odds(0)
     assert not held_out
     side = 1 if little.episodes["side_correct"].iloc[0] == "left" else -1
-    for place, site in enumerate(probes.sites):
-        own = results.direction("color", "mean", site)
-        by_fold = own.weights.astype(np.float64) @ little.column(site)[0] + own.intercepts
-        assert values[0, place] == pytest.approx(side * by_fold.mean(), rel=1e-6, abs=1e-6)
+    for row, site in enumerate(probes.sites):
+        direction = results.direction("color", "mean", site)
+        by_fold = direction.weights.astype(np.float64) @ little.column(site)[0] + direction.intercepts
+        assert values[0, row] == pytest.approx(side * by_fold.mean(), rel=1e-6, abs=1e-6)
 
 
 def test_directions_read_at_once_are_those_read_one_by_one(little: Run) -> None:
     results = load_results(little)
     places = [("color", "mean", site) for site in results.curves["color", "mean"].sites]
     together = read_directions(results.directions, places)
-    for place in places:
-        alone = results.directions[place]
-        assert all(np.array_equal(value, vars(together[place])[name]) for name, value in vars(alone).items())
+    for column_key in places:
+        alone = results.directions[column_key]
+        assert all(np.array_equal(value, vars(together[column_key])[name]) for name, value in vars(alone).items())
     with pytest.raises(KeyError):
         read_directions(results.directions, [("color", "mean", Site("backbone", 77))])
 
@@ -164,9 +164,9 @@ def test_the_cells_of_a_map_are_the_stored_scores(catalogue: Catalogue, little: 
     results = load_results(little)
     stored = little.location.read(f"probes/{results.key}/scores.csv").decode()
     rows = [row for row in csv.DictReader(StringIO(stored)) if row["view"] == "mean"]
-    found = payload(catalogue, "run/map/color")
-    assert len(found["cells"]) == len(rows) == len(payload(catalogue, "run/run")["sites"])
-    for cells, row, signal in zip(found["cells"], rows, found["signal"], strict=True):
+    color_map = payload(catalogue, "run/map/color")
+    assert len(color_map["cells"]) == len(rows) == len(payload(catalogue, "run/run")["sites"])
+    for cells, row, signal in zip(color_map["cells"], rows, color_map["signal"], strict=True):
         share, low, high = (f"{100 * float(row[name]):.1f}" for name in ("accuracy", "ci_low", "ci_high"))
         assert cells[0] == f"{share} [{low}, {high}]"
         assert cells[1:3] == [f"{float(row['p']):.3f}", f"{float(row['p_fwe']):.3f}"]
@@ -176,38 +176,38 @@ def test_the_cells_of_a_map_are_the_stored_scores(catalogue: Catalogue, little: 
 
 def test_the_log_odds_of_a_map_are_the_curves_with_the_correct_side_up(catalogue: Catalogue, little: Run) -> None:
     curve = load_results(little).curves["color", "mean"]
-    found = payload(catalogue, "run/map/color")
-    shown = little.episodes["episode_id"].iloc[found["rows"]]
-    assert shown.tolist() == curve.episodes.tolist()
-    values = log_odds(found["log_odds"]).reshape(len(curve.sites), -1)
+    color_map = payload(catalogue, "run/map/color")
+    mapped_episodes = little.episodes["episode_id"].iloc[color_map["rows"]]
+    assert mapped_episodes.tolist() == curve.episodes.tolist()
+    values = log_odds(color_map["log_odds"]).reshape(len(curve.sites), -1)
     np.testing.assert_allclose(values, curve.decisions * np.where(curve.labels, 1, -1), atol=0.002)
 
 
 def test_the_episodes_are_those_of_the_run(catalogue: Catalogue, little: Run) -> None:
-    found, episodes = payload(catalogue, "run/episodes"), little.episodes
-    assert found["number"] == episodes["episode"].tolist()
-    assert found["id"] == episodes["episode_id"].tolist()
-    assert found["steps"] == episodes["steps"].tolist()
+    episode_list, episodes = payload(catalogue, "run/episodes"), little.episodes
+    assert episode_list["number"] == episodes["episode"].tolist()
+    assert episode_list["id"] == episodes["episode_id"].tolist()
+    assert episode_list["steps"] == episodes["steps"].tolist()
     for name in ("instruction", "outcome", "side_correct", "side_placed", "layout", "category"):
-        assert words(found[name]) == episodes[name].tolist()
+        assert words(episode_list[name]) == episodes[name].tolist()
     best = payload(catalogue, "run/run")["categories"][0]["best"]
     assert best["backbone"]["signal"] == retention_table([little]).rows[0].backbone.has_signal
     curve = load_results(little).curves["color", "mean"]
     expected = curve.decisions[curve.best("expert")] * np.where(curve.labels, 1, -1)
-    np.testing.assert_allclose(log_odds(found["log_odds"]["action"]), expected, atol=0.002)
+    np.testing.assert_allclose(log_odds(episode_list["log_odds"]["action"]), expected, atol=0.002)
 
 
 def test_an_episode_holds_its_trajectory_events_and_outcomes(catalogue: Catalogue, little: Run) -> None:
     for number in (0, 7):
-        found, trajectory = payload(catalogue, f"run/e/{number:05d}"), little.trajectory(number)
-        assert np.array_equal(floats(found["trajectory"]["tool"]), trajectory.tool[:, :3].ravel())
-        assert np.array_equal(floats(found["trajectory"]["commanded"]), trajectory.commanded[:, :3].ravel())
-        assert np.array_equal(floats(found["trajectory"]["tiles"]["left"]), trajectory.tile_left[:, :2].ravel())
-        assert found["trajectory"]["frames"] == len(trajectory)
-        assert found["inferences"] == little.control_steps[number].tolist()
-        assert found["events"] == {name: Events.of(trajectory).frame(name) for name in EVENTS}
-        assert found["outcomes"] == {rule: little.judged(rule)["outcome"].iloc[number] for rule in RULES}
-        assert (found["frames"] is not None) == (number == 0)
+        record, trajectory = payload(catalogue, f"run/e/{number:05d}"), little.trajectory(number)
+        assert np.array_equal(floats(record["trajectory"]["tool"]), trajectory.tool[:, :3].ravel())
+        assert np.array_equal(floats(record["trajectory"]["commanded"]), trajectory.commanded[:, :3].ravel())
+        assert np.array_equal(floats(record["trajectory"]["tiles"]["left"]), trajectory.tile_left[:, :2].ravel())
+        assert record["trajectory"]["frames"] == len(trajectory)
+        assert record["inferences"] == little.control_steps[number].tolist()
+        assert record["events"] == {name: Events.of(trajectory).frame(name) for name in EVENTS}
+        assert record["outcomes"] == {rule: little.judged(rule)["outcome"].iloc[number] for rule in RULES}
+        assert (record["frames"] is not None) == (number == 0)
 
 
 @pytest.mark.parametrize(
@@ -251,10 +251,10 @@ def test_packed_numbers_are_neither_text_nor_paths() -> None:
 
 def test_log_odds_are_exact_to_two_thousandths_and_missing_ones_stay_missing() -> None:
     values = np.array([0, 0.25, -3.1234, 126.9, -127.4, 5000, -5000, np.nan, np.inf])
-    found = log_odds(pack_log_odds(values))
-    np.testing.assert_allclose(found[:5], values[:5], atol=0.002)
-    assert found[5] == found[8] == -found[6] == pytest.approx(127.996, abs=0.001)
-    assert np.isnan(found[7])
+    unpacked = log_odds(pack_log_odds(values))
+    np.testing.assert_allclose(unpacked[:5], values[:5], atol=0.002)
+    assert unpacked[5] == unpacked[8] == -unpacked[6] == pytest.approx(127.996, abs=0.001)
+    assert np.isnan(unpacked[7])
 
 
 def test_runs_of_one_name_have_names_of_their_own_and_none_is_shown_twice(
@@ -282,10 +282,10 @@ def test_a_picture_that_is_not_the_committed_one_is_refused_by_name(little_runs:
 
 def test_the_stamp_of_a_payload_names_commits_and_probes(little_runs: Path) -> None:
     runs = [open_run(little_runs / name) for name in ("run", "other")]
-    one, both = Catalogue(runs[:1]), Catalogue(runs)
-    assert one.stamp("run/run") == both.stamp("run/run") != both.stamp("other/run")
-    assert one.stamp("index") != both.stamp("index")
-    assert json.dumps(one.stamp("run/e/00000")) != json.dumps(one.stamp("run/e/00001"))
+    single, both = Catalogue(runs[:1]), Catalogue(runs)
+    assert single.stamp("run/run") == both.stamp("run/run") != both.stamp("other/run")
+    assert single.stamp("index") != both.stamp("index")
+    assert json.dumps(single.stamp("run/e/00000")) != json.dumps(single.stamp("run/e/00001"))
 
 
 @pytest.mark.slow
@@ -293,25 +293,28 @@ def test_later_inferences_are_read_by_the_fold_that_tests_the_item_and_by_probes
     runs: list[Run],
 ) -> None:
     catalogue, results = Catalogue(runs[:1]), load_results(runs[0])
-    own = {call: found.curves["color", "mean"] for call, found in load_results_by_call(runs[0], results).items()}
-    curve = own[0]
+    curves = {
+        call: call_results.curves["color", "mean"]
+        for call, call_results in load_results_by_call(runs[0], results).items()
+    }
+    curve = curves[0]
     features = {site: [runs[0].column(site, call=call) for call in range(2)] for site in curve.sites}
     for position, number in enumerate(runs[0].episodes["episode"]):
-        found = payload(catalogue, f"a/e/{number:05d}")
+        record = payload(catalogue, f"a/e/{number:05d}")
         at = curve.episodes.tolist().index(runs[0].episodes["episode_id"].iloc[position])
         sign = 1 if curve.labels[at] else -1
-        frozen, refitted = (log_odds(found[name]).reshape(2, -1) for name in ("log_odds", "refitted"))
-        for place, site in enumerate(curve.sites):
+        frozen, refitted = (log_odds(record[name]).reshape(2, -1) for name in ("log_odds", "refitted"))
+        for row, site in enumerate(curve.sites):
             probe = results.direction("color", "mean", site)
             weights, intercept = (
                 probe.weights[curve.fold_of[at]].astype(float),
                 probe.intercepts[curve.fold_of[at]],
             )
             expected = [sign * (features[site][call][position] @ weights + intercept) for call in range(2)]
-            np.testing.assert_allclose(frozen[:, place], expected, atol=0.003)
-            stored = [sign * own[call].decisions[place, own[call].episodes.tolist().index(curve.episodes[at])]
+            np.testing.assert_allclose(frozen[:, row], expected, atol=0.003)
+            stored = [sign * curves[call].decisions[row, curves[call].episodes.tolist().index(curve.episodes[at])]
                       for call in range(2)]  # fmt: skip
-            np.testing.assert_allclose(refitted[:, place], stored, atol=0.003)
+            np.testing.assert_allclose(refitted[:, row], stored, atol=0.003)
 
 
 def test_a_model_that_was_asked_is_shown_with_question_and_answers_in_words(
@@ -321,18 +324,23 @@ def test_a_model_that_was_asked_is_shown_with_question_and_answers_in_words(
     settings = {**little_settings(), "ask": ASK}
     writer = RunWriter(locate(tmp_path / "run"), plan, settings)
     certify(writer)
-    asked = {"question": "Which one?\nA left\nB right", "answer": "Neither <b>", "said": "none", "parse": "none"}
+    question_row = {
+        "question": "Which one?\nA left\nB right",
+        "answer": "Neither <b>",
+        "said": "none",
+        "parse": "none",
+    }
     outcomes = {"outcome": "oob", "outcome_logits": "correct", "outcome_debiased": "wrong"}
     sides = {"side_placed": "none", "side_logits": "left", "side_debiased": "right"}
     measured = {"parse_tier": "none", "letter_bias": 0.1, "content": 1.0, "margin": 1.0, "option_mass": 0.9}
     marks = {"near_tie": False, "side_word": False}
     for number in range(2):
         record = episode(plan, number)
-        said = {**asked, **outcomes, **sides, **measured, **marks}
-        writer.write(replace(record, outcome={**record.outcome, **said}))
+        outcome_fields = {**question_row, **outcomes, **sides, **measured, **marks}
+        writer.write(replace(record, outcome={**record.outcome, **outcome_fields}))
     catalogue = Catalogue([open_run(tmp_path / "run", allow_partial=True)])
     assert payload(catalogue, "run/e/00000")["words"] == {
-        "question": asked["question"], "text": "Neither <b>", "option read": "none", "parsing rule": "none",
+        "question": question_row["question"], "text": "Neither <b>", "option read": "none", "parsing rule": "none",
         "outcome, text": "unread", "outcome, logits": "correct", "outcome, order-balanced": "wrong",
     }  # fmt: skip
     assert words(payload(catalogue, "run/episodes")["outcome"]) == ["unread", "unread"]
@@ -378,8 +386,8 @@ def test_log_odds_are_of_the_runs_own_activations_and_held_out_by_item(
         assert payload["held_out"]
         np.testing.assert_allclose(log_odds(payload["log_odds"]), expected, atol=1 / 256)
         best = read(lent_catalogue, "now/run")["categories"][0]["best"]["backbone"]["site"]
-        shown = read(lent_catalogue, "now/episodes")["log_odds"]["backbone"]
-        np.testing.assert_allclose(log_odds(shown)[position], expected[best], atol=1 / 256)
+        packed = read(lent_catalogue, "now/episodes")["log_odds"]["backbone"]
+        np.testing.assert_allclose(log_odds(packed)[position], expected[best], atol=1 / 256)
 
 
 def test_the_page_says_whose_probes_they_are_and_shows_their_scores(
@@ -388,9 +396,9 @@ def test_the_page_says_whose_probes_they_are_and_shows_their_scores(
     run = read(lent_catalogue, "now/run")
     assert run["probes_of"] == little.label
     assert [column["key"] for column in run["table"]["columns"]] == ["success.sr"], "no rate of lent probes"
-    own = read(Catalogue([little]), "run/map/color")
+    color_map = read(Catalogue([little]), "run/map/color")
     lent = read(lent_catalogue, "now/map/color")
-    assert lent["cells"] == own["cells"]
+    assert lent["cells"] == color_map["cells"]
     assert lent["rows"] == [0, 1, 2]
     assert read(Catalogue([little], little), "run/run")["probes_of"] is None
 

@@ -47,9 +47,9 @@ class Client:
         sent |= {name.replace("_", "-"): value for name, value in headers.items()}
         connection.request(method, path, headers=sent)
         answer = connection.getresponse()
-        found = answer.status, {name.lower(): value for name, value in answer.getheaders()}, answer.read()
+        received = answer.status, {name.lower(): value for name, value in answer.getheaders()}, answer.read()
         connection.close()
-        return found
+        return received
 
     def admit(self) -> None:
         """Open the address that the command prints."""
@@ -75,9 +75,9 @@ def served(runs: list[Run]) -> Iterator[Client]:
 
 @pytest.fixture(scope="module")
 def server(little_runs: Path) -> Iterator[Client]:
-    with served([open_run(little_runs / "run")]) as found:
-        found.admit()
-        yield found
+    with served([open_run(little_runs / "run")]) as viewer:
+        viewer.admit()
+        yield viewer
 
 
 def test_the_icon_needs_no_cookie_because_the_page_that_leads_in_has_none_yet(server: Client) -> None:
@@ -126,8 +126,8 @@ def test_only_the_page_itself_is_answered(
     server: Client, method: str, headers: dict[str, str], status: int
 ) -> None:
     for path in ("/", "/data/run/run.js", "/follow"):
-        found, _, content = server.ask(path, method, **headers)
-        assert found == (204 if status == 200 and path == "/follow" else status)
+        code, _, content = server.ask(path, method, **headers)
+        assert code == (204 if status == 200 and path == "/follow" else status)
         assert status == 200 or b"put(" not in content
 
 
@@ -164,11 +164,11 @@ def test_the_token_stands_on_no_command_line_and_in_a_file_of_this_user_alone(
     monkeypatch.setattr("webbrowser.open", open_browser)
     monkeypatch.setattr(ViewerServer, "run", lambda _: None)
     before = os.umask(0)
-    done = CliRunner().invoke(app, ["view", str(little_runs / "run")])
+    result = CliRunner().invoke(app, ["view", str(little_runs / "run")])
     os.umask(before)
-    assert done.exit_code == 0, done.output
+    assert result.exit_code == 0, result.output
     [(address, page, file_mode, folder_mode)] = opened
-    printed = done.stdout.splitlines()[0]
+    printed = result.stdout.splitlines()[0]
     assert "token" not in address
     assert printed.partition("token=")[2] not in address
     assert f'content="0; url={printed}"' in page
@@ -178,9 +178,9 @@ def test_the_token_stands_on_no_command_line_and_in_a_file_of_this_user_alone(
 
 def test_a_port_that_is_in_use_is_refused_by_number(server: Client, little_runs: Path) -> None:
     command = ["view", str(little_runs / "run"), "--no-browser", "--port", str(server.port)]
-    done = CliRunner().invoke(app, command)
-    assert done.exit_code == 2
-    assert f"port {server.port} of 127.0.0.1: Address already in use" in done.stderr
+    result = CliRunner().invoke(app, command)
+    assert result.exit_code == 2
+    assert f"port {server.port} of 127.0.0.1: Address already in use" in result.stderr
 
 
 def test_no_other_address_than_that_of_loopback_is_opened(server: Client) -> None:
@@ -253,9 +253,9 @@ def test_a_page_is_told_why_an_episode_of_a_damaged_run_cannot_be_shown(little_r
         picture.write_bytes(picture.read_bytes()[:-1])
         status, headers, content = damaged.ask("/data/damaged/e/00000.js")
         assert (status, headers["content-type"]) == (200, "text/javascript; charset=utf-8")
-        said = re.fullmatch(rb'refuse\("damaged/e/00000",(".*")\)\n', content)
-        assert said, content
-        assert json.loads(said[1]).startswith("damaged/frames/00000000.webp has ")
+        refusal = re.fullmatch(rb'refuse\("damaged/e/00000",(".*")\)\n', content)
+        assert refusal, content
+        assert json.loads(refusal[1]).startswith("damaged/frames/00000000.webp has ")
         assert str(tmp_path).encode() not in content
         assert b"<" not in content
         assert damaged.ask("/data/damaged/e/00001.js")[2].startswith(b"put(")
@@ -291,9 +291,9 @@ def test_episodes_that_are_committed_while_the_page_is_open_are_followed(
             while True:
                 line = stream.readline().decode()
                 if line.startswith("data: "):
-                    said = json.loads(line.removeprefix("data: "))
-                    assert (said["run"], said["planned"], said["failed"]) == ("run", 4, 0)
-                    return int(said["committed"])
+                    event = json.loads(line.removeprefix("data: "))
+                    assert (event["run"], event["planned"], event["failed"]) == ("run", 4, 0)
+                    return int(event["committed"])
 
         assert next_count() == 1
         for number in (1, 2, 3):
@@ -352,9 +352,9 @@ def test_the_same_runs_give_the_same_bytes(little_runs: Path, exported: Path, tm
 
 @pytest.mark.slow
 def test_an_export_names_neither_folders_nor_users_of_this_machine(little_runs: Path, tmp_path: Path) -> None:
-    place = tmp_path / "home" / "jane-doe" / "secret project"
-    shutil.copytree(little_runs / "run", place / "run")
-    page = write_viewer([open_run(place / "run")], tmp_path / "out")
+    private_folder = tmp_path / "home" / "jane-doe" / "secret project"
+    shutil.copytree(little_runs / "run", private_folder / "run")
+    page = write_viewer([open_run(private_folder / "run")], tmp_path / "out")
     for name, content in contents(page.parent).items():
         for word in (str(tmp_path), "jane-doe", "secret project"):
             assert word.encode() not in content, name
@@ -389,9 +389,9 @@ def test_an_export_of_some_categories_holds_no_other(little_runs: Path, tmp_path
 @pytest.mark.slow
 def test_the_command_prints_the_page(little_runs: Path, tmp_path: Path) -> None:
     arguments = ["view", str(little_runs / "run"), "--export", str(tmp_path / "out"), "--without-frames"]
-    done = CliRunner().invoke(app, arguments)
-    assert done.exit_code == 0, done.output
-    assert done.stdout.strip() == str(tmp_path / "out" / "index.html")
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 0, result.output
+    assert result.stdout.strip() == str(tmp_path / "out" / "index.html")
 
 
 def test_the_vendored_file_is_the_one_that_its_record_names() -> None:
@@ -406,9 +406,9 @@ def test_the_vendored_file_is_the_one_that_its_record_names() -> None:
 
 
 def test_the_page_is_small_and_names_no_other_host() -> None:
-    own = {name: content for name, content in page_files().items() if "LICENSE" not in name}
-    assert sum(map(len, own.values())) <= MOST_BYTES
-    for name, content in own.items():
+    shipped_files = {name: content for name, content in page_files().items() if "LICENSE" not in name}
+    assert sum(map(len, shipped_files.values())) <= MOST_BYTES
+    for name, content in shipped_files.items():
         hosts = set(re.findall(rb"(?:https?:)?//([a-z0-9-]+\.[a-z]{2,}[a-z0-9.-]*)", content))
         assert hosts <= {b"www.w3.org"}, name
 
@@ -432,6 +432,6 @@ def test_the_page_runs_its_own_scripts_only() -> None:
 
 
 def test_options_of_an_export_need_its_folder(little_runs: Path) -> None:
-    done = CliRunner().invoke(app, ["view", str(little_runs / "run"), "--without-frames"])
-    assert done.exit_code == 2
-    assert "give --export FOLDER" in done.stderr
+    result = CliRunner().invoke(app, ["view", str(little_runs / "run"), "--without-frames"])
+    assert result.exit_code == 2
+    assert "give --export FOLDER" in result.stderr

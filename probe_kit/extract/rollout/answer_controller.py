@@ -23,11 +23,11 @@ from probe_kit.extract.rollout.answers import (
     side_said,
 )
 from probe_kit.extract.rollout.capturing import stored_streams
-from probe_kit.extract.rollout.controllers import Inference, ModelController, Turn, varied
+from probe_kit.extract.rollout.controllers import Inference, ModelController, Turn, vary_observation
 from probe_kit.extract.settings import AskSettings
 from probe_kit.extract.sources.inputs import PICTURE
 from probe_kit.extract.sources.source import Source
-from probe_kit.hooks.checkpoints.third_party import copied
+from probe_kit.hooks.checkpoints.third_party import copy_observations
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.runs.layout import StoredStream
 from probe_kit.suite.items import side_words
@@ -130,7 +130,7 @@ class AnswerController(ModelController["AnswerModel", "Prompt"]):
         absent = self.model.absent_inputs | (set() if question.pictured else {PICTURE})
         variants = {
             name: (replace(question, observation=changed, text=changed.instruction) for changed in observations)
-            for name, observations in varied(clean, texts, self._ids_of, absent).items()
+            for name, observations in vary_observation(clean, texts, self._ids_of, absent).items()
         }
         self._check_inputs(lambda prompt: self.model.read([prompt]).option_logits, question, variants)
 
@@ -141,7 +141,7 @@ class AnswerController(ModelController["AnswerModel", "Prompt"]):
     # -- what is asked -----------------------------------------------------------------------------------
 
     def _question_observation(self, turn: Turn) -> Observation:
-        (observation,) = copied([turn.observation])
+        (observation,) = copy_observations([turn.observation])
         if self._settings.task.picture != "side-by-side":
             return observation
         picture = side_by_side(turn.row.content, self._settings.scene.picture_shape)

@@ -108,7 +108,7 @@ def mentions_of(text: str) -> Mentions:
     """
     mentions = Mentions()
     for clause in _clauses(text):
-        mentions.has_unclear_right |= bool(_RIGHT_MAY_BE_A_SIDE.search(_blanked(_RIGHT_IS_NO_SIDE, clause)))
+        mentions.has_unclear_right |= bool(_RIGHT_MAY_BE_A_SIDE.search(_blank_matches(_RIGHT_IS_NO_SIDE, clause)))
         for side, is_denied in _sides(clause):
             (mentions.denied_sides if is_denied else mentions.sides).add(side)
         for letter, is_denied in _letters(clause):
@@ -127,7 +127,7 @@ def _clauses(text: str) -> Iterator[str]:
 def _sides(clause: str) -> Iterator[tuple[Named, bool]]:
     clean = clause
     for pattern in (_RIGHT_IS_NO_SIDE, _RIGHT_MAY_BE_A_SIDE, _LEFT_IS_NO_SIDE):
-        clean = _blanked(pattern, clean)
+        clean = _blank_matches(pattern, clean)
     for match in _SIDE.finditer(clean):
         yield _SIDE_OF[match[1].lower()], _is_denied(clean, match)
 
@@ -151,7 +151,7 @@ def _is_denied(clause: str, match: re.Match[str]) -> bool:
     return bool(_DENIAL.search(before) or _DENIED_BEHIND.match(behind))
 
 
-def _blanked(pattern: re.Pattern[str], text: str) -> str:
+def _blank_matches(pattern: re.Pattern[str], text: str) -> str:
     """Return the text with spaces where the pattern matches, so that positions stay."""
     return pattern.sub(lambda match: " " * len(match[0]), text)
 
@@ -219,7 +219,7 @@ class Answer:
 
 def read_answer(text: str, template: Template, order: Order = "original") -> Answer:
     """Read an answer to `template`, its sides named in `order`. The first rule that applies decides."""
-    plain = _stripped(text)
+    plain = _strip_markup(text)
     if not plain:
         return Answer("none", "empty")
     options = dict(zip("AB", sides(order), strict=True)) if template.lettered else {}
@@ -238,7 +238,7 @@ def read_answer(text: str, template: Template, order: Order = "original") -> Ans
     return answer
 
 
-def _stripped(text: str) -> str:
+def _strip_markup(text: str) -> str:
     """Return a text without thoughts, special tokens, markup, reasons and outer spaces.
 
     Nothing of an unfinished thought remains.

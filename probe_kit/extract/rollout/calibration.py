@@ -69,7 +69,7 @@ class Calibration:
         )
 
 
-def calibrated(
+def calibrate(
     settings: ExtractSettings, controller: PolicyController, source: Source[Any], rows: Sequence[Row]
 ) -> tuple[ExtractSettings, Calibration]:
     """Return `settings` with a batch and simulating processes chosen for this machine, and the measurement.

@@ -24,7 +24,7 @@ from probe_kit.extract.settings import ExtractSettings
 from probe_kit.extract.sources.inputs import INSTRUCTION, PICTURE, blank_of, normal_form, same_input, with_input
 from probe_kit.extract.sources.source import Source, check_predictions
 from probe_kit.hashing import derive_seed
-from probe_kit.hooks.checkpoints.third_party import begin_randomness, copied, while_acting
+from probe_kit.hooks.checkpoints.third_party import begin_randomness, copy_observations, while_acting
 from probe_kit.hooks.contract.declared import PLAIN, Rotation
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.runs.layout import StoredStream
@@ -114,7 +114,7 @@ def _same(first: "Tensor", second: "Tensor") -> bool:
     return first.shape == second.shape and bool((first == second).all())
 
 
-def varied(
+def vary_observation(
     clean: Observation, texts: Iterable[str], ids: Ids, absent: Collection[str] = ()
 ) -> dict[str, Iterator[Observation]]:
     """Return, by input, observations that differ from a clean one in it alone, the best first.
@@ -449,7 +449,7 @@ class PolicyController(ModelController["Policy", Observation]):
 
     def _captured(self, turns: Sequence[Turn]) -> NDArray[np.float32]:
         """Return the chunks (B, chunk, D) of one call, with activations kept for the turns that are captured."""
-        observations = copied([turn.observation for turn in turns])
+        observations = copy_observations([turn.observation for turn in turns])
         seeds = [turn.derived_seed("inference") for turn in turns]
         infer = partial(self._chunks, [turn.observation for turn in turns], seeds)
         captured = {
@@ -472,7 +472,7 @@ class PolicyController(ModelController["Policy", Observation]):
         """Return the chunk (chunk, D) of a turn as `infer` makes it, without a check, a proof or a capture."""
         with self._acting():
             begin_randomness(derive_seed("global", turn.derived_seed("call")))
-            observations = copied([turn.observation])
+            observations = copy_observations([turn.observation])
             with self._edited(observations):
                 chunk: NDArray[np.float32] = self._chunks(observations, [turn.derived_seed("inference")])[0]
         return chunk
@@ -486,7 +486,7 @@ class PolicyController(ModelController["Policy", Observation]):
         policy, own_units = self.model, self._source.own_units
         acts = policy.infer_without_acting if self.capture_only else policy.act
         # Copies: adapters of others may write into what they are given, and a proof of capture reads it again.
-        chunks = (policy.predict if own_units else acts)(copied(observations), list(seeds))
+        chunks = (policy.predict if own_units else acts)(copy_observations(observations), list(seeds))
         if own_units or not self.capture_only:
             check_predictions(chunks, len(observations), None if own_units else ACTION_SIZE)
         return np.array(chunks)
@@ -498,8 +498,8 @@ class PolicyController(ModelController["Policy", Observation]):
             begin_randomness(derive_seed("global", turn.derived_seed("call")))
             return self._chunks([observation], [seed])
 
-        (observation,) = copied([turn.observation])
-        variants = varied(observation, self._source.instructions, self._ids_of, self.model.absent_inputs)
+        (observation,) = copy_observations([turn.observation])
+        variants = vary_observation(observation, self._source.instructions, self._ids_of, self.model.absent_inputs)
         self._check_inputs(infer, observation, variants, lambda changed: self._edited([changed]))
 
     def run_preflight(self, observations: Sequence[Observation], seeds: Sequence[int]) -> None:

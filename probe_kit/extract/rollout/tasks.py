@@ -11,7 +11,7 @@ from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.extract.parts import SCRIPTED
 from probe_kit.extract.prompts import phrases
 from probe_kit.extract.rollout.answer_controller import AnswerController
-from probe_kit.extract.rollout.calibration import Calibration, calibrated
+from probe_kit.extract.rollout.calibration import Calibration, calibrate
 from probe_kit.extract.rollout.controllers import Controller, PolicyController, ScriptedController
 from probe_kit.extract.settings import AskSettings, ExtractSettings, Settings
 from probe_kit.extract.sizes import PlannedSizes
@@ -48,7 +48,7 @@ def load_of[Loaded: "Model"](load_by_name: Callable[..., Loaded], settings: Sett
     )
 
 
-def fitted[Chosen: Settings](card: "ModelCard", settings: Chosen, source: Source[Any]) -> Chosen:
+def fit_source[Chosen: Settings](card: "ModelCard", settings: Chosen, source: Source[Any]) -> Chosen:
     """Return the settings with those of a source that was fitted to a model.
 
     Raises:
@@ -212,13 +212,13 @@ class Act(_Task):
             check_misfit(settings, model.embodiment_mismatch(), model.card.checkpoint)
         # The source first: it may give the policy further cameras, and batch and needs are those of that card.
         source, policy = source.check(model, settings.machine.accept_units)
-        settings = fitted(policy.card, settings, source)
+        settings = fit_source(policy.card, settings, source)
         check_reachable(settings, policy.card, source)
         controller = PolicyController(policy, source, settings)
         settings, calibration = settings.with_every_call(controller.execute), None
         if settings.machine.batch == "auto":  # last, because it times the controller as the run will use it
             rows = source.rows(settings.seed)
-            settings, calibration = calibrated(settings, controller, source, rows)
+            settings, calibration = calibrate(settings, controller, source, rows)
         return settings, source, controller, calibration
 
 
@@ -317,6 +317,6 @@ class Ask(_Task):
     def fit(self, settings: AskSettings, source: Source[Any], model: "AnswerModel | None") -> Fitted:
         """Show the source to the model, and choose how its answers are read."""
         assert model is not None, "no script answers"
-        source = source.watched(model.card.cameras)
-        settings = fitted(model.card, settings, source)
+        source = source.for_cameras(model.card.cameras)
+        settings = fit_source(model.card, settings, source)
         return settings, source, AnswerController(model, source, settings), None

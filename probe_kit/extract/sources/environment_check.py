@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from probe_kit._execution.process_pool import Child
-from probe_kit._system.counting import counted
+from probe_kit._system.counting import plural
 from probe_kit.errors import MissingExtraError, ProbeKitError, UsageError
 from probe_kit.extract.sources.environment import EnvEpisode, EnvSource, OwnEnvironment, Step
 from probe_kit.extract.sources.environment_source import (
@@ -21,7 +21,7 @@ from probe_kit.extract.sources.environment_source import (
     listed_episodes,
     naming_environment,
     open_environment,
-    started,
+    start_episode,
 )
 from probe_kit.extract.sources.environment_starts import compare_steps
 from probe_kit.extract.sources.step_limits import declared_limit
@@ -82,7 +82,7 @@ class _Trial:
             )
         self.episodes = [episode for _, episode in first[:EPISODES]]
         groups = {episode.group or episode.id for _, episode in first}
-        return f"{counted(len(first), 'episode')} in {counted(len(groups), 'group')}"
+        return f"{plural(len(first), 'episode')} in {plural(len(groups), 'group')}"
 
     def play(self) -> str:
         """Play the episodes, write their first picture, and say where the environment ends them."""
@@ -93,7 +93,9 @@ class _Trial:
         self.notes = tuple(content_notes(frames, names))
         start = self.steps[0][0].observation
         if self.picture is not None:
-            Image.fromarray(np.hstack(_of_one_height([start.image, *start.cameras.values()]))).save(self.picture)
+            Image.fromarray(np.hstack(_pad_to_one_height([start.image, *start.cameras.values()]))).save(
+                self.picture
+            )
         limits = [episode.max_steps for episode in self.episodes if episode.max_steps is not None]
         limit = max(limits, default=None) or declared_limit(self.environment, self.source.name)
         end = "the environment declares no limit" if limit is None else f"an episode ends after {limit} actions"
@@ -146,7 +148,7 @@ class _Trial:
             environment.close()
 
     def _play(self, environment: OwnEnvironment, episode: EnvEpisode) -> list[Step]:
-        steps = [started(environment, episode, self.source.name)]
+        steps = [start_episode(environment, episode, self.source.name)]
         while len(steps) <= STEPS and not steps[-1].done:
             steps.append(self._step(environment, episode, len(steps)))
             self._check_shapes(steps)
@@ -242,7 +244,7 @@ def _by(shape: Sequence[int]) -> str:
     return " × ".join(map(str, shape))
 
 
-def _of_one_height(pictures: Sequence[NDArray[np.uint8]]) -> list[NDArray[np.uint8]]:
+def _pad_to_one_height(pictures: Sequence[NDArray[np.uint8]]) -> list[NDArray[np.uint8]]:
     """Return pictures (H, W, 3), with black below those that are less high than the highest."""
     height = max(len(picture) for picture in pictures)
     return [np.pad(picture, ((0, height - len(picture)), (0, 0), (0, 0))) for picture in pictures]

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit._system.counting import counted, spanned
+from probe_kit._system.counting import describe_range, plural
 from probe_kit._system.escaping import UNSAFE, terminal_safe
 from probe_kit._system.imports import entry_points
 from probe_kit.errors import (
@@ -194,13 +194,14 @@ class RotatedEnvironment:
             (camera for camera, _ in self._rotations if camera not in (*further_cameras, EVERY_CAMERA)), ""
         )
         cameras = {
-            name: _turned(picture, degrees_of(self._rotations, name)) for name, picture in further_cameras.items()
+            name: _rotate_picture(picture, degrees_of(self._rotations, name))
+            for name, picture in further_cameras.items()
         }
-        image = _turned(observation.image, degrees_of(self._rotations, first))
+        image = _rotate_picture(observation.image, degrees_of(self._rotations, first))
         return replace(observation, image=image, cameras=cameras)
 
 
-def _turned(picture: NDArray[np.uint8], degrees: int) -> NDArray[np.uint8]:
+def _rotate_picture(picture: NDArray[np.uint8], degrees: int) -> NDArray[np.uint8]:
     """Return a picture that is rotated counterclockwise; what is no picture stays, and is refused later."""
     if not (isinstance(picture, np.ndarray) and picture.ndim == 3):
         return picture
@@ -266,7 +267,7 @@ def _check_episode(episode: object, where: str) -> None:
         checked_limit(episode.max_steps, where)
 
 
-def started(environment: OwnEnvironment, episode: EnvEpisode, where: str) -> Step:
+def start_episode(environment: OwnEnvironment, episode: EnvEpisode, where: str) -> Step:
     """Return the beginning of an episode, as `checked_step` returns it. Raises OwnEnvironmentError."""
     with naming_environment(where, "reset()"):
         answer = environment.reset(episode)
@@ -318,10 +319,10 @@ def checked_step(answer: object, episode: EnvEpisode, where: str) -> Step:
                 f"{where}: the fact {SUCCESS!r} is {value!r}; expected a truth value: True, False, 1 or 0. Give "
                 "a part or a score another name"
             )
-    return _copied(answer)
+    return _copy_step(answer)
 
 
-def _copied(step: Step) -> Step:
+def _copy_step(step: Step) -> Step:
     observation = step.observation
     cameras = {name: np.array(picture) for name, picture in observation.cameras.items()}
     lens = None if observation.intrinsics is None else np.array(observation.intrinsics)
@@ -415,7 +416,7 @@ def full_name(picture: str) -> str:
     return picture if picture.startswith("observation.") else f"{IMAGES}{picture}"
 
 
-def arranged(step: Step, pairs: Pairs, first: str, where: str) -> Step:
+def arrange_pictures(step: Step, pairs: Pairs, first: str, where: str) -> Step:
     """Return a step whose pictures are those of the model's cameras; as it is where there are no pairs.
 
     Args:
@@ -504,7 +505,7 @@ class EnvironmentSource(Source[EnvSource]):
             if None in limits:
                 limit = declared_limit(environment, name)
                 if limit is None:
-                    started(environment, listed[0][1], name)
+                    start_episode(environment, listed[0][1], name)
                     limit = declared_limit(environment, name)
                 limits = (limits - {None}) | ({limit} if limit is not None else set())
             settings = settings.changed(limit=max((limit for limit in limits if limit is not None), default=None))
@@ -526,8 +527,8 @@ class EnvironmentSource(Source[EnvSource]):
         episodes = [episode for _, episode in self.episodes[:2]]
         environment, name = open_environment(self.settings), self.name
         try:
-            first, *later_starts = (started(environment, episode, name) for episode in episodes)
-            again = started(environment, episodes[0], name)
+            first, *later_starts = (start_episode(environment, episode, name) for episode in episodes)
+            again = start_episode(environment, episodes[0], name)
         finally:
             environment.close()
         if not self.settings.accept_nondeterminism:
@@ -544,7 +545,7 @@ class EnvironmentSource(Source[EnvSource]):
         episode, name = self.episodes[0][1], self.name
         environment = open_environment(self.settings)
         try:
-            elsewhere = started(environment, episode, name)
+            elsewhere = start_episode(environment, episode, name)
         finally:
             environment.close()
         repeats = (
@@ -603,7 +604,7 @@ class EnvironmentSource(Source[EnvSource]):
 
     # -- a model -------------------------------------------------------------------------------------
 
-    def watched(self, cameras: Sequence[str]) -> Self:
+    def for_cameras(self, cameras: Sequence[str]) -> Self:
         """Set up the first chosen episode; no action is executed, so that facts are those of `reset`."""
         return self._begun(DeclaredInputs(tuple(cameras[:1])), False)
 
@@ -611,7 +612,7 @@ class EnvironmentSource(Source[EnvSource]):
         typed = self.settings.cameras
         environment = open_environment(self.settings)
         try:
-            first = started(environment, self.episodes[0][1], self.name)
+            first = start_episode(environment, self.episodes[0][1], self.name)
             first = self._mapped(environment, first, inputs, by_name)
         finally:
             environment.close()
@@ -638,7 +639,7 @@ class EnvironmentSource(Source[EnvSource]):
         pairs = mapped_pictures(typed, inputs, pictures, by_name, self.name)
         self.renamed = self._renamed(inputs, pictures)
         self.settings = self.settings.changed(cameras=pairs)
-        return arranged(step, pairs, pictures[0], self.name)
+        return arrange_pictures(step, pairs, pictures[0], self.name)
 
     def _renamed(self, inputs: DeclaredInputs, pictures: Sequence[str]) -> str:
         """Return the checkpoint's own map in words, and where `--camera` contradicts it; empty without one."""
@@ -672,7 +673,7 @@ class EnvironmentSource(Source[EnvSource]):
             )
         environment, name = open_environment(self.settings), self.name
         try:
-            first = started(environment, self.episodes[0][1], name)
+            first = start_episode(environment, self.episodes[0][1], name)
             first = self._mapped(environment, first, policy.card.inputs(policy.state_numbers))
             policy = self._with_cameras(policy, first.observation)
             self._check_state(policy, first.observation)
@@ -683,7 +684,7 @@ class EnvironmentSource(Source[EnvSource]):
             self._note_facts(second)
             later = [episode for _, episode in self.episodes[1:FIRST_EPISODES]]
             later = later if policy.state_numbers is not None else []
-            begins = [first, *(started(environment, episode, name) for episode in later)]
+            begins = [first, *(start_episode(environment, episode, name) for episode in later)]
             for begin in begins:
                 self._check_state(policy, begin.observation)
             ids = [episode.id for _, episode in self.episodes]
@@ -811,7 +812,7 @@ class EnvironmentSource(Source[EnvSource]):
         groups = {row.columns["group_id"] for row in rows}
         described = {
             "environment": terminal_safe(self.name),
-            "episodes": f"{len(rows)} in {counted(len(groups), 'group')}, {self._limit_words(rows)}",
+            "episodes": f"{len(rows)} in {plural(len(groups), 'group')}, {self._limit_words(rows)}",
             "groups": self._group_words(rows),
             "starts": self._start_words,
         }
@@ -837,7 +838,7 @@ class EnvironmentSource(Source[EnvSource]):
     def _limit_words(self, rows: Sequence[Row]) -> str:
         settings, most = self.settings, sorted({self.most_steps(row.content) for row in rows})
         limits = sorted({limit for row in rows if (limit := limit_in(settings, row.content)) is not None})
-        actions = f"at most {spanned(most)} actions each"
+        actions = f"at most {describe_range(most)} actions each"
         if settings.max_steps is None:
             if not limits:
                 return f"{actions}: the environment declares no limit of its own, --max-steps gives another"
@@ -846,7 +847,7 @@ class EnvironmentSource(Source[EnvSource]):
         if not limits:
             return f"{actions}: --max-steps; the environment declares no limit of its own"
         shorter = "; rates are not the benchmark's" if most[-1] < limits[-1] else ""
-        return f"{actions}: --max-steps; the environment's own limit is {spanned(limits)}{shorter}"
+        return f"{actions}: --max-steps; the environment's own limit is {describe_range(limits)}{shorter}"
 
     def _group_words(self, rows: Sequence[Row]) -> str:
         groups: list[str | None] = [row.content.group for row in rows]
@@ -890,7 +891,7 @@ class EnvironmentPlayer(InputsPlayer):
         del film
         self.row, self._steps, self._succeeded = row, 0, False
         self._clear()
-        step = started(self._environment, row.content, self._settings.name)
+        step = start_episode(self._environment, row.content, self._settings.name)
         self._start = start_digest(step)
         if self._starts.get(row.content.id, self._start) != self._start:
             raise OtherFramesError(
@@ -922,7 +923,9 @@ class EnvironmentPlayer(InputsPlayer):
             self._environment.close()
 
     def _arranged(self, step: Step) -> Step:
-        return arranged(step, self._settings.cameras, first_picture(self._environment), self._settings.name)
+        return arrange_pictures(
+            step, self._settings.cameras, first_picture(self._environment), self._settings.name
+        )
 
     def _see(self, step: Step) -> Observation:
         observation, most = step.observation, self._played.calls

@@ -129,7 +129,7 @@ class LeRobotEnvironment:
         """Return an observation as lerobot's policies get it: its names, order of states and turned pictures."""
         from lerobot.envs.utils import preprocess_observation
 
-        features = self._before(preprocess_observation(_batched(observation)))
+        features = self._before(preprocess_observation(_add_batch_axis(observation)))
         pictures = {
             name: _picture(features[name]) for name in features if name == IMAGE or name.startswith(IMAGES)
         }
@@ -278,10 +278,10 @@ def _text(environment: Any) -> str | None:
     return str(task) if task else None
 
 
-def _batched(observation: Any) -> Any:
+def _add_batch_axis(observation: Any) -> Any:
     """Return the arrays of an observation with a first axis of one, as lerobot's processors expect."""
     if isinstance(observation, Mapping):
-        return {name: _batched(value) for name, value in observation.items()}
+        return {name: _add_batch_axis(value) for name, value in observation.items()}
     return np.asarray(observation)[None]
 
 

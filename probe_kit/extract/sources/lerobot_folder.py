@@ -246,7 +246,7 @@ def resolved_commit(repo: str, revision: str) -> str:
     return str(commit)
 
 
-def fetched(folder: LeRobotFolder, episodes: Sequence[int], cameras: Sequence[str]) -> None:
+def fetch_episodes(folder: LeRobotFolder, episodes: Sequence[int], cameras: Sequence[str]) -> None:
     """Download the files of some episodes, if the data set is one of the hub."""
     if folder.repo is not None and folder.revision is not None:
         names = {
@@ -409,7 +409,7 @@ class LeRobotFrames:
         if strange := [number for number in begins if number not in expected]:
             raise RecordingError(
                 f"{self._where(path)} holds frames of episode {strange[0]:g}, which meta/episodes does not name "
-                f"in this file; expected {_listed(sorted(expected))}. Copy the data set again, or repair its meta"
+                f"in this file; expected {_listing(sorted(expected))}. Copy the data set again, or repair its meta"
             )
         first = {}
         for number, episode in expected.items():
@@ -519,7 +519,7 @@ class LeRobotFrames:
         if (off := np.flatnonzero((match.positions == NONE) | repeated)).size:
             frame = int(off[0])
             raise RecordingError(
-                f"{self._where(path)} shows no picture of {camera} for frames {_listed(off)} of episode "
+                f"{self._where(path)} shows no picture of {camera} for frames {_listing(off)} of episode "
                 f"{episode}: frame {frame} is at {part.begin + timestamps[frame]:.4f} s, "
                 + (
                     "where the video shows the picture of the frame before it"
@@ -591,11 +591,11 @@ def _first_fault(faults: Mapping[int, str], episodes: Sequence[int]) -> str:
     text = next(iter(faults.values()))
     sound = [episode for episode in episodes if episode not in faults]
     if len(faults) > 1:
-        text += f". Of {len(episodes)} episodes, {len(faults)} are refused: {_listed(list(faults))}"
+        text += f". Of {len(episodes)} episodes, {len(faults)} are refused: {_listing(list(faults))}"
     if sound:
         text += f". Without {'it' if len(faults) == 1 else 'them'}: --episodes {episodes_text(sound)}"
     return text
 
 
-def _listed(numbers: Sequence[int] | NDArray[np.int64]) -> str:
+def _listing(numbers: Sequence[int] | NDArray[np.int64]) -> str:
     return ", ".join(map(str, numbers[:5])) + (f" and {len(numbers) - 5} more" if len(numbers) > 5 else "")

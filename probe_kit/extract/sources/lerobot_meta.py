@@ -83,7 +83,7 @@ class HashedFiles:
     def open(self, file: Path) -> BinaryIO:
         """Open a file for reading. Raises RecordingError if it is missing, or was changed after it was hashed."""
         digest = self._hash(file)
-        opened = _opened(file, self._root)
+        opened = _open_file(file, self._root)
         if _stamp(opened) != self._hashed[file][1]:
             now, stamp = _digest(opened)
             if now != digest:
@@ -114,12 +114,12 @@ class HashedFiles:
 
     def _hash(self, file: Path) -> str:
         if file not in self._hashed:
-            with _opened(file, self._root) as opened:
+            with _open_file(file, self._root) as opened:
                 self._hashed[file] = _digest(opened)
         return self._hashed[file][0]
 
 
-def _opened(file: Path, root: Path) -> BinaryIO:
+def _open_file(file: Path, root: Path) -> BinaryIO:
     try:
         return open_regular(file, _MOST_BYTES)
     except OSError as error:
@@ -560,7 +560,7 @@ def _check_line(line: Mapping[str, Any], where: str) -> None:
 def _path_of(root: Path, info: Mapping[str, Any], template: str, episode: int, **parts: Any) -> Path:
     """Return a file that `info` names, in the data set's folder. Raises RecordingError for one outside it."""
     try:
-        path = Path(_filled(info[template], parts))
+        path = Path(_fill_path(info[template], parts))
     except (KeyError, IndexError, ValueError, AttributeError) as error:
         raise RecordingError(
             f"{root.name}: {INFO} has {template} {str(info.get(template))[:200]!r}, which names no file of "
@@ -574,7 +574,7 @@ def _path_of(root: Path, info: Mapping[str, Any], template: str, episode: int, *
     return path
 
 
-def _filled(template: Any, parts: Mapping[str, Any]) -> str:
+def _fill_path(template: Any, parts: Mapping[str, Any]) -> str:
     """Return a path with its fields filled in. Raises ValueError or KeyError for one that names no file.
 
     A format can ask for any width: the fields are those of `parts` alone, and their widths have two digits.

@@ -115,7 +115,7 @@ class Line:
 
     Attributes:
         content: The hash of the picture's bytes.
-        numbers: The cells as `_coded` returns them.
+        numbers: The cells as `_code_columns` returns them.
     """
 
     picture: Path
@@ -172,7 +172,7 @@ class PictureSource(Source[PictureFolder]):
             raise RecordingError(f"{read.where(read.line)} has the heading {hostile[0]!r}; expected plain text")
         names = [name for name in read.names if name and name not in (PICTURE, INSTRUCTION, ID, GROUP)]
         texts = _with_groups(read, list(read.rows()))
-        values, coded_names = _coded(read, texts, names)
+        values, coded_names = _code_columns(read, texts, names)
         lines = [
             (text, _line(text, folder, read.where(number), tuple(column[row] for column in values)))
             for row, (number, text) in enumerate(texts)
@@ -233,7 +233,7 @@ class PictureSource(Source[PictureFolder]):
         """Return the first camera: a row has one picture."""
         return (declared.cameras if declared else (CAMERA,))[:1]
 
-    def watched(self, cameras: Sequence[str]) -> Self:
+    def for_cameras(self, cameras: Sequence[str]) -> Self:
         """Show the pictures to the model's first camera."""
         self.cameras = list(cameras[:1])
         return self
@@ -330,7 +330,7 @@ def read_picture(line: Line) -> NDArray[np.uint8]:
     return np.asarray(decode_bytes(content, f"{where}:", RecordingError, "Write it again as PNG.")).copy()
 
 
-def _coded(
+def _code_columns(
     table: TextTable, lines: Sequence[tuple[int, Cells]], names: Sequence[str]
 ) -> tuple[list[list[float]], dict[str, list[str]]]:
     """Return the columns that become labels as numbers, and the names that a run stores of them.

@@ -297,15 +297,15 @@ def serve(connection: Connection) -> None:
     try:
         while True:
             request, then = connection.recv()
-            answer = _answered(player, request)
+            answer = _answer_of_call(player, request)
             connection.send(answer)
             if then is not None and isinstance(answer, Ending):
-                connection.send(_answered(player, then))
+                connection.send(_answer_of_call(player, then))
     finally:
         player.close()
 
 
-def _answered(player: Player, request: Request) -> Answer | ProbeKitError:
+def _answer_of_call(player: Player, request: Request) -> Answer | ProbeKitError:
     try:
         return player.answer(*request)
     except ProbeKitError as error:  # what it costs, an episode or the run, is decided by the parent

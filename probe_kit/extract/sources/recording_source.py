@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit._system.counting import spanned
+from probe_kit._system.counting import describe_range
 from probe_kit._system.escaping import terminal_safe
 from probe_kit.errors import ObservationError, RecordingError
 from probe_kit.extract.sources.lerobot_folder import (
     MOST_FRAMES,
     LeRobotFolder,
     LeRobotFrames,
-    fetched,
+    fetch_episodes,
     open_lerobot,
 )
 from probe_kit.extract.sources.lerobot_meta import IMAGE, KEYS, NUMERIC
@@ -102,7 +102,7 @@ class RecordingSource(Source[LeRobotSource]):
             settings = settings.changed(folder=f"{folder.repo}@{folder.revision}")
         opened = cls(settings, folder, 1 if settings.single else MOST_FRAMES)
         opened._check_features()
-        fetched(opened.folder, opened.episodes, ())
+        fetch_episodes(opened.folder, opened.episodes, ())
         opened.folder.check_files(opened.episodes, ())
         return opened
 
@@ -110,10 +110,10 @@ class RecordingSource(Source[LeRobotSource]):
         """Return the same recordings with a row per chosen frame."""
         return type(self)(self.settings, self.folder, 1)
 
-    def watched(self, cameras: Sequence[str]) -> Self:
+    def for_cameras(self, cameras: Sequence[str]) -> Self:
         """Map the model's first camera, and read all numbers of the chosen episodes."""
         mapped = self.mapped(DeclaredInputs(tuple(cameras[:1])))
-        fetched(mapped.folder, mapped.episodes, mapped.features)
+        fetch_episodes(mapped.folder, mapped.episodes, mapped.features)
         mapped.check_frames()
         return mapped
 
@@ -332,7 +332,7 @@ class RecordingSource(Source[LeRobotSource]):
         inputs = card.inputs(policy.state_numbers)
         raise_together(self.early_checks(inputs, card.checkpoint))
         fitted = self.mapped(inputs)
-        fetched(fitted.folder, fitted.episodes, fitted.features)
+        fetch_episodes(fitted.folder, fitted.episodes, fitted.features)
         fitted.check_frames()
         try:
             policy = policy.with_cameras([camera for camera, _ in fitted.settings.cameras])
@@ -532,7 +532,7 @@ class RecordingSource(Source[LeRobotSource]):
         return {
             "data set": self.name + (f"@{folder.revision}" if folder.revision else ""),
             "frames per second": f"{folder.fps:g}",
-            "episodes": f"{len(lengths)} of {len(folder.lengths)}, {spanned(lengths)} frames each",
+            "episodes": f"{len(lengths)} of {len(folder.lengths)}, {describe_range(lengths)} frames each",
             "frames": f"{sum(-(-length // every) for length in lengths)} of {sum(lengths)} (every:{every})",
             "instructions": "; ".join(texts[:_LONGEST]) + more,
             **({"same instruction": "; ".join(same)} if (same := self.same_instructions()) else {}),

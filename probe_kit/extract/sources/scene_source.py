@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit._system.counting import counted
+from probe_kit._system.counting import plural
 from probe_kit.env import Act2AnswerEnv, Idle, SceneSpec, ScriptedExpert
 from probe_kit.env.act2answer import Recorder
 from probe_kit.errors import SceneError, UsageError
@@ -306,7 +306,7 @@ class SceneSource(Source[SceneSettings]):
             "suite": self.suite.identity,
             "categories": ", ".join(self.suite.categories),
             "scene": f"{scene.name}, at most {scene.max_steps} actions{early}",
-            "episodes": f"{len(rows)} ({counted(len(self.suite.items), 'item')} in both layouts)",
+            "episodes": f"{len(rows)} ({plural(len(self.suite.items), 'item')} in both layouts)",
             **({"wordings": wordings} if skipped else {}),
         }
 

@@ -267,7 +267,7 @@ class ServedSource(Source[ServedSettings]):
             return ((self.model_cameras[0], pictures[0]),)
         raise ObservationError(
             f"no picture is mapped to the model's first camera: the model has {', '.join(self.model_cameras)}; "
-            f"the observation has {_listed(pictures)}. Start the server with --camera {self.model_cameras[0]}="
+            f"the observation has {_list_keys(pictures)}. Start the server with --camera {self.model_cameras[0]}="
             f"{pictures[0] if pictures else 'KEY'}"
         )
 
@@ -277,11 +277,11 @@ class ServedSource(Source[ServedSettings]):
             keys = [name for name, value in _flat(sent) if isinstance(value, np.ndarray) and value.ndim == 3]
             raise ObservationError(
                 f"the observation has no picture {key!r} for the camera {camera}; its pictures are "
-                f"{_listed(keys)}. Send it, or start the server with another --camera"
+                f"{_list_keys(keys)}. Send it, or start the server with another --camera"
             )
         if not isinstance(picture, np.ndarray) or picture.dtype != np.uint8 or picture.ndim != 3:
             raise ObservationError(
-                f"{key} is {_described(picture)}; expected a picture of uint8, (height, width, 3) or (3, height, "
+                f"{key} is {_in_words(picture)}; expected a picture of uint8, (height, width, 3) or (3, height, "
                 "width)"
             )
         if picture.shape[2] != 3 and picture.shape[0] == 3:
@@ -307,12 +307,12 @@ class ServedSource(Source[ServedSettings]):
             if value is None:
                 keys = [name for name, other in _flat(sent) if isinstance(other, np.ndarray) and other.ndim < 3]
                 raise ObservationError(
-                    f"the observation has no state {key!r}; its other numbers are {_listed(keys)}. Send it, or "
+                    f"the observation has no state {key!r}; its other numbers are {_list_keys(keys)}. Send it, or "
                     "start the server with another --state"
                 )
             numbers = np.asarray(value) if isinstance(value, np.ndarray | int | float) else None
             if numbers is None or numbers.dtype.kind not in NUMBER_KINDS or numbers.ndim > 1:
-                raise ObservationError(f"{key} is {_described(value)}; expected numbers of one axis")
+                raise ObservationError(f"{key} is {_in_words(value)}; expected numbers of one axis")
             with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, and is refused below
                 parts.append(np.atleast_1d(numbers).astype(np.float32))
         state = np.concatenate(parts)
@@ -523,18 +523,18 @@ def _flat(sent: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
 
 def flat_keys(sent: Mapping[str, Any]) -> dict[str, str]:
     """Return type and shape in words by key of what a client sent, of nested maps with their path."""
-    return {key: _described(value) for key, value in _flat(sent)}
+    return {key: _in_words(value) for key, value in _flat(sent)}
 
 
 def _names_of(camera: str) -> tuple[str, ...]:
     return camera, f"images/{camera}", f"observation/{camera}", f"observation.images.{camera}"
 
 
-def _listed(keys: Sequence[str]) -> str:
+def _list_keys(keys: Sequence[str]) -> str:
     return terminal_safe(", ".join(keys)[:300]) or "none"
 
 
-def _described(value: Any) -> str:
+def _in_words(value: Any) -> str:
     if isinstance(value, np.ndarray):
         return f"{value.dtype} {value.shape}"
     return f"a {type(value).__name__}"

@@ -19,7 +19,7 @@ from probe_kit._terminal.field_options import FieldOption, Part, options_of
 from probe_kit.errors import InstructionError, PolicyFailedError, RecordingError, UnitsError, UsageError
 from probe_kit.extract.sources.inputs import describe_spellings
 from probe_kit.extract.sources.units import Units, UnitsNote, compare_units
-from probe_kit.hooks.checkpoints.third_party import copied, while_acting
+from probe_kit.hooks.checkpoints.third_party import copy_observations, while_acting
 from probe_kit.hooks.contract.feature_statistics import FeatureStatistics
 from probe_kit.hooks.contract.observation import Observation
 
@@ -184,7 +184,7 @@ class Source[Chosen: SourceSettings](ABC):
         """Return the source with a row per question, which is about the row's first observation."""
         return self
 
-    def watched(self, cameras: Sequence[str]) -> Self:
+    def for_cameras(self, cameras: Sequence[str]) -> Self:
         """Return the source as it is shown to a model with these cameras that answers and does not act.
 
         Raises an error for cameras that get no picture.
@@ -386,7 +386,7 @@ def exchanged_names(policy: "Policy", names: Sequence[str]) -> str | None:
 def predicted_once(policy: "Policy", observation: Observation) -> NDArray[np.float32]:
     """Return one prediction (chunk, D) of a policy, in its own units. Raises PolicyFailedError otherwise."""
     with while_acting(policy.card.family, policy.card.checkpoint):
-        chunks = policy.predict(copied([observation]), [0])
+        chunks = policy.predict(copy_observations([observation]), [0])
         check_predictions(chunks, 1)
     chunk: NDArray[np.float32] = chunks[0]
     return chunk

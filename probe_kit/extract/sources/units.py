@@ -458,7 +458,7 @@ class _Comparison:
         small, large = next(units for value, units in FACTORS.items() if np.isclose(value, times))
         size, had, due = ("larger", small, large) if factor > 1 else ("smaller", large, small)
         return (
-            f"{self._listed(numbers)} about {_rounded(times)} times {size} than in training, as {had} for {due} "
+            f"{self._listed(numbers)} about {_figures(times)} times {size} than in training, as {had} for {due} "
             f"({self._ranges(numbers[0])})"
         )
 
@@ -482,6 +482,6 @@ class _Comparison:
         )
 
 
-def _rounded(times: float) -> str:
+def _figures(times: float) -> str:
     """Return a factor in figures, such as 57.3 and 1,000."""
     return f"{times:,.1f}".removesuffix(".0")

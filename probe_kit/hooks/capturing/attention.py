@@ -301,7 +301,7 @@ def attended_roles(model: Model, roles: Mapping[str, Sequence[Roles]], site: Sit
         behind = roles.get(acting or "", stream_roles)
     elif len(stream_roles[0]) == tokens and model.prompt_kv is None:
         return list(stream_roles)
-    joined = [_joined(first, last, tokens) for first, last in zip(before, behind, strict=True)]
+    joined = [_join_roles(first, last, tokens) for first, last in zip(before, behind, strict=True)]
     if any(row is None for row in joined):
         raise RolesMismatchError(
             f"{site} attends to {tokens} positions; {backbone} has {len(before[0])} and {stream.name} "
@@ -310,7 +310,7 @@ def attended_roles(model: Model, roles: Mapping[str, Sequence[Roles]], site: Sit
     return [row for row in joined if row is not None]
 
 
-def _joined(before: Roles, behind: Roles, tokens: int) -> Roles | None:
+def _join_roles(before: Roles, behind: Roles, tokens: int) -> Roles | None:
     """The roles of `before`, then `behind`: once or, of a single position, as often as `tokens` in all have room.
 
     The result is None if they do not fit.
@@ -412,7 +412,7 @@ class _AttentionCalls(TorchFunctionMode):
         self.are_inside = self.are_inside and self.is_inside
         with torch._C.DisableTorchFunction():
             weights = last.weights()
-            values = _of_every_head(last.values, weights.shape[1]).float().to(weights.device)
+            values = _repeat_for_heads(last.values, weights.shape[1]).float().to(weights.device)
             computed = tap.rows.of((weights @ values).transpose(1, 2).flatten(2))[:, tap.tokens]
         _check_reading(site, self.model.stream_of(site), weights.shape[1], computed, read)
         return tap.rows.of(weights)[:, :, tap.tokens], tap.rows.of(values)
@@ -440,7 +440,7 @@ class _AttentionCalls(TorchFunctionMode):
             return result
         keywords = kwargs or {}
         if func is _FUSED:
-            self._note(_fused(*args, **keywords))
+            self._note(_fused_attention(*args, **keywords))
         elif func in _SOFTMAX and result.dim() == 4:
             self._shares = result
         elif func in _MATMUL and self._shares is not None and _is_reading(self._shares, *args[:2]):
@@ -467,7 +467,7 @@ def _is_reading(shares: Tensor, weights: Tensor, values: Tensor) -> bool:
     return weights.shape == shares.shape and values.dim() == 4 and values.shape[2] == shares.shape[3]
 
 
-def _fused(
+def _fused_attention(
     query: Tensor,
     key: Tensor,
     value: Tensor,
@@ -482,7 +482,7 @@ def _fused(
         return None
 
     def weights() -> Tensor:
-        keys = _of_every_head(key, query.shape[1]).float()
+        keys = _repeat_for_heads(key, query.shape[1]).float()
         factor = query.shape[-1] ** -0.5 if scale is None else scale
         logits = query.float() @ keys.transpose(2, 3) * factor
         mask = attn_mask
@@ -495,7 +495,7 @@ def _fused(
     return _Attention(weights, value)
 
 
-def _of_every_head(heads: Tensor, count: int) -> Tensor:
+def _repeat_for_heads(heads: Tensor, count: int) -> Tensor:
     """Return keys or values (B, G, T, E) as (B, H, T, E), each of the G repeated for the heads that share it."""
     batch, groups, *shape = heads.shape
     return heads[:, :, None].expand(batch, groups, count // groups, *shape).flatten(1, 2)

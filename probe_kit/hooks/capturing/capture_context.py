@@ -604,7 +604,7 @@ def flowing_tensors(model: Model, sites: Iterable[Site]) -> Iterator[FlowingTens
 
 
 @contextmanager
-def frozen(network: nn.Module) -> Iterator[None]:
+def freeze_weights(network: nn.Module) -> Iterator[None]:
     """Run the body with a graph of activations alone: no weight asks for its gradient."""
     trained = [weight for weight in network.parameters() if weight.requires_grad]
     for weight in trained:

@@ -110,7 +110,7 @@ class TokenSelection:
         return cls(mask.size, torch.from_numpy(positions).to(device))
 
 
-def selected(activation: "Tensor", where: TokenIndex) -> "Tensor":
+def select_positions(activation: "Tensor", where: TokenIndex) -> "Tensor":
     """Return (1, T', D) of (1, T, D), a view where the positions are neighbours."""
     if where is EVERY:
         return activation
@@ -148,7 +148,7 @@ class ReplaceWith:
             raise CaptureError(
                 f"the source's {site} has {other.shape[1]} tokens; expected {self.tokens}, as in the clean one"
             )
-        return selected(other, where).float()
+        return select_positions(other, where).float()
 
 
 @dataclass(frozen=True)
@@ -449,7 +449,7 @@ class ActiveEdits:
         return activation if activation.shape == shape else activation.reshape(shape)
 
     def _changed(self, site: Site, activation: "Tensor", where: TokenIndex, change: TokenEdit) -> "Tensor":
-        before = selected(activation, where)
+        before = select_positions(activation, where)
         after = change(site, before.float(), where)
         if after.dtype != activation.dtype:
             after = after.to(activation.dtype)

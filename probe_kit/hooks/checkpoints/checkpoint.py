@@ -222,7 +222,7 @@ def without_revision(checkpoint: str | None) -> str | None:
     return checkpoint.partition("@")[0]
 
 
-def pinned(checkpoint: str) -> str:
+def pin_revision(checkpoint: str) -> str:
     """Return a hub id with the commit that the cache has of its revision; anything else as it is.
 
     Asks no network.
@@ -294,11 +294,11 @@ def plain_folder(checkpoint: str, patterns: Sequence[str] = PATTERNS) -> Path:
     except RuntimeError as error:  # ~name of an unknown user
         raise CheckpointError(f"checkpoint folder {checkpoint!r} does not exist ({error})") from None
     if not folder.is_dir():
-        folder = _fetched(checkpoint, patterns)
+        folder = _fetch_folder(checkpoint, patterns)
     return _possible(folder)
 
 
-def _fetched(checkpoint: str, patterns: Sequence[str]) -> Path:
+def _fetch_folder(checkpoint: str, patterns: Sequence[str]) -> Path:
     """The folder of a hub id, of which the cache has a copy then.
 
     Raises:
@@ -309,7 +309,7 @@ def _fetched(checkpoint: str, patterns: Sequence[str]) -> Path:
         raise CheckpointError(_not_here(checkpoint))
     parts = _with_pin(parts)
     why = unreachable()
-    snapshot = _snapshot(parts) if why else _downloaded(checkpoint, parts, patterns)
+    snapshot = _snapshot(parts) if why else _download_commit(checkpoint, parts, patterns)
     if snapshot is None:
         raise CheckpointError(
             _not_fetched(checkpoint, f"{why}; the cache has no copy", OFFLINE_WAY_OUT)
@@ -328,7 +328,7 @@ def _with_pin(parts: HubName) -> HubName:
     return parts if parts.revision else parts._replace(revision=pinned_commit(parts.repository))
 
 
-def _downloaded(checkpoint: str, parts: HubName, patterns: Sequence[str]) -> Path:
+def _download_commit(checkpoint: str, parts: HubName, patterns: Sequence[str]) -> Path:
     """The folder of a commit, with the files of these patterns.
 
     Raises:

@@ -45,7 +45,7 @@ class Interruptions:
 
 
 @contextmanager
-def contained(limit: float | None = None) -> Iterator[Interruptions]:
+def contain_policy(limit: float | None = None) -> Iterator[Interruptions]:
     """Run a policy's code in the body; afterwards this process is as it was.
 
     A process that the body forked ends here: it would play on beside its parent, into the same run.
@@ -82,7 +82,7 @@ def begin_randomness(seed: int) -> None:
     torch.manual_seed(seed)
 
 
-def copied(observations: Sequence[Observation]) -> list[Observation]:
+def copy_observations(observations: Sequence[Observation]) -> list[Observation]:
     """Return observations whose arrays may be written to: those of the stage stay as they are."""
     return [
         replace(
@@ -225,13 +225,13 @@ def while_acting(model: str, location: str, limit: float | None = None) -> Itera
     Args:
         model: Name of the model.
         location: The place of its checkpoint, for errors of the checkpoint that show this late.
-        limit: Seconds after which the process is ended, as in `contained`; None for no limit.
+        limit: Seconds after which the process is ended, as in `contain_policy`; None for no limit.
 
     Raises:
         PolicyFailedError: For any error but one of ours, or of memory that ended, which are raised as they are; it
             names the model.
     """
-    with contained(limit) as interruptions:
+    with contain_policy(limit) as interruptions:
         try:
             with naming_checkpoint(model, location):
                 yield

@@ -172,7 +172,8 @@ class Adapter:
         inner.add_module(last, twin)
         # The tensors say which modules change; "all-linear" and patterns would be resolved by peft's own rules.
         scaling = {
-            name: _of_path(value, path) if name in _PATTERNS else value for name, value in self.scaling.items()
+            name: _pattern_entry(value, path) if name in _PATTERNS else value
+            for name, value in self.scaling.items()
         }
         config = peft.LoraConfig(target_modules=[path], bias="none", inference_mode=True, **scaling)
         try:
@@ -224,7 +225,7 @@ class _AdapterParts(NamedTuple):
     copies: dict[str, Tensor]
 
 
-def _of_path(pattern: Mapping[str, Any], path: str) -> dict[str, Any]:
+def _pattern_entry(pattern: Mapping[str, Any], path: str) -> dict[str, Any]:
     """The one entry of a pattern that is for a module, if any; peft warns about entries that match none."""
     from peft.utils.other import get_pattern_key
 
@@ -421,7 +422,7 @@ def check_kinds(tensors: Mapping[str, Tensor], path: Path) -> None:
         )
 
 
-def unpickled(path: Path) -> Any:
+def unpickle_weights(path: Path) -> Any:
     """The content of a `.pt` file, read with `weights_only=True`: it cannot run code.
 
     Raises:
@@ -447,12 +448,12 @@ def _check_not_compressed(path: Path) -> None:
 
 
 def read_pickle(path: Path) -> Weights:
-    """Read the state dict in one `.pt` file; see `unpickled`.
+    """Read the state dict in one `.pt` file; see `unpickle_weights`.
 
     Raises:
         WeightsError: If the file holds no state dict.
     """
-    content = unpickled(path)
+    content = unpickle_weights(path)
     if not isinstance(content, dict) or not all(isinstance(value, Tensor) for value in content.values()):
         raise WeightsError(
             f"{path} holds {type(content).__name__} of something else than tensors; expected a state dict"

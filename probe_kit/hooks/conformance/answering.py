@@ -7,7 +7,7 @@ import torch
 
 from probe_kit.errors import ObservationError, UsageError
 from probe_kit.hooks.capturing.capture_context import capture
-from probe_kit.hooks.conformance.check import SkipTest, check, refused, require, require_bits, require_close
+from probe_kit.hooks.conformance.check import SkipTest, check, expect_refusal, require, require_bits, require_close
 from probe_kit.hooks.conformance.subject import AnswerSubject
 from probe_kit.hooks.contract.roles import Roles
 
@@ -101,7 +101,7 @@ def without_a_picture_nothing_of_it_is_left(subject: AnswerSubject) -> None:
 )
 def questions_with_and_without_a_picture_do_not_go_together(subject: AnswerSubject) -> None:
     first, second = subject.questions[:2]
-    with refused("one call with and without a picture", UsageError, ObservationError):
+    with expect_refusal("one call with and without a picture", UsageError, ObservationError):
         subject.ask([first, replace(second, pictured=False)])
 
 
@@ -111,7 +111,7 @@ def questions_with_and_without_a_picture_do_not_go_together(subject: AnswerSubje
 )
 def options_that_begin_alike_are_refused(subject: AnswerSubject) -> None:
     letter = subject.letters[0]
-    with refused(f"the options {letter} and {letter}", UsageError, says="same token"):
+    with expect_refusal(f"the options {letter} and {letter}", UsageError, says="same token"):
         subject.ask([replace(subject.questions[0], options=(letter, letter))])
 
 

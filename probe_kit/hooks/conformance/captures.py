@@ -34,7 +34,7 @@ from probe_kit.hooks.conformance.check import (
     CheckFailedError,
     SkipTest,
     check,
-    refused,
+    expect_refusal,
     require,
     require_bits,
     require_close,
@@ -203,10 +203,10 @@ def passes_keep_what_fires(subject: Subject) -> None:
 def hooks_are_gone_after_an_exception(subject: Subject) -> None:
     model, observations = subject.model, subject.batch
     plain = subject.run(observations)
-    with refused("an exception in a capture", KeyError, says="body"), capture(model, model.sites()):
+    with expect_refusal("an exception in a capture", KeyError, says="body"), capture(model, model.sites()):
         raise KeyError("body")
     require_bits(subject.run(observations), plain, "outputs after the exception", "those before it")
-    with refused("a capture without an inference", SiteNeverFiredError), capture(model, model.sites()[:1]):
+    with expect_refusal("a capture without an inference", SiteNeverFiredError), capture(model, model.sites()[:1]):
         pass
 
 
@@ -217,7 +217,7 @@ def hooks_are_gone_after_an_exception(subject: Subject) -> None:
 def nested_captures_are_refused(subject: Subject) -> None:
     model, sites = subject.model, subject.model.sites()[:1]
     with capture(model, sites):
-        with refused("a capture inside a capture", CaptureError), capture(model, sites):
+        with expect_refusal("a capture inside a capture", CaptureError), capture(model, sites):
             pass
         subject.run(subject.batch)
 
@@ -229,7 +229,7 @@ def nested_captures_are_refused(subject: Subject) -> None:
 def an_unknown_site_is_refused(subject: Subject) -> None:
     stream = next(iter(subject.model.streams))
     for site in (Site(stream, 999), Site(stream, 0, "nonsense"), Site("nowhere", 0)):
-        with refused(f"tap({site})", UnknownSiteError):
+        with expect_refusal(f"tap({site})", UnknownSiteError):
             subject.model.tap(site)
 
 
@@ -365,10 +365,10 @@ def heads_that_are_not_declared_are_refused_by_name(subject: Subject) -> None:
     if not none:
         raise SkipTest(f"every stream of {model.card.family} declares heads")
     for stream in none:
-        with refused(f"heads of {stream.name}", UnknownSiteError, says=stream.name):
+        with expect_refusal(f"heads of {stream.name}", UnknownSiteError, says=stream.name):
             stream.sites(HEADS)
         site = Site(stream.name, 0, HEADS, None if stream.iterations is None else 0)
-        with refused(f"tap({site})", UnknownSiteError, says=HEADS):
+        with expect_refusal(f"tap({site})", UnknownSiteError, says=HEADS):
             model.tap(site)
 
 
@@ -379,7 +379,7 @@ def heads_that_are_not_declared_are_refused_by_name(subject: Subject) -> None:
 def the_last_row_of_the_logit_lens_is_the_output(subject: Subject) -> None:
     model, unembedding = subject.model, subject.model.unembedding
     if unembedding is None:
-        with refused("a logit lens", UnsupportedInterventionError, says=model.card.family):
+        with expect_refusal("a logit lens", UnsupportedInterventionError, says=model.card.family):
             logit_lens(model, ActivationCache())
         raise SkipTest(f"{model.card.family} puts out no tokens, and refuses a logit lens by name")
     streams = set(unembedding.streams)
@@ -425,7 +425,7 @@ def _streams_with_heads(subject: Subject) -> list[Stream]:
 def a_batch_equals_its_rows_one_by_one(subject: Subject) -> None:
     observations = subject.observations
     if subject.model.card.batch == 1:
-        with refused("two observations where card.batch is 1", ObservationError, says="at most 1"):
+        with expect_refusal("two observations where card.batch is 1", ObservationError, says="at most 1"):
             subject.run(observations)
         return
     together = subject.run(observations)
@@ -443,7 +443,7 @@ def an_observation_without_what_is_needed_is_refused(subject: Subject) -> None:
     if not subject.model.card.needs - {"state"}:
         subject.run([bare])
         return
-    with refused("an observation without cameras and intrinsics", ObservationError, says="reads"):
+    with expect_refusal("an observation without cameras and intrinsics", ObservationError, says="reads"):
         subject.run([bare])
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import ProbeKitError
-from probe_kit.hooks.checkpoints.third_party import contained, in_words
+from probe_kit.hooks.checkpoints.third_party import contain_policy, in_words
 
 __all__ = [
     "Check",
@@ -22,11 +22,11 @@ __all__ = [
     "SkipTest",
     "check",
     "checks_of",
-    "refused",
+    "expect_refusal",
     "require",
     "require_bits",
     "require_close",
-    "tried",
+    "try_check",
 ]
 
 
@@ -112,7 +112,7 @@ def require_close(actual: NDArray[Any], expected: NDArray[Any], tolerance: float
 
 
 @contextmanager
-def refused(request: str, *errors: type[Exception], says: str = "") -> Iterator[None]:
+def expect_refusal(request: str, *errors: type[Exception], says: str = "") -> Iterator[None]:
     """Raise CheckFailedError unless the body raises one of `errors`, whose message holds `says`."""
     classes = " or ".join(error.__name__ for error in errors)
     try:
@@ -156,7 +156,7 @@ class Outcome:
         return asdict(self)
 
 
-def tried(name: str, sentence: str, change: str, body: Callable[[], object], package: str) -> Outcome:
+def try_check(name: str, sentence: str, change: str, body: Callable[[], object], package: str) -> Outcome:
     """Run a check; whatever the adapter raises is a failure.
 
     Ctrl-C is raised. Changes of the adapter in this process are put back.
@@ -169,7 +169,7 @@ def tried(name: str, sentence: str, change: str, body: Callable[[], object], pac
         package: Package of the adapter, to name the place of its error.
     """
     try:
-        with contained() as interruptions:
+        with contain_policy() as interruptions:
             body()
     except SkipTest as skipped:
         return Outcome(name, "skipped", sentence, reason=str(skipped))

@@ -9,7 +9,7 @@ from safetensors.torch import load_file, save_file
 
 from probe_kit.errors import CheckpointError, ProbeKitError, UsageError, WeightsError
 from probe_kit.hooks.checkpoints.folders import CONFIGURATIONS
-from probe_kit.hooks.conformance.check import CheckFailedError, SkipTest, check, refused, require
+from probe_kit.hooks.conformance.check import CheckFailedError, SkipTest, check, expect_refusal, require
 from probe_kit.hooks.conformance.subject import Subject
 from probe_kit.hooks.verify import CHECKPOINT_FOLDER, REFERENCE_FILE, verify_reference
 
@@ -82,7 +82,7 @@ def _settings(subject: Subject, checkpoint: Path, name: str, value: object) -> M
     "Declare options as `Family(options=(Option(…),))`; take no **keywords in the loader.",
 )
 def an_option_that_is_not_declared_is_refused(subject: Subject) -> None:
-    with refused("the option nonsense=1", UsageError, says="no model option nonsense"):
+    with expect_refusal("the option nonsense=1", UsageError, says="no model option nonsense"):
         subject.load(subject.checkpoint, nonsense=1)
 
 
@@ -122,7 +122,7 @@ def weights_that_are_not_exactly_the_models_are_refused(subject: Subject) -> Non
     for damage, words in _DAMAGES.items():
         copied = _copy(subject)
         _damage(copied, damage)
-        with refused(f"a checkpoint in which {words}", WeightsError, CheckpointError):
+        with expect_refusal(f"a checkpoint in which {words}", WeightsError, CheckpointError):
             subject.load(copied)
         shutil.rmtree(copied)
 

@@ -19,7 +19,7 @@ from probe_kit.errors import ObservationError, UnknownSiteError, UnsupportedInte
 from probe_kit.hooks.capturing.attention import capture_attention
 from probe_kit.hooks.capturing.capture_context import ActivationCache, EditFunction, capture, edit, gradients_at
 from probe_kit.hooks.capturing.edits import Edit, apply_edits, vector_hash
-from probe_kit.hooks.conformance.check import SkipTest, check, refused, require, require_bits, require_close
+from probe_kit.hooks.conformance.check import SkipTest, check, expect_refusal, require, require_bits, require_close
 from probe_kit.hooks.conformance.subject import PolicySubject
 from probe_kit.hooks.contract.declared import InterventionKind
 from probe_kit.hooks.contract.model import Policy
@@ -95,7 +95,7 @@ def inference_without_acting_equals_that_of_acting(subject: PolicySubject) -> No
     "Call `self.check(observations, seeds)` first in `act`.",
 )
 def every_observation_needs_its_seed(subject: PolicySubject) -> None:
-    with refused("an observation without a seed", ObservationError):
+    with expect_refusal("an observation without a seed", ObservationError):
         subject.policy.act(subject.batch, [])
 
 
@@ -161,11 +161,11 @@ def what_is_rewritten_in_a_block_is_read_behind_it(subject: PolicySubject) -> No
     policy = subject.policy
     for stream in policy.streams.values():
         behind = [site for site in stream.sites() if site.layer == 1]
-        plain = _captured(subject, subject.single, behind)
+        plain = _capture_sites(subject, subject.single, behind)
         for quantity in set(stream.captured) - {"final_norm"}:
             written = [site for site in stream.sites(quantity) if site.layer == 0]
             with edit(policy, dict.fromkeys(written, torch.zeros_like)):
-                changed = _captured(subject, subject.single, behind)
+                changed = _capture_sites(subject, subject.single, behind)
             reached = any((plain[site] != changed[site]).any() for site in behind)
             require(reached, f"zeros at {stream.name}.00.{quantity} leave layer 1 as it was", "other activations")
 
@@ -195,10 +195,10 @@ def what_is_not_supported_is_refused_by_name(subject: PolicySubject) -> None:
         if policy.interventions.supports(kind):
             policy.interventions.check(kind, family)
             continue
-        with refused(f"the intervention {kind}", UnsupportedInterventionError, says=family):
+        with expect_refusal(f"the intervention {kind}", UnsupportedInterventionError, says=family):
             policy.interventions.check(kind, family)
     if policy.prompt_kv is None:
-        with refused("a site of kv", UnknownSiteError):
+        with expect_refusal("a site of kv", UnknownSiteError):
             policy.tap(kv_stream(1, 1).sites("keys")[0])
 
 
@@ -212,7 +212,7 @@ def what_is_not_supported_is_refused_by_name(subject: PolicySubject) -> None:
 def the_prompt_has_keys_and_values_for_every_token_of_the_backbone(subject: PolicySubject) -> None:
     kv, observations = _prompt_kv(subject), subject.batch
     sites = _all(kv)
-    activations = _captured(subject, observations, sites)
+    activations = _capture_sites(subject, observations, sites)
     tokens = len(subject.policy.token_roles(observations)[kv.name][0])
     require(len(activations) == len(sites), f"{len(activations)} of {len(sites)} sites fired", "all")
     expected = (len(observations), tokens, kv.width)
@@ -232,10 +232,10 @@ def all_keys_and_values_of_another_picture_give_that_pictures_actions(subject: P
     acting = [site for site in policy.sites() if policy.streams[site.stream].part == "action"]
     early = [site for site in acting if (site.iteration or 0) < policy.interventions.first_affected_token]
     late = [site for site in acting if site not in early]
-    plain, source = (_captured(subject, [picture], [*_all(kv), *acting]) for picture in (observation, other))
+    plain, source = (_capture_sites(subject, [picture], [*_all(kv), *acting]) for picture in (observation, other))
     edits, vectors = _edits_from(source, [*_all(kv), *early])
     with apply_edits(policy, edits, [observation], vectors) as edit_log:
-        edited = _captured(subject, [observation], late)
+        edited = _capture_sites(subject, [observation], late)
     with apply_edits(policy, edits, [observation], vectors):
         moved = subject.run([observation])
     require_bits(moved, subject.run([other]), "actions with keys and values of another picture", "its own actions")
@@ -247,7 +247,7 @@ def all_keys_and_values_of_another_picture_give_that_pictures_actions(subject: P
         "other activations",
     )
     order = [entry.site for entry in edit_log.entries if entry.site.startswith(kv.name)]
-    expected = [str(site) for layer in range(kv.layers - 1) for site in _of(kv, layer)]
+    expected = [str(site) for layer in range(kv.layers - 1) for site in _sites_of_kind(kv, layer)]
     require(order == expected, f"edits in the order {order}", f"{expected}")
     require(sum(entry.moved for entry in edit_log.entries) > 0, "edits that move nothing", "other keys and values")
 
@@ -258,14 +258,14 @@ def all_keys_and_values_of_another_picture_give_that_pictures_actions(subject: P
 )
 def values_of_one_role_are_replaced_in_that_role_only(subject: PolicySubject) -> None:
     policy, kv, observation = subject.policy, _prompt_kv(subject), subject.single[0]
-    site = _of(kv, 0)[1]
+    site = _sites_of_kind(kv, 0)[1]
     plain, source = (
-        _captured(subject, [picture], [site])[site][0].float().cpu()
+        _capture_sites(subject, [picture], [site])[site][0].float().cpu()
         for picture in (observation, replace(observation, image=255 - observation.image))
     )
     replacement = Edit("replace", (site,), roles=("image",), vector=vector_hash(source.numpy()))
     with apply_edits(policy, [replacement], [observation], {replacement.vector: source.numpy()}) as edit_log:
-        edited = _captured(subject, [observation], [site])[site][0].float().cpu()
+        edited = _capture_sites(subject, [observation], [site])[site][0].float().cpu()
     image = torch.from_numpy(policy.token_roles([observation])[kv.name][0].mask("image"))
     expected = torch.where(image[:, None], source, plain)
     require(torch.equal(edited, expected), f"{site} differs outside of the picture's tokens", "new values there")
@@ -284,7 +284,7 @@ def every_token_of_the_picture_comes_of_the_patches_that_are_named(subject: Poli
     """Change the tower's output at the patches of one token: that token's embedding moves, and no other."""
     policy, observations = subject.policy, subject.single
     if not policy.interventions.tiles:
-        with refused("patch_order()", UnknownSiteError, says=policy.card.family):
+        with expect_refusal("patch_order()", UnknownSiteError, says=policy.card.family):
             policy.patch_order()
         raise SkipTest(f"{policy.card.family} declares no tiles, and refuses them by name")
     order, stream = policy.patch_order(), policy.every_stream()["vision"]
@@ -297,12 +297,12 @@ def every_token_of_the_picture_comes_of_the_patches_that_are_named(subject: Poli
         f"patch_order names {len(picture_tokens)} tokens",
         f"0 to {picture.size - 1}",
     )
-    plain = _captured(subject, observations, [last, embedded])
+    plain = _capture_sites(subject, observations, [last, embedded])
     tokens = plain[last].shape[-2]
     require(tokens == order.size, f"patch_order of length {order.size}", f"{tokens}, one per token of the tower")
     for token in (0, 1, picture.size // 2, picture.size - 1):
-        with edit(policy, {last: _turned(np.flatnonzero(order == token))}):
-            changed = _captured(subject, observations, [embedded])
+        with edit(policy, {last: _flip_sign(np.flatnonzero(order == token))}):
+            changed = _capture_sites(subject, observations, [embedded])
         moved = (changed[embedded] != plain[embedded])[0].any(dim=-1).cpu().numpy()
         reached = np.flatnonzero(moved).tolist()
         require(
@@ -320,7 +320,7 @@ def every_token_of_the_picture_comes_of_the_patches_that_are_named(subject: Poli
 def attention_is_recorded_without_changing_an_action_bit_for_bit(subject: PolicySubject) -> None:
     policy, observations = subject.policy, subject.batch
     if not policy.interventions.attention:
-        with refused("recorded attention", UnsupportedInterventionError), capture_attention(policy):
+        with expect_refusal("recorded attention", UnsupportedInterventionError), capture_attention(policy):
             pass
         raise SkipTest(f"{policy.card.family} declares no attention, and refuses it by name")
     plain = subject.run(observations)
@@ -344,7 +344,7 @@ def attention_is_recorded_without_changing_an_action_bit_for_bit(subject: Policy
     require(all((share > 0).all() for share in shares), "no attention to the picture", "some, from softmax")
 
 
-def _turned(positions: NDArray[np.int64]) -> EditFunction:
+def _flip_sign(positions: NDArray[np.int64]) -> EditFunction:
     """An edit that changes the sign at some positions."""
     indices = torch.from_numpy(positions)
 
@@ -361,7 +361,7 @@ def _prompt_kv(subject: PolicySubject) -> Stream:
     return subject.policy.prompt_kv
 
 
-def _captured(
+def _capture_sites(
     subject: PolicySubject, observations: Sequence[Observation], sites: Sequence[Site]
 ) -> ActivationCache:
     """Return the activations of one inference at `sites`."""
@@ -370,7 +370,7 @@ def _captured(
     return activations
 
 
-def _of(kv: Stream, layer: int) -> list[Site]:
+def _sites_of_kind(kv: Stream, layer: int) -> list[Site]:
     return [Site(kv.name, layer, quantity) for quantity in KV]
 
 
@@ -481,7 +481,7 @@ def _weights(policy: Policy) -> Sequence[Tensor]:
 def _differentiable(subject: PolicySubject) -> Policy:
     policy = subject.policy
     if not policy.interventions.gradients:
-        with refused("differentiable actions", UnsupportedInterventionError, says=policy.card.family):
+        with expect_refusal("differentiable actions", UnsupportedInterventionError, says=policy.card.family):
             policy.differentiable(subject.single, [0])
         raise SkipTest(f"{policy.card.family} declares no gradients, and refuses them by name")
     if policy.embodiment_mismatch() is not None:

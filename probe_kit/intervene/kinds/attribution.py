@@ -60,7 +60,7 @@ As many are drawn from the others.
 """
 
 
-def _estimated(cell: Cell, by_row: Mapping[tuple[int, int], float]) -> Condition:
+def _estimate_condition(cell: Cell, by_row: Mapping[tuple[int, int], float]) -> Condition:
     """Return a condition without an inference: the clean action, and the displacement estimated for a cell.
 
     Args:
@@ -139,7 +139,7 @@ class AttributionPatching(Intervention):
         patched, sites = {*anchors, *top, *drawn}, sites_of_cells(every)
         exact = [patch_of(cell, sites, EXACT) for cell in every if cell in patched]
         estimated = [
-            _estimated(cell, {at_row: float(by_cell[at]) for at_row, by_cell in rows.items()})
+            _estimate_condition(cell, {at_row: float(by_cell[at]) for at_row, by_cell in rows.items()})
             for at, cell in enumerate(every)
         ]
         names = [str(EditedCell(cell.site_group.name, cell.role, part=EXACT)) for cell in every if cell in drawn]

@@ -342,7 +342,7 @@ def closed_loop_effects(outcomes: ConditionOutcomes) -> list[ClosedLoopEffect]:
     return rows
 
 
-def _of_edits(cell: Callable[[ClosedLoopEffect], TableCell]) -> Callable[[ClosedLoopEffect], TableCell]:
+def _cell_of_edits(cell: Callable[[ClosedLoopEffect], TableCell]) -> Callable[[ClosedLoopEffect], TableCell]:
     """Return the function that gives a cell, with a dash for the identity patch."""
     return lambda row: TableCell(None) if row.sites == CLEAN else cell(row)
 
@@ -356,20 +356,20 @@ _ENDS = (
 _COMPARED = (
     EffectColumn[ClosedLoopEffect](
         "net flip rate [95 %]",
-        _of_edits(lambda row: signed_interval(row.net, row.net_ci)),
+        _cell_of_edits(lambda row: signed_interval(row.net, row.net_ci)),
         "net flip rate: share of episodes that end on the wrong picture, minus that with the identity patch",
     ),
     EffectColumn[ClosedLoopEffect](
         "left / right",
-        _of_edits(lambda row: TableCell(row.net_left, signed, after=f" / {signed(row.net_right)}")),
+        _cell_of_edits(lambda row: TableCell(row.net_left, signed, after=f" / {signed(row.net_right)}")),
     ),
-    EffectColumn[ClosedLoopEffect]("controls", _of_edits(lambda row: TableCell(row.control_net, signed))),
+    EffectColumn[ClosedLoopEffect]("controls", _cell_of_edits(lambda row: TableCell(row.control_net, signed))),
     EffectColumn[ClosedLoopEffect](
-        "only with : only without", _of_edits(lambda row: TableCell(row.gained, after=f" : {row.lost}"))
+        "only with : only without", _cell_of_edits(lambda row: TableCell(row.gained, after=f" : {row.lost}"))
     ),
     EffectColumn[ClosedLoopEffect](
         "p",
-        _of_edits(lambda row: p_of(row.p_fwe)),
+        _cell_of_edits(lambda row: p_of(row.p_fwe)),
         "p: family-wise, of what goes beyond the controls, one-sided",
     ),
     EffectColumn[ClosedLoopEffect](

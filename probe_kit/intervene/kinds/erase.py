@@ -15,7 +15,7 @@ import numpy as np
 
 from probe_kit._tables.content import Cell as TableCell
 from probe_kit._tables.content import absent
-from probe_kit._tables.numbers import number, percent, signed
+from probe_kit._tables.numbers import number, percent, with_sign
 from probe_kit.errors import UsageError
 from probe_kit.hooks.capturing.edits import Identity, TokenIndex, apply_patch
 from probe_kit.hooks.contract.sites import Site
@@ -158,10 +158,10 @@ class ConceptErasure(Intervention):
                     by_name.setdefault(name, {}).update(of_episode)
                     # What is readable with each eraser, and without; untouched comes first.
                     fitted = [(fold, by_fold[name] if of_episode else None) for fold, by_fold in fits]
-                    of_condition = accuracies.setdefault(str(_edited(cell, name)), {})
+                    of_condition = accuracies.setdefault(str(_edited_cell(cell, name)), {})
                     of_condition[category] = _probe_accuracy(features, fitted)
         conditions = [
-            erased(cell, name, of_episode)
+            erase_cell(cell, name, of_episode)
             for cell, by_name in passed_over.left(erasers).items()
             for name, of_episode in by_name.items()
         ]
@@ -193,7 +193,7 @@ class ConceptErasure(Intervention):
     def sentence(rows: "Sequence[ErasureEffect]", context: Measurement) -> str:
         """Return which erasures take the answer from the action."""
         del context
-        tried, has_answer = _tried(rows)
+        tried, has_answer = _split_erasures(rows)
         if not has_answer:
             return "the unedited action does not go to the correct picture, so that nothing can be lost"
         losses = [f"{row.name} keeps {row.share_left:.2f}" for row in tried if row.finding == "effect"]
@@ -204,7 +204,7 @@ class ConceptErasure(Intervention):
     def finding(rows: "Sequence[ErasureEffect]", context: Measurement) -> str:
         """Return whether an erasure takes the answer from the action, and where."""
         del context
-        tried, has_answer = _tried(rows)
+        tried, has_answer = _split_erasures(rows)
         if not has_answer:
             return "nothing to lose: the unedited action does not go to the correct picture"
         lost = sorted((row for row in tried if row.finding == "effect"), key=lambda row: row.share_left or 0.0)
@@ -228,11 +228,11 @@ class ConceptErasure(Intervention):
 KIND = ConceptErasure
 
 
-def _edited(cell: Cell, name: str) -> EditedCell:
+def _edited_cell(cell: Cell, name: str) -> EditedCell:
     return EditedCell(cell.site_group.name, cell.role, name, ZERO if name == UNTOUCHED else "")
 
 
-def erased(cell: Cell, name: str, erasers: Mapping[str, Eraser]) -> Condition:
+def erase_cell(cell: Cell, name: str, erasers: Mapping[str, Eraser]) -> Condition:
     """Return the clean inference with the tokens of one cell erased.
 
     Args:
@@ -248,7 +248,7 @@ def erased(cell: Cell, name: str, erasers: Mapping[str, Eraser]) -> Condition:
         with apply_patch(session.policy, site_group.sites, tokens, change) as edit_log:
             return ConditionResult(context.act(), edit_log)
 
-    return Condition.of_cell(_edited(cell, name), play)
+    return Condition.of_cell(_edited_cell(cell, name), play)
 
 
 @dataclass(frozen=True)
@@ -398,7 +398,7 @@ def erasure_effects(
     return rows
 
 
-def _tried(rows: Sequence[ErasureEffect]) -> tuple[list[ErasureEffect], bool]:
+def _split_erasures(rows: Sequence[ErasureEffect]) -> tuple[list[ErasureEffect], bool]:
     """Return the erasures without identity patches, and whether the unedited action has an answer to lose."""
     tried = [row for row in rows if row.finding != "identity patch"]
     return tried, not tried or any(row.finding != "no baseline effect" for row in tried)
@@ -429,7 +429,7 @@ _ACTION = (
         lambda row: TableCell(row.control_share_left, number),
         "controls: the mean of random subspaces of the same rank",
     ),
-    EffectColumn[ErasureEffect]("displacement cm", lambda row: centimetres(-row.mean_displacement, signed)),
+    EffectColumn[ErasureEffect]("displacement cm", lambda row: centimetres(-row.mean_displacement, with_sign)),
     EffectColumn[ErasureEffect](
         "p",
         lambda row: p_of(row.p, is_resolved(100 * row.mean_displacement, row.right_before - row.right)),

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit._system.counting import counted
+from probe_kit._system.counting import plural
 from probe_kit._tables.content import Cell as TableCell
 from probe_kit._tables.numbers import number
 from probe_kit.hooks.contract.declared import InterventionKind, Readout
@@ -479,7 +479,7 @@ class Swap(Intervention):
         if context.lacks_sides:
             return [f"{row.n_episodes} frames of {row.n_items} episodes: {_describe_input(row)}." for row in rows]
         return [
-            f"{category_of(row.category).title} ({counted(row.n_items, 'item')}): {cls.describe(row, context)}"
+            f"{category_of(row.category).title} ({plural(row.n_items, 'item')}): {cls.describe(row, context)}"
             for row in rows
         ]
 

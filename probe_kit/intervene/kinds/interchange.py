@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 import numpy as np
 
 from probe_kit._tables.content import Cell as TableCell
-from probe_kit._tables.numbers import number, signed
+from probe_kit._tables.numbers import number, with_sign
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.sites import KV_STREAM, Site
 from probe_kit.intervene.edited_cells import SEPARATOR, EditedCell
@@ -633,8 +633,8 @@ def _columns(exchange: str, has_sides: bool) -> list[EffectColumn[PatchEffect]]:
                 "nearer to the source: share of episodes whose action is nearer to the source's than to the clean "
                 "one",
             ),
-            EffectColumn("displacement", lambda row: TableCell(row.mean_displacement, signed)),
-            EffectColumn("controls", lambda row: TableCell(row.control_displacement, signed)),
+            EffectColumn("displacement", lambda row: TableCell(row.mean_displacement, with_sign)),
+            EffectColumn("controls", lambda row: TableCell(row.control_displacement, with_sign)),
             p,
             change,
         ]
@@ -646,10 +646,10 @@ def _columns(exchange: str, has_sides: bool) -> list[EffectColumn[PatchEffect]]:
             "net flip rate: share of episodes that flip to the target side, minus those that flip away from it",
         ),
         EffectColumn(
-            "left / right", lambda row: TableCell(row.net_left, signed, after=f" / {signed(row.net_right)}")
+            "left / right", lambda row: TableCell(row.net_left, with_sign, after=f" / {with_sign(row.net_right)}")
         ),
-        EffectColumn("displacement cm", lambda row: centimetres(row.mean_displacement, signed)),
-        EffectColumn("controls cm", lambda row: centimetres(row.control_displacement, signed)),
+        EffectColumn("displacement cm", lambda row: centimetres(row.mean_displacement, with_sign)),
+        EffectColumn("controls cm", lambda row: centimetres(row.control_displacement, with_sign)),
         p,
         change,
     ]

@@ -229,7 +229,7 @@ class JointPlaces(Intervention):
         Raises:
             RunDamagedError: If a stored intervention was changed.
         """
-        return {result.stored.key for result in _preferred(run).values()}
+        return {result.stored.key for result in _preferred_searches(run).values()}
 
 
 KIND = JointPlaces
@@ -315,14 +315,14 @@ def stored_joint_places(run: RunReader) -> dict[str, list[JointEffect]]:
         RunDamagedError: If a stored intervention was changed.
     """
     rows = {}
-    for category, result in _preferred(run).items():
+    for category, result in _preferred_searches(run).items():
         measured = result.stored
         of_category = _rows(result.outcomes, measured.settings, measured.certificate.get(NAME, {}))
         rows[category] = [replace(row, key=measured.key) for row in of_category]
     return rows
 
 
-def _preferred(run: RunReader) -> dict[str, StoredResult]:
+def _preferred_searches(run: RunReader) -> dict[str, StoredResult]:
     """Return by category the search whose result a verdict reads."""
     preferred: dict[str, StoredResult] = {}
     for result in stored_results(run, NAME):
@@ -432,7 +432,9 @@ def _rows(
     ]
     every = exchange.share(moved[EVERY])
     exact = paired_greater_p(exchange.leads * moved[EVERY], outcomes.items, outcomes.groups)
-    rows.append(_row(EVERY, _all_cells(cells, settings), outcomes, every, None, exact, None, _of_all(every)))
+    rows.append(
+        _row(EVERY, _all_cells(cells, settings), outcomes, every, None, exact, None, _finding_on_all_cells(every))
+    )
     # The smallest sets, on the groups in which they were not searched.
     searched = searches.get(str(outcomes.categories[0]), {})
     scoring = ~np.isin(outcomes.groups, searched.get("choosing", []))
@@ -479,7 +481,7 @@ def _all_cells(cells: Sequence[EditedCell], settings: Mapping[str, Any]) -> str:
     return f"{KV_STREAM if every_block else list_places(list(places))} {', '.join(roles)}"
 
 
-def _of_all(every: SwapShare | None) -> str:
+def _finding_on_all_cells(every: SwapShare | None) -> str:
     """Return the finding on all cells together."""
     if every is None:
         return "n/a"

@@ -32,7 +32,9 @@ LARGE_CHANGE = 2.0
 """Change in token norms beyond which a steering is called large."""
 
 
-def steered(cell: Cell, name: str, coefficient: float, target_side: TargetSide, bases: "Directions") -> Condition:
+def steer_cell(
+    cell: Cell, name: str, coefficient: float, target_side: TargetSide, bases: "Directions"
+) -> Condition:
     """Return the clean inference with the tokens of one cell moved along a direction of `bases`."""
 
     def play(context: ConditionContext) -> ConditionResult:
@@ -139,7 +141,7 @@ class Steering(PatchKind):
             doses = [(self.direction, 0.0)]
             for coefficient in self.coefficients:
                 doses += [(name, coefficient) for name in (self.direction, *bases.control_names)]
-            conditions += [steered(cell, *dose, self.target_side, bases) for dose in doses]
+            conditions += [steer_cell(cell, *dose, self.target_side, bases) for dose in doses]
         return conditions
 
     @staticmethod

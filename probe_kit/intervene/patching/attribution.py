@@ -165,13 +165,16 @@ def sum_over_cells(
     }
     return np.array(
         [
-            sum(float(_of_head(products[site], cell.site_group)[tokens].sum()) for site in cell.site_group.sites)
+            sum(
+                float(_product_of_head(products[site], cell.site_group)[tokens].sum())
+                for site in cell.site_group.sites
+            )
             for cell, tokens in zip(cells, masks, strict=True)
         ]
     )
 
 
-def _of_head(product: "Tensor", site_group: SiteGroup) -> NDArray[np.float64]:
+def _product_of_head(product: "Tensor", site_group: SiteGroup) -> NDArray[np.float64]:
     """Return the product (T, D) of all features, or of those of the place's head."""
     if site_group.head is not None:
         width = product.shape[-1] // site_group.heads
@@ -289,14 +292,14 @@ def describe_screen(rows: Sequence[AttributionEffect]) -> str:
     firsts = [_first([row for row in rows if row.kind == kind]) for kind in kinds]
     drawn = [abs(row.exact) for row in rows if row.is_drawn and row.exact is not None]
     missed = [f"of {len(drawn)} drawn cells the largest exact effect is {max(drawn):.2f}"] if drawn else []
-    return "; ".join([_compared(worst), *filter(None, firsts), *missed])
+    return "; ".join([_compare_orders(worst), *filter(None, firsts), *missed])
 
 
 def describe_void(rows: Sequence[AttributionEffect]) -> str:
     """Return why a screen is void."""
     worst = worst_anchor(rows)
     assert worst is not None
-    return f"screen void: {_compared(worst)}"
+    return f"screen void: {_compare_orders(worst)}"
 
 
 def _first(rows: Sequence[AttributionEffect]) -> str:
@@ -309,7 +312,7 @@ def _first(rows: Sequence[AttributionEffect]) -> str:
     return f"first of {rows[0].kind}: {', '.join(first)}" if first else ""
 
 
-def _compared(anchor: AttributionEffect) -> str:
+def _compare_orders(anchor: AttributionEffect) -> str:
     return f"gradients give {number(anchor.estimate)} where the patch gives {number(anchor.exact)} ({anchor.name})"
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from operator import attrgetter
 from typing import Any
 
-from probe_kit._tables.numbers import number, p_text, percent, points, signed
+from probe_kit._tables.numbers import number, p_text, percent, points, with_sign
 from probe_kit._tables.table import Cell, absent
 from probe_kit.retention.behaviour import Regime
 from probe_kit.retention.choices import Section
@@ -188,7 +188,7 @@ RETENTION_MODELS = replace(
     SR_MODELS,
     key="difference.retention_models",
     heading="retention, p over models (least)",
-    difference=lambda row: models_test(row.retention_models, signed),
+    difference=lambda row: models_test(row.retention_models, with_sign),
 )
 MARGIN = share(
     "success.chance_margin",
@@ -457,7 +457,7 @@ RETENTION = Column(
     "well enough to divide by. n/a: its signal is not shown.",
     cell=retention_value,
     sort=_where_defined("retention.value"),
-    difference=lambda row: Cell(row.retention, signed, row.retention_ci),
+    difference=lambda row: Cell(row.retention, with_sign, row.retention_ci),
     heat=True,
     note=lambda row: row.retention.note,
     answers=(

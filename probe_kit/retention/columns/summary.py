@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from probe_kit._system.escaping import as_argument
-from probe_kit._tables.numbers import Limits, points, signed, whole_percent
+from probe_kit._tables.numbers import Limits, points, whole_percent, with_sign
 from probe_kit._tables.table import Cell, Heading, Row, Table, absent
 from probe_kit.intervene.verdict import UseVerdict, describe_readouts, more_groups, size_of_groups
 from probe_kit.retention.behaviour import Regime
@@ -457,7 +457,7 @@ def _difference_cells(row: Difference) -> tuple[Cell, ...]:
     )
     none = absent("")
     answered, acted = (sr, none) if row.mode == "answers" else (none, sr)
-    ratio = Cell(row.retention, signed, row.retention_ci)
+    ratio = Cell(row.retention, with_sign, row.retention_ci)
     test, over_models = (difference_test(row), none) if row.sr_models is None else (none, models_p(row.sr_models))
     return none, none, none, answered, backbone, action, acted, ratio, none, test, over_models
 

@@ -6,7 +6,7 @@ from functools import partial
 from itertools import chain, count, groupby
 from pathlib import Path
 
-from probe_kit._system.counting import counted
+from probe_kit._system.counting import plural
 from probe_kit._tables.numbers import NONE, number, percent, plain, points, span
 from probe_kit._tables.table import Cell, Cells, Heading, Legend, Row, Table, absent
 from probe_kit.retention.behaviour import rule_sentence
@@ -274,7 +274,7 @@ def _controls(rows: Sequence[RetentionRow]) -> str:
     untrained = f"; untrained: {name}" if name else ""
     fewest = min(row.success.n_items for row in rows if row.category != MEAN)
     share = f"{100 * detectable(fewest):.1f}"
-    findable = f"with {counted(fewest, 'item')} a leak of {share} % is found in 4 of 5 suites"
+    findable = f"with {plural(fewest, 'item')} a leak of {share} % is found in 4 of 5 suites"
     return (
         f"held-out accuracy % without the model, {findable}; selectivity: accuracy above random labels{untrained}"
     )

@@ -5,7 +5,7 @@ from dataclasses import replace
 from math import ceil
 from typing import Literal, cast
 
-from probe_kit._system.counting import counted, enumerated
+from probe_kit._system.counting import list_names, plural
 from probe_kit._tables.numbers import NONE, Write, number, p_text, percent, whole_percent, with_limits
 from probe_kit._tables.table import Cell, absent
 from probe_kit.hooks.contract.sites import label_of
@@ -252,7 +252,7 @@ def label_finding(row: RetentionRow) -> str:
         return f"{'open' if is_open else 'not shown'}: {_missing(row)}."
     action = label_of(row.action.stream or "action")
     if row.action.missed:
-        missed = enumerated(row.action.missed)
+        missed = list_names(row.action.missed)
         where = f"in the {action} not beyond {missed}"
         return f"encoded, not shown in the action: probes read it in the backbone; {where}."
     share_left = (
@@ -275,7 +275,7 @@ def _missing(row: RetentionRow) -> str:
     if backbone.missed and backbone.remedy:
         return f"no p can fall below the level: {backbone.remedy}"
     if backbone.missed:
-        return f"probes of the backbone do no better than {enumerated(backbone.missed)}"
+        return f"probes of the backbone do no better than {list_names(backbone.missed)}"
     return "the backbone holds too little of it above chance to divide by"
 
 
@@ -290,7 +290,7 @@ def label_details(row: RetentionRow) -> str:
     action = label_of(row.action.stream or "action")
     return (
         f"{where}: {share_left} of the backbone's score above chance is left in the {action}; {reached}. "
-        f"{counted(row.controls.n_groups or 0, 'group')}, {counted(row.controls.n_samples or 0, 'sample')}."
+        f"{plural(row.controls.n_groups or 0, 'group')}, {plural(row.controls.n_samples or 0, 'sample')}."
     )
 
 

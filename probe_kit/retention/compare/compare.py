@@ -31,7 +31,7 @@ from probe_kit.retention.rows.build import RowSettings, RowWithEstimates, run_ro
 from probe_kit.retention.rows.row import MEAN, Mode
 from probe_kit.runs.layout import FIRST_FRAME
 from probe_kit.runs.reader import RunReader
-from probe_kit.statistics.paired_tests import corrected, flip_gains_p
+from probe_kit.statistics.paired_tests import flip_gains_p, holm_corrected
 from probe_kit.statistics.retention import Ratio, Scores, retention_difference
 
 if TYPE_CHECKING:
@@ -324,7 +324,7 @@ def with_holm(rows: Sequence[Difference]) -> list[Difference]:
     def test(row: Difference) -> tuple[str | None, str, str, str]:
         return row.run, row.group, row.minus, row.category
 
-    p_values = corrected(rows, lambda row: row.p, lambda row: row.category == MEAN, test)
+    p_values = holm_corrected(rows, lambda row: row.p, lambda row: row.category == MEAN, test)
     return [replace(row, p_holm=p) for row, p in zip(rows, p_values, strict=True)]
 
 

@@ -21,9 +21,9 @@ from probe_kit.runs.layout import FIRST_FRAME
 from probe_kit.runs.reader import RunReader, check_sides
 from probe_kit.statistics.paired_tests import (
     clopper_pearson,
-    corrected,
     fisher_p,
     flip_p,
+    holm_corrected,
     mcnemar_p,
     overlap_p,
 )
@@ -233,7 +233,7 @@ def correct_joins(joins: Sequence[KnownUsedTable]) -> list[KnownUsedTable]:
     The tests of all categories are one family; those over all categories are a summary and no part of it.
     """
     tests = [test for join in joins for row in join.rows if row.category != OVERALL for test in row.comparisons]
-    p_holm = iter(corrected(tests, lambda test: test.p))
+    p_holm = iter(holm_corrected(tests, lambda test: test.p))
 
     def of_row(row: CategoryCounts) -> CategoryCounts:
         if row.category == OVERALL:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit._system.counting import counted
+from probe_kit._system.counting import plural
 from probe_kit._tables.numbers import span
 from probe_kit.errors import UnknownCategoryError, UnknownSiteError
 from probe_kit.retention.choices import Iterations
@@ -67,7 +67,7 @@ class ProvenanceLine:
     def of_run(cls, run: RunReader) -> Self:
         """Return the line of a run's behaviour."""
         rule = run.rule
-        n = f"n = {counted(len(run.episodes), 'episode')}" + ("" if rule == "disc" else f" by the rule {rule}")
+        n = f"n = {plural(len(run.episodes), 'episode')}" + ("" if rule == "disc" else f" by the rule {rule}")
         return cls(run.label, run.random_weights, run.weights_sha256, run.suite, n, run.settings_sha256)
 
     @classmethod
@@ -80,7 +80,7 @@ class ProvenanceLine:
         else:
             curve = results.curves[category, view]
             of = "" if category == EVERYWHERE else f", category {category}"
-            samples = f"{counted(curve.labels.size, 'sample')} in {counted(curve.n_groups, 'group')}"
+            samples = f"{plural(curve.labels.size, 'sample')} in {plural(curve.n_groups, 'group')}"
             n = f"n = {samples}, view {view}{of}"
         return cls(
             results.label if category is None else settings.model, settings.random_weights, settings.weights,
@@ -91,7 +91,7 @@ class ProvenanceLine:
     @classmethod
     def of_row(cls, row: RetentionRow) -> Self:
         """Return the line of a row of the retention table, usually a mean."""
-        n = f"n = {counted(row.success.n_episodes, 'episode')}"
+        n = f"n = {plural(row.success.n_episodes, 'episode')}"
         return cls(
             row.run.label or row.run.model,
             row.run.random_weights,

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 from xml.etree import ElementTree
 
-from probe_kit._system.counting import enumerated
+from probe_kit._system.counting import list_names
 from probe_kit._system.drafts import write_whole
 from probe_kit._system.escaping import without_folders
 from probe_kit._tables.content import heat_key
@@ -153,7 +153,7 @@ def report_html(
         "page.html.jinja",
         paths,
         is_of_sides=table.is_of_sides,
-        title=enumerated(names if table.is_of_sides else table.targets),
+        title=list_names(names if table.is_of_sides else table.targets),
         suites=list(dict.fromkeys(run.suite for run in runs)),
         version=__version__,
         finding=table.summary,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from probe_kit._system.counting import enumerated
+from probe_kit._system.counting import list_names
 from probe_kit._tables.numbers import p_text
 from probe_kit.env.scoring import DEFAULT_RULE
 from probe_kit.errors import UnknownSiteError
@@ -568,7 +568,7 @@ def _missing(row: RetentionRow, results: ProbeResults, tests: int) -> tuple[str,
         advice = "Label more groups, or choose a label that these controls do not decode"
         if remedy := results.remedy(row.category, row.view or "", tests):
             advice = f"No p can be below it: {remedy}"
-        return f"n/a (backbone not shown to exceed {enumerated(missed)})", (
+        return f"n/a (backbone not shown to exceed {list_names(missed)})", (
             f"{best} ({'; '.join(facts)}). Expected p < {SIGNIFICANCE} and more than every control that was run. "
             f"{advice}"
         )

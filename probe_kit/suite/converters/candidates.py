@@ -338,10 +338,10 @@ def photo(path: Path) -> partial[Image.Image]:
 
 def trimmed_art(path: Path) -> Image.Image:
     """Load line art on white without its own margins, as a square, with one margin for all pictures."""
-    return trimmed(decode_picture(path))
+    return trim(decode_picture(path))
 
 
-def trimmed(image: Image.Image) -> Image.Image:
+def trim(image: Image.Image) -> Image.Image:
     """Return the picture cut to its ink and padded to a white square with a margin of 8 %."""
     ink = (255 - np.asarray(image.convert("RGB"), np.int64)).max(axis=2) > _TRIM_STEP
     rows, columns = np.flatnonzero(ink.any(axis=1)), np.flatnonzero(ink.any(axis=0))

@@ -133,7 +133,7 @@ def convert(
         write_curation(Path(emit_curation), _flat(bundles), conversion.load)
     if curation is not None:
         accepted = apply_curation(_flat(bundles), read_curation(Path(curation)), Path(curation))
-        bundles = {category: _reviewed(proposals, accepted) for category, proposals in bundles.items()}
+        bundles = {category: _review_bundles(proposals, accepted) for category, proposals in bundles.items()}
     else:
         bundles = {category: conversion.without_review(proposals) for category, proposals in bundles.items()}
     return conversion.save(bundles, out, Path(curation) if curation is not None else None)
@@ -230,7 +230,7 @@ class _Conversion:
             if self.options.trust_llm or not by_model:
                 status = "llm-trusted" if by_model else "rules-only"
                 accepted[proposal.candidate_id] = replace(proposal, curation_status=status)
-        return _reviewed(bundles, accepted)
+        return _review_bundles(bundles, accepted)
 
     def save(self, bundles: dict[str, list[Bundle]], out: Path, curation: Path | None) -> Suite:
         """Sample, lay out and write; nothing is written if no item is left."""
@@ -290,7 +290,7 @@ def _flat(bundles: dict[str, list[Bundle]]) -> list[Proposal]:
     return [proposal for of_category in bundles.values() for bundle in of_category for proposal in bundle]
 
 
-def _reviewed(bundles: list[Bundle], accepted: dict[str, Proposal]) -> list[Bundle]:
+def _review_bundles(bundles: list[Bundle], accepted: dict[str, Proposal]) -> list[Bundle]:
     reviewed = (
         tuple(accepted[p.candidate_id] for p in bundle if p.candidate_id in accepted) for bundle in bundles
     )

@@ -80,7 +80,7 @@ def read_curation(path: Path) -> list[dict[str, Any]]:
         records = ((table.where(line), cells) for line, cells in table.rows())
     rows: dict[str, tuple[str, dict[str, Any]]] = {}
     for where, record in records:
-        row = _decided({name: _text(cell) for name, cell in record.items()}, where)
+        row = _decisions_in_lower_case({name: _text(cell) for name, cell in record.items()}, where)
         before = rows.setdefault(row["candidate_id"], (where, row))
         changed = [name for name in _DECIDED if before[1].get(name, "") != row.get(name, "")]
         if changed:
@@ -99,7 +99,7 @@ def _text(cell: Any) -> Any:
     return "" if is_missing(text) else text
 
 
-def _decided(row: dict[str, Any], where: str) -> dict[str, Any]:
+def _decisions_in_lower_case(row: dict[str, Any], where: str) -> dict[str, Any]:
     """Return the row with its decisions in lower case.
 
     Raises:
@@ -142,13 +142,13 @@ def apply_curation(proposals: Sequence[Proposal], rows: Sequence[Row], path: Pat
             "Make a new file with emit_curation and review those again."
         )
     return {
-        row["candidate_id"]: _reviewed(by_id[row["candidate_id"]], row, path)
+        row["candidate_id"]: _review_proposal(by_id[row["candidate_id"]], row, path)
         for row in rows
         if row["status"] in ("accept", "edited") and row["recognisable"] != "no"
     }
 
 
-def _reviewed(proposal: Proposal, row: Row, path: Path) -> Proposal:
+def _review_proposal(proposal: Proposal, row: Row, path: Path) -> Proposal:
     if row["status"] == "accept":
         if proposal.wording is None:
             raise SuiteError(

@@ -140,7 +140,7 @@ def _is_comparative(word: str) -> bool:
     return word in ("worse", "more", "less", "fewer") or (word.endswith("er") and word not in _NOT_COMPARATIVE)
 
 
-def _graded(match: re.Match[str]) -> tuple[str, str] | None:
+def _grade(match: re.Match[str]) -> tuple[str, str] | None:
     """Build "more ADJ X" and "less ADJ X" (R1, R3, R6)."""
     noun, degree, adjective = _noun_of(match["x"]), match["degree"], _bare(match["adj"])
     return f"{degree} {adjective} {noun}", f"{opposite_of(degree)} {adjective} {noun}"
@@ -196,11 +196,11 @@ _GRADE = r"(?P<degree>more|less) (?P<adj>[\w -]+)"
 _OWNS_MORE = rf"(?:a |an |the )?(?P<er>{_ER}) (?P<y>.+)"
 _TABLE: tuple[_Rule, ...] = (
     _rule("R9", r"(?:which|what) clock (?:shows|says|reads) (?:the time )?(?P<time>.+)", _clock),
-    _rule("R6", rf"{_IN_WHICH}{_GRADE}", _graded),
+    _rule("R6", rf"{_IN_WHICH}{_GRADE}", _grade),
     _rule("R6", rf"{_IN_WHICH}(?P<er>{_ER})", _comparative),
     _rule("R4", r"which (?P<x>.+?) (?P<verb>smiles|laughs|frowns|shines|glows) more", _doing),
-    _rule("R1", rf"which (?P<x>.+?) (?:is|are) {_GRADE}", _graded),
-    _rule("R3", rf"which (?P<x>.+?) {_LOOKS} {_GRADE}", _graded),
+    _rule("R1", rf"which (?P<x>.+?) (?:is|are) {_GRADE}", _grade),
+    _rule("R3", rf"which (?P<x>.+?) {_LOOKS} {_GRADE}", _grade),
     _rule("R3", rf"which (?P<x>.+?) {_LOOKS} (?P<er>{_ER})", _comparative),
     _rule("R2", rf"which (?P<x>.+?) (?:is|are) (?P<er>{_ER})", _comparative),
     _rule("R7", rf"which (?P<x>{_PICTURE}) (?:has|have|contains|shows) {_OWNS_MORE}", _having),

@@ -19,7 +19,7 @@ from probe_kit.suite.converters.candidates import (
     VlThinkOptions,
     Wording,
     read_annotations,
-    trimmed,
+    trim,
 )
 from probe_kit.suite.items import side_words
 from probe_kit.suite.pictures import WHITE, decode_bytes
@@ -143,7 +143,7 @@ def upright_board(path: Path) -> Image.Image:
     Raises:
         SuiteError: If the file is not a binary glTF with one embedded picture.
     """
-    art = trimmed(_texture(path).transpose(Image.Transpose.TRANSPOSE))
+    art = trim(_texture(path).transpose(Image.Transpose.TRANSPOSE))
     art.thumbnail((_MOST_PIXELS, _MOST_PIXELS), Image.Resampling.LANCZOS)
     return art
 

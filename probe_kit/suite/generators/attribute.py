@@ -19,7 +19,7 @@ from probe_kit.suite.generators.drawing import (
     background_for,
     darker,
     ellipse,
-    jittered,
+    jitter,
     on_hues,
     polygon,
     random_placement,
@@ -268,7 +268,7 @@ class Sample(Tile):
 
 def _sample(gradable: Gradable, level: float, rng: np.random.Generator) -> Sample:
     color = COLORS[str(rng.choice(_INKS))]
-    ink = _shade(level, rng) if gradable.shaded else jittered(color, rng)
+    ink = _shade(level, rng) if gradable.shaded else jitter(color, rng)
     placement = random_placement(rng, _SCALES, turn=2 if gradable.upright else 10)
     return Sample(gradable.more, round(level, 3), placement, ink=ink, background=background_for(ink, rng))
 

@@ -15,7 +15,7 @@ from probe_kit.suite.generators.drawing import (
     background_for,
     darker,
     ellipse,
-    jittered,
+    jitter,
     polygon,
 )
 from probe_kit.suite.generators.generator import Concept, Generator, each
@@ -206,7 +206,7 @@ def _centres(number: int, radius: float, rng: np.random.Generator) -> list[tuple
 
 def _scatter(concept: Count, rng: np.random.Generator) -> Scatter:
     color = str(rng.choice(GLYPHS[concept.glyph].colors))
-    ink = jittered(COLORS[color], rng)
+    ink = jitter(COLORS[color], rng)
     radius = round(_radius(concept.number, rng), 4)
     placements = tuple(
         Placement(radius, x, y, round(rng.uniform(-_MAX_TURN, _MAX_TURN), 2), bool(rng.integers(2)))

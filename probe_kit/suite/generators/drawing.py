@@ -49,7 +49,7 @@ _BACKGROUND_LIGHTNESS = (150, 246)
 _TINT = 12
 
 
-def jittered(color: RGB, rng: np.random.Generator) -> RGB:
+def jitter(color: RGB, rng: np.random.Generator) -> RGB:
     """Draw a shade that still has the same name: up to 14 levels off, and 5 degrees in hue.
 
     Moving the channels one by one would turn gray into olive; in HSV an achromatic colour stays achromatic.
@@ -195,7 +195,7 @@ def ellipse(x: float, y: float, rx: float, ry: float, start: float = 0, end: flo
     return np.stack([x + rx * np.cos(angles), y + ry * np.sin(angles)], axis=1)
 
 
-def tinted(mask: Image.Image, color: RGB) -> Image.Image:
+def tint(mask: Image.Image, color: RGB) -> Image.Image:
     """Return RGBA art of one colour with the grey picture `mask` as its opacity."""
     art = Image.new("RGBA", mask.size, color)
     art.putalpha(mask)
@@ -290,7 +290,7 @@ class Pen:
 
     def text(self, text: str, x: float, y: float, height: float, color: RGB) -> None:
         """Draw bold lettering with its centre at (x, y); `height` of a capital letter in drawing units."""
-        self.stamp(tinted(_lettering(text), color), x, y, height)
+        self.stamp(tint(_lettering(text), color), x, y, height)
 
     def _pixels(self, points: Points) -> list[tuple[float, float]]:
         pixels = (self._placement.apply(points) + 1) * _DRAWN_PIXELS / 2

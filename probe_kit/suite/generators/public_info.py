@@ -13,10 +13,10 @@ from probe_kit.suite.generators.drawing import (
     Tile,
     background_for,
     ellipse,
-    jittered,
+    jitter,
     mask_icon,
     random_placement,
-    tinted,
+    tint,
 )
 from probe_kit.suite.generators.generator import Concept, Generator, none_alike, spread_pairs
 
@@ -120,15 +120,15 @@ class Board(Tile):
         if self.style == "ring":
             pen.fill(ellipse(0, 0, 0.85, 0.85), _RED)
             pen.fill(ellipse(0, 0, 0.85 - _RING, 0.85 - _RING), _WHITE)
-            pen.stamp(tinted(mask, self.ink), 0, 0, 0.95)
+            pen.stamp(tint(mask, self.ink), 0, 0, 0.95)
             _bar(pen)
         elif self.style == "plain":
-            pen.stamp(tinted(mask, self.ink), 0, 0, 1.5)
+            pen.stamp(tint(mask, self.ink), 0, 0, 1.5)
         else:
             field, glyph = (self.ink, _WHITE) if self.style == "dark" else (_WHITE, self.ink)
             pen.fill(_rounded_square(0.8), self.ink)
             pen.fill(_rounded_square(0.74), field)
-            pen.stamp(tinted(mask, glyph), 0, 0, 1.3)
+            pen.stamp(tint(mask, glyph), 0, 0, 1.3)
 
 
 def _bar(pen: Pen) -> None:
@@ -145,7 +145,7 @@ def _rounded_square(half: float, radius: float = 0.12) -> Points:
 def _board(concept: Concept, style: Style, rng: np.random.Generator) -> Board:
     pictogram = _PICTOGRAM_OF[concept.name]
     name = "black" if pictogram.forbidden else str(rng.choice(list(_INKS)))
-    ink = jittered(_INKS[name], rng)
+    ink = jitter(_INKS[name], rng)
     placement = random_placement(rng, (0.9, 1.0), turn=6, mirrored=False)
     background = background_for(ink, rng, _CONTRAST)
     return Board(

@@ -30,7 +30,7 @@ from probe_kit.suite.generators.drawing import (
     Tile,
     background_for,
     ellipse,
-    jittered,
+    jitter,
     lightness,
     polygon,
     random_placement,
@@ -67,7 +67,7 @@ def _cross(arm: float = 0.38) -> Points:
     return np.vstack(corners)
 
 
-def _matched(points: Points) -> Points:
+def _match_area(points: Points) -> Points:
     """Return the same outline with the shared area and its bounding box centred on the origin."""
     x, y = points.T
     area = abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))) / 2
@@ -94,7 +94,7 @@ _DRAWN: dict[str, Points] = {
     "cross": _cross(),
     "arrow": polygon((-1.1, -0.36), (0.1, -0.36), (0.1, -0.9), (1.1, 0), (0.1, 0.9), (0.1, 0.36), (-1.1, 0.36)),
 }
-OUTLINES: dict[str, Points] = {name: _matched(points) for name, points in _DRAWN.items()}
+OUTLINES: dict[str, Points] = {name: _match_area(points) for name, points in _DRAWN.items()}
 
 
 # -- figures -----------------------------------------------------------------------------------------------------
@@ -136,7 +136,7 @@ def colored_outline(figure: Figure) -> str:
 
 def random_figure(color: str, outline: str, style: Style, rng: np.random.Generator) -> Figure:
     """Draw a figure of this colour and outline with everything else from `rng`."""
-    ink = jittered(COLORS[color], rng)
+    ink = jitter(COLORS[color], rng)
     background = background_for(ink, rng)
     return Figure(color, outline, style, random_placement(rng), ink=ink, background=background)
 
@@ -162,7 +162,7 @@ def _colored_tiles(left: Concept, right: Concept, rng: np.random.Generator) -> t
         replace(
             figure,
             background=other_color((left, right), figure.ink, rng),
-            placement=moved(figure.placement, rng),
+            placement=move_placement(figure.placement, rng),
         )
         for figure in drawn
     )
@@ -173,12 +173,12 @@ def other_color(concepts: Sequence[Concept], ink: RGB, rng: np.random.Generator)
     """Draw a background of a basic colour that is none of the two that meet, and apart from the `ink`."""
     names = [name for name in COLORS if name not in {concept.name for concept in concepts}]
     while True:
-        color = jittered(COLORS[str(rng.choice(names))], rng)
+        color = jitter(COLORS[str(rng.choice(names))], rng)
         if abs(lightness(color) - lightness(ink)) >= INK_CONTRAST:
             return color
 
 
-def moved(placement: Placement, rng: np.random.Generator) -> Placement:
+def move_placement(placement: Placement, rng: np.random.Generator) -> Placement:
     """Return a smaller placement, anywhere on the tile."""
     scale = round(placement.scale * rng.uniform(*_SHRUNK), 4)
     reach = _REACH - scale
@@ -302,7 +302,7 @@ def _sides(symmetric: bool, rng: np.random.Generator) -> tuple[tuple[float, ...]
 
 def _outline(concept: Concept, rng: np.random.Generator) -> Outline:
     color = str(rng.choice(list(COLORS)))
-    ink = jittered(COLORS[color], rng)
+    ink = jitter(COLORS[color], rng)
     left_widths, right_widths = _sides(concept.name == "symmetric", rng)
     placement = random_placement(rng, (0.88, 1.0), turn=7)
     lying = bool(rng.integers(2))

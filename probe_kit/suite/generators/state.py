@@ -17,7 +17,7 @@ from probe_kit.suite.generators.drawing import (
     background_for,
     darker,
     ellipse,
-    jittered,
+    jitter,
     polygon,
     random_placement,
     rectangle,
@@ -297,7 +297,7 @@ class Condition(Tile):
 
 def _condition(concept: Concept, rng: np.random.Generator) -> Condition:
     color = str(rng.choice(_THINGS[concept.name].colors))
-    ink = jittered(COLORS[color], rng)
+    ink = jitter(COLORS[color], rng)
     background = background_for(ink, rng)
     return Condition(concept.name, random_placement(rng, FULL_DISK, turn=8), ink=ink, background=background)
 

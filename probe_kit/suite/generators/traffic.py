@@ -23,7 +23,7 @@ from probe_kit.suite.generators.drawing import (
     polygon,
     random_placement,
     rectangle,
-    tinted,
+    tint,
 )
 from probe_kit.suite.generators.generator import Concept, Generator, each_on_hues, half_within, none_alike
 
@@ -74,7 +74,7 @@ def _disk(radius: float, color: RGB) -> Draw:
 
 
 def _icon(name: str, color: RGB, height: float, x: float = 0, y: float = 0) -> Draw:
-    return lambda pen: pen.stamp(tinted(mask_icon(name), color), x, y, height)
+    return lambda pen: pen.stamp(tint(mask_icon(name), color), x, y, height)
 
 
 def _text(text: str, color: RGB, height: float) -> Draw:

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
-from probe_kit._system.counting import enumerated
+from probe_kit._system.counting import list_names
 from probe_kit.hooks.contract.sites import label_of
 from probe_kit.suite.categories import category_of
 from probe_kit.train.choices import EVERYWHERE
@@ -60,10 +60,10 @@ def _findings(results: ProbeResults, rows: "Sequence[pd.Series]") -> Iterator[st
             # Without enough of them nothing can be shown, whatever the network holds.
             open_.setdefault(f"not testable in {{}}: {remedy}", []).append(stream)
         elif missed:
-            open_.setdefault(f"not shown in {{}} beyond {enumerated(missed)}", []).append(stream)
+            open_.setdefault(f"not shown in {{}} beyond {list_names(missed)}", []).append(stream)
         else:
             decodable.append(f"{stream} at {score}" if len(decodable) < 2 else stream)
     if decodable:
-        yield f"decodable in {enumerated(decodable)}"
+        yield f"decodable in {list_names(decodable)}"
     for words, streams in open_.items():
-        yield words.format(enumerated(streams))
+        yield words.format(list_names(streams))

@@ -52,10 +52,10 @@ def test_thirty_lines_around_a_gymnasium_environment_keep_the_contract() -> None
 def test_a_broken_promise_is_named(name: str, check: str, message: str) -> None:
     import re
 
-    found = failures(name)
-    assert re.search(message, found[check])
+    failed_checks = failures(name)
+    assert re.search(message, failed_checks[check])
     if name not in ("Nameless", "Shrinking", "Broken"):
-        assert set(found) == {check}
+        assert set(failed_checks) == {check}
 
 
 @pytest.mark.parametrize(
@@ -127,8 +127,8 @@ def test_chosen_episodes_are_those_of_their_indices_and_endless_lists_end() -> N
         def episodes(self) -> Any:
             return (EnvEpisode(f"e{number}", number, "x") for number in count())
 
-    found = listed_episodes(Endless(), EnvSource("x:Y", episodes=(5, 2)))
-    assert [(number, episode.id) for number, episode in found] == [(2, "e2"), (5, "e5")]
+    episodes = listed_episodes(Endless(), EnvSource("x:Y", episodes=(5, 2)))
+    assert [(number, episode.id) for number, episode in episodes] == [(2, "e2"), (5, "e5")]
     with pytest.raises(UsageError, match="has 12 episodes, counted from 0; asked for 12"):
         listed_episodes(ReachEnv(), EnvSource("x:Y", episodes=(12,)))
 
@@ -161,8 +161,8 @@ def test_steps_that_break_the_contract_are_refused_with_their_place(answer: Any,
         checked_step(answer, EPISODE, "kitchen, step() 3")
 
 
-def stage(name: str = "ReachEnv", **given: Any) -> EnvironmentPlayer:
-    return EnvironmentPlayer(EnvSource(HOME + name, **given), FACTS, Played("ends", 3))
+def stage(name: str = "ReachEnv", **options: Any) -> EnvironmentPlayer:
+    return EnvironmentPlayer(EnvSource(HOME + name, **options), FACTS, Played("ends", 3))
 
 
 def planned(seed: int = 3) -> Row:
@@ -232,10 +232,10 @@ def test_the_command_prints_a_line_per_promise_and_exits_with_the_result(
     with pytest.raises(typer.Exit) as ended:
         run(HOME + name, as_json=True)
     assert ended.value.exit_code == code
-    found = json.loads(capsys.readouterr().out)
-    assert found["passed"] is (code == 0)
+    report = json.loads(capsys.readouterr().out)
+    assert report["passed"] is (code == 0)
     with pytest.raises(typer.Exit):
         run(HOME + name)
-    shown = capsys.readouterr().out
-    assert shown.count("passed  ") == 7 - code
-    assert ("failed" in shown) is bool(code)
+    output = capsys.readouterr().out
+    assert output.count("passed  ") == 7 - code
+    assert ("failed" in output) is bool(code)

@@ -44,10 +44,10 @@ from tests.support.reach_env import ReachEnv
 HOME = "reach_env:"
 
 
-def settings(name: str = "ReachEnv", **given: Any) -> ExtractSettings:
-    source = {"max_steps": 6, **{key: given.pop(key) for key in ("episodes", "max_steps") if key in given}}
-    own = {"captured_calls": 2, "execute": 3, "env_workers": 0, "batch": 6, **given}
-    return ExtractSettings("pi0-tiny", source=EnvSource(HOME + name, **source), **own)
+def settings(name: str = "ReachEnv", **options: Any) -> ExtractSettings:
+    source = {"max_steps": 6, **{key: options.pop(key) for key in ("episodes", "max_steps") if key in options}}
+    all_options = {"captured_calls": 2, "execute": 3, "env_workers": 0, "batch": 6, **options}
+    return ExtractSettings("pi0-tiny", source=EnvSource(HOME + name, **source), **all_options)
 
 
 @pytest.fixture(scope="session")
@@ -79,8 +79,8 @@ def test_a_run_holds_outcomes_states_actions_and_facts_of_the_environment(played
 class Stateless(ReachEnv):
     """The same pictures without a state."""
 
-    def _as_step(self, seen: dict[str, Any], done: bool = False, success: bool = False) -> Step:
-        step = super()._as_step(seen, done, success)
+    def _as_step(self, observation: dict[str, Any], done: bool = False, success: bool = False) -> Step:
+        step = super()._as_step(observation, done, success)
         return replace(step, observation=replace(step.observation, state=np.zeros(0, np.float32)))
 
 
@@ -90,8 +90,10 @@ def test_an_environment_without_a_state_is_stored_without_one(tmp_path: Path) ->
     """Zarr has no arrays of length 0."""
     source = EnvSource(f"{__name__}:{Stateless.__name__}", max_steps=2, episodes="0:2")
     checkpoint, options = WRITERS["openvla"][0](tmp_path / "openvla"), WRITERS["openvla"][1]
-    asked = ExtractSettings("openvla", checkpoint=str(checkpoint), options=options, source=source, env_workers=0)
-    prepare(asked).run(tmp_path / "run")
+    stateless_settings = ExtractSettings(
+        "openvla", checkpoint=str(checkpoint), options=options, source=source, env_workers=0
+    )
+    prepare(stateless_settings).run(tmp_path / "run")
     run = open_run(tmp_path / "run")
     assert verify_run(run.path, deep=True).ok
     assert run.inputs is not None
@@ -113,8 +115,8 @@ def test_facts_are_labels_and_a_run_without_sides_refuses_them(played: Run, tmp_
     assert len(set(results.curves["all", "mean"].groups)) == 6
     assert np.isfinite(results.scores["score"]).all()
     assert Target.of_run(played, "env.block").task == "continuous"
-    for own in (Target.of_run(played, "env.left"), Target.read(file, "env.left")):
-        assert (own.task, own.coded.classes) == ("binary", ("False", "True")), "a fact that is true or false"
+    for target in (Target.of_run(played, "env.left"), Target.read(file, "env.left")):
+        assert (target.task, target.coded.classes) == ("binary", ("False", "True")), "a fact that is true or false"
     with pytest.raises(UsageError, match=r"plays an environment of your own .* a retention table is not possible"):
         retention_table([played])
     with pytest.raises(UsageError, match=r"no column env\.absent; there are: env\.block"):
@@ -137,7 +139,7 @@ def with_episodes(run: Run, monkeypatch: pytest.MonkeyPatch, **columns: Any) -> 
 
 def test_a_start_is_a_group_where_a_user_asks_for_it(played: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever groups the environment names; episodes that start equally stay together."""
-    left = Target.of_run(played, "env.left")
+    left_target = Target.of_run(played, "env.left")
     for column in ("episode_id", "env_seed", START):
         by_column = Target.of_run(played, "env.left", group_by=column)
         assert len(set(target_samples(played, by_column, None, 0, 1).groups)) == 12
@@ -145,7 +147,7 @@ def test_a_start_is_a_group_where_a_user_asks_for_it(played: Run, monkeypatch: p
     with pytest.raises(
         TooFewGroupsError, match=rf"1 groups \(group_id\) .* --group-by {START}, which has 12 groups"
     ):
-        train_probes(played, target=left, permutations=9)
+        train_probes(played, target=left_target, permutations=9)
     by_start = Target.of_run(played, "env.left", group_by=START)
     assert len(set(target_samples(played, by_start, None, 0, 1).groups)) == 12
     with_episodes(played, monkeypatch, **{START: [f"s{row // 4}" for row in range(12)]})
@@ -156,22 +158,22 @@ def test_a_start_is_a_group_where_a_user_asks_for_it(played: Run, monkeypatch: p
     ):
         target_samples(played, by_episode, None, 0, 1)
     with pytest.raises(TooFewGroupsError, match=r"Label episodes of other groups$"):
-        train_probes(played, target=left, permutations=9)
+        train_probes(played, target=left_target, permutations=9)
 
 
 def test_groups_that_start_equally_are_named_before_probes_are_fitted(
     played: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    left = Target.of_run(played, "env.left")
+    left_target = Target.of_run(played, "env.left")
     with_episodes(played, monkeypatch, **{START: [f"s{row % 10}" for row in range(12)]})
-    samples = target_samples(played, left, None, 0, 1)
+    samples = target_samples(played, left_target, None, 0, 1)
     with pytest.warns(UserWarning, match=rf"4 groups start .* as another one.*--group-by {START}: .* 10 in all"):
-        warn_of_equal_starts("left", played, left, samples)
+        warn_of_equal_starts("left", played, left_target, samples)
 
 
-@pytest.mark.parametrize("shown", ["table", "run show", "run show as JSON"])
+@pytest.mark.parametrize("output_kind", ["table", "run show", "run show as JSON"])
 def test_both_rates_stand_where_a_rate_is_printed(
-    played: Run, shown: str, monkeypatch: pytest.MonkeyPatch
+    played: Run, output_kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from typer.testing import CliRunner
 
@@ -181,10 +183,10 @@ def test_both_rates_stand_where_a_rate_is_printed(
     sentence = EnvironmentSuccess.of(played.episodes)
     assert sentence is not None
     assert "the environment's own limit is 300: both rates may be too low" in sentence.sentence
-    if shown == "table":
+    if output_kind == "table":
         notes = list(_success_notes([TableRun.of(played)]))
         assert notes == [f"{played.label}: {sentence.sentence}."]
-    elif shown == "run show as JSON":
+    elif output_kind == "run show as JSON":
         result = CliRunner().invoke(app, ["run", "show", str(played.path), "--json"])
         assert json.loads(result.stdout)["success"]["success_once"] == sentence.success_once
     else:
@@ -242,17 +244,17 @@ def test_an_environment_that_fails_costs_its_episode_and_says_where(pi0_tiny: Pi
 
 
 def test_options_of_scenes_and_recordings_are_refused_with_an_environment() -> None:
-    given = {"model": "pi0-tiny", "env": HOME + "ReachEnv"}
+    options = {"model": "pi0-tiny", "env": HOME + "ReachEnv"}
     with pytest.raises(UsageError, match="--light-level does not apply with --env"):
-        ExtractSettings.of_command({**given, "light_level": 0.7})
+        ExtractSettings.of_command({**options, "light_level": 0.7})
     with pytest.raises(UsageError, match="--select does not apply with --env"):
-        ExtractSettings.of_command({**given, "select": "every:2"})
+        ExtractSettings.of_command({**options, "select": "every:2"})
     with pytest.raises(UsageError, match="2 sources"):
-        ExtractSettings.of_command({**given, "dataset": "kitchen"})
+        ExtractSettings.of_command({**options, "dataset": "kitchen"})
     with pytest.raises(UsageError, match="--env-option is for environments; give --env"):
         ExtractSettings.of_command({"model": "pi0-tiny", "env_option": ["a=1"]})
     typed = ExtractSettings.of_command(
-        {**given, "episodes": "0:2", "max_steps": 9, "no_pixels": False, "captured_calls": "all"}
+        {**options, "episodes": "0:2", "max_steps": 9, "no_pixels": False, "captured_calls": "all"}
     )
     assert typed.source == EnvSource(HOME + "ReachEnv", episodes=(0, 1), max_steps=9, pixels=False)
     assert typed.most_inferences(4) == 3
@@ -274,8 +276,8 @@ def test_a_run_of_more_than_64_gb_begins_with_yes_only(tmp_path: Path) -> None:
 FACTS = ("block", "left", "success")
 
 
-def settings_of(name: str, **given: Any) -> ExtractSettings:
-    return ExtractSettings("pi0-tiny", source=EnvSource(f"reach_env:{name}"), env_workers=0, **given)
+def settings_of(name: str, **options: Any) -> ExtractSettings:
+    return ExtractSettings("pi0-tiny", source=EnvSource(f"reach_env:{name}"), env_workers=0, **options)
 
 
 def outcome_of(monkeypatch: pytest.MonkeyPatch, successes: list[bool], steps: int) -> Mapping[str, Any]:
@@ -284,8 +286,8 @@ def outcome_of(monkeypatch: pytest.MonkeyPatch, successes: list[bool], steps: in
     plain = ReachEnv.step
 
     def step(self: ReachEnv, _action: np.ndarray) -> Step:
-        found = plain(self, np.zeros(7, np.float32))
-        return Step(found.observation, False, {**found.facts, SUCCESS: next(after)})
+        plain_step = plain(self, np.zeros(7, np.float32))
+        return Step(plain_step.observation, False, {**plain_step.facts, SUCCESS: next(after)})
 
     stage = EnvironmentPlayer(EnvSource("reach_env:ReachEnv", max_steps=steps), FACTS, Played())
     monkeypatch.setattr(type(stage._environment), "step", step)
@@ -321,8 +323,8 @@ def test_a_part_a_score_and_an_unknown_success_are_refused(value: Any) -> None:
 def test_the_outcome_is_the_success_at_the_end_and_success_before_it_is_stored_beside(
     monkeypatch: pytest.MonkeyPatch, successes: list[bool], outcome: str, once: bool, at_end: bool
 ) -> None:
-    found = outcome_of(monkeypatch, successes, 3)
-    assert (found["outcome"], found[ONCE], found[AT_END]) == (outcome, once, at_end)
+    finished = outcome_of(monkeypatch, successes, 3)
+    assert (finished["outcome"], finished[ONCE], finished[AT_END]) == (outcome, once, at_end)
 
 
 # -- buffers -----------------------------------------------------------------------------------------------
@@ -336,14 +338,14 @@ def test_an_environment_may_write_into_the_arrays_that_it_gave() -> None:
     )  # fmt: skip
     facts = {"count": 0}
     step = Step(Observation(picture, state, EPISODE.instruction, lens, {"wrist": wrist}), False, facts)
-    taken = checked_step(step, EPISODE, "here")
+    checked = checked_step(step, EPISODE, "here")
     for array in (picture, state, wrist, lens):
         array[...] = 7
     facts["count"] = 7
-    seen = taken.observation
-    assert not seen.image.any() and not seen.state.any() and not seen.cameras["wrist"].any()  # noqa: PT018
-    assert seen.intrinsics is not None and (seen.intrinsics == np.eye(3)).all()  # noqa: PT018
-    assert taken.facts == {"count": 0}
+    observation = checked.observation
+    assert not observation.image.any() and not observation.state.any() and not observation.cameras["wrist"].any()  # noqa: PT018
+    assert observation.intrinsics is not None and (observation.intrinsics == np.eye(3)).all()  # noqa: PT018
+    assert checked.facts == {"count": 0}
 
 
 @pytest.mark.parametrize("name", ["ReachEnv", "Reusing"])
@@ -364,8 +366,8 @@ def multiplied(factor: float) -> type[ReachEnv]:
 
     def as_step(self: ReachEnv, *of: Any) -> Step:
         step = ReachEnv._as_step(self, *of)
-        seen = step.observation
-        return replace(step, observation=replace(seen, state=seen.state * np.float32(factor)))
+        observation = step.observation
+        return replace(step, observation=replace(observation, state=observation.state * np.float32(factor)))
 
     return type("Degrees", (ReachEnv,), {"_as_step": as_step})
 
@@ -387,11 +389,11 @@ def test_states_in_other_units_are_refused_of_an_environment_unless_accepted(
         prepare(settings_of("Degrees"), model=pi0_tiny)
     accepted = prepare(settings_of("Degrees", accept_units=True), model=pi0_tiny)
     assert words in accepted.plan.selection["units"]["state units"]["misfits"]
-    one, two = (
+    first, two = (
         prepare(settings_of(name, accept_units=name == "Degrees"), model=pi0_tiny)
         for name in ("Degrees", "ReachEnv")
     )
-    assert one.settings.identity() == two.settings.identity(), "accepting units changes no number"
+    assert first.settings.identity() == two.settings.identity(), "accepting units changes no number"
 
 
 @pytest.mark.slow
@@ -399,8 +401,8 @@ def test_a_scene_whose_states_lie_outside_the_statistics_is_refused_unless_accep
     pi0_tiny: Pi0, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of a checkpoint whose state never moved in one number."""
-    chosen = ExtractSettings("pi0-tiny", categories=("color",), items=2, env_workers=0)
-    assert prepare(chosen, model=pi0_tiny).plan.episodes
+    scene_settings = ExtractSettings("pi0-tiny", categories=("color",), items=2, env_workers=0)
+    assert prepare(scene_settings, model=pi0_tiny).plan.episodes
 
     moved = pi0_tiny.state_statistics
     assert moved is not None
@@ -408,13 +410,13 @@ def test_a_scene_whose_states_lie_outside_the_statistics_is_refused_unless_accep
     still = replace(moved, values={**moved.values, "std": deviations})
     monkeypatch.setattr(Pi0, "state_statistics", still)
     with pytest.raises(UnitsError, match=r"the scene .*: number 3 lies outside the statistics in 100%.*-units"):
-        prepare(chosen, model=pi0_tiny)
+        prepare(scene_settings, model=pi0_tiny)
     accepted = ExtractSettings("pi0-tiny", categories=("color",), items=2, env_workers=0, accept_units=True)
     assert prepare(accepted, model=pi0_tiny).plan.episodes
 
 
 @pytest.mark.parametrize(
-    ("own", "message"),
+    ("action_names", "message"),
     [
         (("dy", "dx", "dz", "roll", "pitch", "yaw", "grip"), "named in another order: dx, dy, dz"),
         (("a", "dx", "dz", "roll", "pitch", "yaw", "grip"), "named otherwise: dx, dy, dz"),
@@ -424,9 +426,9 @@ def test_a_scene_whose_states_lie_outside_the_statistics_is_refused_unless_accep
     ],
 )
 def test_actions_with_names_at_another_place_are_not_executed(
-    pi0_tiny: Pi0, monkeypatch: pytest.MonkeyPatch, own: tuple[str, ...] | None, message: str | None
+    pi0_tiny: Pi0, monkeypatch: pytest.MonkeyPatch, action_names: tuple[str, ...] | None, message: str | None
 ) -> None:
-    monkeypatch.setattr(Pi0, "action_names", property(lambda _self: own))
+    monkeypatch.setattr(Pi0, "action_names", property(lambda _self: action_names))
     if message is None:
         assert prepare(settings_of("ReachEnv"), model=pi0_tiny).plan.episodes
     else:

@@ -37,8 +37,8 @@ def test_observations_and_actions_pass_lerobots_processors() -> None:
     np.testing.assert_array_equal(begin.observation.state, expected["agent_pos"])
     action = np.full(7, 0.005, np.float32)
     step = played.step(action)
-    seen, reward, *_ = plain.step(2 * action)
-    np.testing.assert_allclose(step.observation.state, seen["agent_pos"])
+    observed, reward, *_ = plain.step(2 * action)
+    np.testing.assert_allclose(step.observation.state, observed["agent_pos"])
     assert step.facts == {"reward": pytest.approx(float(reward)), "success": False}
     played.close()
 

@@ -43,8 +43,8 @@ class PerEpisode(ReachEnv):
             yield EnvEpisode(f"e{seed}", seed, "Put the cube on the red shape", None, limit)
 
 
-def opened(name: str = HOME + "ReachEnv", **given: Any) -> EnvironmentSource:
-    source = EnvSource(name, **given).open()
+def opened(name: str = HOME + "ReachEnv", **options: Any) -> EnvironmentSource:
+    source = EnvSource(name, **options).open()
     assert isinstance(source, EnvironmentSource)
     return source
 
@@ -71,11 +71,11 @@ def words_of(source: EnvironmentSource) -> dict[str, str]:
         (SimpleNamespace(horizon=7), None),  # nothing that is reset and stepped
     ],
 )
-@pytest.mark.parametrize("held", [lambda one: one, lambda one: {"task": one}, lambda one: [one, Reach()]])
+@pytest.mark.parametrize("wrap", [lambda task: task, lambda task: {"task": task}, lambda task: [task, Reach()]])
 def test_a_limit_is_that_of_the_simulator_that_an_environment_holds(
-    simulator: Any, limit: int | None, held: Any
+    simulator: Any, limit: int | None, wrap: Any
 ) -> None:
-    assert declared_limit(SimpleNamespace(env=held(simulator)), "kitchen") == limit
+    assert declared_limit(SimpleNamespace(env=wrap(simulator)), "kitchen") == limit
 
 
 def test_an_environment_says_its_limit_itself_and_the_longest_of_several_simulators_counts() -> None:
@@ -169,8 +169,8 @@ def test_both_rates_are_said_and_that_fewer_actions_than_the_benchmarks_lower_th
     assert (
         "--max-steps ended 2 of them after 200 actions, and the environment's own limit is 300" in rates.sentence
     )
-    whole = {ONCE: [True], AT_END: [True], "steps": [300], "done": [False]}
-    full, old = (EnvironmentSuccess.of(pd.DataFrame(whole | limit)) for limit in ({LIMIT: [300]}, {}))
+    complete = {ONCE: [True], AT_END: [True], "steps": [300], "done": [False]}
+    full, old = (EnvironmentSuccess.of(pd.DataFrame(complete | limit)) for limit in ({LIMIT: [300]}, {}))
     assert full is not None and old is not None  # noqa: PT018
     assert "--max-steps" not in full.sentence + old.sentence
     assert EnvironmentSuccess.of(pd.DataFrame({"outcome": ["ended"]})) is None
@@ -250,7 +250,8 @@ def test_pictures_of_all_cameras_or_of_one_are_rotated_at_every_step(
     rotations: Any, first: int, wrist: int
 ) -> None:
     plain, turned = (
-        open_environment(EnvSource(HOME + "TwoCameras", rotations=given)) for given in ((), rotations)
+        open_environment(EnvSource(HOME + "TwoCameras", rotations=chosen_rotations))
+        for chosen_rotations in ((), rotations)
     )
     episode = next(iter(plain.episodes()))
     for was, now in (

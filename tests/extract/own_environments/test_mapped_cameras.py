@@ -10,7 +10,7 @@ from probe_kit.errors import OwnEnvironmentError
 from probe_kit.extract import EnvSource, Step
 from probe_kit.extract.sources.environment_source import (
     EnvironmentSource,
-    arranged,
+    arrange_pictures,
     mapped_pictures,
     open_environment,
 )
@@ -48,9 +48,9 @@ def test_named_pictures_reach_the_cameras_that_lerobot_gives_them(case: str) -> 
     from lerobot.processor.rename_processor import RenameObservationsProcessorStep
 
     cameras, pictures, renames = MAPS[case]
-    shown = {f"{IMAGES}{name}": name for name in pictures}
-    given: Any = RenameObservationsProcessorStep(rename_map=renames).observation(dict(shown))
-    expected = {camera: given[f"{IMAGES}{camera}"] for camera in cameras}
+    pictures_by_key = {f"{IMAGES}{name}": name for name in pictures}
+    renamed: Any = RenameObservationsProcessorStep(rename_map=renames).observation(dict(pictures_by_key))
+    expected = {camera: renamed[f"{IMAGES}{camera}"] for camera in cameras}
     pairs = mapped_pictures((), DeclaredInputs(cameras, renames=renames), pictures, True, "kitchen")
     in_order = dict(zip(cameras, pictures, strict=False))  # what the contract gives where nothing is mapped
     assert dict(pairs or in_order.items()) == expected
@@ -98,17 +98,17 @@ def test_a_step_has_the_pictures_of_the_cameras_and_the_lens_of_the_first_pictur
     front, wrist = (np.full((2, 3, 3), value, np.uint8) for value in (1, 2))
     lens = np.eye(3, dtype=np.float32)
     step = Step(Observation(front, np.zeros(2, np.float32), "push", lens, {"wrist": wrist}))
-    same = arranged(step, (("base", "front"), ("side", "wrist")), "front", "kitchen").observation
-    exchanged = arranged(step, (("base", "wrist"), ("side", "front")), "front", "kitchen").observation
+    same = arrange_pictures(step, (("base", "front"), ("side", "wrist")), "front", "kitchen").observation
+    exchanged = arrange_pictures(step, (("base", "wrist"), ("side", "front")), "front", "kitchen").observation
     assert (same.image, same.cameras["side"], same.intrinsics) == (front, wrist, lens)
     assert (exchanged.image is wrist, exchanged.cameras["side"] is front, exchanged.intrinsics) == (
         True,
         True,
         None,
     )
-    assert arranged(step, (), "front", "kitchen") is step
+    assert arrange_pictures(step, (), "front", "kitchen") is step
     with pytest.raises(OwnEnvironmentError, match=r"kitchen shows front, wrist, and no 'top'\. Correct"):
-        arranged(step, (("base", "top"),), "front", "kitchen")
+        arrange_pictures(step, (("base", "top"),), "front", "kitchen")
 
 
 @pytest.mark.parametrize(
@@ -136,7 +136,7 @@ def test_a_rotation_of_a_camera_turns_the_picture_that_it_is_given(
     plain = open_environment(EnvSource(NAMED))
     observation = plain.reset(next(iter(plain.episodes()))).observation  # type: ignore[union-attr]
     pictures = {"front": observation.image, **observation.cameras}
-    shown = {**dict(zip(pairs, [decided.seen.image], strict=False)), **decided.seen.cameras}
-    assert [*shown] == [*pairs]
+    by_camera = {**dict(zip(pairs, [decided.seen.image], strict=False)), **decided.seen.cameras}
+    assert [*by_camera] == [*pairs]
     for camera, picture in pairs.items():
-        np.testing.assert_array_equal(shown[camera], np.rot90(pictures[picture], turns.get(picture, 0)))
+        np.testing.assert_array_equal(by_camera[camera], np.rot90(pictures[picture], turns.get(picture, 0)))

@@ -17,13 +17,13 @@ STATE = np.array([0.29, 0.0, 0.16, 0.0, 0.0, 0.0, 0.0, 1.0], np.float32)
 
 @pytest.fixture(scope="session")
 def _lerobot_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    place = shared_folder(tmp_path_factory) / "datasets-cache"
+    cache = shared_folder(tmp_path_factory) / "datasets-cache"
     before = os.environ.get("HF_DATASETS_CACHE")
-    os.environ["HF_DATASETS_CACHE"] = str(place)
+    os.environ["HF_DATASETS_CACHE"] = str(cache)
     import datasets.config
 
     old = datasets.config.HF_DATASETS_CACHE
-    datasets.config.HF_DATASETS_CACHE = place
+    datasets.config.HF_DATASETS_CACHE = cache
     yield
     datasets.config.HF_DATASETS_CACHE = old
     os.environ.pop("HF_DATASETS_CACHE")

@@ -79,21 +79,25 @@ def opened(folder: Path) -> Any:
 
 def check(folder: Path, episodes: Sequence[Expected], cameras: Sequence[str] = (TOP, WRIST)) -> None:
     """Compare every frame with the source, as `extract` reads it."""
-    shown = RecordingSource.open(LeRobotSource(str(folder)), False)
-    shown.check_frames()
-    assert shown.folder.cameras == list(cameras)
-    assert shown.folder.lengths == [LENGTHS[expected.episode] for expected in episodes]
+    opened_source = RecordingSource.open(LeRobotSource(str(folder)), False)
+    opened_source.check_frames()
+    assert opened_source.folder.cameras == list(cameras)
+    assert opened_source.folder.lengths == [LENGTHS[expected.episode] for expected in episodes]
     for number, expected in enumerate(episodes):
         frames = range(LENGTHS[expected.episode])
         texts = [expected.text or words(expected.episode, frame) for frame in frames]
-        assert shown._texts(number) == texts
-        states = shown.reader.numbers(number, ["observation.state"])["observation.state"]
+        assert opened_source._texts(number) == texts
+        states = opened_source.reader.numbers(number, ["observation.state"])["observation.state"]
         np.testing.assert_array_equal(states, [state(expected.episode, frame) for frame in frames])
         for frame in frames:
-            for camera, pixels in shown.reader.pictures(number, frame, cameras).items():
+            for camera, pixels in opened_source.reader.pictures(number, frame, cameras).items():
                 due = picture(camera, expected.episode, frame)
                 far = np.abs(pixels.astype(float) - due).mean()
-                assert far == 0 if not shown.folder.is_video(camera) else far < CODED, (number, frame, camera)
+                assert far == 0 if not opened_source.folder.is_video(camera) else far < CODED, (
+                    number,
+                    frame,
+                    camera,
+                )
 
 
 def all_but(*left_out: int) -> list[Expected]:
@@ -200,8 +204,8 @@ def test_edits_one_after_another(source: Path, tmp_path: Path) -> None:
     """Delete, merge with the source, split, remove a camera, and change the words."""
     from lerobot.datasets import delete_episodes, merge_datasets, modify_tasks, remove_feature, split_dataset
 
-    rest = delete_episodes(opened(source), [1, 4], tmp_path / "rest", "local/rest")
-    both = merge_datasets([rest, opened(source)], "local/both", tmp_path / "both")
+    remaining = delete_episodes(opened(source), [1, 4], tmp_path / "rest", "local/rest")
+    both = merge_datasets([remaining, opened(source)], "local/both", tmp_path / "both")
     order = all_but(1, 4) + all_but()
     check(tmp_path / "both", order)
     split_dataset(both, {"train": [1, 2, 5, 7], "val": [0, 3]}, tmp_path)

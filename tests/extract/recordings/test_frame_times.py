@@ -36,12 +36,12 @@ ORDER = [(episode, frame) for episode, length in enumerate(LENGTHS) for frame in
 # -- the rule ----------------------------------------------------------------------------------------------------
 
 
-def named(moment: Fraction, frames: list[Fraction], step: Fraction) -> int:
+def nearest_frame(moment: Fraction, frames: list[Fraction], step: Fraction) -> int:
     """The rule by its definition, over all frames."""
     distances = [abs(frame - moment) for frame in frames]
     for position, distance in enumerate(distances):
-        others = distances[:position] + distances[position + 1 :]
-        if 3 * distance <= step and all(other > distance and other >= 2 * distance for other in others):
+        other_distances = distances[:position] + distances[position + 1 :]
+        if 3 * distance <= step and all(other > distance and other >= 2 * distance for other in other_distances):
             return position
     return NONE
 
@@ -55,20 +55,22 @@ JITTERED = st.lists(st.tuples(st.integers(0, 12), st.sampled_from([0, 0, 1, 2, 3
 @given(
     lines=JITTERED,
     begin=st.floats(0, 2000) | st.sampled_from([0.0, 1120.0, 1 / 3]),
-    shown=JITTERED,
+    video_frames=JITTERED,
     base=st.sampled_from(BASES),
     fps=st.sampled_from([5.0, 30.0, 29.97, 30000 / 1001]),
 )
 def test_the_frame_that_is_nearest_by_far_is_that_of_fractions(
-    lines: list[tuple[int, int]], begin: float, shown: list[tuple[int, int]], base: Fraction, fps: float
+    lines: list[tuple[int, int]], begin: float, video_frames: list[tuple[int, int]], base: Fraction, fps: float
 ) -> None:
     """Videos may lack frames, and have two at one time."""
     step = 1 / (Fraction(fps) * base)
-    frames = sorted(int((Fraction(begin) / base) + (number + Fraction(late, 10)) * step) for number, late in shown)
+    frames = sorted(
+        int((Fraction(begin) / base) + (number + Fraction(late, 10)) * step) for number, late in video_frames
+    )
     seconds = [float(np.float32((number + late / 10) / fps)) for number, late in lines]
     match = nearest_by_far(TickTimes.of(seconds, begin, base), frames, step)
     moments = [(Fraction(begin) + Fraction(second)) / base for second in seconds]
-    due = [named(moment, list(map(Fraction, frames)), step) for moment in moments]
+    due = [nearest_frame(moment, list(map(Fraction, frames)), step) for moment in moments]
     assert match.positions.tolist() == due
     for moment, drift in zip(moments, match.drifts.tolist(), strict=True):
         nearest = min((abs(frame - moment) / step for frame in frames), default=None)

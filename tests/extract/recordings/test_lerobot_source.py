@@ -63,7 +63,7 @@ def test_other_words_for_frames_are_refused(text: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("given", "message"),
+    ("maps", "message"),
     [
         ({"cameras": ["base"]}, "expected CAMERA=VALUE"),
         ({"cameras": ["base=a", "base=b"]}, "camera 'base' is mapped twice"),
@@ -74,14 +74,14 @@ def test_other_words_for_frames_are_refused(text: str) -> None:
         ({"rotations": ["base=90", "base=180"]}, "--rotate gives base twice"),
     ],
 )
-def test_maps_that_cannot_be_meant_are_refused(given: dict[str, list[str]], message: str) -> None:
+def test_maps_that_cannot_be_meant_are_refused(maps: dict[str, list[str]], message: str) -> None:
     with pytest.raises(UsageError, match=message):
-        LeRobotSource("folder", **given)  # type: ignore[arg-type]
+        LeRobotSource("folder", **maps)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("given", [["180"], ["180", "wrist=90"], {"*": 180}, [("*", 180)], 180])
-def test_degrees_without_a_camera_rotate_all_and_those_of_a_camera_count_before(given: Any) -> None:
-    rotations = LeRobotSource("folder", rotations=given).rotations
+@pytest.mark.parametrize("rotation_options", [["180"], ["180", "wrist=90"], {"*": 180}, [("*", 180)], 180])
+def test_degrees_without_a_camera_rotate_all_and_those_of_a_camera_count_before(rotation_options: Any) -> None:
+    rotations = LeRobotSource("folder", rotations=rotation_options).rotations
     assert degrees_of(rotations, "base") == 180
     assert degrees_of(rotations, "wrist") == (90 if len(rotations) > 1 else 180)
     assert degrees_of((("base", 90),), "wrist") == 0
@@ -99,12 +99,12 @@ def test_the_only_picture_goes_to_the_only_camera() -> None:
 
 
 def test_a_map_is_ordered_as_the_model_has_its_cameras() -> None:
-    given = (("wrist", TOP), ("base", WRIST))
-    assert mapped_cameras(given, ["base", "wrist"], [TOP, WRIST]) == (("base", WRIST), ("wrist", TOP))
+    camera_map = (("wrist", TOP), ("base", WRIST))
+    assert mapped_cameras(camera_map, ["base", "wrist"], [TOP, WRIST]) == (("base", WRIST), ("wrist", TOP))
 
 
 @pytest.mark.parametrize(
-    ("given", "model", "recorded"),
+    ("camera_map", "model", "recorded"),
     [
         ((), ["base"], [TOP, WRIST]),
         ((), ["base", "wrist"], [WRIST]),
@@ -113,10 +113,10 @@ def test_a_map_is_ordered_as_the_model_has_its_cameras() -> None:
     ],
 )
 def test_cameras_that_nothing_decides_are_refused_with_both_lists(
-    given: tuple[tuple[str, str], ...], model: list[str], recorded: list[str]
+    camera_map: tuple[tuple[str, str], ...], model: list[str], recorded: list[str]
 ) -> None:
     with pytest.raises(RecordingError, match=r"the model has base.*the data set has.*--camera base="):
-        mapped_cameras(given, model, recorded)
+        mapped_cameras(camera_map, model, recorded)
 
 
 @pytest.mark.parametrize("pair", [("gripper", TOP), ("base", "observation.images.side")])
@@ -180,9 +180,9 @@ def test_a_data_set_of_the_hub_is_told_from_a_folder(tmp_path: Path) -> None:
 
 def test_options_of_scenes_are_refused_with_recordings(tmp_path: Path) -> None:
     source = LeRobotSource(str(tmp_path))
-    for given in ({"items": 4}, {"categories": ("color",)}, {"execute": 2}, {"video": "all"}, {"batch": "auto"}):
+    for options in ({"items": 4}, {"categories": ("color",)}, {"execute": 2}, {"video": "all"}, {"batch": "auto"}):
         with pytest.raises(UsageError, match="does not apply with --dataset"):
-            check_meaningless(ExtractSettings("pi0-tiny", source=source, **given))  # type: ignore[arg-type]
+            check_meaningless(ExtractSettings("pi0-tiny", source=source, **options))  # type: ignore[arg-type]
     with pytest.raises(UsageError, match="expert is scripted and looks at nothing"):
         prepare(ExtractSettings("expert", source=source))
     for typed, flag in (({"max_steps": 3}, "--max-steps"), ({"captured_calls": 2}, "--captured-calls")):
@@ -230,9 +230,9 @@ ASKED = {
 @pytest.mark.parametrize("source", slow_but(["recordings"], ASKED))
 def test_a_model_is_asked_about_every_frame_episode_or_picture(source: str, home: Path) -> None:
     options, count = ASKED[source]
-    asked = ask(*options, "--tokens", "pooled", "--out", "asked")
-    assert asked.exit_code == 0, asked.output
-    assert "next: probe-kit targets" in " ".join(asked.stderr.split())
+    result = ask(*options, "--tokens", "pooled", "--out", "asked")
+    assert result.exit_code == 0, result.output
+    assert "next: probe-kit targets" in " ".join(result.stderr.split())
     run = pk.open_run(home / "asked" / "instruction")
     assert verify_run(run.path, deep=True).ok
     assert len(run.episodes) == count
@@ -283,8 +283,8 @@ def test_activations_are_those_of_the_model_itself_and_numbers_of_the_table_are_
 def test_yes_and_no_are_read_where_the_prompt_asks_for_them(home: Path) -> None:
     (home / "seen.txt").write_text("{instruction}. Do you see the cube? Answer yes or no.", encoding="utf-8")
     options, count = ASKED["pictures"]
-    asked = ask(*options, "--prompt", "seen.txt", "--out", "asked")
-    assert asked.exit_code == 0, asked.output
+    result = ask(*options, "--prompt", "seen.txt", "--out", "asked")
+    assert result.exit_code == 0, result.output
     episodes = pk.open_run(home / "asked" / "seen").episodes
     assert {"logit_yes", "logit_no", "option_mass", "said"} <= set(episodes)
     assert len(episodes) == count
@@ -319,7 +319,7 @@ FILES = {
 @pytest.fixture(
     params=[pytest.param(source, marks=pytest.mark.slow if source != "recordings" else ()) for source in SOURCES]
 )
-def made(
+def run_and_files(
     request: pytest.FixtureRequest,
     recording: Path,
     small_suite: Suite,
@@ -361,9 +361,9 @@ def extract(*words: str, code: int = 0) -> str:
 
 
 def test_a_run_is_repeated_from_any_folder_and_its_files_are_found_again(
-    made: tuple[str, Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run_and_files: tuple[str, Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    source, home, first = made
+    source, home, first = run_and_files
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
     monkeypatch.setattr(sys, "path", [folder for folder in sys.path if folder != str(home)])
@@ -378,9 +378,9 @@ def test_a_run_is_repeated_from_any_folder_and_its_files_are_found_again(
 
 @pytest.mark.slow
 def test_a_file_that_is_gone_is_named_before_anything_is_made(
-    made: tuple[str, Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run_and_files: tuple[str, Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    source, home, first = made
+    source, home, first = run_and_files
     gone = home / FILES[source]
     gone.rename(home / "moved")
     monkeypatch.setattr(sys, "path", [folder for folder in sys.path if folder != str(home)])
@@ -401,9 +401,9 @@ AGAIN = {
 
 @pytest.mark.slow
 def test_an_option_takes_the_place_of_every_file_that_was_moved(
-    made: tuple[str, Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run_and_files: tuple[str, Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    source, home, first = made
+    source, home, first = run_and_files
     (tmp_path / "elsewhere").mkdir()
     home.rename(tmp_path / "elsewhere" / "moved")
     monkeypatch.chdir(tmp_path / "elsewhere" / ("moved" if source == "environment" else ""))
@@ -416,9 +416,9 @@ def test_an_option_takes_the_place_of_every_file_that_was_moved(
     extract(*again, *AGAIN[source], *accepted)
     before, after = pk.open_run(first), pk.open_run(tmp_path / "again")
     assert before.root.identity == after.root.identity
-    here = after.origins[0].files
-    assert all(str(tmp_path / "elsewhere") in path for path in here.values())
-    assert here.keys() == before.origins[0].files.keys()
+    paths = after.origins[0].files
+    assert all(str(tmp_path / "elsewhere") in path for path in paths.values())
+    assert paths.keys() == before.origins[0].files.keys()
 
 
 def test_files_of_the_model_that_were_moved_are_named_and_given_by_their_options(
@@ -449,8 +449,10 @@ def test_files_of_the_model_that_were_moved_are_named_and_given_by_their_options
 
 
 @pytest.mark.slow
-def test_a_source_of_another_kind_needs_no_file_of_the_run(made: tuple[str, Path, Path], tmp_path: Path) -> None:
-    source, home, first = made
+def test_a_source_of_another_kind_needs_no_file_of_the_run(
+    run_and_files: tuple[str, Path, Path], tmp_path: Path
+) -> None:
+    source, home, first = run_and_files
     home.rename(tmp_path / "gone")
     other = ["--env", "lerobot:pusht"] if source != "environment" else ["--dataset", "rec"]
     printed = json.loads(extract("--config", str(first), *other, "--print-config"))

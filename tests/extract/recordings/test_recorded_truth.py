@@ -43,9 +43,9 @@ def opened(folder: Path) -> LeRobotFolder:
 
 def shown_states(folder: Path) -> np.ndarray:
     """(frames, 8) of all episodes, as a run reads them."""
-    found = opened(folder)
-    found.check_files(range(3), [CAMERA])
-    frames = LeRobotFrames(found)
+    source = opened(folder)
+    source.check_files(range(3), [CAMERA])
+    frames = LeRobotFrames(source)
     frames.check(range(3), [CAMERA])
     return np.concatenate([frames.numbers(episode, [STATE])[STATE] for episode in range(3)])
 
@@ -53,10 +53,10 @@ def shown_states(folder: Path) -> np.ndarray:
 def change(file: Path, column: str, of: Callable[[list[Any]], list[Any]], **types: Any) -> None:
     """Rewrite one column of a Parquet file."""
     table = pq.read_table(file)
-    place = table.schema.get_field_index(column)
+    column_index = table.schema.get_field_index(column)
     kind = types.get("kind", table.schema.field(column).type)
     cells = pa.array(of(table.column(column).to_pylist()), kind)
-    pq.write_table(table.set_column(place, pa.field(column, kind), cells), file)
+    pq.write_table(table.set_column(column_index, pa.field(column, kind), cells), file)
 
 
 def edit_info(folder: Path, **parts: Any) -> None:
@@ -64,7 +64,7 @@ def edit_info(folder: Path, **parts: Any) -> None:
     path.write_text(json.dumps({**json.loads(path.read_text(encoding="utf-8")), **parts}), encoding="utf-8")
 
 
-WRITTEN = np.concatenate([[one.state for one in episode] for episode in observations()])
+WRITTEN = np.concatenate([[observation.state for observation in episode] for episode in observations()])
 
 
 # -- what is hashed is what is read ------------------------------------------------------------------------------
@@ -80,12 +80,12 @@ def test_a_folder_is_read_by_its_name_and_never_as_a_pattern(recording: Path, tm
 
 
 @pytest.mark.parametrize(
-    "place", ["data/chunk-000/file-001.parquet", "data/chunk-007/x.parquet", "data/x.parquet"]
+    "file_name", ["data/chunk-000/file-001.parquet", "data/chunk-007/x.parquet", "data/x.parquet"]
 )
-def test_a_data_file_that_meta_does_not_name_is_refused_by_name(copy: Path, place: str) -> None:
-    (copy / place).parent.mkdir(exist_ok=True)
-    shutil.copy(copy / DATA, copy / place)
-    with pytest.raises(RecordingError, match=f"rec holds {place}, in which meta/episodes names no episode"):
+def test_a_data_file_that_meta_does_not_name_is_refused_by_name(copy: Path, file_name: str) -> None:
+    (copy / file_name).parent.mkdir(exist_ok=True)
+    shutil.copy(copy / DATA, copy / file_name)
+    with pytest.raises(RecordingError, match=f"rec holds {file_name}, in which meta/episodes names no episode"):
         shown_states(copy)
 
 
@@ -132,11 +132,11 @@ def test_a_file_that_was_replaced_with_its_old_time_stamp_is_read_anew(copy: Pat
 
 def test_a_file_that_changes_between_hash_and_reading_is_refused(copy: Path) -> None:
     plain(copy)
-    found = opened(copy)
-    found.content_blake2b(0, [CAMERA])
+    source = opened(copy)
+    source.content_blake2b(0, [CAMERA])
     replace_same_size(copy / DATA, negated((copy / DATA).read_bytes(), float(WRITTEN[0, 0])))
     with pytest.raises(RecordingError, match=f"{DATA} of rec was changed while it was read"):
-        LeRobotFrames(found).numbers(0, [STATE])
+        LeRobotFrames(source).numbers(0, [STATE])
 
 
 def test_a_file_that_was_touched_or_copied_over_itself_is_the_same_file(copy: Path) -> None:
@@ -191,8 +191,8 @@ def test_rows_are_the_episodes_own_however_a_file_is_divided(
     np.testing.assert_array_equal(shown_states(copy), WRITTEN)
     frames = LeRobotFrames(opened(copy))
     for episode, frame in ((2, 6), (0, 0), (1, 3), (1, 5)):
-        seen = frames.pictures(episode, frame, [CAMERA])[CAMERA]
-        np.testing.assert_array_equal(seen, observations()[episode][frame].image)
+        picture = frames.pictures(episode, frame, [CAMERA])[CAMERA]
+        np.testing.assert_array_equal(picture, observations()[episode][frame].image)
 
 
 def test_a_picture_that_lies_outside_the_data_file_is_refused(copy: Path) -> None:
@@ -334,20 +334,20 @@ def test_meta_that_contradicts_itself_or_its_data_is_refused(copy: Path, kind: s
 
 
 @pytest.mark.parametrize(
-    ("named", "expected"),
+    ("names", "expected"),
     [
         ([*"hgfedcba"], [*"hgfedcba"]),
         ({"motors": [*"abcdefgh"]}, [*"abcdefgh"]),
         ({"left": [*"abcd"], "right": [*"efgh"]}, [*"abcdefgh"]),
-        ({name: 7 - place for place, name in enumerate("abcdefgh")}, [*"hgfedcba"]),
+        ({name: 7 - position for position, name in enumerate("abcdefgh")}, [*"hgfedcba"]),
         (None, [*"01234567"]),
         ([*"abc"], [*"01234567"]),
         ("abcdefgh", [*"01234567"]),
         ({"a": "b"}, [*"01234567"]),
     ],
 )
-def test_names_of_numbers_are_a_list_groups_or_places(copy: Path, named: Any, expected: list[str]) -> None:
-    rename(copy, named)
+def test_names_of_numbers_are_a_list_groups_or_places(copy: Path, names: Any, expected: list[str]) -> None:
+    rename(copy, names)
     assert opened(copy).names(STATE) == expected
 
 
@@ -357,12 +357,14 @@ TEXTS = ["Put the cube on the gray shape", "Put the cube on the red shape"]
 
 
 def tasks(folder: Path) -> list[str]:
-    found = opened(folder)
-    frames = LeRobotFrames(found)
+    source = opened(folder)
+    frames = LeRobotFrames(source)
     numbers = {
-        int(number) for one in range(3) for number in frames.numbers(one, ["task_index"])["task_index"][:, 0]
+        int(number)
+        for episode in range(3)
+        for number in frames.numbers(episode, ["task_index"])["task_index"][:, 0]
     }
-    return sorted(map(found.task, numbers))
+    return sorted(map(source.task, numbers))
 
 
 def retask(folder: Path, of: Callable[[pd.DataFrame], pd.DataFrame], index: bool = False) -> None:
@@ -428,8 +430,8 @@ def test_an_empty_task_names_its_episodes(copy: Path) -> None:
 @pytest.fixture(scope="module")
 def filmed(_lerobot_cache: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("filmed") / "rec"
-    shades = [[one.__class__(np.full((48, 64, 3), 40 * row + 8 * place, np.uint8), one.state, one.instruction)
-               for place, one in enumerate(episode)] for row, episode in enumerate(observations())]  # fmt: skip
+    shades = [[view.__class__(np.full((48, 64, 3), 40 * row + 8 * frame, np.uint8), view.state, view.instruction)
+               for frame, view in enumerate(episode)] for row, episode in enumerate(observations())]  # fmt: skip
     return write_recording(folder, shades, videos=True)
 
 
@@ -444,8 +446,8 @@ def test_videos_show_the_frames_of_their_episode_whatever_the_folder_is_called(
     frames = LeRobotFrames(opened(Path(shutil.copytree(filmed, tmp_path / name))))
     frames.check(range(3), [CAMERA])
     for episode, frame in ((0, 0), (1, 2), (2, 6), (1, 5)):
-        seen = frames.pictures(episode, frame, [CAMERA])[CAMERA]
-        assert abs(float(seen.mean()) - (40 * episode + 8 * frame)) < 4
+        picture = frames.pictures(episode, frame, [CAMERA])[CAMERA]
+        assert abs(float(picture.mean()) - (40 * episode + 8 * frame)) < 4
 
 
 VIDEOS: dict[str, tuple[Callable[[Path], None], str]] = {
@@ -542,7 +544,7 @@ def test_a_data_set_in_other_units_is_shown_and_then_refused_unless_accepted(
 
 
 @pytest.mark.parametrize(
-    ("recorded", "own", "reason"),
+    ("recorded", "action_names", "reason"),
     [
         ([*"yxzabcg"], tuple("xyzabcg"), "named in another order: y, x, z"),
         ([*"xyzabch"], tuple("xyzabcg"), "named otherwise: x, y, z"),
@@ -552,13 +554,13 @@ def test_a_data_set_in_other_units_is_shown_and_then_refused_unless_accepted(
     ],
 )
 def test_actions_are_compared_with_recorded_ones_of_the_same_names_in_the_same_order_only(
-    copy: Path, pi0_tiny: Pi0, monkeypatch: pytest.MonkeyPatch, recorded: Any, own: Any, reason: str
+    copy: Path, pi0_tiny: Pi0, monkeypatch: pytest.MonkeyPatch, recorded: Any, action_names: Any, reason: str
 ) -> None:
     """The recorded numbers themselves lie outside the statistics."""
     features = json.loads((copy / "meta/info.json").read_text(encoding="utf-8"))["features"]
     features["action"]["names"] = recorded
     edit_info(copy, features=features)
-    monkeypatch.setattr(Pi0, "action_names", property(lambda _self: own))
+    monkeypatch.setattr(Pi0, "action_names", property(lambda _self: action_names))
     prepared = prepare(ExtractSettings("pi0-tiny", source=LeRobotSource(str(copy)), env_workers=0), model=pi0_tiny)
     assert reason in prepared.plan.selection["recording"]["other_actions"]
 
@@ -569,7 +571,8 @@ def test_actions_are_compared_with_recorded_ones_of_the_same_names_in_the_same_o
 def misfit(folder: Path, state: int, words: str, camera: str) -> ExtractSettings:
     """A recording with a state of so many numbers, such words and a camera of that name of the model."""
     episodes = [
-        [replace(one, state=one.state[:state], instruction=words) for one in episode] for episode in observations()
+        [replace(observation, state=observation.state[:state], instruction=words) for observation in episode]
+        for episode in observations()
     ]
     write_recording(folder, episodes)
     source = LeRobotSource(str(folder), cameras=((camera, CAMERA),))
@@ -583,11 +586,11 @@ def test_camera_words_and_state_that_do_not_fit_are_refused_together_before_a_ne
     settings = misfit(tmp_path / "rec", 6, "Stack the plates", "wrist")
     with pytest.raises(RecordingError) as refused:
         prepare(settings)
-    said = str(refused.value)
-    assert said.startswith("3 things about the recordings do not fit the model")
-    assert "--camera wrist" in said
-    assert "'plates'" in said
-    assert "has 6 numbers as observation.state; pi0-tiny reads 8" in said
+    message = str(refused.value)
+    assert message.startswith("3 things about the recordings do not fit the model")
+    assert "--camera wrist" in message
+    assert "'plates'" in message
+    assert "has 6 numbers as observation.state; pi0-tiny reads 8" in message
 
 
 @pytest.mark.parametrize(

@@ -58,7 +58,7 @@ def states(folder: Path) -> np.ndarray:
     return np.concatenate([source.reader.numbers(episode, [STATE])[STATE] for episode in source.episodes])
 
 
-WRITTEN = np.concatenate([[one.state for one in episode] for episode in observations()])
+WRITTEN = np.concatenate([[observation.state for observation in episode] for episode in observations()])
 
 
 # -- recordings that ended early ---------------------------------------------------------------------------------
@@ -163,8 +163,8 @@ write_recording(folder, observations(episodes), videos=videos)
 
 def killed(folder: Path, *arguments: object) -> None:
     command = [sys.executable, "-c", KILLED, str(folder), *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, env={**os.environ, **OFFLINE}, check=False)
-    assert done.returncode == 9, done.stderr[-2000:]
+    completed = subprocess.run(command, capture_output=True, env={**os.environ, **OFFLINE}, check=False)
+    assert completed.returncode == 9, completed.stderr[-2000:]
 
 
 @pytest.mark.slow
@@ -227,19 +227,21 @@ def typed(command: str, folder: Path, **environment: str) -> None:
     """Run a command as typed in a shell, whose working folder is another one."""
     variables = {**os.environ, **OFFLINE, **environment}
     shell = ["bash", "-c", command]
-    done = subprocess.run(
+    completed = subprocess.run(
         shell, cwd=folder, env=variables, capture_output=True, text=True, check=False, encoding="utf-8"
     )
-    assert done.returncode == 0, done.stderr[-2000:]
+    assert completed.returncode == 0, completed.stderr[-2000:]
 
 
-@pytest.mark.parametrize("taken", [(), ("_old",), ("_v30",), ("_old", "_v30")])
-def test_the_printed_line_moves_what_the_converter_would_remove(copy: Path, taken: tuple[str, ...]) -> None:
+@pytest.mark.parametrize("taken_suffixes", [(), ("_old",), ("_v30",), ("_old", "_v30")])
+def test_the_printed_line_moves_what_the_converter_would_remove(
+    copy: Path, taken_suffixes: tuple[str, ...]
+) -> None:
     edit_info(copy, codebase_version="v2.1")
-    for suffix in taken:
+    for suffix in taken_suffixes:
         (copy.parent / f"rec{suffix}").mkdir()
     steps = line(message(copy)).split(" && ")
-    assert steps[:-1] == [f"mv {copy}{suffix} {copy}{suffix}_1" for suffix in taken]
+    assert steps[:-1] == [f"mv {copy}{suffix} {copy}{suffix}_1" for suffix in taken_suffixes]
     assert shlex.split(steps[-1])[1:] == [
         "-m", "lerobot.scripts.convert_dataset_v21_to_v30", "--repo-id=local/rec", f"--root={copy}",
         "--push-to-hub=false",
@@ -265,8 +267,8 @@ def test_the_printed_line_converts_a_folder_of_format_21(tmp_path: Path, name: s
         (tmp_path / "sets" / f"{name}{suffix}" / "other").write_text(suffix, encoding="utf-8")
     typed(line(message(folder)), tmp_path)
     np.testing.assert_array_equal(states(folder), WRITTEN)
-    others = {path.read_text(encoding="utf-8") for path in (tmp_path / "sets").glob("*_1/other")}
-    assert others == {"_old", "_v30"}, "the converter removes folders of these names"
+    contents = {path.read_text(encoding="utf-8") for path in (tmp_path / "sets").glob("*_1/other")}
+    assert contents == {"_old", "_v30"}, "the converter removes folders of these names"
     assert (tmp_path / "sets" / f"{name}_old" / "meta/episodes.jsonl").is_file(), "the data set as it was"
 
 
@@ -293,9 +295,9 @@ def test_the_printed_line_downloads_and_converts_a_data_set_of_the_hub(tmp_path:
         paths = [path for path in folder.rglob("*") if path.is_file()]
         served.models["lab/kitchen"] = {commit: {p.relative_to(folder).as_posix(): p.read_bytes() for p in paths}}
         environment = {"HF_ENDPOINT": served.address, "HF_HOME": str(tmp_path / "hf"), "HF_HUB_OFFLINE": "0"}
-        shown = [str(Path(sys.executable).with_name("probe-kit")), "dataset", "show"]
+        show = [str(Path(sys.executable).with_name("probe-kit")), "dataset", "show"]
         refused = subprocess.run(
-            [*shown, f"lab/kitchen@{commit}"], cwd=work, env={**os.environ, **environment}, capture_output=True,
+            [*show, f"lab/kitchen@{commit}"], cwd=work, env={**os.environ, **environment}, capture_output=True,
             text=True, check=False, encoding="utf-8")  # fmt: skip
         text = " ".join(refused.stderr.split())
         assert f"Then give {work / 'kitchen'} in place of lab/kitchen" in text
@@ -309,8 +311,8 @@ def test_the_episodes_that_a_refusal_names_are_read_as_typed(copy: Path) -> None
     table = pq.read_table(copy / DATA).to_pandas()
     table.loc[table["episode_index"] == 1, "timestamp"] = 0.0
     pd.DataFrame(table).to_parquet(copy / DATA)
-    shown = [str(Path(sys.executable).with_name("probe-kit")), "dataset", "show", str(copy)]
-    refused = subprocess.run(shown, capture_output=True, text=True, check=False, encoding="utf-8")
+    show = [str(Path(sys.executable).with_name("probe-kit")), "dataset", "show", str(copy)]
+    refused = subprocess.run(show, capture_output=True, text=True, check=False, encoding="utf-8")
     option = re.search(r"--episodes \S+", refused.stderr)
     assert option is not None, refused.stderr
-    subprocess.run([*shown, *option[0].split()], capture_output=True, check=True)
+    subprocess.run([*show, *option[0].split()], capture_output=True, check=True)

@@ -93,10 +93,10 @@ def test_a_policy_is_shown_what_lerobot_gives_it(
 ) -> None:
     inputs = inputs_of(fine_tune(tmp_path / "tuned", cameras, renames))
     mapped = RecordingSource.open(LeRobotSource(str(recording)), False).mapped(inputs)
-    given = renamed_by_lerobot(renames)
+    renamed = renamed_by_lerobot(renames)
     assert inputs.cameras == cameras
-    assert mapped.settings.cameras == tuple((camera, given[f"{IMAGES}{camera}"]) for camera in cameras)
-    assert dict(mapped.settings.features).get(STATE) == given.get(STATE)
+    assert mapped.settings.cameras == tuple((camera, renamed[f"{IMAGES}{camera}"]) for camera in cameras)
+    assert dict(mapped.settings.features).get(STATE) == renamed.get(STATE)
     assert (" → " in mapped.renamed) == bool(renames)
 
 
@@ -172,16 +172,18 @@ def test_a_map_of_something_else_is_refused(change: Callable[[dict[str, Any]], N
 
 
 @pytest.mark.parametrize(
-    ("names", "shown"),
+    ("names", "description"),
     [
         ([["x", "y"], [*"zuvwt"]], "x, y, z, u, v, w, t"),
         (["a", "b"], "its 2 names do not fit: a, b"),
     ],
 )
-def test_names_of_a_data_set_are_shown_or_said(names: object, shown: str, recording: Path, tmp_path: Path) -> None:
+def test_names_of_a_data_set_are_shown_or_said(
+    names: object, description: str, recording: Path, tmp_path: Path
+) -> None:
     folder = shutil.copytree(recording, tmp_path / "rec")
     info = json.loads((folder / "meta" / "info.json").read_text(encoding="utf-8"))
     info["features"][ACTIONS]["names"] = names
     (folder / "meta" / "info.json").write_text(json.dumps(info), encoding="utf-8")
     source = RecordingSource.open(LeRobotSource(str(folder), features={ACTION: ACTIONS}), False)
-    assert shown in source.facts()[ACTION]
+    assert description in source.facts()[ACTION]

@@ -34,7 +34,7 @@ from probe_kit.errors import (
 from probe_kit.extract import ExtractSettings, extract_run, prepare
 from probe_kit.extract.sources.player import LONGEST_TRACEBACK, add_traceback, traceback_of
 from probe_kit.hooks import Observation
-from probe_kit.hooks.checkpoints.third_party import contained, while_acting
+from probe_kit.hooks.checkpoints.third_party import contain_policy, while_acting
 from probe_kit.hooks.families.pi0.adapter import Pi0, load_pi0_tiny
 from probe_kit.hooks.family import Family
 from probe_kit.runs import Run, open_run
@@ -73,8 +73,10 @@ def numbers(run: Run) -> dict[str, str]:
         "activations": [run.rows(stream)[row] for stream in run.streams for row in rows],
     }
     assert all(values.values())
-    found = {name: [sha256(array.tobytes()).hexdigest() for array in arrays] for name, arrays in values.items()}
-    return {name: str(digests) for name, digests in found.items()} | {
+    digests_by_name = {
+        name: [sha256(array.tobytes()).hexdigest() for array in arrays] for name, arrays in values.items()
+    }
+    return {name: str(digests) for name, digests in digests_by_name.items()} | {
         "episodes": without_seconds(run.episodes).to_csv()
     }
 
@@ -82,8 +84,8 @@ def numbers(run: Run) -> dict[str, str]:
 def misbehave(monkeypatch: pytest.MonkeyPatch, spoil: Callable[[list[Observation], Any], Any]) -> None:
     """Let the embedded policy do something else as well at every inference."""
 
-    def act(self: Pi0, seen: list[Observation], seeds: Any) -> Any:
-        return spoil(seen, ACT(self, seen, seeds))
+    def act(self: Pi0, observations: list[Observation], seeds: Any) -> Any:
+        return spoil(observations, ACT(self, observations, seeds))
 
     monkeypatch.setattr(Pi0, "act", act)
 
@@ -95,10 +97,10 @@ def reseed(_: Any, chunks: Any) -> Any:
     return chunks
 
 
-def scribble(seen: list[Observation], chunks: Any) -> Any:
-    for one in seen:
-        one.image[:] = 0
-        one.state[:] = np.nan
+def scribble(observations: list[Observation], chunks: Any) -> Any:
+    for observation in observations:
+        observation.image[:] = 0
+        observation.state[:] = np.nan
     return chunks
 
 
@@ -138,7 +140,7 @@ def fork(_: Any, chunks: Any) -> Any:
     "spoil",
     [
         reseed,
-        *(pytest.param(one, marks=pytest.mark.slow) for one in (scribble, change_later, move, deafen, fork)),
+        *(pytest.param(fault, marks=pytest.mark.slow) for fault in (scribble, change_later, move, deafen, fork)),
     ],
 )
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
@@ -238,12 +240,12 @@ def test_what_is_no_action_costs_its_own_episode_by_name_and_no_other(
     spoil: Any, words: str, settings: ExtractSettings, plain: dict[str, str], tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
-    seen: list[Any] = []
+    calls: list[Any] = []
 
     def once(_: Any, chunks: Any) -> Any:
         """The first inference of the second episode, which is tried again, and is the last one then."""
-        seen.append(None)
-        return spoil(chunks) if len(seen) == PROVED + 1 else chunks
+        calls.append(None)
+        return spoil(chunks) if len(calls) == PROVED + 1 else chunks
 
     misbehave(monkeypatch, once)
     extract_run(settings, tmp_path / "once")
@@ -274,10 +276,10 @@ def test_what_a_policy_prints_is_text_on_stderr(
 
     misbehave(monkeypatch, shout)
     extract_run(settings, tmp_path / "run")
-    shown = capsys.readouterr()
-    assert shown.out == ""
-    assert "␛[31mred␛]0;title␇ \ufffd\n␛[2J" in shown.err
-    assert not UNSAFE.search(shown.err)
+    output = capsys.readouterr()
+    assert output.out == ""
+    assert "␛[31mred␛]0;title␇ \ufffd\n␛[2J" in output.err
+    assert not UNSAFE.search(output.err)
 
 
 def press_ctrl_c() -> None:
@@ -341,8 +343,8 @@ def test_a_model_that_hangs_in_a_worker_is_ended_and_its_episodes_are_played_aga
 ) -> None:
     """The second episode of every worker hangs: the first one is kept, and the last ones are named."""
     hurried = settings.changed(model=installed, workers=1, inference_limit=15.0)
-    said = r"worker 0 was ended, because a call of its model took longer than --inference-limit 15 s"
-    with pytest.warns(WorkerLostWarning, match=said), suppress(EpisodesFailedError):
+    warning = r"worker 0 was ended, because a call of its model took longer than --inference-limit 15 s"
+    with pytest.warns(WorkerLostWarning, match=warning), suppress(EpisodesFailedError):
         extract_run(hurried, tmp_path / "run")
     assert len(open_run(tmp_path / "run", allow_partial=True).episodes) >= 2
 
@@ -364,12 +366,12 @@ def test_the_limit_ends_a_process_that_holds_the_interpreter() -> None:
     code = (
         "from probe_kit.hooks.checkpoints.third_party import contained\nwith contained(0.2):\n  sum(range(10**12))"
     )
-    done = subprocess.run([sys.executable, "-c", code], check=False, timeout=120)
-    assert done.returncode == -signal.SIGALRM
+    completed = subprocess.run([sys.executable, "-c", code], check=False, timeout=120)
+    assert completed.returncode == -signal.SIGALRM
 
 
 def test_a_call_within_its_limit_is_not_ended_later() -> None:
-    with contained(0.2):
+    with contain_policy(0.2):
         pass
     time.sleep(0.3)
     assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)

@@ -26,12 +26,12 @@ from probe_kit.extract.rollout.controllers import (
     executed_actions,
     with_rotation_vectors,
 )
-from probe_kit.extract.rollout.tasks import check_reachable, fitted
+from probe_kit.extract.rollout.tasks import check_reachable, fit_source
 from probe_kit.extract.sources.scene import SceneSettings
 from probe_kit.extract.sources.scene_source import SceneSource
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks import ModelCard, Observation, load_policy
-from probe_kit.intervene.rollout import executed
+from probe_kit.intervene.rollout import executed_chunk
 from probe_kit.runs.plan import Row
 from probe_kit.suite import Suite
 from tests.support.spatialvla_checkpoints import write_checkpoint
@@ -48,12 +48,14 @@ def chunk(seed: int, length: int = 4) -> Any:
 def test_axis_times_angle_is_that_of_the_same_turn() -> None:
     """scipy's lower-case "xyz" turns about fixed axes, as transforms3d's default "sxyz" does."""
     actions = chunk(0, 50)
-    found = with_rotation_vectors(actions)
+    converted = with_rotation_vectors(actions)
     turns = Rotation.from_euler("xyz", actions[:, 3:6].astype(np.float64))
-    np.testing.assert_allclose(found[:, 3:6], turns.as_rotvec(), atol=1e-7)
-    np.testing.assert_array_equal(np.delete(found, range(3, 6), axis=1), np.delete(actions, range(3, 6), axis=1))
+    np.testing.assert_allclose(converted[:, 3:6], turns.as_rotvec(), atol=1e-7)
+    np.testing.assert_array_equal(
+        np.delete(converted, range(3, 6), axis=1), np.delete(actions, range(3, 6), axis=1)
+    )
     np.testing.assert_array_equal(actions, chunk(0, 50))
-    assert found.dtype == np.float32
+    assert converted.dtype == np.float32
 
 
 def test_no_turn_stays_no_turn_and_one_axis_stays_its_angle() -> None:
@@ -83,14 +85,14 @@ def test_a_replayed_episode_executes_what_the_run_did(rotation: Any, exponent: f
     session = SimpleNamespace(
         run=SimpleNamespace(settings=settings), policy=SimpleNamespace(card=SimpleNamespace(ensemble=exponent))
     )
-    found = executed_actions(past, 2, exponent, rotation)
-    np.testing.assert_array_equal(executed(cast(Any, session), past), found)
-    assert found.shape == ((2, 7) if exponent is None else (1, 7))
+    replayed = executed_actions(past, 2, exponent, rotation)
+    np.testing.assert_array_equal(executed_chunk(cast(Any, session), past), replayed)
+    assert replayed.shape == ((2, 7) if exponent is None else (1, 7))
     head = executed_actions(past, 2, exponent)
     if rotation == "roll-pitch-yaw":
-        np.testing.assert_array_equal(found, head)
+        np.testing.assert_array_equal(replayed, head)
     else:
-        np.testing.assert_array_equal(found, with_rotation_vectors(head))
+        np.testing.assert_array_equal(replayed, with_rotation_vectors(head))
 
 
 def chunks(*firsts: float) -> list[np.ndarray]:
@@ -125,22 +127,24 @@ def test_an_episode_is_played_by_the_mean_of_its_plans(
 ) -> None:
     checkpoint = str(write_checkpoint(tmp_path))
     policy = load_policy("spatialvla", checkpoint, ensemble="true", constrained=True, camera="default")
-    asked = ExtractSettings("spatialvla", checkpoint, suite=small_suite.folder, categories=("color",), items=2)
-    source = asked.source.open()
-    controller = PolicyController(policy, source, asked)
+    spatialvla_settings = ExtractSettings(
+        "spatialvla", checkpoint, suite=small_suite.folder, categories=("color",), items=2
+    )
+    source = spatialvla_settings.source.open()
+    controller = PolicyController(policy, source, spatialvla_settings)
     past: list[np.ndarray] = []
     planned: list[np.ndarray] = []
     for call in range(3):
-        seen = replace(observation, image=np.roll(observation.image, call, axis=1))
-        turn = Turn(seen, Row(0, {"policy_seed": 5}), call + 1, cast(Any, None), past)
+        rolled = replace(observation, image=np.roll(observation.image, call, axis=1))
+        turn = Turn(rolled, Row(0, {"policy_seed": 5}), call + 1, cast(Any, None), past)
         executed = controller.infer([turn])[0].actions
-        planned.append(policy.act([seen], [derive_seed(5, "inference", call + 1)])[0])
+        planned.append(policy.act([rolled], [derive_seed(5, "inference", call + 1)])[0])
         np.testing.assert_array_equal(executed, ensemble(planned, 0.8)[None])
     assert len(past) == 3
-    asked = asked.changed(execute=2)
+    spatialvla_settings = spatialvla_settings.changed(execute=2)
     with pytest.raises(UsageError, match="needs an inference per action"):
-        check_reachable(asked, policy.card, source)
-    check_reachable(asked.changed(execute=None), policy.card, source)
+        check_reachable(spatialvla_settings, policy.card, source)
+    check_reachable(spatialvla_settings.changed(execute=None), policy.card, source)
 
 
 WORDS = ["put", "the", "cube", "on", "the", "black", "shape"]
@@ -150,11 +154,11 @@ TEMPLATE = "what to do : {} ?"
 def tokenizer(most: int | None) -> Tokenizer:
     """Of whole words; most: tokens that it keeps."""
     vocabulary = dict.fromkeys([*TEMPLATE.format(" ".join(WORDS)).split(), "[UNK]"])
-    found = Tokenizer(WordLevel({word: place for place, word in enumerate(vocabulary)}, unk_token="[UNK]"))
-    found.pre_tokenizer = Whitespace()
+    built = Tokenizer(WordLevel({word: index for index, word in enumerate(vocabulary)}, unk_token="[UNK]"))
+    built.pre_tokenizer = Whitespace()
     if most is not None:
-        found.enable_truncation(most)
-    return found
+        built.enable_truncation(most)
+    return built
 
 
 @pytest.mark.parametrize("framed", [False, True], ids=["bare", "in a frame"])
@@ -174,22 +178,22 @@ def test_the_words_behind_a_cut_are_counted(lost: int, framed: bool) -> None:
 
 
 def test_what_is_whole_or_unknown_has_lost_nothing() -> None:
-    whole = tokenizer(None)
-    asked = []
+    full_tokenizer = tokenizer(None)
+    texts = []
 
     def refuse(text: str) -> list[int]:
-        asked.append(text)
-        if len(asked) > 1:
+        texts.append(text)
+        if len(texts) > 1:
             raise InstructionError("too short")
         return [1]
 
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert count_lost_words(lambda text: list(whole.encode(text).ids), " ".join(WORDS)) == 0
+        assert count_lost_words(lambda text: list(full_tokenizer.encode(text).ids), " ".join(WORDS)) == 0
         assert count_lost_words(lambda _text: None, " ".join(WORDS)) == 0
         assert count_lost_words(lambda _text: [1], "put") == 0
         assert count_lost_words(refuse, " ".join(WORDS)) == 0
-    assert len(asked) == 2
+    assert len(texts) == 2
 
 
 CARD = ModelCard("mine", "none", "0" * 64, True, 1, "float32", "cpu", "none", ("primary",), 1, 1)
@@ -214,8 +218,8 @@ def test_intrinsics_project_as_the_camera_does_whatever_the_picture_size() -> No
 
 def test_a_batch_that_changes_numbers_and_a_camera_that_is_not_there_are_refused(small_suite: Suite) -> None:
     source, two = SceneSource(SceneSettings(scene=SceneSpec()), small_suite), ExtractSettings("pi0", batch=2)
-    fitted(replace(CARD, batch=1, needs=frozenset({"intrinsics", "state"})), two.changed(batch=1), source)
+    fit_source(replace(CARD, batch=1, needs=frozenset({"intrinsics", "state"})), two.changed(batch=1), source)
     with pytest.raises(UsageError, match="--batch 2 with mine, which takes at most 1"):
-        fitted(replace(CARD, batch=1), two, source)
+        fit_source(replace(CARD, batch=1), two, source)
     with pytest.raises(UsageError, match=r"reads camera\.wrist"):
-        fitted(replace(CARD, needs=frozenset({"camera.wrist"})), two, source)
+        fit_source(replace(CARD, needs=frozenset({"camera.wrist"})), two, source)

@@ -43,12 +43,12 @@ class Quick:
 
     def ask(self, method: str, *arguments: Any, then: Any = None) -> None:
         self._log.append(("asked", -1))
-        answer = self._done(method, *arguments)
+        answer = self._call(method, *arguments)
         self._answers.append(answer)
         if then is not None and isinstance(answer, Ending):
-            self._answers.append(self._done(then[0], *then[1]))
+            self._answers.append(self._call(then[0], *then[1]))
 
-    def _done(self, method: str, *arguments: Any) -> Any:
+    def _call(self, method: str, *arguments: Any) -> Any:
         if method == "begin":
             self._number, self._turns = arguments[0].index, 0
             self._log.append(("begun", self._number))
@@ -96,11 +96,11 @@ def played(
     room: int = 99,
 ) -> tuple[list[Ended | Failed], list[tuple[str, int]]]:
     log: list[tuple[str, int]] = []
-    left = iter([Row(number, {"policy_seed": number}) for number in range(episodes)])
+    remaining = iter([Row(number, {"policy_seed": number}) for number in range(episodes)])
     free: Any = SimpleNamespace(get=lambda: SimpleNamespace(clear=lambda: None), put=lambda _buffers: None)
     stages: Any = [Quick(log, length, bad or set()) for _ in range(2 * batch)]
     controller: Any = Thinking(log, capture_only, room)
-    next_episode: Callable[[], Any] = lambda: next(left, None)  # noqa: E731
+    next_episode: Callable[[], Any] = lambda: next(remaining, None)  # noqa: E731
     return list(EpisodeLoop(stages, controller, free, next_episode, lambda _planned: False)), log
 
 
@@ -121,8 +121,8 @@ def test_stages_begin_what_follows_before_their_results_are_collected(
 def test_a_stage_asks_for_nothing_between_the_inferences_of_two_episodes() -> None:
     _, log = played(8)
     thoughts = [position for position, (what, _) in enumerate(log) if what == "asked for actions"]
-    asked = [sum(what == "asked" for what, _ in log[one:other]) for one, other in pairwise(thoughts)]
-    assert asked == [1] * 7, "its actions, and nothing else"
+    requests = [sum(what == "asked" for what, _ in log[start:other]) for start, other in pairwise(thoughts)]
+    assert requests == [1] * 7, "its actions, and nothing else"
     assert [log[position][1] for position in thoughts] == list(range(8)), "the groups in turn, none left out"
 
 
@@ -130,9 +130,9 @@ def test_a_stage_asks_for_nothing_between_the_inferences_of_two_episodes() -> No
 def test_what_was_to_follow_a_failed_episode_is_played_all_the_same(batch: int) -> None:
     results, _ = played(12, batch, bad={0, 3, 4, 11})
     failed = [result.number for result in results if isinstance(result, Failed)]
-    kept = [result[0].planned.index for result in results if isinstance(result, tuple)]
+    completed = [result[0].planned.index for result in results if isinstance(result, tuple)]
     assert sorted(failed) == [0, 3, 4, 11]
-    assert sorted(failed + kept) == list(range(12)), "every episode once"
+    assert sorted(failed + completed) == list(range(12)), "every episode once"
 
 
 def test_a_batch_that_exceeds_the_memory_gives_its_episodes_up_and_a_single_one_ends_the_run() -> None:
@@ -145,9 +145,9 @@ def test_a_batch_that_exceeds_the_memory_gives_its_episodes_up_and_a_single_one_
 
 @pytest.fixture(params=[LocalPlayer, ProcessPlayer])
 def stage(request: pytest.FixtureRequest) -> Iterator[LocalPlayer | ProcessPlayer]:
-    made = request.param(partial(ScenePlayer, SceneSpec(max_steps=2)))
-    yield made
-    made.close()
+    staged = request.param(partial(ScenePlayer, SceneSpec(max_steps=2)))
+    yield staged
+    staged.close()
 
 
 @pytest.mark.slow
@@ -210,8 +210,8 @@ def test_capture_adds_nothing_to_an_inference_that_waits_for_the_device(
     pi0_tiny: Pi0, observation: Observation, with_tokens: bool
 ) -> None:
     """The same code runs on a GPU; what waits there is known by its name here."""
-    seen, inferences, misses = [observation, observation], list[Called](), list[int]()
-    roles = pi0_tiny.roles(seen)
+    observations, inferences, misses = [observation, observation], list[Called](), list[int]()
+    roles = pi0_tiny.roles(observations)
     streams = stored_streams(pi0_tiny, roles)
     capturer = Capturer(pi0_tiny, streams, with_tokens, "actions")
     buffers = {row: EpisodeBuffers(streams, 1, with_tokens, pinned=False) for row in range(2)}
@@ -219,7 +219,7 @@ def test_capture_adds_nothing_to_an_inference_that_waits_for_the_device(
     def infer() -> np.ndarray:
         before = _matrix.cache_info().misses
         with Called() as called:
-            actions = pi0_tiny.act(seen, [0, 1])
+            actions = pi0_tiny.act(observations, [0, 1])
         inferences.append(called)
         misses.append(_matrix.cache_info().misses - before)
         return actions
@@ -236,21 +236,21 @@ def test_one_question_to_the_device_tells_whether_all_sites_are_finite(
 ) -> None:
     from probe_kit.hooks import capture
 
-    asked = []
+    questions = []
     for sites in (pi0_tiny.sites()[:1], pi0_tiny.sites()):
         with Called() as called, capture(pi0_tiny, sites):
             pi0_tiny.act([observation], [0])
-        asked.append(called.waiting().count("_local_scalar_dense"))
-    assert asked[0] == asked[1]
+        questions.append(called.waiting().count("_local_scalar_dense"))
+    assert questions[0] == questions[1]
 
 
 def test_tokens_arrive_in_whole_rows_with_zeros_behind_them(monkeypatch: pytest.MonkeyPatch) -> None:
     buffers = EpisodeBuffers([STREAM], 1, True, pinned=False)
     buffers.tokens["backbone"].fill(7)  # as a row of a longer episode would leave it
-    whole: list[bool] = []
+    contiguous: list[bool] = []
 
     def copied(source: torch.Tensor, target: torch.Tensor) -> None:
-        whole.append(target.is_contiguous() and source.is_contiguous())
+        contiguous.append(target.is_contiguous() and source.is_contiguous())
         copy_aside(source, target)
 
     monkeypatch.setattr(staging, "copy_aside", copied)
@@ -262,7 +262,7 @@ def test_tokens_arrive_in_whole_rows_with_zeros_behind_them(monkeypatch: pytest.
     assert stored.shape == (2, STREAM.stored_tokens, 4)
     np.testing.assert_array_equal(stored[:, :5], bits.numpy().view(np.uint16))
     assert not stored[:, 5:].any()
-    assert whole == [True, True]
+    assert contiguous == [True, True]
     buffers.wait()
 
 

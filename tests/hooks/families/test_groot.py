@@ -70,9 +70,9 @@ def changed(stored: Path, tmp_path: Path) -> Changed:
 
 
 def seen_by(policy: Groot, picture: NDArray[np.uint8] | None = None) -> list[Observation]:
-    (one,) = examples_for(policy, "put the cube on the star")
+    (example,) = examples_for(policy, "put the cube on the star")
     image = np.random.default_rng(0).integers(0, 256, (48, 80, 3), np.uint8) if picture is None else picture
-    return [replace(one, image=image, state=STATE)]
+    return [replace(example, image=image, state=STATE)]
 
 
 def state_read(policy: Groot) -> NDArray[np.float32]:
@@ -92,8 +92,8 @@ def test_without_further_fields_the_state_is_mapped_by_its_quantiles(changed: Ch
 def test_angles_are_read_as_sines_then_cosines_in_the_place_of_their_group(changed: Changed) -> None:
     policy = changed({"sin_cos_embedding_keys": ["rotation"]}, apply_sincos_state_encoding=True)
     angles = STATE[3:6]
-    own = expected(_MINMAX[:3], np.sin(angles), np.cos(angles), _MINMAX[6:])
-    np.testing.assert_allclose(state_read(policy), own, atol=1e-6)
+    expected_state = expected(_MINMAX[:3], np.sin(angles), np.cos(angles), _MINMAX[6:])
+    np.testing.assert_allclose(state_read(policy), expected_state, atol=1e-6)
     assert any("SIN_COS" in note for note in policy.card.notes)
     assert policy.state_statistics is not None
     assert not policy.state_statistics.outside(np.full((1, 8), -6, np.float32))[0, 3:6].any()  # less than a turn
@@ -110,8 +110,8 @@ def test_angles_need_the_switch_and_the_group(changed: Changed, switched_on: boo
 
 def test_groups_with_mean_and_deviation_are_scores_that_are_not_clamped(changed: Changed) -> None:
     policy = changed({"mean_std_embedding_keys": ["x", "gripper"]})
-    own = expected(_SCORES[:1], _MINMAX[1:6], _SCORES[6:])
-    np.testing.assert_allclose(state_read(policy), own, atol=1e-5)
+    expected_state = expected(_SCORES[:1], _MINMAX[1:6], _SCORES[6:])
+    np.testing.assert_allclose(state_read(policy), expected_state, atol=1e-5)
     far = policy.state_units.normalise(np.full((1, 8), 50, np.float32))[0]
     assert far[0] > 1
     assert far[1] == 1
@@ -180,8 +180,8 @@ def test_the_cameras_of_a_checkpoint_are_those_whose_pictures_lerobot_packs(view
     """One picture for each view, under the other name of a wrist if it has no picture of its own, or else all."""
     step = processor_groot.GrootN17PackInputsStep.__new__(processor_groot.GrootN17PackInputsStep)
     step.video_modality_keys, step._warned_image_keys = views, True
-    for shown in (shown for size in range(1, 5) for shown in permutations(CAMERAS, size)):
-        features = [f"{IMAGES}{camera}" for camera in shown]
+    for cameras in (cameras for size in range(1, 5) for cameras in permutations(CAMERAS, size)):
+        features = [f"{IMAGES}{camera}" for camera in cameras]
         packed = read_views(features, views) if views else features
         assert packed == [name for name in features if name in packed]
         assert sorted(packed) == sorted(step._ordered_image_keys(dict.fromkeys(features)))
@@ -239,14 +239,16 @@ PICTURE = np.random.default_rng(1).integers(0, 256, (48, 80, 3), np.uint8)
 
 def test_pictures_are_squashed_bilinearly_and_cut_as_nvidias_newest_code(changed: Changed) -> None:
     policy = changed()
-    own = v2.Compose([v2.Resize((64, 64)), v2.CenterCrop((58, 58)), v2.Resize((64, 64))])
-    np.testing.assert_array_equal(pictures_of(policy, PICTURE), own(torch.from_numpy(PICTURE).permute(2, 0, 1)))
+    pipeline = v2.Compose([v2.Resize((64, 64)), v2.CenterCrop((58, 58)), v2.Resize((64, 64))])
+    np.testing.assert_array_equal(
+        pictures_of(policy, PICTURE), pipeline(torch.from_numpy(PICTURE).permute(2, 0, 1))
+    )
     assert any("Isaac-GR00T" in note and "without letterbox" in note for note in policy.card.notes)
     assert policy.card.settings["resize"] == "nvidia"
 
 
 def test_lerobots_resizing_is_another_one_and_can_be_chosen(changed: Changed) -> None:
-    plain, other = (pictures_of(changed(options=own), PICTURE) for own in ({}, {"resize": "lerobot"}))
+    plain, other = (pictures_of(changed(options=options), PICTURE) for options in ({}, {"resize": "lerobot"}))
     assert plain.shape == other.shape == (3, 64, 64)
     assert np.abs(plain.astype(int) - other).max() > 10
 
@@ -267,8 +269,8 @@ def test_letterbox_puts_black_bars_above_and_below(changed: Changed, where: str)
 def test_area_resizing_keeps_proportions_with_a_shortest_edge_and_squashes_where_it_is_null(
     changed: Changed,
 ) -> None:
-    kept = changed(use_albumentations=True, shortest_image_edge=32, crop_fraction=None)
-    assert pictures_of(kept, PICTURE).shape == (3, 32, 53)
+    proportional = changed(use_albumentations=True, shortest_image_edge=32, crop_fraction=None)
+    assert pictures_of(proportional, PICTURE).shape == (3, 32, 53)
     squashed = changed(use_albumentations=True, shortest_image_edge=None, crop_fraction=1.0)
     area = cv2.resize(PICTURE, (64, 64), interpolation=cv2.INTER_AREA)
     np.testing.assert_array_equal(pictures_of(squashed, PICTURE), area.transpose(2, 0, 1))
@@ -291,10 +293,10 @@ def groot(folder: Path) -> Groot:
 
 
 @pytest.fixture
-def seen(groot: Groot) -> list[Observation]:
-    (one,) = examples_for(groot, "Put the cube on the star!")
+def observations(groot: Groot) -> list[Observation]:
+    (example,) = examples_for(groot, "Put the cube on the star!")
     picture = np.random.default_rng(0).integers(0, 256, (48, 80, 3), np.uint8)
-    return [replace(one, image=picture, state=np.linspace(-0.2, 0.7, 8, dtype=np.float32))]
+    return [replace(example, image=picture, state=np.linspace(-0.2, 0.7, 8, dtype=np.float32))]
 
 
 def lerobots(folder: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[GrootPolicy, Any, Any]:
@@ -305,10 +307,10 @@ def lerobots(folder: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[GrootPolicy
     build = processor_groot._build_n1_7_processor
     monkeypatch.setattr(processor_groot, "_build_n1_7_processor", lambda _: build("vlm"))
     if nvidias:
-        own = Groot.load(str(folder), embodiment=TAG).config
+        configuration = Groot.load(str(folder), embodiment=TAG).config
         config = GrootConfig(
             device="cpu", base_model_path=str(folder), embodiment_tag=TAG, max_state_dim=12, max_action_dim=10,
-            input_features=own.input_features, output_features=own.output_features,
+            input_features=configuration.input_features, output_features=configuration.output_features,
         )  # fmt: skip
     else:
         config = PreTrainedConfig.from_pretrained(folder)
@@ -328,90 +330,92 @@ def lerobots(folder: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[GrootPolicy
     ],
 )
 def test_actions_are_those_of_lerobots_own_loading_processors_and_sampling_bit_for_bit(
-    folder: Path, seen: list[Observation], monkeypatch: pytest.MonkeyPatch, layout: str, dtype: str
+    folder: Path, observations: list[Observation], monkeypatch: pytest.MonkeyPatch, layout: str, dtype: str
 ) -> None:
     """From the raw picture and state to metres, with noise that lerobot draws itself of the same seed."""
-    place = folder if layout == "lerobot" else folder / "base"
-    ours = Groot.load(str(place), dtype=dtype, embodiment=TAG if layout == "nvidia" else None, resize="lerobot")
-    policy, before, behind = lerobots(place, monkeypatch)
+    checkpoint = folder if layout == "lerobot" else folder / "base"
+    ours = Groot.load(
+        str(checkpoint), dtype=dtype, embodiment=TAG if layout == "nvidia" else None, resize="lerobot"
+    )
+    policy, before, behind = lerobots(checkpoint, monkeypatch)
     policy.config.use_bf16 = dtype == "bfloat16"
-    (one,) = seen
+    (observation,) = observations
     raw = {
-        "observation.images.image": torch.from_numpy(one.image).permute(2, 0, 1),
-        "observation.state": torch.from_numpy(np.asarray(one.state, np.float32)),
-        "task": one.instruction,
+        "observation.images.image": torch.from_numpy(observation.image).permute(2, 0, 1),
+        "observation.state": torch.from_numpy(np.asarray(observation.state, np.float32)),
+        "task": observation.instruction,
     }
     packed = before(raw)
-    own = ours.batch(seen)
-    for name, tensor in own.items():
+    batch = ours.batch(observations)
+    for name, tensor in batch.items():
         torch.testing.assert_close(tensor, packed[name], rtol=0, atol=0)
     torch.manual_seed(7)
     theirs = policy.predict_action_chunk(packed)
     drawn = ours.noise([7])
     if dtype == "bfloat16":  # lerobot draws in the precision of what the bridge puts out
         torch.manual_seed(7)
-        drawn = torch.randn(drawn.shape, dtype=_end_of_bridge(ours, seen).dtype)
-    torch.testing.assert_close(ours.infer(own, drawn), theirs[:, :CHUNK], rtol=0, atol=0)
+        drawn = torch.randn(drawn.shape, dtype=_end_of_bridge(ours, observations).dtype)
+    torch.testing.assert_close(ours.infer(batch, drawn), theirs[:, :CHUNK], rtol=0, atol=0)
     metres = behind(theirs).numpy()
     assert metres.shape == (1, CHUNK, 7)
     np.testing.assert_allclose(ours.action_units.restore(theirs[:, :CHUNK].float().numpy()), metres, atol=1e-6)
     if dtype == "float32":
-        np.testing.assert_allclose(ours.act(seen, [7]), metres, atol=1e-6)
+        np.testing.assert_allclose(ours.act(observations, [7]), metres, atol=1e-6)
     assert theirs.abs().max() > 0.1
 
 
-def _end_of_bridge(policy: Groot, seen: list[Observation]) -> torch.Tensor:
+def _end_of_bridge(policy: Groot, observations: list[Observation]) -> torch.Tensor:
     site = policy.streams["bridge"].sites()[-1]
     with capture(policy, [site]) as cache:
-        policy.infer(policy.batch(seen), policy.noise([0]))
+        policy.infer(policy.batch(observations), policy.noise([0]))
     return cache[site]
 
 
 def test_select_action_of_lerobot_gives_the_first_actions(
-    folder: Path, groot: Groot, seen: list[Observation], monkeypatch: pytest.MonkeyPatch
+    folder: Path, groot: Groot, observations: list[Observation], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     policy, _, behind = lerobots(folder, monkeypatch)
     torch.manual_seed(3)
-    actions = [behind(policy.select_action(groot.batch(seen))).numpy() for _ in range(2)]
-    np.testing.assert_allclose(groot.act(seen, [3])[:, :2], np.stack(actions, 1), atol=1e-6)
+    actions = [behind(policy.select_action(groot.batch(observations))).numpy() for _ in range(2)]
+    np.testing.assert_allclose(groot.act(observations, [3])[:, :2], np.stack(actions, 1), atol=1e-6)
 
 
 def test_everything_that_the_expert_reads_passes_the_end_of_the_bridge(
-    groot: Groot, seen: list[Observation]
+    groot: Groot, observations: list[Observation]
 ) -> None:
     """Zeros there, and in what the bridge reads, change the expert; Qwen's own last norm is not read."""
     expert = groot.streams["expert"].sites()
     with capture(groot, expert) as plain:
-        actions = groot.act(seen, [0])
+        actions = groot.act(observations, [0])
     for site in (groot.streams["bridge"].sites()[-1], groot.streams["backbone"].sites()[-1]):
         with edit(groot, {site: torch.zeros_like}):
-            changed = groot.act(seen, [0])
+            changed = groot.act(observations, [0])
         assert not np.array_equal(changed, actions)
     norm = groot.network._groot_model.backbone.language_model.norm
     handle = norm.register_forward_hook(lambda *_: torch.zeros(1, 38, 32))
     try:
-        np.testing.assert_array_equal(groot.act(seen, [0]), actions)
+        np.testing.assert_array_equal(groot.act(observations, [0]), actions)
     finally:
         handle.remove()
-    other = replace(seen[0], instruction="Put the cube on the moon")
+    other = replace(observations[0], instruction="Put the cube on the moon")
     unread = []
-    for one in (seen[0], other):
+    for observation in (observations[0], other):
         with edit(groot, {groot.streams["bridge"].sites()[-1]: torch.zeros_like}):
-            unread.append(groot.act([one], [0]))
+            unread.append(groot.act([observation], [0]))
     np.testing.assert_array_equal(*unread)
     assert plain[expert[1]].shape == (1, 1 + HORIZON, 24)
 
 
 @pytest.mark.slow
 def test_blocks_attend_by_turns_to_words_to_themselves_and_to_pictures(
-    groot: Groot, seen: list[Observation]
+    groot: Groot, observations: list[Observation]
 ) -> None:
     """As lerobot's masks have it: block 0 reads the text, block 2 the pictures, 1 and 3 nothing of the prompt."""
     sites = [Site("expert", layer, "attention", 0) for layer in range(4)]
     end = groot.streams["bridge"].sites()[-1]
-    (roles,) = groot.roles(seen)["bridge"]
+    (roles,) = groot.roles(observations)["bridge"]
     with capture(groot, sites) as plain:
-        groot.act(seen, [0])
+        groot.act(observations, [0])
 
     def changed(role: str) -> list[bool]:
         mask = torch.from_numpy(roles.mask(role))
@@ -419,28 +423,28 @@ def test_blocks_attend_by_turns_to_words_to_themselves_and_to_pictures(
         def without(activation: torch.Tensor) -> torch.Tensor:
             return torch.where(mask[None, :, None], 0, activation)
 
-        found = []
+        differences = []
         for layer, site in enumerate(sites):
             entering = Site("expert", layer, iteration=0)
             with capture(groot, [entering]) as before:
-                groot.act(seen, [0])
+                groot.act(observations, [0])
             with (
-                edit(groot, {end: without, entering: lambda _, own=before[entering]: own}),
+                edit(groot, {end: without, entering: lambda _, replaced=before[entering]: replaced}),
                 capture(groot, [site]) as now,
             ):
-                groot.act(seen, [0])
-            found.append(not torch.equal(plain[site], now[site]))
-        return found
+                groot.act(observations, [0])
+            differences.append(not torch.equal(plain[site], now[site]))
+        return differences
 
     assert changed("language") == [True, False, False, False]
     assert changed("image.image") == [False, False, True, False]
 
 
 def test_roles_name_pictures_and_the_instruction_as_lerobot_writes_it(
-    groot: Groot, seen: list[Observation]
+    groot: Groot, observations: list[Observation]
 ) -> None:
-    (roles,) = groot.roles(seen)["backbone"]
-    ids = groot.batch(seen)["input_ids"][0]
+    (roles,) = groot.roles(observations)["backbone"]
+    ids = groot.batch(observations)["input_ids"][0]
     assert groot.tokenizer.decode(ids[torch.from_numpy(roles.mask("language"))]) == "put the cube on the star"
     assert set(ids[torch.from_numpy(roles.mask("image.image"))].tolist()) == {
         groot.tokenizer.convert_tokens_to_ids("<|image_pad|>")
@@ -449,18 +453,20 @@ def test_roles_name_pictures_and_the_instruction_as_lerobot_writes_it(
 
 
 @pytest.mark.slow
-def test_two_cameras_are_told_apart_in_the_checkpoints_order(tmp_path: Path, seen: list[Observation]) -> None:
+def test_two_cameras_are_told_apart_in_the_checkpoints_order(
+    tmp_path: Path, observations: list[Observation]
+) -> None:
     policy = Groot.load(str(write_groot(tmp_path, cameras=("image", "wrist")))).with_cameras(["image", "wrist"])
-    one = replace(seen[0], cameras={"wrist": seen[0].image[:, ::-1].copy()})
-    (roles,) = policy.roles([one])["bridge"]
+    two_cameras = replace(observations[0], cameras={"wrist": observations[0].image[:, ::-1].copy()})
+    (roles,) = policy.roles([two_cameras])["bridge"]
     counts = [int(roles.mask(f"image.{camera}").sum()) for camera in ("image", "wrist")]
     assert counts[0] == counts[1] > 0
-    assert policy.batch([one])["image_grid_thw"].shape == (2, 3)
-    assert np.isfinite(policy.act([one], [0])).all()
+    assert policy.batch([two_cameras])["image_grid_thw"].shape == (2, 3)
+    assert np.isfinite(policy.act([two_cameras], [0])).all()
 
 
 def test_a_checkpoint_that_reads_a_video_says_that_its_frame_is_repeated(
-    folder: Path, tmp_path: Path, groot: Groot, seen: list[Observation]
+    folder: Path, tmp_path: Path, groot: Groot, observations: list[Observation]
 ) -> None:
     assert not any("video" in note for note in groot.card.notes)
     shutil.copytree(folder / "base", tmp_path, dirs_exist_ok=True)
@@ -470,9 +476,11 @@ def test_a_checkpoint_that_reads_a_video_says_that_its_frame_is_repeated(
     file.write_text(json.dumps(content), encoding="utf-8")
     policy = Groot.load(str(tmp_path), embodiment=TAG)
     assert any("given 2 times" in note for note in policy.card.notes)
-    (roles,) = policy.roles(seen)["backbone"]
-    assert roles.mask("image.image").sum() == 2 * groot.roles(seen)["backbone"][0].mask("image.image").sum()
-    assert np.isfinite(policy.act(seen, [0])).all()
+    (roles,) = policy.roles(observations)["backbone"]
+    assert (
+        roles.mask("image.image").sum() == 2 * groot.roles(observations)["backbone"][0].mask("image.image").sum()
+    )
+    assert np.isfinite(policy.act(observations, [0])).all()
 
 
 def test_units_are_the_quantiles_clamped_and_libero_closes_by_sign(groot: Groot) -> None:
@@ -486,14 +494,14 @@ def test_units_are_the_quantiles_clamped_and_libero_closes_by_sign(groot: Groot)
 
 
 def test_actions_relative_to_the_state_are_captured_and_not_carried_out(
-    tmp_path: Path, seen: list[Observation]
+    tmp_path: Path, observations: list[Observation]
 ) -> None:
     policy = Groot.load(str(write_nvidias(tmp_path, relative=True)), embodiment=TAG)
     assert policy.predicts_relative
     assert "relative to the state" in str(policy.embodiment_mismatch())
     with pytest.raises(CheckpointError, match="relative to the state"):
-        policy.act(seen, [0])
-    assert policy.infer_without_acting(seen, [0]).shape == (1, CHUNK, 7)
+        policy.act(observations, [0])
+    assert policy.infer_without_acting(observations, [0]).shape == (1, CHUNK, 7)
 
 
 @pytest.mark.slow
@@ -504,19 +512,19 @@ def test_the_embodiment_of_nvidias_layout_must_be_chosen_and_be_there(folder: Pa
         Groot.load(str(folder / "base"), embodiment="gr1")
     with pytest.raises(UsageError, match="Leave it out"):
         Groot.load(str(folder), embodiment=TAG)
-    one, other = (Groot.load(str(folder / "base"), embodiment=tag) for tag in (TAG, "other"))
-    observation = examples_for(one, "put the cube on the star")
-    actions = [own.infer_without_acting(observation, [0]) for own in (one, other)]
+    first, other = (Groot.load(str(folder / "base"), embodiment=tag) for tag in (TAG, "other"))
+    observation = examples_for(first, "put the cube on the star")
+    actions = [policy.infer_without_acting(observation, [0]) for policy in (first, other)]
     assert not np.array_equal(*actions)
 
 
 @pytest.mark.parametrize("text", ["", "?!"])
 def test_an_instruction_without_words_is_refused_and_never_replaced(
-    groot: Groot, seen: list[Observation], text: str
+    groot: Groot, observations: list[Observation], text: str
 ) -> None:
     """lerobot would write 'Perform the task.' for an empty one."""
     with pytest.raises(InstructionError, match="no word"):
-        groot.act([replace(seen[0], instruction=text)], [0])
+        groot.act([replace(observations[0], instruction=text)], [0])
     Groot.check_words(str(groot.folder), ["put the cube on the star"])
     with pytest.raises(InstructionError, match="no word"):
         Groot.check_words(str(groot.folder), [text])
@@ -532,18 +540,18 @@ def test_an_instruction_without_words_is_refused_and_never_replaced(
     ],
 )
 def test_files_that_would_change_numbers_in_silence_are_refused(
-    folder: Path, tmp_path: Path, seen: list[Observation], file: str, old: str, new: str, message: str
+    folder: Path, tmp_path: Path, observations: list[Observation], file: str, old: str, new: str, message: str
 ) -> None:
     shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
     text = (tmp_path / file).read_text(encoding="utf-8")
     assert old in text
     (tmp_path / file).write_text(text.replace(old, new), encoding="utf-8")
     with pytest.raises(CheckpointError, match=message):
-        Groot.load(str(tmp_path)).act(seen, [0])
+        Groot.load(str(tmp_path)).act(observations, [0])
 
 
 def test_remote_code_beside_the_language_model_is_never_run(
-    folder: Path, tmp_path: Path, seen: list[Observation]
+    folder: Path, tmp_path: Path, observations: list[Observation]
 ) -> None:
     shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
     vlm = tmp_path / "base" / "vlm"
@@ -552,23 +560,25 @@ def test_remote_code_beside_the_language_model_is_never_run(
         content = json.loads((vlm / name).read_text(encoding="utf-8"))
         entry = ["evil.Thing", None] if kind == "AutoTokenizer" else "evil.Thing"
         (vlm / name).write_text(json.dumps({**content, "auto_map": {kind: entry}}), encoding="utf-8")
-    Groot.load(str(tmp_path)).act(seen, [0])
+    Groot.load(str(tmp_path)).act(observations, [0])
     assert not (tmp_path / "ran").exists()
 
 
 @pytest.mark.parametrize("name", ["action_head.vl_self_attention", "lm_head", "embed_tokens"])
 def test_weights_must_be_whole_but_for_the_output_weights_that_nothing_reads(
-    folder: Path, tmp_path: Path, seen: list[Observation], groot: Groot, name: str
+    folder: Path, tmp_path: Path, observations: list[Observation], groot: Groot, name: str
 ) -> None:
     """lerobot's file holds the tied embeddings under one of their names."""
     shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
     tensors = load_file(tmp_path / "model.safetensors")
-    own = next(own for key, own in tensors.items() if "embed_tokens" in key or "lm_head" in key)
+    embedding = next(tensor for key, tensor in tensors.items() if "embed_tokens" in key or "lm_head" in key)
     both = {"embed_tokens": network_name("model.language_model.embed_tokens"), "lm_head": network_name("lm_head")}
-    tensors |= {key: own.clone() for key in both.values()}
-    save_file({key: own for key, own in tensors.items() if name not in key}, tmp_path / "model.safetensors")
+    tensors |= {key: embedding.clone() for key in both.values()}
+    save_file({key: tensor for key, tensor in tensors.items() if name not in key}, tmp_path / "model.safetensors")
     if name in both:
-        np.testing.assert_array_equal(Groot.load(str(tmp_path)).act(seen, [0]), groot.act(seen, [0]))
+        np.testing.assert_array_equal(
+            Groot.load(str(tmp_path)).act(observations, [0]), groot.act(observations, [0])
+        )
     else:
         with pytest.raises(WeightsError, match="vl_self_attention"):
             Groot.load(str(tmp_path))
@@ -579,9 +589,9 @@ def network_name(name: str) -> str:
 
 
 def test_without_a_bridge_the_expert_reads_the_norm_of_the_backbone(
-    tmp_path: Path, seen: list[Observation]
+    tmp_path: Path, observations: list[Observation]
 ) -> None:
     policy = Groot.load(str(write_nvidias(tmp_path, vl_self_attention_cfg={"num_layers": 0})), embodiment=TAG)
     assert list(policy.streams) == ["backbone", "expert"]
     with capture(policy, policy.sites()):
-        assert np.isfinite(policy.act(seen, [0])).all()
+        assert np.isfinite(policy.act(observations, [0])).all()

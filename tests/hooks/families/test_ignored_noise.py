@@ -53,8 +53,8 @@ def test_noise_that_is_ignored_fails_the_contract(family: str, tmp_path: Path) -
         first, other = (checked(policy).run_row(checked(policy).single[0], seed) for seed in (5, 6))
         assert (first == other).all()  # nothing is drawn, so that there is no noise to ignore
         return
-    for own in (DRAWN, CONSTANT):
-        own(checked(policy))
+    for check in (DRAWN, CONSTANT):
+        check(checked(policy))
     for instead, found_by in IGNORED.values():
         with pytest.raises((CheckFailedError, ProbeKitError), match="seed"):
             found_by(checked(ignoring(policy, instead)))
@@ -65,8 +65,8 @@ def ignoring(policy: Policy, instead: Callable[[Tensor], Tensor]) -> Policy:
     kind: Any = type(policy)
     other: Any = copy(policy)
 
-    def infer(self: Any, *given: Any) -> Any:
-        return kind.infer(self, *given[:-1], instead(given[-1]))
+    def infer(self: Any, *arguments: Any) -> Any:
+        return kind.infer(self, *arguments[:-1], instead(arguments[-1]))
 
     other.__class__ = type("Ignoring", (kind,), {"infer": infer})
     return cast(Policy, other)

@@ -128,9 +128,9 @@ def test_a_picture_that_is_no_whole_patches_is_resized_with_pil_for_qwen_and_not
     by_hand = np.array(Image.fromarray(picture).resize((196, 196), Image.Resampling.BICUBIC))
     np.testing.assert_array_equal(policy.patched_picture(observation), by_hand)
     expected, grid = policy.pictures.patches([by_hand])
-    seen = policy.inputs([observation])
-    assert torch.equal(seen.pixel_values, expected)
-    assert torch.equal(seen.grid, grid)
+    model_inputs = policy.inputs([observation])
+    assert torch.equal(model_inputs.pixel_values, expected)
+    assert torch.equal(model_inputs.grid, grid)
     assert torch.equal(policy.views([observation])[0], dino_pixels(picture, 56))
     assert policy.roles([observation])["backbone"][0].mask("image").sum() == 49
     assert np.isfinite(policy.act([observation], [0])).all()
@@ -190,7 +190,7 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_run_its_folder_of_weights_and_the_file_are_the_same_checkpoint(run_folder: Path) -> None:
     places = (run_folder, run_folder / "checkpoints", run_folder / "checkpoints" / NAME)
-    parts = [find_parts(str(place), None) for place in places]
+    parts = [find_parts(str(path), None) for path in places]
     assert {part.weights for part in parts} == {run_folder / "checkpoints" / NAME}
     assert {part.run for part in parts} == {run_folder}
     assert {part.vlm for part in parts} == {run_folder.parent / "vlm"}
@@ -222,10 +222,10 @@ def test_a_runs_configuration_may_be_json(run_folder: Path, tmp_path: Path, obse
         find_parts(str(copy), None)
     (copy / "aside").rename(copy / "dims.json")
     (copy / "config.json").write_text(json.dumps(values), encoding="utf-8")
-    one, other = (
+    original, other = (
         load_internvla(str(folder), steps=5, unnorm_key="bridge_dataset") for folder in (run_folder, copy)
     )
-    np.testing.assert_array_equal(one.act([observation], [3]), other.act([observation], [3]))
+    np.testing.assert_array_equal(original.act([observation], [3]), other.act([observation], [3]))
     assert f"weights of {NAME}" in other.card.notes
 
 
@@ -233,32 +233,32 @@ def test_of_the_hub_one_step_is_downloaded(
     run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As the hub does it: only files that match a pattern come."""
-    there = Path(shutil.copytree(run_folder, tmp_path / "hub"))
+    hub = Path(shutil.copytree(run_folder, tmp_path / "hub"))
     steps = [f"steps_{number}_pytorch_model.pt" for number in (10000, 30000, 50000)]
     for name in steps:
-        shutil.copy(there / "checkpoints" / NAME, there / "checkpoints" / name)
-    (there / "checkpoints" / NAME).unlink()
-    here = tmp_path / "cache"
+        shutil.copy(hub / "checkpoints" / NAME, hub / "checkpoints" / name)
+    (hub / "checkpoints" / NAME).unlink()
+    cache = tmp_path / "cache"
 
     def download(_name: str, allow_patterns: list[str], **_: object) -> str:
-        files = (file for file in there.rglob("*") if file.is_file())
+        files = (file for file in hub.rglob("*") if file.is_file())
         for file in files:
-            path = file.relative_to(there).as_posix()
+            path = file.relative_to(hub).as_posix()
             if any(fnmatch(path, pattern) for pattern in allow_patterns):
-                (here / path).parent.mkdir(parents=True, exist_ok=True)
-                shutil.copy(file, here / path)
-        return str(here)
+                (cache / path).parent.mkdir(parents=True, exist_ok=True)
+                shutil.copy(file, cache / path)
+        return str(cache)
 
-    listed = [file.relative_to(there).as_posix() for file in there.rglob("*") if file.is_file()]
+    listed = [file.relative_to(hub).as_posix() for file in hub.rglob("*") if file.is_file()]
     monkeypatch.setattr("huggingface_hub.snapshot_download", download)
-    monkeypatch.setattr("huggingface_hub.HfApi.list_repo_files", lambda _, _name, **_further: listed)
+    monkeypatch.setattr("huggingface_hub.HfApi.list_repo_files", lambda _, _name, **_keywords: listed)
     monkeypatch.setattr("probe_kit.hooks.checkpoints.checkpoint.unreachable", lambda: "")
-    assert find_parts("some/run", None, unread=True).weights == here
-    assert not list(here.rglob("*.pt"))
-    assert find_parts("some/run", None).weights == here / "checkpoints" / RELEASED_STEP
-    assert [file.name for file in here.rglob("*.pt")] == [RELEASED_STEP]
+    assert find_parts("some/run", None, unread=True).weights == cache
+    assert not list(cache.rglob("*.pt"))
+    assert find_parts("some/run", None).weights == cache / "checkpoints" / RELEASED_STEP
+    assert [file.name for file in cache.rglob("*.pt")] == [RELEASED_STEP]
     find_parts("some/run", None, steps[0])
-    assert sorted(file.name for file in here.rglob("*.pt")) == sorted([steps[0], RELEASED_STEP])
+    assert sorted(file.name for file in cache.rglob("*.pt")) == sorted([steps[0], RELEASED_STEP])
 
 
 def test_a_vision_language_model_can_be_named_and_has_to_be_one(run_folder: Path, tmp_path: Path) -> None:
@@ -327,11 +327,11 @@ def test_a_converted_folder_is_whole_and_has_the_same_hash_and_actions(
 @pytest.mark.slow
 def test_the_converter_is_a_command(run_folder: Path, tmp_path: Path) -> None:
     command = [sys.executable, "-m", "probe_kit.hooks.families.internvla.checkpoint"]
-    done = subprocess.run(
+    completed = subprocess.run(
         [*command, str(run_folder), str(tmp_path / "out")], capture_output=True, encoding="utf-8", check=False
     )
-    assert done.returncode == 0, done.stderr
-    assert len(done.stdout.strip()) == 64
+    assert completed.returncode == 0, completed.stderr
+    assert len(completed.stdout.strip()) == 64
     refused = subprocess.run(
         [*command, str(tmp_path / "no"), "x"], capture_output=True, encoding="utf-8", check=False
     )
@@ -345,9 +345,9 @@ LOW, HIGH = [-1.0] * 6 + [0.0], [3.0] * 6 + [1.0]
 
 def test_values_are_clipped_and_stretched_and_the_gripper_is_cut_at_a_half() -> None:
     units = ActionUnits.of("x", {"q01": LOW, "q99": HIGH, "mask": [True] * 6 + [False]})
-    given = np.array([[-2, -1, 0, 0.5, 1, 5, 0.5], [0, 0, 0, 0, 0, 0, 0.49]], np.float32)
-    np.testing.assert_allclose(units.restore(given)[0], [-1, -1, 1, 2, 3, 3, 1])
-    np.testing.assert_allclose(units.restore(given)[1, 6], 0)
+    normalised = np.array([[-2, -1, 0, 0.5, 1, 5, 0.5], [0, 0, 0, 0, 0, 0, 0.49]], np.float32)
+    np.testing.assert_allclose(units.restore(normalised)[0], [-1, -1, 1, 2, 3, 3, 1])
+    np.testing.assert_allclose(units.restore(normalised)[1, 6], 0)
 
 
 def test_a_masked_in_gripper_is_stretched_after_it_was_cut() -> None:

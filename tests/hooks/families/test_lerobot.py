@@ -36,7 +36,7 @@ from probe_kit.hooks.families.shared.lerobot.pipelines import (
 from probe_kit.hooks.families.shared.lerobot.policy import TEXT_FILES
 from probe_kit.hooks.families.shared.lerobot.window import PictureWindow, read_window
 from probe_kit.hooks.registry import find_family
-from probe_kit.models.pi0 import PaliGemmaSize, Pi0Size, resized
+from probe_kit.models.pi0 import PaliGemmaSize, Pi0Size, resize_network
 from tests.support.every_checkpoint import WRITERS
 from tests.support.lerobot_pipelines import changed, raw, save_pipelines, without_hub
 from tests.support.molmoact2_checkpoints import write_molmoact2
@@ -172,7 +172,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, patch: pytest.MonkeyPatch) 
     return folder
 
 
-def seen() -> list[Observation]:
+def observations() -> list[Observation]:
     """Two observations with states that lie beyond the quantiles too."""
     rng, texts = np.random.default_rng(0), ("Put_the cube\non the star", "put the cube on the red shape")
     return [
@@ -202,16 +202,16 @@ def test_pi05_acts_as_lerobots_own_loading_processors_and_policy_bit_for_bit(
     modes = {"VISUAL": "IDENTITY", "STATE": mode, "ACTION": mode}
     before, behind = save_pipelines(folder, normalization_mapping=modes, dtype=dtype)
     every = Pi05.load(str(folder))
-    with resized(modeling_pi05, Pi0Size.from_file(folder / "dims.json"), every.config):
+    with resize_network(modeling_pi05, Pi0Size.from_file(folder / "dims.json"), every.config):
         theirs = modeling_pi05.PI05Policy.from_pretrained(folder).eval()
-    for shown in (CAMERAS, CAMERAS[:1]):
-        ours = every.with_cameras(shown)
-        for seed, one in enumerate(seen()):
-            pictures = {"base": one.image, **one.cameras}
-            packed = before(raw(one, {name: pictures[name] for name in shown}))
+    for cameras in (CAMERAS, CAMERAS[:1]):
+        ours = every.with_cameras(cameras)
+        for seed, observation in enumerate(observations()):
+            pictures = {"base": observation.image, **observation.cameras}
+            packed = before(raw(observation, {name: pictures[name] for name in cameras}))
             chunk = theirs.predict_action_chunk(packed, noise=ours.noise([seed]))
-            metres = torch.stack([behind(own) for own in chunk.float().unbind(1)], 1)
-            np.testing.assert_array_equal(ours.act([one], [seed]), metres.numpy())
+            metres = torch.stack([behind(action) for action in chunk.float().unbind(1)], 1)
+            np.testing.assert_array_equal(ours.act([observation], [seed]), metres.numpy())
 
 
 def test_pi0_fast_acts_as_lerobots_own_select_action(
@@ -239,15 +239,17 @@ def _fast_acts_as_lerobot(folder: Path, patch: pytest.MonkeyPatch) -> Any:
     without_hub(folder, patch)
     before, behind = save_pipelines(folder)
     ours, fast = Pi0Fast.load(str(folder)), fast_processor(folder / "fast")
-    for name, own in (("AutoTokenizer", ours.tokenizer), ("AutoProcessor", fast)):
-        patch.setattr(modeling_pi0_fast, name, SimpleNamespace(from_pretrained=lambda *_, own=own, **__: own))
-    with resized(modeling_pi0_fast, PaliGemmaSize.from_file(folder / "dims.json"), ours.config):
+    for name, component in (("AutoTokenizer", ours.tokenizer), ("AutoProcessor", fast)):
+        patch.setattr(
+            modeling_pi0_fast, name, SimpleNamespace(from_pretrained=lambda *_, returned=component, **__: returned)
+        )
+    with resize_network(modeling_pi0_fast, PaliGemmaSize.from_file(folder / "dims.json"), ours.config):
         theirs = modeling_pi0_fast.PI0FastPolicy.from_pretrained(folder).eval()
-    for one in seen():
-        packed = before(raw(one, {"base": one.image}))
+    for observation in observations():
+        packed = before(raw(observation, {"base": observation.image}))
         theirs.reset()
         actions = [behind(theirs.select_action(packed)).numpy() for _ in range(4)]
-        np.testing.assert_array_equal(ours.act([one], [0]), np.stack(actions, 1))
+        np.testing.assert_array_equal(ours.act([observation], [0]), np.stack(actions, 1))
     return ours
 
 
@@ -283,11 +285,11 @@ def test_an_unknown_step_behind_the_policy_forbids_to_act_and_not_to_capture(fol
     _inserted(content["steps"])
     path.write_text(json.dumps(content), encoding="utf-8")
     policy = Pi05.load(str(folder))
-    seen = examples_for(policy, "put the cube on the star")
+    examples = examples_for(policy, "put the cube on the star")
     with pytest.raises(CheckpointError, match="vla_jepa_binarize_gripper"):
-        policy.act(seen, [0])
+        policy.act(examples, [0])
     assert "vla_jepa_binarize_gripper" in str(policy.embodiment_mismatch())
-    assert policy.infer_without_acting(seen, [0]).shape == (1, 4, 7)
+    assert policy.infer_without_acting(examples, [0]).shape == (1, 4, 7)
 
 
 def test_pictures_that_lerobot_would_normalise_are_refused(folder: Path) -> None:
@@ -312,17 +314,17 @@ def test_changes_relative_to_the_state_are_no_actions_of_this_arm(folder: Path, 
     save_pipelines(folder, use_relative_actions=False)  # what was read at loading counts
     assert policy.predicts_relative
     assert any("relative to the state" in note for note in policy.card.notes)
-    (one,) = examples_for(policy, "put the cube on the star")
+    (example,) = examples_for(policy, "put the cube on the star")
     with pytest.raises(CheckpointError, match="relative to the state"):
-        policy.act([one], [0])
+        policy.act([example], [0])
 
 
 def test_the_length_of_the_text_is_that_of_the_saved_step(folder: Path) -> None:
     save_pipelines(folder, changed("tokenizer_processor", max_length=20))
     policy = Pi05.load(str(folder))
-    (one,) = examples_for(policy, "put the cube on the star")
+    (example,) = examples_for(policy, "put the cube on the star")
     with pytest.raises(InstructionError, match="this checkpoint reads 20"):
-        policy.act([one], [0])
+        policy.act([example], [0])
 
 
 @pytest.mark.parametrize("numbers", [1, 5])
@@ -331,7 +333,9 @@ def test_statistics_of_another_width_are_no_units(folder: Path, numbers: int) ->
     save_pipelines(folder)
     (file,) = folder.glob("policy_postprocessor_*.safetensors")
     tensors = load_file(file)
-    save_file({name: own[:numbers] if name.startswith("action") else own for name, own in tensors.items()}, file)
+    save_file(
+        {name: tensor[:numbers] if name.startswith("action") else tensor for name, tensor in tensors.items()}, file
+    )
     assert f"statistics of shape ({numbers},)" in str(Pi05.load(str(folder)).embodiment_mismatch())
 
 
@@ -358,7 +362,10 @@ def test_an_unknown_field_of_any_step_is_refused_by_name_in_every_family(family:
     steps = steps_of(folder) or [{"registry_name": "device_processor", "config": {"device": "cpu"}}]
     for step in steps:
         changed = [
-            {**own, "config": {**own.get("config", {}), "blur": 2}} if own is step else own for own in steps
+            {**saved_step, "config": {**saved_step.get("config", {}), "blur": 2}}
+            if saved_step is step
+            else saved_step
+            for saved_step in steps
         ]
         write_steps(folder, changed)
         with pytest.raises(CheckpointError, match=f"'{step['registry_name']}' has the field blur: 2"):
@@ -368,10 +375,10 @@ def test_an_unknown_field_of_any_step_is_refused_by_name_in_every_family(family:
 def test_a_prompt_without_the_state_is_refused(tmp_path: Path) -> None:
     folder = write_pi05(tmp_path / "checkpoint")
     name = "pi05_prepare_state_tokenizer_processor_step"
-    others = [step for step in steps_of(folder) if step["registry_name"] != name]
+    other_steps = [step for step in steps_of(folder) if step["registry_name"] != name]
     for value in (True, False):
         step = {"registry_name": name, "config": {"max_state_dim": 32, "include_state_in_prompt": value}}
-        write_steps(folder, [*others, step])
+        write_steps(folder, [*other_steps, step])
         if value:
             load_policy("pi05", str(folder))
     with pytest.raises(CheckpointError, match=r"include_state_in_prompt: False.*Supported is True"):
@@ -570,9 +577,9 @@ def test_a_broken_step_names_the_file(tmp_path: Path) -> None:
 
 def test_a_smaller_picture_is_brought_to_the_size_the_crop_was_chosen_on() -> None:
     window = PictureWindow(crop=(10, 0, 20, 40), size=(20, 40), camera=(40, 40))
-    whole = torch.linspace(0, 1, 40).expand(1, 3, 40, 40)
-    halved = torch.nn.functional.interpolate(whole, (20, 20), mode="area")
-    assert (window(halved) - window(whole)).abs().max() < 0.02
+    picture = torch.linspace(0, 1, 40).expand(1, 3, 40, 40)
+    halved = torch.nn.functional.interpolate(picture, (20, 20), mode="area")
+    assert (window(halved) - window(picture)).abs().max() < 0.02
     wide = window(torch.ones(1, 3, 10, 40))
     assert float(wide[..., 0, :].max()) == 0.0, "padding is black"
     assert float(wide[..., 10, :].min()) == pytest.approx(1.0)

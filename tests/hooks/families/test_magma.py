@@ -51,11 +51,11 @@ def unsteered(tmp_path_factory: pytest.TempPathFactory) -> Magma:
 
 
 def test_seven_action_tokens_and_the_end_of_the_turn_make_an_action(loaded: Magma) -> None:
-    seen = example_observations(INSTRUCTIONS)
-    actions = loaded.act(seen, [0, 1])
+    observations = example_observations(INSTRUCTIONS)
+    actions = loaded.act(observations, [0, 1])
     assert not loaded.flagged.any()
-    prompts = [loaded.prompt(one.instruction).ids for one in seen]
-    ids = loaded.generate(prompts, [loaded.picture(one.image) for one in seen]).ids.numpy()
+    prompts = [loaded.prompt(observation.instruction).ids for observation in observations]
+    ids = loaded.generate(prompts, [loaded.picture(observation.image) for observation in observations]).ids.numpy()
     low, high = loaded.statistics.low, loaded.statistics.high
     centres = (np.linspace(-1, 1, 256)[:-1] + np.linspace(-1, 1, 256)[1:]) / 2
     values = centres[np.clip(512 - ids - 1, 0, 254)]
@@ -69,9 +69,9 @@ def test_seven_action_tokens_and_the_end_of_the_turn_make_an_action(loaded: Magm
 def test_a_row_without_an_action_is_flagged_and_holds_still(
     unsteered: Magma, openness: float, gripper: float
 ) -> None:
-    seen = example_observations(INSTRUCTIONS[:1])[0]
-    state = np.array([*seen.state[:7], openness], np.float32)
-    action = unsteered.act([Observation(seen.image, state, seen.instruction)], [0])[0, 0]
+    observation = example_observations(INSTRUCTIONS[:1])[0]
+    state = np.array([*observation.state[:7], openness], np.float32)
+    action = unsteered.act([Observation(observation.image, state, observation.instruction)], [0])[0, 0]
     assert unsteered.flagged.tolist() == [True]
     np.testing.assert_array_equal(action, [0, 0, 0, 0, 0, 0, gripper])
 
@@ -83,23 +83,23 @@ def test_seven_action_tokens_that_the_turn_does_not_end_behind_are_flagged(tmp_p
     network.language_model.lm_head.weight[IDS["<|eot_id|>"], 7] = -16
     network.language_model.lm_head.weight[300] = end
     policy = load_magma(str(write_checkpoint(tmp_path, tensors=weights(network))), unnorm_key="bridge_orig")
-    seen = example_observations(INSTRUCTIONS)
-    assert np.abs(policy.act(seen, [0, 1])[:, 0, :6]).max() == 0
+    observations = example_observations(INSTRUCTIONS)
+    assert np.abs(policy.act(observations, [0, 1])[:, 0, :6]).max() == 0
     assert policy.flagged.all()
 
 
 def test_flags_belong_to_their_row(loaded: Magma, monkeypatch: pytest.MonkeyPatch) -> None:
-    seen = example_observations(INSTRUCTIONS)
+    observations = example_observations(INSTRUCTIONS)
     is_action = loaded.action_tokens.__class__.is_action
 
     def second_is_text(self: object, ids: np.ndarray) -> np.ndarray:
         return is_action(self, ids) & (np.arange(len(ids)) != 1)[:, None]
 
-    whole = loaded.act(seen, [0, 1])
+    unflagged = loaded.act(observations, [0, 1])
     monkeypatch.setattr(loaded.action_tokens.__class__, "is_action", second_is_text)
-    flagged = loaded.act(seen, [0, 1])
+    flagged = loaded.act(observations, [0, 1])
     assert loaded.flagged.tolist() == [False, True]
-    np.testing.assert_array_equal(flagged[0], whole[0])
+    np.testing.assert_array_equal(flagged[0], unflagged[0])
     assert np.abs(flagged[1, 0, :6]).max() == 0
 
 
@@ -108,18 +108,20 @@ def test_what_is_generated_behind_the_action_fires_no_tap(loaded: Magma) -> None
     with capture(loaded, loaded.sites()) as activations:
         loaded.act(example_observations(INSTRUCTIONS), [0, 1])
     assert set(activations.fires.values()) == {7}
-    own, twin = loaded.network.language_model, loaded.network.unhooked()
-    assert all(a.data_ptr() == b.data_ptr() for a, b in zip(own.parameters(), twin.parameters(), strict=True))
+    language_model, twin = loaded.network.language_model, loaded.network.unhooked()
+    assert all(
+        a.data_ptr() == b.data_ptr() for a, b in zip(language_model.parameters(), twin.parameters(), strict=True)
+    )
 
 
 def test_temperature_changes_actions_by_seed_alone(folder: Path) -> None:
-    policy, seen = (
+    policy, observations = (
         load_magma(str(folder), temperature=5.0, unnorm_key="bridge_orig"),
         example_observations(INSTRUCTIONS[:1]),
     )
-    drawn = {policy.act(seen, [seed]).tobytes() for seed in range(6)}
+    drawn = {policy.act(observations, [seed]).tobytes() for seed in range(6)}
     assert len(drawn) > 1
-    assert policy.act(seen, [3]).tobytes() == policy.act(seen, [3]).tobytes()
+    assert policy.act(observations, [3]).tobytes() == policy.act(observations, [3]).tobytes()
 
 
 def test_statistics_of_other_than_seven_dimensions_do_not_act(folder: Path, tmp_path: Path) -> None:
@@ -134,15 +136,15 @@ def test_statistics_of_other_than_seven_dimensions_do_not_act(folder: Path, tmp_
 
 
 def test_the_token_count_comes_from_the_pictures_size(folder: Path) -> None:
-    seen = example_observations(INSTRUCTIONS[:1])[0]
-    wide = Observation(np.tile(seen.image, (1, 3, 1)), seen.state, seen.instruction)
+    small = example_observations(INSTRUCTIONS[:1])[0]
+    wide = Observation(np.tile(small.image, (1, 3, 1)), small.state, small.instruction)
     counts = {}
     for shrink in (0, 64):
         policy = load_magma(str(folder), shrink=shrink, unnorm_key="bridge_orig")
-        for name, one in (("small", seen), ("wide", wide)):
+        for name, observation in (("small", small), ("wide", wide)):
             with capture(policy, [Site("backbone", 0)]) as activations:
-                policy.act([one], [0])
-            roles = policy.roles([one])["backbone"][0]
+                policy.act([observation], [0])
+            roles = policy.roles([observation])["backbone"][0]
             assert len(roles) == activations[Site("backbone", 0)].shape[1]
             counts[shrink, name] = int(roles.mask("image").sum()), int(roles.mask("separator").sum())
     assert counts[0, "small"] == counts[64, "small"] == counts[64, "wide"] == (4, 2)
@@ -151,25 +153,25 @@ def test_the_token_count_comes_from_the_pictures_size(folder: Path) -> None:
 
 def test_roles_point_at_what_they_name(loaded: Magma) -> None:
     """Compared with the embeddings themselves."""
-    one = example_observations(INSTRUCTIONS[:1])[0]
+    observation = example_observations(INSTRUCTIONS[:1])[0]
     with capture(loaded, [Site("backbone", 0)]) as activations:
-        loaded.act([one], [0])
-    tokens, roles = activations[Site("backbone", 0)][0], loaded.roles([one])["backbone"][0]
+        loaded.act([observation], [0])
+    tokens, roles = activations[Site("backbone", 0)][0], loaded.roles([observation])["backbone"][0]
     separator = loaded.network.multi_modal_projector.row_seperator[0, 0]
     assert torch.equal(tokens[roles.mask("separator")], separator.expand(int(roles.mask("separator").sum()), -1))
-    picture = loaded.network.look([loaded.picture(one.image)])[0]
+    picture = loaded.network.look([loaded.picture(observation.image)])[0]
     assert torch.equal(tokens[roles.mask("image") | roles.mask("separator")], picture)
-    asked = loaded.network.language_model.model.embed_tokens.weight
-    words = [int((asked == token).all(dim=1).nonzero()[0, 0]) for token in tokens[roles.mask("language")]]
+    embeddings = loaded.network.language_model.model.embed_tokens.weight
+    words = [int((embeddings == token).all(dim=1).nonzero()[0, 0]) for token in tokens[roles.mask("language")]]
     assert loaded.text.decode(words) == "What action should the robot take to Put the cube on the star?"
 
 
 def test_what_does_not_fit_is_refused_whole(loaded: Magma) -> None:
-    seen = example_observations(["Put the cube on the " + "very " * 300 + "red shape"])
+    observations = example_observations(["Put the cube on the " + "very " * 300 + "red shape"])
     with pytest.raises(InstructionError, match="this model has 1024"):
-        loaded.act(seen, [0])
+        loaded.act(observations, [0])
     with pytest.raises(ObservationError, match="uint8"):
-        loaded.act([Observation(np.zeros((4, 4)), seen[0].state, "go")], [0])
+        loaded.act([Observation(np.zeros((4, 4)), observations[0].state, "go")], [0])
 
 
 @pytest.mark.parametrize(
@@ -188,10 +190,10 @@ def test_every_stage_of_the_trunk_is_a_stream_of_its_own_width(loaded: Magma) ->
     widths = {name: (stream.layers, stream.width) for name, stream in loaded.further_streams.items()}
     assert widths == {"vision_0": (2, 8), "vision_1": (2, 16), "vision_2": (3, 24), "vision_3": (2, 32)}
     sites = [site for stream in loaded.further_streams.values() for site in stream.sites()]
-    one = example_observations(INSTRUCTIONS[:1])[0]
+    observation = example_observations(INSTRUCTIONS[:1])[0]
     with capture(loaded, sites) as activations:
-        loaded.act([one], [0])
-    crops = loaded.picture(one.image).crops
+        loaded.act([observation], [0])
+    crops = loaded.picture(observation.image).crops
     maps = loaded.network.vision_tower.stem(crops)
     for number, stage in enumerate(loaded.network.vision_tower.stages):
         maps = stage(maps)
@@ -204,15 +206,15 @@ def test_every_stage_of_the_trunk_is_a_stream_of_its_own_width(loaded: Magma) ->
 
 
 def questions(count: int = 2) -> list[Prompt]:
-    seen = example_observations([""] * count)
+    observations = example_observations([""] * count)
     texts = ["Is the star left (A) or right (B)?", "Do you see a square? A: yes, B: no"]
-    return [Prompt(one, text, ("A", "B")) for one, text in zip(seen, texts, strict=False)]
+    return [Prompt(observation, text, ("A", "B")) for observation, text in zip(observations, texts, strict=False)]
 
 
 def test_options_are_compared_by_the_logits_behind_the_prompt(unsteered: Magma) -> None:
-    asked = questions()
-    reading = unsteered.read(asked)
-    for row, question in enumerate(asked):
+    prompts = questions()
+    reading = unsteered.read(prompts)
+    for row, question in enumerate(prompts):
         ids = unsteered.text.prompt(question.text).ids
         with torch.inference_mode():
             logits = unsteered.network([ids], [unsteered.picture(question.observation.image)]).logits[0, -1]
@@ -223,25 +225,25 @@ def test_options_are_compared_by_the_logits_behind_the_prompt(unsteered: Magma) 
 
 
 def test_speaking_goes_on_greedily_and_can_be_asked_again(unsteered: Magma) -> None:
-    asked = questions()
-    reading = unsteered.read(asked)
+    prompts = questions()
+    reading = unsteered.read(prompts)
     long, short, again = (unsteered.speak(reading, tokens) for tokens in (12, 3, 12))
     assert long == again
     assert unsteered.speak(reading, 0) == ["", ""]
-    for row, question in enumerate(asked):
+    for row, question in enumerate(prompts):
         ids = unsteered.text.prompt(question.text).ids
         picture = [unsteered.picture(question.observation.image)]
         with torch.inference_mode():
-            whole = unsteered.network.decode([ids], picture, steps=12).ids[0].tolist()
-        assert long[row] == unsteered.text.decode(whole)
-        assert short[row] == unsteered.text.decode(whole[:3])
+            generated = unsteered.network.decode([ids], picture, steps=12).ids[0].tolist()
+        assert long[row] == unsteered.text.decode(generated)
+        assert short[row] == unsteered.text.decode(generated[:3])
 
 
 def test_being_asked_is_one_inference_and_speaking_is_none(unsteered: Magma) -> None:
-    asked = questions()
-    plain = unsteered.read(asked)
+    prompts = questions()
+    plain = unsteered.read(prompts)
     with capture(unsteered, unsteered.sites()) as activations:
-        reading = unsteered.read(asked)
+        reading = unsteered.read(prompts)
         unsteered.speak(reading, 12)
     assert set(activations.fires.values()) == {7}
     np.testing.assert_array_equal(plain.option_logits, reading.option_logits)
@@ -338,12 +340,14 @@ def test_the_actions_of_a_file_do_not_depend_on_how_it_names_its_layer_scales(
         write_checkpoint(tmp_path / name, tensors=stored)
         for name, stored in (("gamma", tensors), ("weight", renamed(tensors)))
     ]
-    seen = [observation] * 2
-    one, other = (
-        load_magma(str(folder), prompt="act2answer", temperature=0.7, unnorm_key="bridge_orig").act(seen, [1, 2])
+    observations = [observation] * 2
+    first, other = (
+        load_magma(str(folder), prompt="act2answer", temperature=0.7, unnorm_key="bridge_orig").act(
+            observations, [1, 2]
+        )
         for folder in folders
     )
-    np.testing.assert_array_equal(one, other)
+    np.testing.assert_array_equal(first, other)
 
 
 def test_a_layer_scale_under_both_names_is_damage(tmp_path: Path) -> None:
@@ -463,8 +467,8 @@ def text(text_folder: Path, **options: bool) -> ChatText:
 def test_the_question_is_told_from_the_frames_around_it(text_folder: Path) -> None:
     spoken = text(text_folder)
     prompt = spoken.prompt("Where is the star?")
-    asked = [number for number, inside in zip(prompt.ids, prompt.question, strict=True) if inside]
-    assert spoken.decode(asked) == "Where is the star?"
+    question_ids = [number for number, inside in zip(prompt.ids, prompt.question, strict=True) if inside]
+    assert spoken.decode(question_ids) == "Where is the star?"
     frames = [number for number, inside in zip(prompt.ids, prompt.question, strict=True) if not inside]
     assert IDS["<image>"] in frames
     assert "talk and act" in spoken.decode(frames[: frames.index(IDS["<|eot_id|>"])])
@@ -477,8 +481,8 @@ def test_a_question_whose_words_stand_in_the_frames_too_is_found(
 ) -> None:
     spoken = text(text_folder, user_first=user_first)
     prompt = spoken.prompt(question)
-    places = [place for place, inside in enumerate(prompt.question) if inside]
-    assert spoken.decode([prompt.ids[place] for place in places]) == question
+    places = [position for position, inside in enumerate(prompt.question) if inside]
+    assert spoken.decode([prompt.ids[position] for position in places]) == question
     assert places == list(range(places[0], places[-1] + 1))
     assert places[0] > prompt.ids.index(IDS["<image>"])
 

@@ -34,18 +34,18 @@ def molmoact2(folder: Path) -> MolmoAct2:
 
 
 @pytest.fixture
-def seen(molmoact2: MolmoAct2) -> list[Observation]:
+def observations(molmoact2: MolmoAct2) -> list[Observation]:
     return examples_for(molmoact2, "Put the cube on the star", "Put the cube on the red shape")
 
 
 @pytest.mark.parametrize("dtype", ["float32", pytest.param("bfloat16", marks=pytest.mark.slow)])
 def test_actions_are_those_of_lerobots_own_policy_bit_for_bit(
-    folder: Path, seen: list[Observation], dtype: str
+    folder: Path, observations: list[Observation], dtype: str
 ) -> None:
     """Its own sampling, with its own blocks, draws the noise of the same seed."""
-    policy, place = MolmoAct2.load(str(folder), dtype=dtype), folder / "vlm"
-    batch = policy.batch(seen[:1])
-    plain = network.lerobots_policy(policy.config, network.network_config(place), place)
+    policy, checkpoint = MolmoAct2.load(str(folder), dtype=dtype), folder / "vlm"
+    batch = policy.batch(observations[:1])
+    plain = network.lerobots_policy(policy.config, network.network_config(checkpoint), checkpoint)
     assert not hasattr(plain._backbone().action_expert.blocks[0], "mlp_gate")
     plain.load_state_dict(policy.network.state_dict())
     drawn = torch.randn((1, 4, 32), generator=torch.Generator().manual_seed(5), dtype=network.DTYPES[dtype])
@@ -81,31 +81,33 @@ def _without_clamps(steps: list[dict[str, Any]]) -> None:
     ],
 )  # fmt: skip
 def test_actions_are_those_of_lerobots_saved_pipelines_and_policy(
-    tmp_path: Path, seen: list[Observation], fields: dict[str, Any], change: Any
+    tmp_path: Path, observations: list[Observation], fields: dict[str, Any], change: Any
 ) -> None:
     """From the raw pictures and state to metres: what the saved steps say counts, not the configuration."""
     write_molmoact2(tmp_path, cameras=("image", "wrist"))
-    place = str(tmp_path / "vlm")  # the other action mode reads a FAST tokenizer on the hub
-    before, behind = save_pipelines(tmp_path, change, action_mode="continuous", checkpoint_path=place, **fields)
+    checkpoint = str(tmp_path / "vlm")  # the other action mode reads a FAST tokenizer on the hub
+    before, behind = save_pipelines(
+        tmp_path, change, action_mode="continuous", checkpoint_path=checkpoint, **fields
+    )
     ours = MolmoAct2.load(str(tmp_path))
     ours = ours.with_cameras(ours.cameras)
-    theirs = network.lerobots_policy(copy(ours.config), network.network_config(Path(place)), Path(place))
+    theirs = network.lerobots_policy(copy(ours.config), network.network_config(Path(checkpoint)), Path(checkpoint))
     theirs.load_state_dict(load_file(tmp_path / "model.safetensors"))
     states = np.array([LOW + 0.3 * (HIGH - LOW), LOW - 0.1 * (HIGH - LOW)], np.float32)
     states[:, 7] = np.abs(states[:, 7])
-    for seed, (one, state) in enumerate(zip(seen, states, strict=True)):
-        pictures = {"image": one.image, "wrist": one.image[:, ::-1].copy()}
-        packed = before(raw(replace(one, state=state), pictures))
+    for seed, (observation, state) in enumerate(zip(observations, states, strict=True)):
+        pictures = {"image": observation.image, "wrist": observation.image[:, ::-1].copy()}
+        packed = before(raw(replace(observation, state=state), pictures))
         first, second = ours.cameras
-        given = replace(one, state=state, image=pictures[first], cameras={second: pictures[second]})
+        rearranged = replace(observation, state=state, image=pictures[first], cameras={second: pictures[second]})
         for name in ("input_ids", "pixel_values"):
-            torch.testing.assert_close(ours.batch([given])[name], packed[name], rtol=0, atol=0)
+            torch.testing.assert_close(ours.batch([rearranged])[name], packed[name], rtol=0, atol=0)
         metres = behind(theirs.predict_action_chunk(packed, generator=torch.Generator().manual_seed(seed)))
-        np.testing.assert_allclose(ours.act([given], [seed]), metres.numpy(), atol=1e-6)
+        np.testing.assert_allclose(ours.act([rearranged], [seed]), metres.numpy(), atol=1e-6)
 
 
 def test_a_gripper_that_stays_as_it_is_must_lie_between_its_bounds(
-    tmp_path: Path, seen: list[Observation]
+    tmp_path: Path, observations: list[Observation]
 ) -> None:
     """lerobot refuses it too."""
     write_molmoact2(tmp_path)
@@ -114,7 +116,7 @@ def test_a_gripper_that_stays_as_it_is_must_lie_between_its_bounds(
     policy = MolmoAct2.load(str(tmp_path))
     state = np.array([0.3, 0, 0.1, 0, 0, 0, 0, 1.5], np.float32)
     with pytest.raises(ObservationError, match=r"number 7 of the state is 1\.5"):
-        policy.act([replace(seen[0], state=state)], [0])
+        policy.act([replace(observations[0], state=state)], [0])
 
 
 @pytest.mark.parametrize(
@@ -142,18 +144,18 @@ def test_pipelines_that_say_something_else_are_refused(
         MolmoAct2.load(str(tmp_path))
 
 
-def test_cuda_graphs_are_off_and_an_error_while_they_are_on(folder: Path, seen: list[Observation]) -> None:
+def test_cuda_graphs_are_off_and_an_error_while_they_are_on(folder: Path, observations: list[Observation]) -> None:
     policy = MolmoAct2.load(str(folder))
     assert not network.uses_cuda_graphs(policy.network)
     policy.network._set_inference_cuda_graph_enabled(True)
     with pytest.raises(CaptureError, match="CUDA graphs"), capture(policy, policy.sites()):
-        policy.act(seen, [0, 0])
+        policy.act(observations, [0, 0])
     with pytest.raises(CaptureError, match="CUDA graphs"):
-        policy.act(seen, [0, 0])
+        policy.act(observations, [0, 0])
 
 
 def test_every_block_of_the_expert_reads_the_keys_and_values_of_its_own_layer(
-    molmoact2: MolmoAct2, seen: list[Observation]
+    molmoact2: MolmoAct2, observations: list[Observation]
 ) -> None:
     """Zeros in block n's change what block n of the expert reads, and nothing that enters it."""
     from probe_kit.hooks import Site, edit
@@ -161,32 +163,32 @@ def test_every_block_of_the_expert_reads_the_keys_and_values_of_its_own_layer(
     read = [Site("expert", layer, "cross_attention", 0) for layer in range(2)]
     entering = [Site("expert", layer, iteration=0) for layer in range(3)]
     with capture(molmoact2, [*read, *entering]) as plain:
-        molmoact2.act(seen, [0, 0])
+        molmoact2.act(observations, [0, 0])
     for layer in range(2):
         with (
             edit(molmoact2, {Site("kv", layer, "values"): torch.zeros_like}),
             capture(molmoact2, [*read, *entering]) as changed,
         ):
-            molmoact2.act(seen, [0, 0])
+            molmoact2.act(observations, [0, 0])
         assert torch.equal(plain[entering[layer]], changed[entering[layer]])
         assert not torch.equal(plain[read[layer]], changed[read[layer]])
 
 
 def test_recorded_attention_on_the_values_is_what_the_block_reads(
-    molmoact2: MolmoAct2, seen: list[Observation]
+    molmoact2: MolmoAct2, observations: list[Observation]
 ) -> None:
     """Weights times values, projected, is the block's cross-attention, which a fused kernel computes."""
     recorded: dict[tuple[int, int], torch.Tensor] = {}
     read: list[torch.Tensor] = []
     attention = molmoact2.network._backbone().action_expert.blocks[1].cross_attn
     handle = attention.register_forward_hook(
-        lambda _, __, given, output: (read.append(output), values.append(given["kv_v"]), None)[-1],
+        lambda _, __, keywords, output: (read.append(output), values.append(keywords["kv_v"]), None)[-1],
         with_kwargs=True,
     )
     values: list[torch.Tensor] = []
     try:
-        with molmoact2.record_attention(lambda *own: recorded.update({own[:2]: own[2]})):
-            molmoact2.act(seen, [0, 1])
+        with molmoact2.record_attention(lambda *record: recorded.update({record[:2]: record[2]})):
+            molmoact2.act(observations, [0, 1])
     finally:
         handle.remove()
     assert recorded.keys() == {(block, step) for block in range(2) for step in range(3)}
@@ -194,19 +196,19 @@ def test_recorded_attention_on_the_values_is_what_the_block_reads(
         heads = recorded[1, step] @ attention._as_heads(values[step]).transpose(1, 2)
         ours = attention.out_proj(heads.transpose(1, 2).flatten(2))
         torch.testing.assert_close(ours, read[step], rtol=0, atol=1e-5)
-    (roles,) = molmoact2.roles(seen[1:])["backbone"]
+    (roles,) = molmoact2.roles(observations[1:])["backbone"]
     assert recorded[1, 0].shape[-1] >= len(roles)
     padded = recorded[1, 0][1, :, :, len(roles) :]
     assert not padded.any()
 
 
 def test_what_a_block_adds_makes_the_next_residual_with_both_attentions(
-    molmoact2: MolmoAct2, seen: list[Observation]
+    molmoact2: MolmoAct2, observations: list[Observation]
 ) -> None:
     stream = molmoact2.streams["expert"]
     parts = [site for name in ("residual", "attention", "cross_attention", "mlp") for site in stream.sites(name)]
     with capture(molmoact2, parts) as cache:
-        molmoact2.act(seen, [0, 0])
+        molmoact2.act(observations, [0, 0])
     for site in stream.sites("mlp"):
         added = sum(
             cache[replace(site, quantity=name)] for name in ("residual", "attention", "cross_attention", "mlp")
@@ -215,8 +217,10 @@ def test_what_a_block_adds_makes_the_next_residual_with_both_attentions(
         torch.testing.assert_close(added, behind, rtol=0, atol=1e-5)
 
 
-def test_roles_name_pictures_instruction_and_state(molmoact2: MolmoAct2, seen: list[Observation]) -> None:
-    row = molmoact2.packing.row({"image": seen[0].image}, "Put the cube on the star", np.zeros(8, np.float32))
+def test_roles_name_pictures_instruction_and_state(molmoact2: MolmoAct2, observations: list[Observation]) -> None:
+    row = molmoact2.packing.row(
+        {"image": observations[0].image}, "Put the cube on the star", np.zeros(8, np.float32)
+    )
     pieces = molmoact2.tokenizer.convert_ids_to_tokens(row.inputs["input_ids"][0].tolist())
     by_role = {role: "".join(piece for piece, label in zip(pieces, row.labels, strict=True) if label == role)
                for role in ("language", "state", "image.image")}  # fmt: skip
@@ -229,12 +233,12 @@ def test_two_cameras_are_told_apart(tmp_path: Path) -> None:
     policy = MolmoAct2.load(str(write_molmoact2(tmp_path, cameras=("image", "wrist")))).with_cameras(
         ["image", "wrist"]
     )
-    (one,) = examples_for(policy, "put the cube on the star")
-    one = replace(one, cameras={"wrist": one.image[:, ::-1].copy()})
-    (roles,) = policy.roles([one])["backbone"]
+    (example,) = examples_for(policy, "put the cube on the star")
+    example = replace(example, cameras={"wrist": example.image[:, ::-1].copy()})
+    (roles,) = policy.roles([example])["backbone"]
     counts = [int(roles.mask(f"image.{camera}").sum()) for camera in ("image", "wrist")]
     assert counts[0] == counts[1] > 0
-    assert np.isfinite(policy.act([one], [0])).all()
+    assert np.isfinite(policy.act([example], [0])).all()
 
 
 @pytest.mark.parametrize(("field", "value"), [("action_mode", "discrete"), ("enable_lora_vlm", True)])
@@ -253,18 +257,21 @@ def test_weights_without_an_expert_are_refused(folder: Path, tmp_path: Path) -> 
     shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
     tensors = load_file(tmp_path / "model.safetensors")
     save_file(
-        {name: own for name, own in tensors.items() if "action_expert" not in name}, tmp_path / "model.safetensors"
+        {name: tensor for name, tensor in tensors.items() if "action_expert" not in name},
+        tmp_path / "model.safetensors",
     )
     with pytest.raises(WeightsError, match="action_expert"):
         MolmoAct2.load(str(tmp_path))
 
 
-def test_half_precision_acts_as_captured_and_is_named_in_the_card(folder: Path, seen: list[Observation]) -> None:
+def test_half_precision_acts_as_captured_and_is_named_in_the_card(
+    folder: Path, observations: list[Observation]
+) -> None:
     policy = MolmoAct2.load(str(folder), dtype="bfloat16")
     assert policy.card.dtype == "bfloat16"
-    plain = policy.act(seen, [0, 1])
+    plain = policy.act(observations, [0, 1])
     with capture(policy, policy.sites()) as cache:
-        np.testing.assert_array_equal(policy.act(seen, [0, 1]), plain)
+        np.testing.assert_array_equal(policy.act(observations, [0, 1]), plain)
     assert cache["backbone.01.residual"].dtype == torch.bfloat16
-    full = MolmoAct2.load(str(folder)).act(seen, [0, 1])
+    full = MolmoAct2.load(str(folder)).act(observations, [0, 1])
     np.testing.assert_allclose(plain, full, atol=0.05 * np.abs(full).max())

@@ -50,10 +50,10 @@ def test_masked_dimensions_stay_as_decoded_and_others_span_their_quantiles() -> 
 
 
 def test_the_only_data_set_needs_no_name_and_several_have_to_be_chosen_from() -> None:
-    known = {"bridge_orig": entry(), "other": entry()}
-    assert ActionStatistics.choose(known, "other").key == "other"
+    statistics_by_name = {"bridge_orig": entry(), "other": entry()}
+    assert ActionStatistics.choose(statistics_by_name, "other").key == "other"
     with pytest.raises(UsageError, match="with -M unnorm_key=NAME: bridge_orig, other"):
-        ActionStatistics.choose(known, None)
+        ActionStatistics.choose(statistics_by_name, None)
 
 
 @pytest.mark.parametrize(
@@ -148,14 +148,14 @@ def test_without_a_tokenizer_the_missing_files_are_named(tmp_path: Path, observa
 
 def test_picture_positions_cannot_know_the_instruction(fused: OpenVLA, observation: Observation) -> None:
     """Attention is causal and the picture comes first; docs/token-policies.md says what that means for probes."""
-    kept = []
+    captured = []
     for text in ("Put the cube on the star", "Take it away"):
         with capture(fused, fused.sites()) as activations:
             fused.act([replace(observation, instruction=text)], [0])
-        kept.append(activations[Site("backbone", 2)])
+        captured.append(activations[Site("backbone", 2)])
     patches = 1 + fused.network.patches
-    torch.testing.assert_close(kept[0][:, :patches], kept[1][:, :patches], rtol=0, atol=1e-5)
-    assert (kept[0][:, -1] - kept[1][:, -1]).abs().max() > 1e-3
+    torch.testing.assert_close(captured[0][:, :patches], captured[1][:, :patches], rtol=0, atol=1e-5)
+    assert (captured[0][:, -1] - captured[1][:, -1]).abs().max() > 1e-3
 
 
 # -- actions ---------------------------------------------------------------------------------------------------
@@ -213,14 +213,14 @@ def test_tokens_that_name_no_action_are_said(fused: OpenVLA, observation: Observ
 def test_the_centre_crop_changes_what_the_model_sees_and_is_written_down(
     folder: Path, observation: Observation
 ) -> None:
-    whole, middle = (
+    uncropped, middle = (
         load_openvla(str(folder), centre_crop=crop, unnorm_key="bridge_orig") for crop in (False, True)
     )
     edge = observation.image.copy()
     edge[:2] = 255 - edge[:2]
-    seen = [middle.pixel_values([middle._look(image)]) for image in (observation.image, edge)]
-    torch.testing.assert_close(seen[0][..., 4:, :], seen[1][..., 4:, :], rtol=0, atol=1e-5)
-    assert (whole.card.settings["centre_crop"], middle.card.settings["centre_crop"]) == ("False", "True")
+    pixels = [middle.pixel_values([middle._look(image)]) for image in (observation.image, edge)]
+    torch.testing.assert_close(pixels[0][..., 4:, :], pixels[1][..., 4:, :], rtol=0, atol=1e-5)
+    assert (uncropped.card.settings["centre_crop"], middle.card.settings["centre_crop"]) == ("False", "True")
     assert any("90%" in note for note in middle.card.notes)
 
 
@@ -272,12 +272,12 @@ def test_draws_as_the_release_does_are_of_the_50_likeliest_tokens_of_actions(
     """At a temperature that makes all kept tokens alike: the first of the seven tokens has 50 values, not 256."""
     policy = load_openvla(str(folder), temperature=1e6, top_k="checkpoint", unnorm_key="bridge_orig")
     assert policy.card.settings["top_k"] == "50"
-    seen = [observation] * 300
-    found = policy.infer_without_acting(seen, range(300))[:, 0, 0]
-    assert 40 < len(set(found.tolist())) <= 51  # two tokens name the last bin's neighbour alike
+    observations = [observation] * 300
+    drawn = policy.infer_without_acting(observations, range(300))[:, 0, 0]
+    assert 40 < len(set(drawn.tolist())) <= 51  # two tokens name the last bin's neighbour alike
     everything = load_openvla(str(folder), temperature=1e6, unnorm_key="bridge_orig")
     assert "top_k" not in everything.card.settings
-    assert len(set(everything.infer_without_acting(seen, range(300))[:, 0, 0].tolist())) > 100
+    assert len(set(everything.infer_without_acting(observations, range(300))[:, 0, 0].tolist())) > 100
 
 
 def test_pictures_resized_as_tensors_are_near_those_of_pil_and_not_the_same(

@@ -32,15 +32,17 @@ from tests.support.pi0_checkpoints import bounds_of, network_chunk, old_golden, 
 
 def test_roles_describe_the_packing_the_model_really_uses(pi0_tiny: Pi0, observation: Observation) -> None:
     """Position ids count valid tokens, so they say which positions the model treats as padding."""
-    seen: list[torch.Tensor] = []
+    position_ids: list[torch.Tensor] = []
     layer = pi0_tiny.stacks["backbone"].layers[0]
-    handle = layer.register_forward_pre_hook(lambda _m, _a, kw: seen.append(kw["position_ids"]), with_kwargs=True)
+    handle = layer.register_forward_pre_hook(
+        lambda _m, _a, kw: position_ids.append(kw["position_ids"]), with_kwargs=True
+    )
     longer = replace(observation, instruction="Put the cube on the picture with three apples")
     pi0_tiny.act([observation, longer], [0, 0])
     handle.remove()
     roles = pi0_tiny.roles([observation, longer])["backbone"]
     expected = np.stack([np.cumsum(row.valid) - 1 for row in roles])
-    np.testing.assert_array_equal(seen[0], expected)
+    np.testing.assert_array_equal(position_ids[0], expected)
     assert roles[0].mask("image.base").sum() == 36
     assert roles[0].mask("language").sum() == 8  # seven words and the newline
     assert roles[0].mask("special").sum() == 1
@@ -107,7 +109,7 @@ def policy(folder: Path, statistics: Path) -> Pi0:
 
 
 @pytest.fixture
-def seen() -> Observation:
+def wide_observation() -> Observation:
     image = np.random.default_rng(1).integers(0, 256, (480, 640, 3), dtype=np.uint8)
     state = np.array([0.292, -0.006, 0.135, -0.0045, 0.0568, -0.019, 0.0, 0.8], np.float32)
     return Observation(image, state, "Put the cube on the red shape")
@@ -116,27 +118,27 @@ def seen() -> Observation:
 @pytest.mark.slow
 @pytest.mark.parametrize("openness", ["measured", "release"])
 def test_actions_are_those_of_the_bare_network_in_the_evaluations_units(
-    folder: Path, statistics: Path, policy: Pi0, seen: Observation, openness: str
+    folder: Path, statistics: Path, policy: Pi0, observation: Observation, openness: str
 ) -> None:
     """Everything around the network recomputed in float64: squashed picture, seven numbers, p01 and p99."""
-    asked = (
+    acting = (
         policy if openness == "measured" else Pi0.load(str(folder), statistics=str(statistics), openness=openness)
     )
     low, high = bounds_of("proprio")
     gripper = 0.8 if openness == "measured" else 1 - (0.015 + 0.8 * 0.022)
-    numbers = np.array([*seen.state[:6], gripper], np.float64)
+    numbers = np.array([*observation.state[:6], gripper], np.float64)
     state = np.clip((numbers - low) / (high - low) * 2 - 1, -1, 1)
-    picture = cv2.resize(seen.image, (96, 96), interpolation=cv2.INTER_LANCZOS4)
-    raw = network_chunk(asked, picture, state, seen.instruction, SEED)
+    picture = cv2.resize(observation.image, (96, 96), interpolation=cv2.INTER_LANCZOS4)
+    raw = network_chunk(acting, picture, state, observation.instruction, SEED)
     first, last = bounds_of("action")
     expected = (raw + 1) / 2 * (last - first) + first
     expected[:, 6] = raw[:, 6] > 0.5
 
-    actions = asked.act([seen], [SEED])
+    actions = acting.act([observation], [SEED])
     assert actions.shape == (1, 4, 7)
     np.testing.assert_allclose(actions[0], expected, atol=1e-5)
     assert set(np.unique(actions[..., 6])) <= {0.0, 1.0}
-    assert asked.embodiment_mismatch() is None
+    assert acting.embodiment_mismatch() is None
 
 
 def test_what_the_evaluation_decides_is_part_of_the_identity(folder: Path, statistics: Path, policy: Pi0) -> None:
@@ -151,11 +153,13 @@ def test_what_the_evaluation_decides_is_part_of_the_identity(folder: Path, stati
     assert "BOUNDS from client.json" in policy.card.notes[-1]
 
 
-def test_without_statistics_the_checkpoint_is_refused_with_the_way_out(folder: Path, seen: Observation) -> None:
+def test_without_statistics_the_checkpoint_is_refused_with_the_way_out(
+    folder: Path, observation: Observation
+) -> None:
     policy = Pi0.load(str(folder))
     assert "-M statistics=bridge" in str(policy.embodiment_mismatch())
     with pytest.raises(CheckpointError, match="-M statistics=bridge"):
-        policy.act([seen], [0])
+        policy.act([observation], [0])
 
 
 def test_statistics_that_lie_in_the_folder_are_read(folder: Path, statistics: Path, tmp_path: Path) -> None:
@@ -218,13 +222,13 @@ def test_openness_as_the_release_has_it_uses_the_fingers_of_our_widowx() -> None
     assert state[0, 7] == 1.0
 
 
-def test_inference_without_acting_equals_that_of_acting(policy: Pi0, seen: Observation) -> None:
-    captured = policy.infer_without_acting([seen], [SEED])
-    np.testing.assert_array_equal(policy.action_units.restore(captured), policy.act([seen], [SEED]))
+def test_inference_without_acting_equals_that_of_acting(policy: Pi0, observation: Observation) -> None:
+    captured = policy.infer_without_acting([observation], [SEED])
+    np.testing.assert_array_equal(policy.action_units.restore(captured), policy.act([observation], [SEED]))
 
 
 def test_a_checkpoint_of_other_actions_and_another_state_can_be_captured(
-    folder: Path, tmp_path: Path, seen: Observation
+    folder: Path, tmp_path: Path, observation: Observation
 ) -> None:
     copy = Path(shutil.copytree(folder, tmp_path / "base"))
     config = json.loads((copy / "config.json").read_text(encoding="utf-8"))
@@ -235,10 +239,10 @@ def test_a_checkpoint_of_other_actions_and_another_state_can_be_captured(
     assert "acts in 32 dimensions" in str(policy.embodiment_mismatch())
     assert policy.zero_filled_inputs() == ("state",)
     with pytest.raises(CheckpointError, match="acts in 32 dimensions"):
-        policy.act([seen], [0])
-    captured = policy.infer_without_acting([seen], [SEED])
+        policy.act([observation], [0])
+    captured = policy.infer_without_acting([observation], [SEED])
     assert captured.shape == (1, 4, 32)
-    moved = replace(seen, state=seen.state + 1)
+    moved = replace(observation, state=observation.state + 1)
     np.testing.assert_array_equal(policy.infer_without_acting([moved], [SEED]), captured)
 
 
@@ -260,7 +264,7 @@ def old_policy(golden: Path) -> Pi0:
 
 def test_the_golden_reference_in_the_old_layout_gives_every_recorded_number(golden: Path) -> None:
     verification = verify_reference("pi0", golden)
-    compared = {own.output for own in verification.comparisons if own.status == "ok"}
+    compared = {comparison.output for comparison in verification.comparisons if comparison.status == "ok"}
     assert verification.passed
     assert {"actions", "actions_unnormalized", "backbone_resid", "expert_resid", "prep_images"} <= compared
 
@@ -277,10 +281,10 @@ def test_statistics_among_the_weights_are_those_of_the_processor_files(golden_pi
 def test_pictures_are_padded_on_the_left_and_top_as_that_lerobot_did(old_policy: Pi0) -> None:
     """Today's pads on both sides; another place in the picture is another token."""
     picture = np.full((24, 40, 3), 255, np.uint8)
-    seen = old_policy.look("top", [picture])[0, 0]
-    assert seen.shape == (32, 32)
+    padded = old_policy.look("top", [picture])[0, 0]
+    assert padded.shape == (32, 32)
     assert old_policy.card.settings["picture"] == "padded-top-left"
-    rows = seen.mean(dim=1)
+    rows = padded.mean(dim=1)
     height = int(24 * 32 / 40)
     assert (rows[: 32 - height] == 0).all()
     assert (rows[32 - height :] == 1).all()

@@ -32,15 +32,15 @@ def pi05(folder: Path) -> Pi05:
 
 
 @pytest.fixture
-def seen(pi05: Pi05) -> list[Observation]:
+def observations(pi05: Pi05) -> list[Observation]:
     return examples_for(pi05, "put the cube on the red shape", "put the cube on the star")
 
 
 def test_actions_are_those_of_lerobots_own_blocks_bit_for_bit(
-    pi05: Pi05, folder: Path, seen: list[Observation], monkeypatch: pytest.MonkeyPatch
+    pi05: Pi05, folder: Path, observations: list[Observation], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The blocks that hold gates as modules put out what lerobot's blocks do."""
-    batch, noise = pi05.batch(seen), pi05.noise([3, 4])
+    batch, noise = pi05.batch(observations), pi05.noise([3, 4])
     ours = pi05.infer(batch, noise)
     monkeypatch.setattr(network, "_attach_gates", lambda _: None)
     plain = Pi05.build(pi05.config, folder)
@@ -59,16 +59,18 @@ def test_prompts_are_those_of_lerobots_processor(pi05: Pi05) -> None:
         TransitionKey.OBSERVATION: {"observation.state": torch.from_numpy(state)},
         TransitionKey.COMPLEMENTARY_DATA: {"task": texts},
     }
-    asked = step(transition)[TransitionKey.COMPLEMENTARY_DATA]["task"]
-    assert pi05.prompts(texts, state) == asked
-    assert asked[0].startswith("Task: put the cube on the star, State: -1 0 0 128 192 255 255 255;")
+    prompts = step(transition)[TransitionKey.COMPLEMENTARY_DATA]["task"]
+    assert pi05.prompts(texts, state) == prompts
+    assert prompts[0].startswith("Task: put the cube on the star, State: -1 0 0 128 192 255 255 255;")
 
 
-def test_the_state_reaches_the_network_as_digits_of_its_prompt(pi05: Pi05, seen: list[Observation]) -> None:
-    moved = replace(seen[0], state=np.array(seen[0].state) + np.float32(0.05))
-    tokens = pi05.batch([seen[0], moved])["observation.language.tokens"]
+def test_the_state_reaches_the_network_as_digits_of_its_prompt(
+    pi05: Pi05, observations: list[Observation]
+) -> None:
+    moved = replace(observations[0], state=np.array(observations[0].state) + np.float32(0.05))
+    tokens = pi05.batch([observations[0], moved])["observation.language.tokens"]
     changed = (tokens[0] != tokens[1]).numpy()
-    roles = pi05.roles([seen[0]])["backbone"][0]
+    roles = pi05.roles([observations[0]])["backbone"][0]
     text = len(roles) - tokens.shape[1]
     assert changed.any()
     assert not changed[~roles.mask("state")[text:]].any()
@@ -101,12 +103,12 @@ def test_the_ids_of_an_instruction_hold_no_digit_of_a_state(pi05: Pi05) -> None:
     assert " ".join(pieces) == "<bos> task : put the cube on the star , state : ; \n action :"
 
 
-def test_what_a_block_adds_is_behind_its_gate(pi05: Pi05, seen: list[Observation]) -> None:
+def test_what_a_block_adds_is_behind_its_gate(pi05: Pi05, observations: list[Observation]) -> None:
     """Not what its MLP puts out: the gates of random weights are far from 1."""
     block, written = pi05.stacks["expert"].layers[0], []
     handle = block.mlp.register_forward_hook(lambda _m, _i, output: written.append(output.clone()))
     with capture(pi05, pi05.streams["expert"].sites("mlp")) as cache:
-        pi05.act(seen, [0, 0])
+        pi05.act(observations, [0, 0])
     handle.remove()
     added = cache["expert.00.mlp@0"]
     assert added.shape == written[0].shape

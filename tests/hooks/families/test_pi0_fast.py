@@ -73,10 +73,10 @@ def test_tokens_of_lerobots_class_decode_as_lerobots_class_decodes_them(
     """Its encoding loses coefficients that it was not trained on. It then decodes zeros; here it is a problem."""
     theirs, chunks = fast_processor(fast_files), smooth_chunks(40, seed=7)
     tokens = theirs(chunks)
-    wanted = theirs.decode(tokens, time_horizon=CHUNK, action_dim=ACTIONS)
-    found = [fast.decode(row, CHUNK, ACTIONS) for row in tokens]
-    assert 1 <= sum(bool(one.problems) for one in found) <= 20
-    for ours, expected, chunk in zip(found, wanted, chunks, strict=True):
+    expected_chunks = theirs.decode(tokens, time_horizon=CHUNK, action_dim=ACTIONS)
+    decoded = [fast.decode(row, CHUNK, ACTIONS) for row in tokens]
+    assert 1 <= sum(bool(decoded_chunk.problems) for decoded_chunk in decoded) <= 20
+    for ours, expected, chunk in zip(decoded, expected_chunks, chunks, strict=True):
         if ours.problems:
             assert not expected.any()
             assert ours.values.any()
@@ -86,21 +86,21 @@ def test_tokens_of_lerobots_class_decode_as_lerobots_class_decodes_them(
 
 
 def test_what_is_no_whole_chunk_is_a_problem_and_never_zeros_in_silence(fast: FastTokenizer) -> None:
-    whole = encoded(fast, np.full((CHUNK, ACTIONS), 3))
+    encoded_chunk = encoded(fast, np.full((CHUNK, ACTIONS), 3))
     short, long = (encoded(fast, np.full((rows, ACTIONS), 3)) for rows in (CHUNK - 1, CHUNK + 1))
-    assert fast.decode(whole, CHUNK, ACTIONS).problems == ()
-    for ids, said in (
+    assert fast.decode(encoded_chunk, CHUNK, ACTIONS).problems == ()
+    for ids, problem in (
         (short, "21 coefficients; a chunk has 4 x 7"),
         (long, "35 coefficients; a chunk has 4 x 7"),
-        ([*whole, -1, fast.size], f"2 of {len(whole) + 2} tokens name no FAST token"),
+        ([*encoded_chunk, -1, fast.size], f"2 of {len(encoded_chunk) + 2} tokens name no FAST token"),
         ([], "0 coefficients; a chunk has 4 x 7"),
     ):
         chunk = fast.decode(ids, CHUNK, ACTIONS)
-        assert said in chunk.problems
+        assert problem in chunk.problems
         assert chunk.values.shape == (CHUNK, ACTIONS)
         assert np.isfinite(chunk.values).all()
     np.testing.assert_array_equal(
-        fast.decode(long, CHUNK, ACTIONS).values, fast.decode(whole, CHUNK, ACTIONS).values
+        fast.decode(long, CHUNK, ACTIONS).values, fast.decode(encoded_chunk, CHUNK, ACTIONS).values
     )
 
 
@@ -182,26 +182,29 @@ def untrained(tmp_path_factory: pytest.TempPathFactory) -> Pi0Fast:
 
 
 @pytest.fixture
-def seen(pi0_fast: Pi0Fast) -> list[Observation]:
+def observations(pi0_fast: Pi0Fast) -> list[Observation]:
     return examples_for(pi0_fast, *INSTRUCTIONS)
 
 
-def test_whole_chunks_are_acted_on_without_a_flag(pi0_fast: Pi0Fast, seen: list[Observation]) -> None:
+def test_whole_chunks_are_acted_on_without_a_flag(pi0_fast: Pi0Fast, observations: list[Observation]) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        actions = pi0_fast.act(seen, [0, 0])
+        actions = pi0_fast.act(observations, [0, 0])
     assert pi0_fast.flagged is not None
     assert not pi0_fast.flagged.any()
-    wanted = pi0_fast.action_units.restore(TRAINED)
+    expected = pi0_fast.action_units.restore(TRAINED)
     assert (
-        np.abs(actions - wanted).max() <= 0.1 * np.abs(pi0_fast.action_units.slopes(np.zeros(7, np.float32))).max()
+        np.abs(actions - expected).max()
+        <= 0.1 * np.abs(pi0_fast.action_units.slopes(np.zeros(7, np.float32))).max()
     )
 
 
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
-def test_tokens_are_those_of_lerobots_sampling(untrained: Pi0Fast, seen: list[Observation], dtype: str) -> None:
+def test_tokens_are_those_of_lerobots_sampling(
+    untrained: Pi0Fast, observations: list[Observation], dtype: str
+) -> None:
     fast = untrained if dtype == "float32" else Pi0Fast.load(str(untrained.folder), dtype=dtype)
-    batch, policy = fast.batch(seen), fast.network
+    batch, policy = fast.batch(observations), fast.network
     ours = fast.tokens(batch, [0, 0])
     policy.model._paligemma_tokenizer = fast.tokenizer
     pictures, masks = policy._preprocess_images(batch)
@@ -213,10 +216,10 @@ def test_tokens_are_those_of_lerobots_sampling(untrained: Pi0Fast, seen: list[Ob
 
 
 def test_the_instruction_keeps_its_case_as_in_lerobot_or_loses_it_as_in_openpi(
-    folder: Path, pi0_fast: Pi0Fast, seen: list[Observation]
+    folder: Path, pi0_fast: Pi0Fast, observations: list[Observation]
 ) -> None:
     lower = Pi0Fast.load(str(folder), lowercase=True)
-    text, state = [seen[0].instruction.title()], np.zeros((1, 7), np.float32)
+    text, state = [observations[0].instruction.title()], np.zeros((1, 7), np.float32)
     assert text[0] != text[0].lower()
     assert pi0_fast.prompts(text, state)[0].startswith(f"Task: {text[0]}, State:")
     assert lower.prompts(text, state) == pi0_fast.prompts([text[0].lower()], state)
@@ -231,15 +234,15 @@ def test_the_card_says_where_lerobot_decodes_another_number_of_actions(folder: P
     path = tmp_path / "config.json"
     text = path.read_text(encoding="utf-8")
     path.write_text(text.replace('"n_action_steps": 4', '"n_action_steps": 2'), encoding="utf-8")
-    notes = [Pi0Fast.load(str(place)).card.notes for place in (folder, tmp_path)]
-    assert [any("lerobot decodes 2" in note for note in one) for one in notes] == [False, True]
+    notes = [Pi0Fast.load(str(checkpoint)).card.notes for checkpoint in (folder, tmp_path)]
+    assert [any("lerobot decodes 2" in note for note in card_note) for card_note in notes] == [False, True]
 
 
-def test_a_chunk_that_does_not_end_is_flagged_and_warned_of(folder: Path, seen: list[Observation]) -> None:
+def test_a_chunk_that_does_not_end_is_flagged_and_warned_of(folder: Path, observations: list[Observation]) -> None:
     cut = Pi0Fast.load(str(folder))
     cut.config.max_decoding_steps = 12
     with pytest.warns(UserWarning, match="no whole chunk of actions"):
-        actions = cut.act(seen, [0, 0])
+        actions = cut.act(observations, [0, 0])
     assert all("no end of the actions in 12 tokens" in row for row in cut.problems)
     assert cut.flagged is not None
     assert cut.flagged.all()
@@ -247,19 +250,19 @@ def test_a_chunk_that_does_not_end_is_flagged_and_warned_of(folder: Path, seen: 
 
 
 def test_a_row_that_has_ended_does_not_flag_for_the_tokens_behind_its_end(
-    pi0_fast: Pi0Fast, seen: list[Observation]
+    pi0_fast: Pi0Fast, observations: list[Observation]
 ) -> None:
     """One row ends before the other, and is decoded until that one ends."""
-    ids, end = pi0_fast.tokens(pi0_fast.batch(seen), [0, 0]), pi0_fast.action_text.end
+    ids, end = pi0_fast.tokens(pi0_fast.batch(observations), [0, 0]), pi0_fast.action_text.end
     ends = (ids == end).int().argmax(dim=1)
     assert ends[0] != ends[1]
     assert ids.shape[1] == ends.max() + 1
 
 
-def test_more_tokens_are_captured_than_a_row_needs(folder: Path, seen: list[Observation]) -> None:
+def test_more_tokens_are_captured_than_a_row_needs(folder: Path, observations: list[Observation]) -> None:
     policy = Pi0Fast.load(str(folder), captured_tokens=23)
     with capture(policy, policy.streams["action"].sites()) as cache:
-        policy.act(seen, [0, 0])
+        policy.act(observations, [0, 0])
     assert len(cache) == 23 * policy.streams["action"].layers
     assert policy.flagged is not None
     assert not policy.flagged.any()
@@ -271,22 +274,24 @@ def test_a_number_of_captured_tokens_that_never_come_is_refused(folder: Path, ca
         Pi0Fast.load(str(folder), captured_tokens=captured)
 
 
-def test_drawn_tokens_come_from_the_rows_own_seed(folder: Path, seen: list[Observation]) -> None:
+def test_drawn_tokens_come_from_the_rows_own_seed(folder: Path, observations: list[Observation]) -> None:
     policy = Pi0Fast.load(str(folder), temperature=3.0)
-    batch = policy.batch([seen[0], seen[0], seen[1]])
+    batch = policy.batch([observations[0], observations[0], observations[1]])
     ids = policy.tokens(batch, [1, 2, 1])
     assert not torch.equal(ids[0], ids[1])
-    alone = policy.tokens(policy.batch([seen[0]]), [2])[0]
+    alone = policy.tokens(policy.batch([observations[0]]), [2])[0]
     shared = min(len(alone), ids.shape[1])
     assert torch.equal(ids[1, :shared], alone[:shared])
 
 
-def test_half_precision_acts_as_captured_and_puts_out_whole_chunks(folder: Path, seen: list[Observation]) -> None:
+def test_half_precision_acts_as_captured_and_puts_out_whole_chunks(
+    folder: Path, observations: list[Observation]
+) -> None:
     policy = Pi0Fast.load(str(folder), dtype="bfloat16")
     assert policy.card.dtype == "bfloat16"
-    plain = policy.act(seen, [0, 0])
+    plain = policy.act(observations, [0, 0])
     with capture(policy, policy.sites()) as cache:
-        np.testing.assert_array_equal(policy.act(seen, [0, 0]), plain)
+        np.testing.assert_array_equal(policy.act(observations, [0, 0]), plain)
     assert cache["action.01.residual@3"].dtype == torch.bfloat16
     assert policy.flagged is not None
     assert not policy.flagged.any()
@@ -299,8 +304,8 @@ def test_prompts_are_those_of_lerobots_processor(pi0_fast: Pi0Fast) -> None:
         TransitionKey.OBSERVATION: {"observation.state": torch.from_numpy(state)},
         TransitionKey.COMPLEMENTARY_DATA: {"task": texts},
     }
-    asked = Pi0FastPrepareStateAndLanguageTokenizerProcessorStep()(transition)
-    assert pi0_fast.prompts(texts, state) == asked[TransitionKey.COMPLEMENTARY_DATA]["task"]
+    tokenised = Pi0FastPrepareStateAndLanguageTokenizerProcessorStep()(transition)
+    assert pi0_fast.prompts(texts, state) == tokenised[TransitionKey.COMPLEMENTARY_DATA]["task"]
 
 
 def test_roles_name_the_instruction_the_digits_and_the_words_around_them(pi0_fast: Pi0Fast) -> None:
@@ -318,8 +323,8 @@ def test_roles_name_the_instruction_the_digits_and_the_words_around_them(pi0_fas
 def test_head_and_embedding_may_be_stored_as_one(untrained: Pi0Fast, tmp_path: Path, left_out: str) -> None:
     shutil.copytree(untrained.folder, tmp_path, dirs_exist_ok=True)
     tensors = load_file(tmp_path / "model.safetensors")
-    (kept,) = {HEAD, EMBEDDING} - {left_out}
+    (stored_weight,) = {HEAD, EMBEDDING} - {left_out}
     del tensors[left_out]
     save_file(tensors, tmp_path / "model.safetensors")
     loaded = Pi0Fast.load(str(tmp_path)).network.state_dict()
-    assert torch.equal(loaded[left_out], tensors[kept])
+    assert torch.equal(loaded[left_out], tensors[stored_weight])

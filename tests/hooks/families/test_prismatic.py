@@ -86,9 +86,9 @@ def test_the_last_site_of_a_tower_is_what_the_projector_reads(model: Prismatic, 
 
 def test_roles_name_what_every_position_is(model: Prismatic, observation: Observation) -> None:
     """Beginning, patches, then a byte per letter; the last one belongs to the other stream. The frame is Phi's."""
-    asked = replace(observation, instruction="1+1?")
+    question = replace(observation, instruction="1+1?")
     longer = replace(observation, instruction="1+1=2+0?")
-    short, long = model.roles([asked, longer])["backbone"]
+    short, long = model.roles([question, longer])["backbone"]
     patches, prompt, start = model.network.patches, len("Input: 1+1?\nOutput:"), len("Input: ")
     assert short.spans == (
         ("special", 0, 1),
@@ -127,14 +127,14 @@ def test_chats_begin_with_their_system_prompt(language: str) -> None:
 def test_what_is_spoken_goes_on_from_the_prefill(tmp_path: Path, observation: Observation) -> None:
     """Against as many steps of one decoding, and without the towers being run once more."""
     folder = str(write_checkpoint(tmp_path, model_type="prismatic"))
-    vlm, whole = (load_prismatic(folder, steps=steps) for steps in (1, 6))
+    vlm, complete = (load_prismatic(folder, steps=steps) for steps in (1, 6))
     reading = vlm.read([Prompt(observation, "Which?", ("A", "B"))])
-    decoded = whole.generate(whole.pixel_values([observation.image]), [whole.prompt("Which?")])
+    decoded = complete.generate(complete.pixel_values([observation.image]), [complete.prompt("Which?")])
     with torch.inference_mode():
-        said = reading.state.speak(6, frozenset())
-    assert said.tolist() == decoded.ids.tolist()
+        spoken = reading.state.speak(6, frozenset())
+    assert spoken.tolist() == decoded.ids.tolist()
     with pytest.raises(UsageError, match="does not come from this model"):
-        whole.speak(reading, 3)
+        complete.speak(reading, 3)
 
 
 def test_a_reading_compares_what_may_stand_behind_the_prompt(
@@ -207,9 +207,9 @@ def load(folder: Path) -> PrismaticNetwork:
 
 def test_shards_give_the_same_weights_and_the_same_hash_as_one_file(base: Path, tmp_path: Path) -> None:
     sharded = load_checkpoint(str(write_checkpoint(tmp_path, shards=3)), "cpu", None, random_weights=False)
-    whole = load_checkpoint(str(base), "cpu", None, random_weights=False)
-    assert sharded.audit == whole.audit
-    for name, tensor in whole.network.state_dict().items():
+    single_file = load_checkpoint(str(base), "cpu", None, random_weights=False)
+    assert sharded.audit == single_file.audit
+    for name, tensor in single_file.network.state_dict().items():
         assert torch.equal(sharded.network.state_dict()[name], tensor)
 
 
@@ -371,9 +371,9 @@ def test_a_model_of_the_release_is_the_same_model(
 ) -> None:
     write_release(cache, towers_inside=towers_inside)
     ours, theirs = load_prismatic(), plain(tmp_path / "plain")
-    expected, found = theirs.network.state_dict(), ours.network.state_dict()
-    assert found.keys() == expected.keys()
-    assert all(torch.equal(found[name], expected[name]) for name in expected)
+    expected, loaded = theirs.network.state_dict(), ours.network.state_dict()
+    assert loaded.keys() == expected.keys()
+    assert all(torch.equal(loaded[name], expected[name]) for name in expected)
     assert ours.card.weights_sha256 == theirs.card.weights_sha256
     question = [Prompt(observation, "put the cube on the star", (" red", " shape"))]
     np.testing.assert_array_equal(ours.read(question).option_logits, theirs.read(question).option_logits)
@@ -383,12 +383,12 @@ def test_a_model_of_the_release_is_the_same_model(
 
 def test_positions_of_a_tower_are_resampled_as_timm_does_it(cache: Path) -> None:
     write_release(cache, published_side=56)
-    found = load_prismatic().network.vision_backbone.featurizer.pos_embed
+    resampled = load_prismatic().network.vision_backbone.featurizer.pos_embed
     stored = torch.randn((1, 16, 16), generator=torch.Generator().manual_seed(1))
     network = timm.create_model("vit_large_patch14_reg4_dinov2.lvd142m", img_size=28, depth=1, embed_dim=16)
     expected = resample_abs_pos_embed(stored, [2, 2], num_prefix_tokens=0)
-    assert found.shape == expected.shape == network.pos_embed.shape
-    torch.testing.assert_close(found, expected)
+    assert resampled.shape == expected.shape == network.pos_embed.shape
+    torch.testing.assert_close(resampled, expected)
 
 
 def test_a_folder_of_the_release_loads_as_the_id_does(cache: Path) -> None:
@@ -402,16 +402,16 @@ def test_a_folder_of_the_release_loads_as_the_id_does(cache: Path) -> None:
 def test_no_other_model_of_the_repository_is_asked_for(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A repository of several hundred GB: what is asked for lies in one folder."""
     folder = write_release(cache)
-    asked: list[tuple[str, list[str]]] = []
+    downloads: list[tuple[str, list[str]]] = []
 
     def download(name: str, allow_patterns: list[str], **_: object) -> str:
-        asked.append((name, allow_patterns))
+        downloads.append((name, allow_patterns))
         return str(folder.parent)
 
     monkeypatch.setattr("huggingface_hub.snapshot_download", download)
     monkeypatch.setattr("probe_kit.hooks.checkpoints.checkpoint.unreachable", lambda: "")
     find_family("prismatic").check(None)
-    ((repository, patterns),) = asked
+    ((repository, patterns),) = downloads
     assert repository == "TRI-ML/prismatic-vlms"
     assert all(pattern.startswith("prism-dinosiglip-224px+7b/") for pattern in patterns)
     assert "prism-dinosiglip-224px+7b/checkpoints/latest-checkpoint.pt" in patterns
@@ -455,7 +455,7 @@ def test_code_in_the_file_is_not_run(cache: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "reason"),
     [
         ({"state": {}}, "holds dict under `model`"),
         ({"model": {"projector": {"projector.0.weight": torch.zeros(2)}}}, "expected llm_backbone, projector"),
@@ -463,9 +463,9 @@ def test_code_in_the_file_is_not_run(cache: Path, tmp_path: Path) -> None:
          "'projector.7.weight' is no tensor of a known part"),
     ],
 )  # fmt: skip
-def test_a_file_of_another_layout_is_refused(cache: Path, content: object, said: str) -> None:
+def test_a_file_of_another_layout_is_refused(cache: Path, content: object, reason: str) -> None:
     torch.save(content, write_release(cache) / "checkpoints" / "latest-checkpoint.pt")
-    with pytest.raises(WeightsError, match=said):
+    with pytest.raises(WeightsError, match=reason):
         load_prismatic()
 
 
@@ -496,8 +496,8 @@ def test_a_run_names_the_published_language_model(language: str, width: int, lay
 
 def test_the_first_folder_that_has_a_tokenizer_wins(tmp_path: Path) -> None:
     write_tokenizer(tmp_path / "base")
-    found = find_tokenizer([tmp_path / "adapter", tmp_path / "base"], None, 1)
-    assert found == FileTokenizer(tmp_path / "base", 1)
+    tokenizer = find_tokenizer([tmp_path / "adapter", tmp_path / "base"], None, 1)
+    assert tokenizer == FileTokenizer(tmp_path / "base", 1)
 
 
 def test_a_folder_that_was_asked_for_is_the_only_place(tmp_path: Path) -> None:

@@ -22,7 +22,13 @@ from probe_kit.errors import (
     WeightsError,
 )
 from probe_kit.hooks import Prompt, load_model
-from probe_kit.hooks.families.shared.taps import on_the_prompt, recomputed, recording_weights, returned, shares
+from probe_kit.hooks.families.shared.taps import (
+    on_the_prompt,
+    recompute_weights,
+    recording_weights,
+    returned_weights,
+    shares,
+)
 from probe_kit.hooks.families.shared.text import Frame, FramedText
 from probe_kit.hooks.families.shared.token_decoder import ALL, CHECKPOINT, TOP, chooser, top_of
 from probe_kit.hooks.registry import find_family
@@ -41,14 +47,14 @@ from tests.support.vlm_checkpoints import (
 def test_shares_are_those_of_torchs_own_attention_under_either_kind_of_mask() -> None:
     torch.manual_seed(0)
     queries, keys, values = (torch.randn(2, heads, tokens, 8) for heads, tokens in ((4, 3), (2, 5), (2, 5)))
-    seen = torch.rand(2, 1, 3, 5) > 0.3
-    seen[..., 0] = True
+    allowed = torch.rand(2, 1, 3, 5) > 0.3
+    allowed[..., 0] = True
     every = values.repeat_interleave(2, dim=1)
     expected = functional.scaled_dot_product_attention(
-        queries, keys.repeat_interleave(2, dim=1), every, attn_mask=seen, scale=0.5
+        queries, keys.repeat_interleave(2, dim=1), every, attn_mask=allowed, scale=0.5
     )
-    added = torch.zeros(2, 1, 3, 5).masked_fill(~seen, torch.finfo(torch.float32).min)
-    for mask in (seen, added):
+    added = torch.zeros(2, 1, 3, 5).masked_fill(~allowed, torch.finfo(torch.float32).min)
+    for mask in (allowed, added):
         torch.testing.assert_close(shares(queries, keys, 0.5, {"attention_mask": mask}) @ every, expected)
 
 
@@ -69,8 +75,8 @@ def test_llamas_last_position_is_weighed_as_eager_attention_weighs_it() -> None:
 
     with (
         torch.inference_mode(),
-        recording_weights(attentions, noting("returned"), returned),
-        recording_weights(attentions, noting("recomputed"), recomputed),
+        recording_weights(attentions, noting("returned"), returned_weights),
+        recording_weights(attentions, noting("recomputed"), recompute_weights),
     ):
         for ids in ([[1, 2, 3, 4, 5, 6]], [[7]], [[8]]):
             network(input_ids=torch.tensor(ids), past_key_values=cache, use_cache=True)
@@ -105,12 +111,12 @@ def test_an_attention_with_a_norm_of_queries_or_a_soft_cap_is_refused_not_recomp
     attention = getattr(transformers, f"{network}Model")(config).layers[0].self_attn
     step = {"Qwen3": "q_norm", "Gemma2": "attn_logit_softcapping"}[network]
     with pytest.raises(UnsupportedInterventionError, match=rf"{network}Attention .*{step}.*Patch `kv`"):
-        recomputed(attention, (torch.zeros(1, 1, 32),), {}, None)
+        recompute_weights(attention, (torch.zeros(1, 1, 32),), {}, None)
 
 
 def test_an_attention_of_another_kind_is_refused() -> None:
     with pytest.raises(UnsupportedInterventionError, match="Patch `kv`"):
-        recomputed(torch.nn.Identity(), (), {}, None)
+        recompute_weights(torch.nn.Identity(), (), {}, None)
 
 
 def logits(rows: int) -> torch.Tensor:
@@ -167,10 +173,10 @@ def test_what_can_be_drawn_is_what_transformers_keeps_ties_of_the_last_one_inclu
     masked[:, among.start : among.stop] = row[:, among.start : among.stop]
     ids = torch.zeros((1, 1), dtype=torch.long)
     theirs = TopKLogitsWarper(top)(ids, TemperatureLogitsWarper(0.6)(ids, masked.float()))
-    kept = set(torch.isfinite(theirs[0]).nonzero().flatten().tolist())
+    allowed = set(torch.isfinite(theirs[0]).nonzero().flatten().tolist())
     draw = chooser(0.6, [1], top, among)
     counts = torch.bincount(torch.cat([draw(row) for _ in range(4000)]), minlength=400)
-    assert set(counts.nonzero().flatten().tolist()) <= kept
+    assert set(counts.nonzero().flatten().tolist()) <= allowed
     expected = torch.softmax(theirs[0], dim=0)
     spread = (expected * (1 - expected) / 4000).sqrt()
     assert ((counts / 4000 - expected).abs() < 5 * spread + 1e-9).all()
@@ -186,15 +192,24 @@ def test_how_many_are_kept_is_the_checkpoints_word_or_the_librarys_default(tmp_p
     assert (top_of(ALL, [tmp_path]), top_of("7", [tmp_path]), top_of(CHECKPOINT, [tmp_path])) == (None, 7, TOP)
     file = tmp_path / "generation_config.json"
     stored = {"bos_token_id": 1, "eos_token_id": 2, "pad_token_id": 32000, "transformers_version": "4.40.1"}
-    for own, expected in (({}, TOP), ({"top_k": 20}, 20), ({"top_k": 0}, None), ({"top_p": 1.0}, TOP)):
-        file.write_text(json.dumps(stored | own), encoding="utf-8")
+    for generation_settings, expected in (
+        ({}, TOP),
+        ({"top_k": 20}, 20),
+        ({"top_k": 0}, None),
+        ({"top_p": 1.0}, TOP),
+    ):
+        file.write_text(json.dumps(stored | generation_settings), encoding="utf-8")
         assert top_of(CHECKPOINT, [tmp_path / "adapter", tmp_path]) == expected
 
 
-@pytest.mark.parametrize("own", [{"top_p": 0.9}, {"repetition_penalty": 1.2}, {"top_k": "many"}, {"top_k": -1}])
-def test_a_draw_that_is_shaped_otherwise_is_refused(tmp_path: Path, own: dict[str, object]) -> None:
-    (tmp_path / "generation_config.json").write_text(json.dumps(own), encoding="utf-8")
-    with pytest.raises(CheckpointError, match=next(iter(own))):
+@pytest.mark.parametrize(
+    "generation_settings", [{"top_p": 0.9}, {"repetition_penalty": 1.2}, {"top_k": "many"}, {"top_k": -1}]
+)
+def test_a_draw_that_is_shaped_otherwise_is_refused(
+    tmp_path: Path, generation_settings: dict[str, object]
+) -> None:
+    (tmp_path / "generation_config.json").write_text(json.dumps(generation_settings), encoding="utf-8")
+    with pytest.raises(CheckpointError, match=next(iter(generation_settings))):
         top_of(CHECKPOINT, [tmp_path])
     with pytest.raises(UsageError, match="expected a number from 1 on, all or checkpoint"):
         top_of("0", [tmp_path])
@@ -230,9 +245,9 @@ def test_the_larger_internvl_has_another_tower(tmp_path: Path) -> None:
     names = {name.rpartition("encoder.layer.0.")[2] for name in vlm.network.state_dict()}
     assert "attention.q_norm.weight" in names
     assert "attention.q_proj.bias" not in names
-    seen = example_observations(["Why?"])[0]
-    reading = vlm.read([Prompt(seen, "Why?", ("A", "B"))])
-    other = vlm.read([Prompt(replace(seen, image=255 - seen.image), "Why?", ("A", "B"))])
+    observation = example_observations(["Why?"])[0]
+    reading = vlm.read([Prompt(observation, "Why?", ("A", "B"))])
+    other = vlm.read([Prompt(replace(observation, image=255 - observation.image), "Why?", ("A", "B"))])
     assert np.abs(reading.option_logits - other.option_logits).max() > 0
 
 
@@ -291,11 +306,11 @@ def test_two_pictures_of_different_size_go_together(tmp_path: Path) -> None:
     vlm = load_model("qwen3-vl", str(write_qwen3_vl(tmp_path)))
     small, large = example_observations(["Why?", "Why not?"])
     large = replace(large, image=np.tile(large.image, (3, 2, 1)))
-    asked = [Prompt(own, own.instruction, ("A", "B")) for own in (small, large)]
-    together = vlm.read(asked)
-    alone = [vlm.read([question]).option_logits[0] for question in asked]
+    prompts = [Prompt(observation, observation.instruction, ("A", "B")) for observation in (small, large)]
+    together = vlm.read(prompts)
+    alone = [vlm.read([question]).option_logits[0] for question in prompts]
     np.testing.assert_allclose(together.option_logits, alone, atol=1e-5)
-    assert vlm.speak(together, 5) == [vlm.speak(vlm.read([question]), 5)[0] for question in asked]
+    assert vlm.speak(together, 5) == [vlm.speak(vlm.read([question]), 5)[0] for question in prompts]
 
 
 @pytest.mark.parametrize(
@@ -321,12 +336,12 @@ def _text(folder: Path, vocabulary: int = 272, end: object = ID["<|im_end|>"]) -
 
 def test_the_question_stands_between_picture_and_end(tmp_path: Path) -> None:
     prompt = _text(tmp_path).prompt("Why not?", "Yes", [PAD] * 5)
-    said = [index for index, asked in enumerate(prompt.question) if asked]
-    assert len(said) == len("Why not?")
+    question_positions = [index for index, is_question in enumerate(prompt.question) if is_question]
+    assert len(question_positions) == len("Why not?")
     assert prompt.ids[slice(*prompt.picture)] == (PAD,) * 5
     assert prompt.ids[prompt.picture[1]] == ID["<|vision_end|>"]
-    assert said[0] == prompt.picture[1] + 1
-    assert len(prompt.ids) - 1 - said[-1] == 1 + len("\nSay: ") + len("Yes")
+    assert question_positions[0] == prompt.picture[1] + 1
+    assert len(prompt.ids) - 1 - question_positions[-1] == 1 + len("\nSay: ") + len("Yes")
 
 
 def test_without_a_picture_nothing_marks_its_place(tmp_path: Path) -> None:
@@ -364,9 +379,9 @@ def test_what_is_said_ends_at_an_end(tmp_path: Path) -> None:
         json.dumps({"eos_token_id": [ID["<|endoftext|>"], 0]}), encoding="utf-8"
     )
     text = _text(tmp_path)
-    left = list(text.prompt("", "left").ids[-4:])
-    assert text.decode([*left, ID["<|endoftext|>"], *left]) == "left"
-    assert text.decode([ID["<|im_start|>"], *left]) == "left"
+    left_ids = list(text.prompt("", "left").ids[-4:])
+    assert text.decode([*left_ids, ID["<|endoftext|>"], *left_ids]) == "left"
+    assert text.decode([ID["<|im_start|>"], *left_ids]) == "left"
 
 
 def test_another_models_tokenizer_is_refused(tmp_path: Path) -> None:

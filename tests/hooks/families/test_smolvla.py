@@ -13,7 +13,7 @@ from tests.support.smolvla_checkpoints import write_smolvla
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("shown", [1, 2])
+@pytest.mark.parametrize("shown_cameras", [1, 2])
 @pytest.mark.parametrize(
     "fields",
     [
@@ -24,19 +24,21 @@ from tests.support.smolvla_checkpoints import write_smolvla
         {"add_image_special_tokens": True, "prefix_length": 50},
     ],
 )
-def test_roles_name_the_positions_that_lerobot_masks(tmp_path: Path, fields: dict, shown: int) -> None:
+def test_roles_name_the_positions_that_lerobot_masks(tmp_path: Path, fields: dict, shown_cameras: int) -> None:
     cameras = ("top", "wrist")
-    policy = SmolVLA.load(str(write_smolvla(tmp_path, cameras=cameras, **fields))).with_cameras(cameras[:shown])
-    seen = example_observations(["Put the cube on the star", "Put the cube on the red shape"], cameras)
-    batch = policy.batch(seen)
+    policy = SmolVLA.load(str(write_smolvla(tmp_path, cameras=cameras, **fields))).with_cameras(
+        cameras[:shown_cameras]
+    )
+    observations = example_observations(["Put the cube on the star", "Put the cube on the red shape"], cameras)
+    batch = policy.batch(observations)
     images, masks = policy.network.prepare_images(batch)
-    tokens, valid = policy.tokenise([one.instruction for one in seen])
+    tokens, valid = policy.tokenise([observation.instruction for observation in observations])
     state = policy.network.prepare_state(batch)
     with torch.no_grad():
         _, expected, _ = policy.network.model.embed_prefix(images, masks, tokens, valid, state)
-    ours = np.stack([row.valid for row in policy.roles(seen)["backbone"]])
+    ours = np.stack([row.valid for row in policy.roles(observations)["backbone"]])
     np.testing.assert_array_equal(ours, expected.bool().numpy())
-    assert {f"image.{camera}" for camera in cameras[:shown]} <= set(policy.role_names["backbone"])
+    assert {f"image.{camera}" for camera in cameras[:shown_cameras]} <= set(policy.role_names["backbone"])
 
 
 def test_a_second_camera_is_needed_once_it_is_shown(tmp_path: Path) -> None:

@@ -43,9 +43,14 @@ FRACTAL = "fractal20220817_data/0.1.0"
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    own = processor_values()["statistics"]["bridge_orig/1.0.0"]
-    known = {"statistics": {"bridge_orig/1.0.0": own, "my_arm": {"action": {**own["action"], "q99": [0.2] * 7}}}}
-    return write_checkpoint(tmp_path_factory.mktemp("spatialvla"), processor=known)
+    bridge_statistics = processor_values()["statistics"]["bridge_orig/1.0.0"]
+    processor_statistics = {
+        "statistics": {
+            "bridge_orig/1.0.0": bridge_statistics,
+            "my_arm": {"action": {**bridge_statistics["action"], "q99": [0.2] * 7}},
+        }
+    }
+    return write_checkpoint(tmp_path_factory.mktemp("spatialvla"), processor=processor_statistics)
 
 
 @pytest.fixture(scope="module")
@@ -73,10 +78,10 @@ def flat(tmp_path_factory: pytest.TempPathFactory) -> SpatialVLA:
 
 
 @pytest.fixture
-def seen() -> list[Observation]:
+def observations() -> list[Observation]:
     """Two cameras, two instructions of different length."""
     examples = example_observations(["Put the cube on the star", "Put the cube on the red shape"])
-    return [replace(one, intrinsics=SCENE * [[1 + row], [1], [1]]) for row, one in enumerate(examples)]
+    return [replace(example, intrinsics=SCENE * [[1 + row], [1], [1]]) for row, example in enumerate(examples)]
 
 
 # -- capture ---------------------------------------------------------------------------------------------------
@@ -84,37 +89,37 @@ def seen() -> list[Observation]:
 
 @pytest.mark.slow
 def test_the_first_step_of_a_chunk_is_the_same_whether_the_rest_is_captured(
-    folder: Path, plain: SpatialVLA, seen: list[Observation]
+    folder: Path, plain: SpatialVLA, observations: list[Observation]
 ) -> None:
-    whole = load_spatialvla(str(folder), iterations="chunk", unnorm_key="bridge_orig/1.0.0")
-    assert (plain.streams["action"].iterations, whole.streams["action"].iterations) == (3, 12)
+    whole_chunk = load_spatialvla(str(folder), iterations="chunk", unnorm_key="bridge_orig/1.0.0")
+    assert (plain.streams["action"].iterations, whole_chunk.streams["action"].iterations) == (3, 12)
     caches = []
-    for policy in (plain, whole):
+    for policy in (plain, whole_chunk):
         with capture(policy, policy.sites()) as activations:
-            policy.act(seen, [0, 1])
+            policy.act(observations, [0, 1])
         caches.append(activations)
     for site in plain.sites():
         assert torch.equal(caches[0][site], caches[1][site])
     assert (caches[1][Site("action", 2, iteration=11)] - caches[1][Site("action", 2, iteration=2)]).abs().max() > 0
 
 
-def test_picture_positions_know_the_instruction(plain: SpatialVLA, seen: list[Observation]) -> None:
+def test_picture_positions_know_the_instruction(plain: SpatialVLA, observations: list[Observation]) -> None:
     """Attention goes both ways over the prompt; docs/token-policies.md says what that means for probes."""
-    kept = []
+    captured = []
     for text in ("put the cube on the star", "take it away"):
         with capture(plain, plain.sites()) as activations:
-            plain.act([replace(seen[0], instruction=text)], [0])
-        kept.append(activations[Site("backbone", 2)][:, : plain.config.patches])
-    assert (kept[0] - kept[1]).abs().max() > 1e-3
+            plain.act([replace(observations[0], instruction=text)], [0])
+        captured.append(activations[Site("backbone", 2)][:, : plain.config.patches])
+    assert (captured[0] - captured[1]).abs().max() > 1e-3
 
 
-def test_every_position_has_its_role(plain: SpatialVLA, seen: list[Observation]) -> None:
-    short, long = plain.roles(seen)["backbone"]
+def test_every_position_has_its_role(plain: SpatialVLA, observations: list[Observation]) -> None:
+    short, long = plain.roles(observations)["backbone"]
     patches = plain.config.patches
     assert [span.role for span in long.spans] == ["image.primary", "special", "language"]
     assert [span.role for span in short.spans] == ["image.primary", "special", "language", "padding"]
     assert (long.spans[0].stop, long.spans[1].stop) == (patches, patches + 1)
-    ids = plain.token_ids([one.instruction for one in seen])
+    ids = plain.token_ids([observation.instruction for observation in observations])
     assert len(long) == patches + len(ids[1]) - 1
     assert len(ids[0]) < len(ids[1])
 
@@ -122,24 +127,26 @@ def test_every_position_has_its_role(plain: SpatialVLA, seen: list[Observation])
 # -- cameras ---------------------------------------------------------------------------------------------------
 
 
-def test_a_picture_without_intrinsics_is_refused_by_name(plain: SpatialVLA, seen: list[Observation]) -> None:
+def test_a_picture_without_intrinsics_is_refused_by_name(
+    plain: SpatialVLA, observations: list[Observation]
+) -> None:
     assert plain.card.needs == {"intrinsics"}
     with pytest.raises(ObservationError, match="no intrinsics"):
-        plain.act([replace(seen[0], intrinsics=None)], [0])
+        plain.act([replace(observations[0], intrinsics=None)], [0])
     with pytest.raises(ObservationError, match="invertible"):
-        plain.act([replace(seen[0], intrinsics=np.zeros((3, 3), np.float32))], [0])
+        plain.act([replace(observations[0], intrinsics=np.zeros((3, 3), np.float32))], [0])
 
 
 def test_the_camera_of_the_scene_reaches_the_network_scaled_to_the_models_picture(
-    plain: SpatialVLA, seen: list[Observation]
+    plain: SpatialVLA, observations: list[Observation]
 ) -> None:
-    height, width = seen[0].image.shape[:2]
+    height, width = observations[0].image.shape[:2]
     expected = SCENE * np.array([[SIDE / width], [SIDE / height], [1]])
-    np.testing.assert_allclose(plain.cameras(seen)[0].numpy(), expected, rtol=1e-6)
+    np.testing.assert_allclose(plain.cameras(observations)[0].numpy(), expected, rtol=1e-6)
     residuals = []
     for matrix in (SCENE, SCENE * [[2], [2], [1]]):
         with capture(plain, plain.sites()) as activations:
-            plain.act([replace(seen[0], intrinsics=matrix.astype(np.float32))], [0])
+            plain.act([replace(observations[0], intrinsics=matrix.astype(np.float32))], [0])
         residuals.append(activations[Site("backbone", 0)])
     patches = plain.config.patches
     assert (residuals[0] - residuals[1])[:, :patches].abs().max() > 1e-3
@@ -148,17 +155,19 @@ def test_the_camera_of_the_scene_reaches_the_network_scaled_to_the_models_pictur
 
 @pytest.mark.slow
 def test_the_training_camera_may_stand_in_for_the_scenes(
-    folder: Path, plain: SpatialVLA, seen: list[Observation]
+    folder: Path, plain: SpatialVLA, observations: list[Observation]
 ) -> None:
     preset = load_spatialvla(str(folder), camera="default", unnorm_key="bridge_orig/1.0.0")
     assert preset.card.needs == frozenset()
     assert preset.card.settings["camera"] == "default"
     camera = processor_values()["intrinsic_config"]["default"]
-    height, width = seen[0].image.shape[:2]
+    height, width = observations[0].image.shape[:2]
     scale = [[width / camera["width"]], [height / camera["height"]], [1]]
-    same = replace(seen[0], intrinsics=np.array(camera["intrinsic"]) * scale)
-    np.testing.assert_allclose(preset.cameras(seen[:1]), plain.cameras([same]), rtol=1e-6)
-    np.testing.assert_array_equal(preset.act([replace(seen[0], intrinsics=None)], [0]), plain.act([same], [0]))
+    same = replace(observations[0], intrinsics=np.array(camera["intrinsic"]) * scale)
+    np.testing.assert_allclose(preset.cameras(observations[:1]), plain.cameras([same]), rtol=1e-6)
+    np.testing.assert_array_equal(
+        preset.act([replace(observations[0], intrinsics=None)], [0]), plain.act([same], [0])
+    )
     with pytest.raises(
         UsageError, match=r"neither scene nor one of the checkpoint's: bridge_orig/1\.0\.0, default"
     ):
@@ -173,9 +182,9 @@ def test_a_model_without_depth_needs_no_camera(flat: SpatialVLA) -> None:
 
 
 def test_a_chunk_is_in_units_of_the_data_and_one_step_of_it_is_executed(
-    plain: SpatialVLA, seen: list[Observation]
+    plain: SpatialVLA, observations: list[Observation]
 ) -> None:
-    actions = plain.act(seen, [0, 1])
+    actions = plain.act(observations, [0, 1])
     assert actions.shape == (2, 4, 7)
     assert (plain.card.chunk, plain.card.execute) == (4, 1)
     assert (np.abs(actions[..., :6]) <= 0.03).all()
@@ -183,27 +192,27 @@ def test_a_chunk_is_in_units_of_the_data_and_one_step_of_it_is_executed(
 
 
 def test_an_executed_step_that_names_no_action_is_flagged_and_said(
-    plain: SpatialVLA, seen: list[Observation], monkeypatch: pytest.MonkeyPatch
+    plain: SpatialVLA, observations: list[Observation], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ids = torch.tensor([[slot.start for slot in plain.bins.slots] * 4] * 2)
     ids[0, 5] = 7  # in a step that is planned and not executed
     monkeypatch.setattr(plain, "generate", lambda *_: SimpleNamespace(ids=ids))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        plain.act(seen, [0, 1])
+        plain.act(observations, [0, 1])
     assert plain.flagged is not None
     assert plain.flagged.tolist() == [False, False]
     ids[1, 1] = plain.bins.slots[0].start  # a movement where a rotation belongs
     with pytest.warns(UserWarning, match="name no action"):
-        plain.act(seen, [0, 1])
+        plain.act(observations, [0, 1])
     assert plain.flagged.tolist() == [False, True]
 
 
 @pytest.mark.slow
 def test_decoding_within_slots_always_names_an_action_and_says_so(
-    plain: SpatialVLA, chunked: SpatialVLA, seen: list[Observation]
+    plain: SpatialVLA, chunked: SpatialVLA, observations: list[Observation]
 ) -> None:
-    chunked.act(seen, [0, 1])
+    chunked.act(observations, [0, 1])
     assert chunked.flagged is not None
     assert not chunked.flagged.any()
     assert any("original does not" in note for note in chunked.card.notes)
@@ -234,12 +243,12 @@ def variants(tmp_path: Path) -> dict[str, SpatialVLA]:
 
 @pytest.mark.slow
 def test_the_released_variants_differ_in_bins_and_statistics_only(
-    variants: dict[str, SpatialVLA], seen: list[Observation]
+    variants: dict[str, SpatialVLA], observations: list[Observation]
 ) -> None:
     assert len({policy.card.weights_sha256 for policy in variants.values()}) == 1
     keys = [policy.statistics.key for policy in variants.values()]
     assert keys == ["bridge_orig/1.0.0", "bridge_orig/1.0.0", "bridge_orig/1.0.0", FRACTAL]
-    actions = {name: policy.act(seen, [0, 1]) for name, policy in variants.items()}
+    actions = {name: policy.act(observations, [0, 1]) for name, policy in variants.items()}
     np.testing.assert_array_equal(actions["pt"], actions["mix"])
     assert np.abs(actions["pt"] - actions["sft-bridge"])[..., :3].max() > 1e-3
     np.testing.assert_array_equal(actions["pt"][..., 3:6], actions["sft-bridge"][..., 3:6])
@@ -254,8 +263,12 @@ def test_the_released_variants_differ_in_bins_and_statistics_only(
 
 @pytest.mark.slow
 def test_the_statistics_key_is_an_option_with_a_suggestion(tmp_path: Path) -> None:
-    own = processor_values()["statistics"]["bridge_orig/1.0.0"]
-    checkpoint = str(write_checkpoint(tmp_path, processor={"statistics": {"my_arm": own, FRACTAL: own}}))
+    bridge_statistics = processor_values()["statistics"]["bridge_orig/1.0.0"]
+    checkpoint = str(
+        write_checkpoint(
+            tmp_path, processor={"statistics": {"my_arm": bridge_statistics, FRACTAL: bridge_statistics}}
+        )
+    )
     assert load_spatialvla(checkpoint, unnorm_key=FRACTAL).statistics.key == FRACTAL
     with pytest.raises(UsageError, match="Did you mean my_arm"):
         load_spatialvla(checkpoint, unnorm_key="my_arms")
@@ -265,20 +278,20 @@ def test_the_statistics_key_is_an_option_with_a_suggestion(tmp_path: Path) -> No
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("statistics", "said"),
+    ("statistics", "reason"),
     [({}, "has no statistics"), ({"arm": {"action": {"q01": [0.0] * 8, "q99": [1.0] * 8}}}, "8 dimensions")],
 )
-def test_statistics_that_cannot_be_used_are_refused(tmp_path: Path, statistics: Any, said: str) -> None:
-    with pytest.raises(CheckpointError, match=said):
+def test_statistics_that_cannot_be_used_are_refused(tmp_path: Path, statistics: Any, reason: str) -> None:
+    with pytest.raises(CheckpointError, match=reason):
         load_spatialvla(str(write_checkpoint(tmp_path, processor={"statistics": statistics})))
 
 
 @pytest.mark.slow
-def test_a_longer_chunk_has_more_tokens(tmp_path: Path, seen: list[Observation]) -> None:
+def test_a_longer_chunk_has_more_tokens(tmp_path: Path, observations: list[Observation]) -> None:
     checkpoint = str(write_checkpoint(tmp_path, processor={"action_chunk_size": 2}))
     policy = load_spatialvla(checkpoint, iterations="chunk", unnorm_key="bridge_orig/1.0.0")
     assert (policy.steps, policy.streams["action"].iterations) == (6, 6)
-    assert policy.act(seen, [0, 1]).shape == (2, 2, 7)
+    assert policy.act(observations, [0, 1]).shape == (2, 2, 7)
     with pytest.raises(CheckpointError, match="action_chunk_size is 0"):
         load_spatialvla(
             str(write_checkpoint(tmp_path / "none", processor={"action_chunk_size": 0})),
@@ -286,9 +299,9 @@ def test_a_longer_chunk_has_more_tokens(tmp_path: Path, seen: list[Observation])
         )
 
 
-def test_a_prompt_longer_than_the_model_is_refused(plain: SpatialVLA, seen: list[Observation]) -> None:
+def test_a_prompt_longer_than_the_model_is_refused(plain: SpatialVLA, observations: list[Observation]) -> None:
     with pytest.raises(InstructionError, match="this model has 4096"):
-        plain.act([replace(seen[0], instruction="x " * 4096)], [0])
+        plain.act([replace(observations[0], instruction="x " * 4096)], [0])
 
 
 def test_options_are_declared_and_checked(folder: Path) -> None:
@@ -341,8 +354,8 @@ CONFIG = SpatialVLAConfig.from_json(config_values())
 
 
 def speech(folder: Path, **fields: Any) -> Speech:
-    chosen = {"prompt": None, "lowercase": True, "tokenizer": None, **fields}
-    return Speech.of(CONFIG, write_tokenizer(folder), **chosen)
+    speech_options = {"prompt": None, "lowercase": True, "tokenizer": None, **fields}
+    return Speech.of(CONFIG, write_tokenizer(folder), **speech_options)
 
 
 def words(ids: list[int]) -> str:
@@ -358,8 +371,8 @@ def test_the_picture_comes_first_then_the_bare_instruction_in_lower_case_and_a_n
 
 def test_case_and_template_are_options(tmp_path: Path) -> None:
     assert words(speech(tmp_path, lowercase=False).prompt("Put it")[9:]) == "<bos>Put it\n"
-    asked = speech(tmp_path, prompt="question").prompt("Take it")
-    assert words(asked[9:]) == "<bos>What action should the robot take to take it?\n"
+    prompt_ids = speech(tmp_path, prompt="question").prompt("Take it")
+    assert words(prompt_ids[9:]) == "<bos>What action should the robot take to take it?\n"
     assert words(speech(tmp_path, prompt="do: {instruction}").prompt("it")[9:]) == "<bos>do: it\n"
     with pytest.raises(UsageError, match="neither one of bare, question nor a template"):
         speech(tmp_path, prompt="do it")

@@ -31,51 +31,51 @@ DEFAULTS = {
 
 def tuned(family: str, folder: Path, *names: str) -> Path:
     """A tiny checkpoint with the file that fine-tuning writes."""
-    place = WRITERS[family][0](folder)
-    (place / "dataset_statistics.json").write_text(json.dumps(dict.fromkeys(names, UNITS)), encoding="utf-8")
-    return place
+    checkpoint = WRITERS[family][0](folder)
+    (checkpoint / "dataset_statistics.json").write_text(json.dumps(dict.fromkeys(names, UNITS)), encoding="utf-8")
+    return checkpoint
 
 
 @pytest.mark.parametrize("family", FAMILIES)
 def test_what_fine_tuning_wrote_stands_alone_and_the_only_set_needs_no_name(family: str, tmp_path: Path) -> None:
-    place = tuned(family, tmp_path / "tuned", "my_arm")
-    assert load_policy(family, str(place)).card.settings["unnorm_key"] == "my_arm"
+    checkpoint = tuned(family, tmp_path / "tuned", "my_arm")
+    assert load_policy(family, str(checkpoint)).card.settings["unnorm_key"] == "my_arm"
     for name in DEFAULTS[family].values():
         with pytest.raises(UsageError, match=rf"no action statistics of '{name}'.*my_arm"):
-            load_policy(family, str(place), unnorm_key=name)
+            load_policy(family, str(checkpoint), unnorm_key=name)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("family", ["openvla", "spatialvla", "internvla-m1"])
 def test_several_sets_have_to_be_chosen_from_before_anything_is_loaded(family: str, tmp_path: Path) -> None:
     other = next(iter(DEFAULTS[family].values()))
-    place = tuned(family, tmp_path / "tuned", "my_arm", other)
+    checkpoint = tuned(family, tmp_path / "tuned", "my_arm", other)
     with pytest.raises(UsageError, match=f"with -M unnorm_key=NAME: {other}, my_arm"):
-        find_family(family).whose_units(str(place))
+        find_family(family).whose_units(str(checkpoint))
     with pytest.raises(UsageError, match=f"with -M unnorm_key=NAME: {other}, my_arm"):
-        load_policy(family, str(place))
-    chosen = load_policy(family, str(place), unnorm_key="my_arm")
-    assert chosen.card.settings["unnorm_key"] == "my_arm"
+        load_policy(family, str(checkpoint))
+    policy = load_policy(family, str(checkpoint), unnorm_key="my_arm")
+    assert policy.card.settings["unnorm_key"] == "my_arm"
 
 
 def test_a_magma_without_chosen_units_answers_and_does_not_act(tmp_path: Path) -> None:
-    place = WRITERS["magma"][0](tmp_path / "model")
-    model = load_policy("magma", str(place))
+    checkpoint = WRITERS["magma"][0](tmp_path / "model")
+    model = load_policy("magma", str(checkpoint))
     assert "-M unnorm_key=bridge_orig" in str(model.embodiment_mismatch())
     assert model.card.settings["unnorm_key"] == "none"
-    packaged = load_policy("magma", str(place), unnorm_key="bridge_orig")
+    packaged = load_policy("magma", str(checkpoint), unnorm_key="bridge_orig")
     assert packaged.embodiment_mismatch() is None
 
 
 def test_a_robot_among_several_has_to_be_chosen(tmp_path: Path) -> None:
-    place = WRITERS["xiaomi-r0"][0](tmp_path / "model")
+    checkpoint = WRITERS["xiaomi-r0"][0](tmp_path / "model")
     with pytest.raises(UsageError, match="with -M robot=NAME: bridge_delta, "):
-        load_policy("xiaomi-r0", str(place))
-    path = place / "preprocessor_config.json"
+        load_policy("xiaomi-r0", str(checkpoint))
+    path = checkpoint / "preprocessor_config.json"
     values = json.loads(path.read_text(encoding="utf-8"))
     values["action_config"] = {"fractal_delta": values["action_config"]["fractal_delta"]}
     path.write_text(json.dumps(values), encoding="utf-8")
-    assert load_policy("xiaomi-r0", str(place)).card.settings["robot"] == "fractal_delta"
+    assert load_policy("xiaomi-r0", str(checkpoint)).card.settings["robot"] == "fractal_delta"
 
 
 def test_statistics_of_an_adapters_folder_count_over_those_of_its_base(tmp_path: Path) -> None:
@@ -94,22 +94,22 @@ def test_statistics_of_an_adapters_folder_count_over_those_of_its_base(tmp_path:
 
 @pytest.mark.parametrize("family", list(DEFAULTS))
 def test_the_default_checkpoint_alone_has_default_units(family: str) -> None:
-    own = find_family(family)
-    assert own.of_default == DEFAULTS[family]
-    released = own.check(random_weights=True, fetch=False, device="cpu")
+    entry = find_family(family)
+    assert entry.of_default == DEFAULTS[family]
+    released = entry.check(random_weights=True, fetch=False, device="cpu")
     assert released.items() >= DEFAULTS[family].items()
-    assert not own.check("someone/fine-tune", random_weights=True, fetch=False).keys() & DEFAULTS[family].keys()
+    assert not entry.check("someone/fine-tune", random_weights=True, fetch=False).keys() & DEFAULTS[family].keys()
 
 
 @pytest.mark.slow
 def test_the_plan_prints_whose_units_are_used(tmp_path: Path) -> None:
-    place = tuned("openvla", tmp_path / "tuned", "my_arm")
+    checkpoint = tuned("openvla", tmp_path / "tuned", "my_arm")
     command = [
         "extract",
         "--model",
         "openvla",
         "--checkpoint",
-        str(place),
+        str(checkpoint),
         "--items",
         "12",
     ]
@@ -118,9 +118,9 @@ def test_the_plan_prints_whose_units_are_used(tmp_path: Path) -> None:
     assert "my_arm, from" in " ".join(result.output.split())
 
 
-ACTING = {name: made for name, made in WRITERS.items() if own_families()[name].acts}
+ACTING = {name: writer for name, writer in WRITERS.items() if own_families()[name].acts}
 MADE: dict[str, tuple[str, Callable[[Path], Path], dict[str, Any]]] = {
-    **{name: (name, *made) for name, made in ACTING.items()},
+    **{name: (name, *arguments) for name, arguments in ACTING.items()},
     "groot of NVIDIA": ("groot", write_nvidias, {"embodiment": "libero_sim"}),
     "pi0 of Bridge": ("pi0", ACTING["pi0"][0], {"statistics": "bridge"}),
 }

@@ -60,8 +60,8 @@ def test_the_experts_quantities_are_what_its_layers_compute(loaded: Xiaomi, obse
 
 @torch.inference_mode()
 def _apply(layer: Module, norm: str, value: torch.Tensor) -> torch.Tensor:
-    found: torch.Tensor = getattr(layer, norm)(value)
-    return found
+    normed: torch.Tensor = getattr(layer, norm)(value)
+    return normed
 
 
 def test_deepstack_reaches_the_backbone_between_layers_at_the_picture_only(
@@ -89,8 +89,8 @@ def test_roles_follow_the_pictures_size_and_the_chat(loaded: Xiaomi, observation
     assert first.mask("special").sum() == 6
     assert [span.role for span in roles["expert"][0].spans] == ["special", "state", "action"]
     assert len(roles["expert"][0]) == 2 + 4
-    seen = loaded.inputs([observation])
-    assert (seen.ids == ID["<|image_pad|>"]).sum() == 64
+    model_inputs = loaded.inputs([observation])
+    assert (model_inputs.ids == ID["<|image_pad|>"]).sum() == 64
 
 
 def test_the_vision_tower_is_read_picture_by_picture(loaded: Xiaomi, observation: Observation) -> None:
@@ -202,7 +202,7 @@ def test_the_releases_openness_is_one_minus_the_fingers_in_metres(folder: Path, 
         load_xiaomi(str(folder), robot="bridge_delta"),
         load_xiaomi(str(folder), openness="release", robot="bridge_delta"),
     )
-    measured, said = (policy.state([observation])[0, 0].numpy() for policy in (loaded, released))
+    measured, released_state = (policy.state([observation])[0, 0].numpy() for policy in (loaded, released))
     assert measured[7] == 1.0
-    assert said[7] == pytest.approx(1 - 0.037)
-    np.testing.assert_array_equal(measured[:7], said[:7])
+    assert released_state[7] == pytest.approx(1 - 0.037)
+    np.testing.assert_array_equal(measured[:7], released_state[:7])

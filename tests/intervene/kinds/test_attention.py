@@ -99,12 +99,12 @@ def test_attention_on_patches_adds_up_to_the_pictures_share_and_patches_lie_wher
     height, width = pair.clean.image.shape[:2]
     for side, pixels in pair.tiles.items():
         rows, columns = np.nonzero(pixels)
-        seen = tokens_overlapping(session.policy, pair.clean, pixels)
+        on_tile = tokens_overlapping(session.policy, pair.clean, pixels)
         blur = 1 / BANDS
         crosses = ((left - blur) * width <= columns.max()) & ((right + blur) * width > columns.min())
         crosses &= ((top - blur) * height <= rows.max()) & ((bottom + blur) * height > rows.min())
-        assert seen.any()
-        assert crosses[seen].all(), side
+        assert on_tile.any()
+        assert crosses[on_tile].all(), side
         assert not crosses.all()
     areas = (right - left) * (bottom - top)
     assert areas.sum() <= 1.2, "patches lie beside each other"
@@ -131,7 +131,7 @@ def test_every_camera_has_its_patches_where_they_look_and_a_frame_shows_them_sid
         strongest = boxes[camera][policy.patch_order()[moved[at].argmax()]]
         assert (strongest[:2] <= 0.15).all(), camera
     roles = ("all", "image.top", "image.wrist")
-    session = SimpleNamespace(policy=policy, act=lambda seen, seed: policy.act([seen], [seed])[0])
+    session = SimpleNamespace(policy=policy, act=lambda frame, seed: policy.act([frame], [seed])[0])
     context = ConditionContext(session, Pair(observation, observation))  # type: ignore[arg-type]
     result = attention_recorded("backbone", roles, boxes).play(context)
     assert result.patches is not None
@@ -154,14 +154,19 @@ def test_every_camera_has_its_patches_where_they_look_and_a_frame_shows_them_sid
 
 
 def test_noting_changes_no_action_bit_for_bit(attention_records: InterventionResult) -> None:
-    said = attention_records.certificate["attention"]
-    assert (said["inferences"], said["blocks"], said["iterations"], said["heads"]) == (
+    attention_facts = attention_records.certificate["attention"]
+    assert (
+        attention_facts["inferences"],
+        attention_facts["blocks"],
+        attention_facts["iterations"],
+        attention_facts["heads"],
+    ) == (
         4,
         BLOCKS,
         ITERATIONS,
         HEADS,
     )
-    assert said["max_action_change"] == 0.0
+    assert attention_facts["max_action_change"] == 0.0
     assert attention_records.certificate["replay"]["equal"] == 4
     changed = replace(outcomes_of({"color": follower(4)}), max_action_change=np.full((2, 4), 1e-6))
     with pytest.raises(CaptureChangedActionError, match="1e-06"):
@@ -172,19 +177,19 @@ def test_shares_add_up_and_tiles_are_told_by_where_the_answer_lies(weighed: Atte
     shares = weighed.shares()
     assert set(TILES) <= set(weighed.roles)
     np.testing.assert_allclose(shares["all"] + shares["action"], 1)
-    rest = sum(shares[role] for role in weighed.roles if role not in ("all", *TILES))
-    np.testing.assert_allclose(rest, shares["all"], atol=1e-6)
+    summed_shares = sum(shares[role] for role in weighed.roles if role not in ("all", *TILES))
+    np.testing.assert_allclose(summed_shares, shares["all"], atol=1e-6)
     np.testing.assert_allclose(
         shares["image.correct"] + shares["image.other"], shares["image.left"] + shares["image.right"]
     )
-    left = weighed.sides == "left"
-    np.testing.assert_array_equal(shares["image.correct"][left], shares["image.left"][left])
-    np.testing.assert_array_equal(shares["image.correct"][~left], shares["image.right"][~left])
+    is_left = weighed.sides == "left"
+    np.testing.assert_array_equal(shares["image.correct"][is_left], shares["image.left"][is_left])
+    np.testing.assert_array_equal(shares["image.correct"][~is_left], shares["image.right"][~is_left])
     apart = weighed.correct_minus_other("suite")
     assert set(apart) == set(range(BLOCKS))
     for block, (value, (low, high)) in apart.items():
-        own = shares["image.correct"][:, block] - shares["image.other"][:, block]
-        assert value == pytest.approx(own.mean())
+        difference = shares["image.correct"][:, block] - shares["image.other"][:, block]
+        assert value == pytest.approx(difference.mean())
         assert low <= value <= high
 
 
@@ -223,9 +228,9 @@ def test_what_nobody_plays_is_left_out_and_a_hidden_tile_counts_where_it_is_seen
     mass[..., at["special"]] = np.nan
     mass[0, ..., at["image.left"]] = np.nan
     hidden = replace(weighed, mass=mass)
-    found = {row.role: row.share for row in hidden.rows(())}
-    assert "special" not in found
-    assert found["image.left"] == pytest.approx(float(mass[1:, ..., at["image.left"]].mean()), rel=1e-5)
+    share_by_role = {row.role: row.share for row in hidden.rows(())}
+    assert "special" not in share_by_role
+    assert share_by_role["image.left"] == pytest.approx(float(mass[1:, ..., at["image.left"]].mean()), rel=1e-5)
     values = (hidden.shares()["image.correct"] - hidden.shares()["image.other"])[1:, 1]
     assert hidden.correct_minus_other("suite")[1][0] == pytest.approx(values.mean())
     every = replace(weighed, mass=np.where(np.arange(mass.shape[-1]) == at["special"], np.nan, weighed.mass))
@@ -249,15 +254,17 @@ def test_the_command_shows_a_table_json_and_csv(copy: Run, attention_records: In
         assert "not causal" in " ".join(answer.stderr.split())
         return answer.stdout
 
-    shown = " ".join(ask("table").split())
-    assert "What does it attend to?" in shown
-    assert "correct − other" in shown
-    assert "block 02" in shown
-    found = json.loads(ask("json"))
-    assert found["certificate"]["attention"]["stream"] == "backbone"
-    assert {"category", "role", "block", "iteration", "head", "share"} <= found["effects"][0].keys()
+    printed = " ".join(ask("table").split())
+    assert "What does it attend to?" in printed
+    assert "correct − other" in printed
+    assert "block 02" in printed
+    json_answer = json.loads(ask("json"))
+    assert json_answer["certificate"]["attention"]["stream"] == "backbone"
+    assert {"category", "role", "block", "iteration", "head", "share"} <= json_answer["effects"][0].keys()
     assert ask("csv").splitlines()[0] == "category,role,block,iteration,head,share,n_episodes"
-    assert len(found["effects"]) == BLOCKS * ITERATIONS * HEADS * len({row["role"] for row in found["effects"]})
+    assert len(json_answer["effects"]) == BLOCKS * ITERATIONS * HEADS * len(
+        {row["role"] for row in json_answer["effects"]}
+    )
 
 
 @pytest.mark.slow
@@ -313,13 +320,13 @@ def test_what_cannot_be_told_is_refused_by_name(session: ReplaySession) -> None:
 def test_blocks_with_other_numbers_of_heads_are_no_table() -> None:
     weights = np.ones((1, 2, 3), np.float32) / 3
     mass = AttentionMass({(0, 0): weights, (2, 1): weights})
-    found = shares_by_role(mass, [np.array([True, False, True]), None])
-    assert found.shape == (3, 2, 2, 2)
-    assert np.isnan(found[..., 1]).all()
-    found = found[..., :1]
-    np.testing.assert_allclose(found[0, 0], 2 / 3)
-    assert np.isnan(found[1]).all()
-    assert np.isnan(found[0, 1]).all()
+    shares = shares_by_role(mass, [np.array([True, False, True]), None])
+    assert shares.shape == (3, 2, 2, 2)
+    assert np.isnan(shares[..., 1]).all()
+    shares = shares[..., :1]
+    np.testing.assert_allclose(shares[0, 0], 2 / 3)
+    assert np.isnan(shares[1]).all()
+    assert np.isnan(shares[0, 1]).all()
     for other in (weights[:, :1], np.concatenate([weights, weights])):
         with pytest.raises(CaptureError, match="as many heads"):
             shares_by_role(replace(mass, by_head={**mass.by_head, (1, 0): other}), [np.array([True] * 3)])

@@ -37,11 +37,13 @@ def wired() -> WiredSession:
 
 
 def screened(session: WiredSession, name: str, **options: Any) -> Measurement:
-    asked = AttributionPatching(categories=(name,), roles=ROLES, **options)
-    conditions = asked.conditions(session)
+    intervention = AttributionPatching(categories=(name,), roles=ROLES, **options)
+    conditions = intervention.conditions(session)
     outcomes = outcomes_of(session, [name], conditions[2:])
     entries = dict(session.certificate)
-    return measured(outcomes, SUITE, asked.parameters() | {"kind": asked.kind}, entries, lambda _: b"")
+    return measured(
+        outcomes, SUITE, intervention.parameters() | {"kind": intervention.kind}, entries, lambda _: b""
+    )
 
 
 def by_name(rows: list[AttributionEffect]) -> dict[str, AttributionEffect]:
@@ -49,8 +51,8 @@ def by_name(rows: list[AttributionEffect]) -> dict[str, AttributionEffect]:
 
 
 def test_what_is_read_linearly_is_ranked_first_and_its_estimate_is_the_effect(wired: WiredSession) -> None:
-    found = screened(wired, "copied")
-    rows = by_name(AttributionPatching.effects(found))
+    screen = screened(wired, "copied")
+    rows = by_name(AttributionPatching.effects(screen))
     first, anchor = rows["kv.01 language"], rows["kv.* all"]
     assert (first.rank, first.finding) == (1, "anchored")
     assert first.estimate == pytest.approx(1.0, abs=0.02)
@@ -59,7 +61,7 @@ def test_what_is_read_linearly_is_ranked_first_and_its_estimate_is_the_effect(wi
     assert anchor.estimate == pytest.approx(anchor.exact, abs=0.02)
     assert rows["backbone.01 language"].estimate == pytest.approx(1.0, abs=0.02)
     assert all(abs(row.estimate or 0) < 0.02 for row in rows.values() if row.sites in ("kv.00", "kv.02"))
-    (sentence,) = AttributionPatching.sentences(list(rows.values()), said_of(found))
+    (sentence,) = AttributionPatching.sentences(list(rows.values()), said_of(screen))
     assert sentence.startswith("Copied: gradients give 1.0")
     assert "; first of kv: kv.01 language 1.0" in sentence
 
@@ -67,16 +69,16 @@ def test_what_is_read_linearly_is_ranked_first_and_its_estimate_is_the_effect(wi
 @pytest.mark.parametrize("name", ["blocks", "roles"])
 def test_a_screen_is_void_where_a_decision_has_no_slope(wired: WiredSession, name: str) -> None:
     """All of `kv` carries everything, and no gradient shows it."""
-    found = screened(wired, name)
-    rows = AttributionPatching.effects(found)
+    screen = screened(wired, name)
+    rows = AttributionPatching.effects(screen)
     assert {row.finding for row in rows} == {"void"}
     assert {row.rank for row in rows} == {None}
     assert (rows[0].name, rows[0].estimate) == ("kv.* all", 0.0)
     assert rows[0].exact == pytest.approx(1.0, abs=0.02)
-    (sentence,) = AttributionPatching.sentences(rows, said_of(found))
-    said = "screen void: gradients give 0.00 where the patch gives 1.00 (kv.* all)"
-    assert f"{said}; no order is shown" in sentence
-    assert said in str(AttributionPatching.table(rows, said_of(found)).title)
+    (sentence,) = AttributionPatching.sentences(rows, said_of(screen))
+    void_sentence = "screen void: gradients give 0.00 where the patch gives 1.00 (kv.* all)"
+    assert f"{void_sentence}; no order is shown" in sentence
+    assert void_sentence in str(AttributionPatching.table(rows, said_of(screen)).title)
 
 
 def test_nothing_is_ordered_where_the_swap_moves_nothing(wired: WiredSession) -> None:
@@ -86,16 +88,16 @@ def test_nothing_is_ordered_where_the_swap_moves_nothing(wired: WiredSession) ->
 
 
 def test_the_largest_estimates_and_drawn_cells_are_patched_exactly(wired: WiredSession) -> None:
-    found = screened(wired, "copied", sites=("kv.*",), top=1, controls=2)
-    rows = by_name(AttributionPatching.effects(found))
+    screen = screened(wired, "copied", sites=("kv.*",), top=1, controls=2)
+    rows = by_name(AttributionPatching.effects(screen))
     exact = {name for name, row in rows.items() if row.exact is not None and not row.is_anchor}
     drawn = {name for name, row in rows.items() if row.is_drawn}
     assert exact == {"kv.01 language", *drawn}
     assert len(drawn) == 2
-    assert found.certificate["attribution"]["drawn"] == sorted(
+    assert screen.certificate["attribution"]["drawn"] == sorted(
         f"{EXACT}|{name.replace(' ', '|')}" for name in drawn
     )
-    (sentence,) = AttributionPatching.sentences(list(rows.values()), said_of(found))
+    (sentence,) = AttributionPatching.sentences(list(rows.values()), said_of(screen))
     assert sentence.endswith("; of 2 drawn cells the largest exact effect is 0.00.")
 
 
@@ -116,14 +118,14 @@ def test_both_ends_are_the_mean_of_two_gradients(wired: WiredSession) -> None:
 
 def test_a_gradient_at_kv_is_of_what_the_acting_part_reads_alone(wired: WiredSession) -> None:
     """The block's own reading of the same tokens, and the other tapped sites, do not count."""
-    one, at = replay_inputs("copied")[0], Site("kv", 0, "values")
-    others = [Site("backbone", layer) for layer in range(4)]
-    for sites in ([at], [*others, at]):
+    pair, at = replay_inputs("copied")[0], Site("kv", 0, "values")
+    backbone_sites = [Site("backbone", layer) for layer in range(4)]
+    for sites in ([at], [*backbone_sites, at]):
         _, slopes = gradients_at(
-            wired.policy, [one.clean], [one.seed], sites, lambda chunks: chunks[0, :, 1].sum()
+            wired.policy, [pair.clean], [pair.seed], sites, lambda chunks: chunks[0, :, 1].sum()
         )
         assert not slopes[at].any(), "block 0 is not read by the acting part"
-    assert slopes[others[0]].any()
+    assert slopes[backbone_sites[0]].any()
 
 
 def test_what_cannot_be_screened_is_refused_with_what_to_do() -> None:
@@ -139,18 +141,18 @@ def test_a_screen_is_stored_with_the_run_and_enters_no_verdict(
     copy: Run, source: ReplaySource, twin: Policy
 ) -> None:
     before = verdicts_of(copy)
-    asked = AttributionPatching(categories=("color",), items=1, sites=("kv.*", "backbone.01"))
-    found = run_intervention(copy, asked, source, load=lambda *_: twin)
-    assert load_effects(copy, kind="attribution").to_csv() == found.to_csv()
-    assert {row.sites for row in found.effects} == {"kv.*", "kv.00", "kv.01", "kv.02", "backbone.01"}
+    intervention = AttributionPatching(categories=("color",), items=1, sites=("kv.*", "backbone.01"))
+    screen = run_intervention(copy, intervention, source, load=lambda *_: twin)
+    assert load_effects(copy, kind="attribution").to_csv() == screen.to_csv()
+    assert {row.sites for row in screen.effects} == {"kv.*", "kv.00", "kv.01", "kv.02", "backbone.01"}
     assert verdicts_of(copy) == before
-    assert found.certificate["edits"][f"{EXACT}|kv.02|image"]["fires"] > 0
+    assert screen.certificate["edits"][f"{EXACT}|kv.02|image"]["fires"] > 0
 
 
 def test_a_family_without_gradients_is_refused_before_anything_is_loaded() -> None:
     from probe_kit.hooks.registry import find_family
 
-    asked = AttributionPatching()
-    assert "gradients" in asked.required_capabilities
+    intervention = AttributionPatching()
+    assert "gradients" in intervention.required_capabilities
     with pytest.raises(UnsupportedInterventionError, match=r"openvla does not support.*--kind interchange"):
         find_family("openvla").check_intervention("gradients")

@@ -46,7 +46,7 @@ NAMES = (
 RIGHT, WRONG, OUT = "correct", "wrong", "oob"
 
 
-def made(episode_outcomes: Sequence[Sequence[str]], names: Sequence[str] = NAMES) -> ConditionOutcomes:
+def build_outcomes(episode_outcomes: Sequence[Sequence[str]], names: Sequence[str] = NAMES) -> ConditionOutcomes:
     """episode_outcomes: (K, E), two layouts an item, each item a group of its own."""
     episodes = len(episode_outcomes[0])
     items = np.array([f"color-{number // 2}" for number in range(episodes)])
@@ -66,12 +66,16 @@ def made(episode_outcomes: Sequence[Sequence[str]], names: Sequence[str] = NAMES
     )
 
 
-def found(episode_outcomes: Sequence[Sequence[str]], names: Sequence[str] = NAMES) -> dict[str, ClosedLoopEffect]:
-    return {row.name: row for row in ClosedLoop.effects(measured(made(episode_outcomes, names), "suite"))}
+def effects_by_name(
+    episode_outcomes: Sequence[Sequence[str]], names: Sequence[str] = NAMES
+) -> dict[str, ClosedLoopEffect]:
+    return {
+        row.name: row for row in ClosedLoop.effects(measured(build_outcomes(episode_outcomes, names), "suite"))
+    }
 
 
 def test_a_choice_that_turns_beyond_its_control_is_confirmed() -> None:
-    rows = found([[RIGHT] * 16, [WRONG] * 16, [WRONG] * 16, [WRONG] * 14 + [OUT] * 2, [RIGHT] * 16])
+    rows = effects_by_name([[RIGHT] * 16, [WRONG] * 16, [WRONG] * 16, [WRONG] * 14 + [OUT] * 2, [RIGHT] * 16])
     assert [row.finding for row in rows.values()] == ["identity patch", *["confirmed"] * 3, "control"]
     along = rows["backbone.02 image mean-difference"]
     assert (along.net, along.control_net, along.in_zone, along.wrong_in_zone) == (0.875, 0.0, 0.875, 1.0)
@@ -82,7 +86,7 @@ def test_a_choice_that_turns_beyond_its_control_is_confirmed() -> None:
 
 
 def test_what_its_control_does_as_well_is_not_confirmed() -> None:
-    rows = found([[RIGHT] * 16, [WRONG] * 16, [RIGHT] * 16, [WRONG] * 16, [WRONG] * 16])
+    rows = effects_by_name([[RIGHT] * 16, [WRONG] * 16, [RIGHT] * 16, [WRONG] * 16, [WRONG] * 16])
     assert rows["backbone.02 image mean-difference"].finding == "not confirmed"
     assert rows["backbone.02 image"].finding == "not confirmed"
 
@@ -90,7 +94,7 @@ def test_what_its_control_does_as_well_is_not_confirmed() -> None:
 def test_a_broken_hand_enters_no_verdict_and_no_family() -> None:
     """Neither as a claim, nor as a control that a claim is compared with."""
     broken = [WRONG] * 7 + [OUT] * 9
-    rows = found([[RIGHT] * 16, [WRONG] * 16, broken, [WRONG] * 16, broken])
+    rows = effects_by_name([[RIGHT] * 16, [WRONG] * 16, broken, [WRONG] * 16, broken])
     assert rows["backbone.02 image"].finding == "task disrupted"
     assert rows["backbone.02 image"].p_fwe is None
     assert rows["backbone.02 image"].net > 0
@@ -98,23 +102,23 @@ def test_a_broken_hand_enters_no_verdict_and_no_family() -> None:
     assert rows["backbone.02 image mean-difference"].control_net is None
     assert rows["backbone.02 image mean-difference"].finding == "confirmed"
     half = [WRONG] * 8 + [OUT] * 8
-    assert not found([[RIGHT] * 16, half], NAMES[:2])["image_swap"].disrupted
+    assert not effects_by_name([[RIGHT] * 16, half], NAMES[:2])["image_swap"].disrupted
 
 
 def test_falling_out_of_the_zones_is_no_turn() -> None:
-    rows = found([[RIGHT] * 16, [OUT] * 6 + [RIGHT] * 10], NAMES[:2])
+    rows = effects_by_name([[RIGHT] * 16, [OUT] * 6 + [RIGHT] * 10], NAMES[:2])
     assert rows["image_swap"].net == 0
     assert rows["image_swap"].correct == 0.625
     assert rows["image_swap"].finding == "not confirmed"
 
 
 def test_sides_are_of_the_picture_that_is_turned_to() -> None:
-    rows = found([[RIGHT] * 16, [WRONG, RIGHT] * 8], NAMES[:2])
+    rows = effects_by_name([[RIGHT] * 16, [WRONG, RIGHT] * 8], NAMES[:2])
     assert (rows["image_swap"].net_left, rows["image_swap"].net_right) == (0.0, 1.0)
 
 
 def test_nothing_in_a_zone_is_no_ratio() -> None:
-    rows = found([[OUT] * 16, [OUT] * 16], NAMES[:2])
+    rows = effects_by_name([[OUT] * 16, [OUT] * 16], NAMES[:2])
     assert rows["image_swap"].wrong_in_zone is None
     assert not rows["image_swap"].disrupted
 
@@ -123,7 +127,7 @@ def test_shuffled_conditions_are_seldom_confirmed() -> None:
     """Plain and changed outcomes of the same coin: not above one in twenty."""
     draw = np.random.default_rng(0)
     confirmed = [
-        found(draw.choice([RIGHT, WRONG, OUT], size=(2, 16)).tolist(), NAMES[:2])["image_swap"].finding
+        effects_by_name(draw.choice([RIGHT, WRONG, OUT], size=(2, 16)).tolist(), NAMES[:2])["image_swap"].finding
         == "confirmed"
         for _ in range(100)
     ]
@@ -131,13 +135,13 @@ def test_shuffled_conditions_are_seldom_confirmed() -> None:
 
 
 def test_stored_answers_come_back_with_outcomes_and_without() -> None:
-    outcomes = made([[RIGHT, WRONG], [OUT, WRONG]], NAMES[:2])
+    outcomes = build_outcomes([[RIGHT, WRONG], [OUT, WRONG]], NAMES[:2])
     again = ConditionOutcomes(**arrays_from_bytes(outcomes.to_bytes()))
     assert again.episode_outcomes is not None
     np.testing.assert_array_equal(again.episode_outcomes, [[RIGHT, WRONG], [OUT, WRONG]])
 
 
-def place(name: str, role: str, effect: float, p: float = 0.001) -> PatchEffect:
+def patch(name: str, role: str, effect: float, p: float = 0.001) -> PatchEffect:
     return PatchEffect(
         category="color", sites=name, role=role, direction="", coefficient="", is_control=False,
         n_episodes=8, n_items=4,
@@ -149,8 +153,8 @@ def place(name: str, role: str, effect: float, p: float = 0.001) -> PatchEffect:
 
 def test_the_best_cell_is_the_last_located_place_in_its_narrowest_role() -> None:
     rows = [
-        place("backbone.00", "all", 1.0), place("backbone.02", "all", 0.99), place("backbone.02", "image", 0.9),
-        place("backbone.02", "language", 0.1), place("backbone.03", "all", 0.0, 1.0),
+        patch("backbone.00", "all", 1.0), patch("backbone.02", "all", 0.99), patch("backbone.02", "image", 0.9),
+        patch("backbone.02", "language", 0.1), patch("backbone.03", "all", 0.0, 1.0),
     ]  # fmt: skip
     cells = [best_cell(rows), best_cell(rows[:2])]
     assert [cell and (cell.sites, cell.role) for cell in cells] == [
@@ -193,8 +197,8 @@ def effects(run: Run, source: ReplaySource, twin: "Policy") -> InterventionResul
     return run_intervention(run, ASKED, source, load=lambda *_: twin)
 
 
-def row_of(effects: InterventionResult, place: str, direction: str = "") -> dict[str, object]:
-    (row,) = (row for row in effects.effects if (row.sites, row.direction) == (place, direction))
+def row_of(effects: InterventionResult, sites: str, direction: str = "") -> dict[str, object]:
+    (row,) = (row for row in effects.effects if (row.sites, row.direction) == (sites, direction))
     return row.to_json()
 
 
@@ -204,8 +208,8 @@ def test_dose_zero_is_the_stored_run_bit_for_bit_with_every_hook_in_place(effect
     assert check == {
         "episodes": 2, "compared": 2, "equal": 2, "largest_difference": 0.0, "outcomes_equal": 2,
     }  # fmt: skip
-    said = effects.certificate["edits"]["clean"]
-    assert said["fires"] == said["no_op_fires"] == 2 * CALLS * (2 + 2)
+    ledger = effects.certificate["edits"]["clean"]
+    assert ledger["fires"] == ledger["no_op_fires"] == 2 * CALLS * (2 + 2)
     notes = [note for note in effects.notes if "of items no p" not in note]
     assert [note.partition(".")[0] for note in notes] == ["unread: backbone"], (
         "the end of the backbone is a target"
@@ -270,32 +274,32 @@ def test_killed_and_resumed_gives_the_same_bytes(
     keys = {run_intervention(copy, intervention, source, load=lambda *_: twin).key for copy in copies}
     (key,) = keys
     for name in ("episodes.npz", "effects.csv", "certificate.json"):
-        whole, killed = ((copy.path / "interventions" / key / name).read_bytes() for copy in copies)
-        assert whole == killed
+        uninterrupted, killed = ((copy.path / "interventions" / key / name).read_bytes() for copy in copies)
+        assert uninterrupted == killed
     edits = load_effects(copies[0], key).certificate["edits"]
     assert {name.rpartition("|")[2] for name in edits} == {"clean", "image", "mean-difference:1", "control-1"}
-    assert all(said["fires"] == 2 * 2 for said in edits.values())
+    assert all(counts["fires"] == 2 * 2 for counts in edits.values())
 
 
 @pytest.mark.slow
 def test_every_inference_has_its_own_state_and_the_pictures_exchanged(
     run: Run, source: ReplaySource, twin: "Policy"
 ) -> None:
-    seen: list[tuple[Observation, Observation]] = []
+    observations: list[tuple[Observation, Observation]] = []
 
     def watch(context: ConditionContext) -> ConditionResult:
-        seen.append((context.pair.clean, context.pair.source))  # type: ignore[arg-type]
+        observations.append((context.pair.clean, context.pair.source))  # type: ignore[arg-type]
         return CLEAN_RUN.play(context)
 
     session: ReplaySession
     with open_session(run, source, lambda *_: twin) as session, session.ready():
         (replay_input, _) = session.pairs(str(run.episodes["item_id"][0]))
         roll_out(session, replay_input, Condition("watched", watch))
-    assert len(seen) == CALLS
-    assert (seen[0][0].state != seen[1][0].state).any()
-    for own, other in seen:
-        np.testing.assert_array_equal(own.state, other.state)
-        assert (own.image != other.image).any()
+    assert len(observations) == CALLS
+    assert (observations[0][0].state != observations[1][0].state).any()
+    for clean, other in observations:
+        np.testing.assert_array_equal(clean.state, other.state)
+        assert (clean.image != other.image).any()
 
 
 @pytest.mark.slow

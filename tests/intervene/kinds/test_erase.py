@@ -48,8 +48,8 @@ def effects(copy: Run, source: ReplaySource, twin: "Policy") -> InterventionResu
     return run_intervention(copy, ASKED, source, load=lambda *_: twin)
 
 
-def row_of(effects: InterventionResult, place: str, direction: str) -> ErasureEffect:
-    (row,) = (row for row in effects.effects if (row.sites, row.direction) == (place, direction))
+def row_of(effects: InterventionResult, sites: str, direction: str) -> ErasureEffect:
+    (row,) = (row for row in effects.effects if (row.sites, row.direction) == (sites, direction))
     return row
 
 
@@ -67,7 +67,7 @@ def test_writing_back_what_is_there_changes_no_action_bit_for_bit(effects: Inter
 @pytest.mark.slow
 def test_what_is_erased_is_moved_and_what_nothing_reads_is_not_missed(effects: InterventionResult) -> None:
     for name in ("leace", "control-1"):
-        read, unread = (row_of(effects, place, name) for place in ("backbone.02", "backbone.03"))
+        read, unread = (row_of(effects, site, name) for site in ("backbone.02", "backbone.03"))
         assert read.fires == unread.fires == EPISODES
         assert read.no_op_fires == unread.no_op_fires == 0
         assert min(read.relative_change, unread.relative_change) > 0
@@ -78,16 +78,16 @@ def test_what_is_erased_is_moved_and_what_nothing_reads_is_not_missed(effects: I
 
 @pytest.mark.slow
 def test_the_certificate_says_what_a_fresh_probe_reads(effects: InterventionResult) -> None:
-    said = effects.certificate["probe_accuracy"]
-    assert set(said) == {
-        f"{place}|image|{what}"
-        for place in ("backbone.02", "backbone.03")
+    accuracies = effects.certificate["probe_accuracy"]
+    assert set(accuracies) == {
+        f"{site}|image|{what}"
+        for site in ("backbone.02", "backbone.03")
         for what in ("none|0", "leace", "control-1")
     }
-    assert all(0 <= share <= 1 for one in said.values() for share in one.values())
+    assert all(0 <= share <= 1 for by_probe in accuracies.values() for share in by_probe.values())
     row = row_of(effects, "backbone.02", "leace")
     assert (row.probe_accuracy_before, row.probe_accuracy) == tuple(
-        said[f"backbone.02|image|{what}"]["color"] for what in ("none|0", "leace")
+        accuracies[f"backbone.02|image|{what}"]["color"] for what in ("none|0", "leace")
     )
 
 
@@ -109,8 +109,8 @@ def test_killed_and_resumed_gives_the_same_bytes(
     folder = mine.path / "interventions" / effects.key
     shutil.rmtree(folder)
 
-    def stop(done: int, *_: object) -> None:
-        if done == 2:
+    def stop(finished: int, *_: object) -> None:
+        if finished == 2:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -123,15 +123,15 @@ def test_killed_and_resumed_gives_the_same_bytes(
 # -- what the numbers are called -------------------------------------------------------------------------------
 
 
-def erased_answers(own: float, beside: float, base: str = "follower") -> ConditionOutcomes:
-    """Actions that keep the share `own` of how far they go, and `beside` under two controls."""
+def erased_answers(erasure_share: float, control_share: float, base: str = "follower") -> ConditionOutcomes:
+    """Actions that keep the share `erasure_share` of how far they go, and `control_share` under two controls."""
     outcomes = outcomes_of({"color": {"follower": follower, "habit": habit}[base](24)})
     plain = outcomes.of("clean")
-    rows = np.array([plain, own * plain, beside * plain, beside * plain])
-    place = "backbone.02|image"
+    rows = np.array([plain, erasure_share * plain, control_share * plain, control_share * plain])
+    cell = "backbone.02|image"
     return replace(
         outcomes,
-        conditions=("clean", f"{place}|leace", f"{place}|control-1", f"{place}|control-2"),
+        conditions=("clean", f"{cell}|leace", f"{cell}|control-1", f"{cell}|control-2"),
         displacement=rows,
         max_action_change=np.abs(rows - rows[0]),
         edit_log=np.zeros((4, plain.size, 5)),
@@ -140,7 +140,7 @@ def erased_answers(own: float, beside: float, base: str = "follower") -> Conditi
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("own", "beside", "base", "finding"),
+    ("erasure_share", "control_share", "base", "finding"),
     [
         (0.1, 0.95, "follower", "effect"),
         (-0.5, 0.9, "follower", "effect"),
@@ -149,26 +149,28 @@ def erased_answers(own: float, beside: float, base: str = "follower") -> Conditi
         (0.1, 0.95, "habit", "no baseline effect"),
     ],
 )
-def test_what_is_lost_is_lost_beyond_the_controls(own: float, beside: float, base: str, finding: str) -> None:
-    row, *controls = ConceptErasure.effects(measured(erased_answers(own, beside, base), "suite"))
+def test_what_is_lost_is_lost_beyond_the_controls(
+    erasure_share: float, control_share: float, base: str, finding: str
+) -> None:
+    row, *controls = ConceptErasure.effects(measured(erased_answers(erasure_share, control_share, base), "suite"))
     assert row.finding == finding
-    assert [one.finding for one in controls] == ["control", "control"]
+    assert [effect.finding for effect in controls] == ["control", "control"]
     if finding == "no baseline effect":
         assert row.share_left is None
         return
-    assert row.share_left == pytest.approx(own)
-    assert row.control_share_left == pytest.approx(beside)
+    assert row.share_left == pytest.approx(erasure_share)
+    assert row.control_share_left == pytest.approx(control_share)
     assert row.p is not None
     # Twelve items with the same sign: the smallest possible p.
     assert row.p == 2.0**-12
-    assert row.right == (own > 0)
+    assert row.right == (erasure_share > 0)
 
 
 @pytest.mark.slow
 def test_a_loss_in_one_group_is_no_evidence() -> None:
     outcomes = erased_answers(1.0, 1.0)
-    one = outcomes.groups == outcomes.groups[0]
-    outcomes.displacement[1] = np.where(one, -outcomes.displacement[0], outcomes.displacement[0])
+    first_group = outcomes.groups == outcomes.groups[0]
+    outcomes.displacement[1] = np.where(first_group, -outcomes.displacement[0], outcomes.displacement[0])
     row = ConceptErasure.effects(measured(outcomes, "suite"))[0]
     assert row.net > 0
     assert row.p is not None
@@ -204,65 +206,65 @@ METHODS = [Method.of(name) for name in ("leace", "mean-difference:2", "inlp:3")]
 def drawn(episodes: int = 120, gap: float = 2.0, seed: int = 0) -> tuple[PaddedTokens, NDArray[np.bool_]]:
     """Correlated noise, and an answer that lies elsewhere at every position."""
     draw = np.random.default_rng(seed)
-    left = draw.permutation(np.arange(episodes) % 2 == 0)
+    is_left = draw.permutation(np.arange(episodes) % 2 == 0)
     noise = draw.normal(size=(episodes, POSITIONS, WIDTH)) @ draw.normal(size=(WIDTH, WIDTH))
     where = draw.normal(size=(POSITIONS, WIDTH))
-    values = noise + gap * left[:, None, None] * where + 5.0
-    return PaddedTokens(values, np.ones((episodes, POSITIONS), bool)), left
+    values = noise + gap * is_left[:, None, None] * where + 5.0
+    return PaddedTokens(values, np.ones((episodes, POSITIONS), bool)), is_left
 
 
-def balanced(tokens: PaddedTokens, left: NDArray[np.bool_], positions: list[int]) -> PaddedTokens:
+def balanced(tokens: PaddedTokens, is_left: NDArray[np.bool_], positions: list[int]) -> PaddedTokens:
     """At these positions every value occurs as often with either answer, as before the first layer of a suite
     that asks of every picture both ways: class means differ by rounding alone.
     """
     values = tokens.values.copy()
     for position in positions:
-        values[left, position] = values[np.flatnonzero(~left)[::-1], position]
+        values[is_left, position] = values[np.flatnonzero(~is_left)[::-1], position]
     return PaddedTokens(values, tokens.present)
 
 
 def test_after_leace_no_linear_probe_reads_anything_in_what_it_was_fitted_on() -> None:
     """Of any position, and of their mean: least squares explain nothing, logistic regression gives the prior."""
-    tokens, left = drawn()
-    erased = fit_eraser(tokens, left, Method())(tokens.values)
+    tokens, is_left = drawn()
+    erased = fit_eraser(tokens, is_left, Method())(tokens.values)
     views = [erased[:, position] for position in range(POSITIONS)] + [erased.mean(axis=1)]
     for before, after in zip([tokens.values[:, 0]] * len(views), views, strict=True):
-        assert LinearRegression().fit(before, left).score(before, left) > 0.3
-        assert LinearRegression().fit(after, left).score(after, left) == pytest.approx(0, abs=1e-8)
-        assert LinearDiscriminantAnalysis().fit(after, left).decision_function(after).std() < 1e-3
-        probe = LogisticRegression(C=1e4, max_iter=2000, tol=1e-8).fit(after, left)
-        np.testing.assert_allclose(probe.predict_proba(after)[:, 1], left.mean(), atol=1e-3)
+        assert LinearRegression().fit(before, is_left).score(before, is_left) > 0.3
+        assert LinearRegression().fit(after, is_left).score(after, is_left) == pytest.approx(0, abs=1e-8)
+        assert LinearDiscriminantAnalysis().fit(after, is_left).decision_function(after).std() < 1e-3
+        probe = LogisticRegression(C=1e4, max_iter=2000, tol=1e-8).fit(after, is_left)
+        np.testing.assert_allclose(probe.predict_proba(after)[:, 1], is_left.mean(), atol=1e-3)
 
 
 def test_leace_changes_the_least_of_all_that_leave_nothing_to_read() -> None:
     """Than the projection on the difference of means, and than INLP as soon as that leaves nothing either."""
-    tokens, left = drawn(400)
+    tokens, is_left = drawn(400)
     centred, _ = tokens.centred()
-    values, label = centred[:, 0], left - left.mean()
+    values, label = centred[:, 0], is_left - is_left.mean()
     removed, read = leace_direction(values, label, shrinkage=0.0)
-    own = float((np.outer(values @ read, removed) ** 2).sum())
+    leace_change = float((np.outer(values @ read, removed) ** 2).sum())
     along = removed / np.linalg.norm(removed)
-    assert own < float(((values @ along) ** 2).sum())
+    assert leace_change < float(((values @ along) ** 2).sum())
     only = PaddedTokens(tokens.values[:, :1], tokens.present[:, :1])
     for rank in range(1, WIDTH + 1):
-        rest = fit_eraser(only, left, Method("inlp", rank))(only.values)
-        score = LinearRegression().fit(rest[:, 0], left).score(rest[:, 0], left)
+        remaining = fit_eraser(only, is_left, Method("inlp", rank))(only.values)
+        score = LinearRegression().fit(remaining[:, 0], is_left).score(remaining[:, 0], is_left)
         if score < 0.01:
             break
     assert score < 0.01
-    assert own < float(((rest - only.values) ** 2).sum())
+    assert leace_change < float(((remaining - only.values) ** 2).sum())
 
 
 def test_leace_is_the_projection_of_its_paper() -> None:
     """W⁺ P W with W the whitening matrix and P the projection on the whitened covariance with the answer."""
-    tokens, left = drawn()
+    tokens, is_left = drawn()
     values = tokens.centred()[0][:, 0]
-    label = left - left.mean()
+    label = is_left - is_left.mean()
     covariance = values.T @ values / len(values)
     sizes, axes = np.linalg.eigh(covariance)
     whiten, unwhiten = (axes @ np.diag(sizes**power) @ axes.T for power in (-0.5, 0.5))
-    seen = whiten @ (values.T @ label)
-    expected = unwhiten @ np.outer(seen, seen) / (seen @ seen) @ whiten
+    direction = whiten @ (values.T @ label)
+    expected = unwhiten @ np.outer(direction, direction) / (direction @ direction) @ whiten
     removed, read = leace_direction(values, label, shrinkage=0.0)
     np.testing.assert_allclose(np.outer(removed, read), expected, atol=1e-8)
 
@@ -276,66 +278,66 @@ def test_the_covariance_is_shrunk_as_ledoit_and_wolf_say(episodes: int) -> None:
 
 
 def test_fewer_episodes_than_dimensions_are_erased_as_well() -> None:
-    tokens, left = drawn(10)
-    erased = fit_eraser(tokens, left, Method())(tokens.values)
-    gap = erased[left].mean(axis=0) - erased[~left].mean(axis=0)
+    tokens, is_left = drawn(10)
+    erased = fit_eraser(tokens, is_left, Method())(tokens.values)
+    gap = erased[is_left].mean(axis=0) - erased[~is_left].mean(axis=0)
     np.testing.assert_allclose(gap, 0, atol=1e-5)
 
 
 @pytest.mark.parametrize("method", METHODS, ids=str)
 def test_every_way_takes_the_difference_of_means_and_its_control_does_not(method: Method) -> None:
-    tokens, left = drawn(gap=4.0)
-    own = fit_eraser(tokens, left, method)
-    control = fit_control(tokens, left, method, own, np.random.default_rng(0))
+    tokens, is_left = drawn(gap=4.0)
+    eraser = fit_eraser(tokens, is_left, method)
+    control = fit_control(tokens, is_left, method, eraser, np.random.default_rng(0))
 
     def gap(values: NDArray[np.float64]) -> float:
-        return float(np.linalg.norm(values[left].mean(axis=0) - values[~left].mean(axis=0)))
+        return float(np.linalg.norm(values[is_left].mean(axis=0) - values[~is_left].mean(axis=0)))
 
-    before, after, beside = (gap(values) for values in (
-        tokens.values, own(tokens.values), control(tokens.values),
+    before, after, after_control = (gap(values) for values in (
+        tokens.values, eraser(tokens.values), control(tokens.values),
     ))  # fmt: skip
     assert after < 0.5 * before
-    assert beside > after + 0.3 * before
-    assert own.removed.shape == control.removed.shape
+    assert after_control > after + 0.3 * before
+    assert eraser.removed.shape == control.removed.shape
 
 
 @pytest.mark.parametrize("method", METHODS[1:], ids=str)
 def test_directions_are_orthonormal_and_controls_stand_beside_them(method: Method) -> None:
-    tokens, left = drawn()
-    own = fit_eraser(tokens, left, method)
-    control = fit_control(tokens, left, method, own, np.random.default_rng(0))
-    for mine, other in zip(own.removed, control.removed, strict=True):
+    tokens, is_left = drawn()
+    eraser = fit_eraser(tokens, is_left, method)
+    control = fit_control(tokens, is_left, method, eraser, np.random.default_rng(0))
+    for mine, other in zip(eraser.removed, control.removed, strict=True):
         np.testing.assert_allclose(mine @ mine.T, np.eye(method.rank), atol=1e-5)
         np.testing.assert_allclose(other @ other.T, np.eye(method.rank), atol=1e-5)
         np.testing.assert_allclose(mine @ other.T, 0, atol=1e-5)
 
 
 def test_the_label_of_a_leace_control_is_uncorrelated_with_the_answer() -> None:
-    tokens, left = drawn()
-    own = fit_eraser(tokens, left, Method())
-    control = fit_control(tokens, left, Method(), own, np.random.default_rng(0))
-    rest = control(tokens.values)[:, 0]
-    assert LinearRegression().fit(rest, left).score(rest, left) > 0.3
+    tokens, is_left = drawn()
+    eraser = fit_eraser(tokens, is_left, Method())
+    control = fit_control(tokens, is_left, Method(), eraser, np.random.default_rng(0))
+    remaining = control(tokens.values)[:, 0]
+    assert LinearRegression().fit(remaining, is_left).score(remaining, is_left) > 0.3
 
 
 def test_a_position_with_too_few_episodes_is_left_as_it_is() -> None:
-    tokens, left = drawn()
+    tokens, is_left = drawn()
     tokens.present[5:, 2] = False
-    erase = fit_eraser(tokens, left, Method())
+    erase = fit_eraser(tokens, is_left, Method())
     assert erase.fitted.tolist() == [True, True, False]
     erased = erase(tokens.values)
     np.testing.assert_array_equal(erased[:, 2], tokens.values[:, 2])
     assert (erased[:, :2] != tokens.values[:, :2]).any()
     np.testing.assert_array_equal(erase(tokens.values[:, :2]), erased[:, :2])
     with pytest.raises(UsageError, match="4 episodes of either answer"):
-        fit_eraser(tokens.only(np.arange(3)), left[:3], Method())
+        fit_eraser(tokens.only(np.arange(3)), is_left[:3], Method())
 
 
 def test_erasing_is_in_place_of_nothing_else() -> None:
     """The means over both answers stay, and an eraser without a direction changes no bit."""
-    tokens, left = drawn()
+    tokens, is_left = drawn()
     for method in METHODS:
-        erased = fit_eraser(tokens, left, method)(tokens.values)
+        erased = fit_eraser(tokens, is_left, method)(tokens.values)
         np.testing.assert_allclose(erased.mean(axis=0), tokens.values.mean(axis=0), atol=1e-4)
     none = np.zeros((1, 1, WIDTH))
     means = tokens.values.mean(axis=0)
@@ -356,31 +358,33 @@ def test_ways_have_names() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "there"), [("mean-difference:4", POSITIONS), ("mean-difference:999", WIDTH), ("inlp:13", WIDTH)]
+    ("name", "available"), [("mean-difference:4", POSITIONS), ("mean-difference:999", WIDTH), ("inlp:13", WIDTH)]
 )
-def test_no_name_is_kept_for_fewer_directions_than_it_says(name: str, there: int) -> None:
-    tokens, left = drawn()
-    with pytest.raises(UsageError, match=f"asks for .* have {there} to find; expected .*:{there} or fewer"):
-        fit_eraser(tokens, left, Method.of(name))
+def test_no_name_is_kept_for_fewer_directions_than_it_says(name: str, available: int) -> None:
+    tokens, is_left = drawn()
+    with pytest.raises(
+        UsageError, match=f"asks for .* have {available} to find; expected .*:{available} or fewer"
+    ):
+        fit_eraser(tokens, is_left, Method.of(name))
 
 
 @pytest.mark.parametrize("offset", [0.0, 1e3])
 @pytest.mark.parametrize("method", METHODS, ids=str)
 def test_rounding_is_no_direction(method: Method, offset: float) -> None:
-    tokens, left = drawn()
+    tokens, is_left = drawn()
     tokens = PaddedTokens(tokens.values + offset, tokens.present)
     with pytest.raises(UsageError, match=r"no direction.*later --sites"):
-        fit_eraser(balanced(tokens, left, [0, 1, 2]), left, method)
+        fit_eraser(balanced(tokens, is_left, [0, 1, 2]), is_left, method)
 
 
 @pytest.mark.parametrize("method", [Method.of(name) for name in ("leace", "inlp:3")], ids=str)
 def test_a_position_that_says_nothing_of_the_answer_is_left_as_it_is(method: Method) -> None:
     """By the eraser and by its control, which would otherwise take away more than the eraser."""
-    tokens, left = drawn()
-    tokens = balanced(tokens, left, [1])
+    tokens, is_left = drawn()
+    tokens = balanced(tokens, is_left, [1])
     tokens.values[:, 1, :6] = 7.0  # as a token that is the same in every instruction
-    own = fit_eraser(tokens, left, method)
-    for eraser in (own, fit_control(tokens, left, method, own, np.random.default_rng(0))):
+    fitted_eraser = fit_eraser(tokens, is_left, method)
+    for eraser in (fitted_eraser, fit_control(tokens, is_left, method, fitted_eraser, np.random.default_rng(0))):
         assert eraser.fitted.tolist() == [True, False, True]
         erased = eraser(tokens.values)
         np.testing.assert_array_equal(erased[:, 1], tokens.values[:, 1])
@@ -390,10 +394,10 @@ def test_a_position_that_says_nothing_of_the_answer_is_left_as_it_is(method: Met
 @pytest.mark.parametrize(("way", "most"), [("mean-difference", 1), ("inlp", 2)])
 def test_controls_that_find_no_room_beside_it_are_refused(way: str, most: int) -> None:
     """In four dimensions a control of three directions has one that is beside, and would be called equal."""
-    tokens, left = drawn()
+    tokens, is_left = drawn()
     narrow = PaddedTokens(tokens.values[..., : 2 * most], tokens.present)
-    fits = {rank: fit_eraser(narrow, left, Method.of(f"{way}:{rank}")) for rank in (most, most + 1)}
-    control = fit_control(narrow, left, Method.of(f"{way}:{most}"), fits[most], np.random.default_rng(0))
+    fits = {rank: fit_eraser(narrow, is_left, Method.of(f"{way}:{rank}")) for rank in (most, most + 1)}
+    control = fit_control(narrow, is_left, Method.of(f"{way}:{most}"), fits[most], np.random.default_rng(0))
     assert (np.linalg.norm(control.removed, axis=-1) > 0.99).all()
     with pytest.raises(UsageError, match=f"leaves room for {most - 1} random directions"):
-        fit_control(narrow, left, Method.of(f"{way}:{most + 1}"), fits[most + 1], np.random.default_rng(0))
+        fit_control(narrow, is_left, Method.of(f"{way}:{most + 1}"), fits[most + 1], np.random.default_rng(0))

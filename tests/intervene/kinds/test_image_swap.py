@@ -21,15 +21,17 @@ SUITE = "suite@1#0123456789ab"
 
 
 def of(signs: tuple[Cell, Cell], groups: int | None = None) -> ImageSwapEffect:
-    (found,) = swaps_of(outcomes_of({"color": signs}, groups), SUITE)
-    return found
+    (swap,) = swaps_of(outcomes_of({"color": signs}, groups), SUITE)
+    return swap
 
 
 def test_one_module_alone_makes_a_verdict() -> None:
     """The retention table, the demo and the intervention had one each."""
     root = Path(probe_kit.__file__).parent
-    made = [path for path in root.rglob("*.py") if re.search(r"\bUseVerdict\(", path.read_text(encoding="utf-8"))]
-    assert [path.relative_to(root).as_posix() for path in made] == ["intervene/verdict.py"]
+    modules = [
+        path for path in root.rglob("*.py") if re.search(r"\bUseVerdict\(", path.read_text(encoding="utf-8"))
+    ]
+    assert [path.relative_to(root).as_posix() for path in modules] == ["intervene/verdict.py"]
 
 
 @pytest.mark.parametrize(
@@ -63,32 +65,32 @@ def test_a_displacement_in_few_episodes_is_not_used_in_the_others() -> None:
     """Every action moves toward the correct side, but hardly one changes sides."""
     plain, swapped = np.full(48, 0.1), np.full(48, 0.09)
     swapped[:4] = -0.01
-    found = of((plain, swapped))
-    assert found.follow_p == 2.0**-24
-    assert classify_behaviour(found, "shape").behaviour != "used"
+    swap = of((plain, swapped))
+    assert swap.follow_p == 2.0**-24
+    assert classify_behaviour(swap, "shape").behaviour != "used"
 
 
 def test_five_groups_that_always_follow_are_not_used_in_part() -> None:
     """Their rate has no bound above 0, the displacement has: *partly* was said of the number of groups."""
-    found = of(follower(20), groups=5)
-    assert found.net_follow_rate_ci[0] <= 0 < found.reach_share_ci[0]
-    assert classify_behaviour(found, None).verdict == "used"
+    swap = of(follower(20), groups=5)
+    assert swap.net_follow_rate_ci[0] <= 0 < swap.reach_share_ci[0]
+    assert classify_behaviour(swap, None).verdict == "used"
 
 
 def test_what_goes_against_in_half_of_the_episodes_is_not_called_unused() -> None:
     """Only the upper end of the interval counted: [-0.58, 0.08] was *encoded, unused*."""
     plain, swapped = follower(48)
     lot = np.random.default_rng(3).choice([-1.0, 1.0], 24, p=[0.6, 0.4]).repeat(2)
-    found = of((lot * plain, lot * swapped))
-    assert found.net_follow_rate < 0
-    assert classify_behaviour(found, "shape").behaviour == "undecided"
+    swap = of((lot * plain, lot * swapped))
+    assert swap.net_follow_rate < 0
+    assert classify_behaviour(swap, "shape").behaviour == "undecided"
 
 
 def test_not_used_needs_another_category_that_is_used() -> None:
     both = swaps_of(outcomes_of({"color": follower(48), "state": habit(48)}), SUITE)
-    found = {one.category: one for one in both}
-    assert classify_all(found, {})["state"].reason.endswith("positive control: color")
-    alone = classify_all({"state": found["state"]}, {})["state"]
+    swap_by_category = {swap.category: swap for swap in both}
+    assert classify_all(swap_by_category, {})["state"].reason.endswith("positive control: color")
+    alone = classify_all({"state": swap_by_category["state"]}, {})["state"]
     assert (alone.behaviour, alone.lacks_control, alone.is_bounded) == ("undecided", True, True)
 
 
@@ -122,8 +124,8 @@ def drawn(seed: int, groups: int, mean: float, spread: float, other: float = 0.0
     lot = draw.choice([-1.0, 1.0], items).repeat(2) * np.tile([1.0, -1.0], items)
     habits = lot * (max(mean, other) < 0.5) * 0.15
     clean, swapped = (habits + sign * 0.15 * toward + draw.normal(size=2 * items) * 0.002 for sign in (1, -1))
-    made = outcomes_of({"color": (clean, swapped), "shape": (np.full(400, 0.15), np.full(400, -0.15))}, groups)
-    return classify_all({row.category: row for row in swaps_of(made, SUITE)}, {})["color"].behaviour
+    outcomes = outcomes_of({"color": (clean, swapped), "shape": (np.full(400, 0.15), np.full(400, -0.15))}, groups)
+    return classify_all({row.category: row for row in swaps_of(outcomes, SUITE)}, {})["color"].behaviour
 
 
 DRAWS = 300
@@ -153,36 +155,36 @@ Kind = Callable[[int], tuple[np.ndarray, np.ndarray]]
 
 
 def test_who_goes_where_the_correct_picture_lies_follows() -> None:
-    found = of(follower(48))
-    assert (found.follow_rate, found.reversal_rate, found.net_follow_rate) == (1.0, 0.0, 1.0)
-    assert found.follow_p == 2.0**-24
-    assert found.median_displacement == pytest.approx(0.2)
-    assert (found.reach, found.reach_source) == (pytest.approx(0.2), "actions")
-    assert (found.reach_share, found.moved_share) == (pytest.approx(1.0), pytest.approx(1.0))
-    assert (found.left_reached, found.right_reached) == (1.0, 1.0)
+    swap = of(follower(48))
+    assert (swap.follow_rate, swap.reversal_rate, swap.net_follow_rate) == (1.0, 0.0, 1.0)
+    assert swap.follow_p == 2.0**-24
+    assert swap.median_displacement == pytest.approx(0.2)
+    assert (swap.reach, swap.reach_source) == (pytest.approx(0.2), "actions")
+    assert (swap.reach_share, swap.moved_share) == (pytest.approx(1.0), pytest.approx(1.0))
+    assert (swap.left_reached, swap.right_reached) == (1.0, 1.0)
 
 
 def test_the_mirror_of_following_is_going_against() -> None:
     plain, exchanged = follower(48)
-    found = of((-plain, -exchanged))
-    assert (found.follow_rate, found.reversal_rate) == (0.0, 1.0)
-    assert found.reach_share == pytest.approx(-1.0)
-    assert (found.left_reached, found.right_reached) == (-1.0, -1.0)
-    assert found.follow_p == 1.0
+    swap = of((-plain, -exchanged))
+    assert (swap.follow_rate, swap.reversal_rate) == (0.0, 1.0)
+    assert swap.reach_share == pytest.approx(-1.0)
+    assert (swap.left_reached, swap.right_reached) == (-1.0, -1.0)
+    assert swap.follow_p == 1.0
 
 
 def test_a_habit_is_no_following_however_often_it_is_right() -> None:
     """Half of its episodes end on the correct picture."""
-    found = of(habit(48))
-    assert (found.follow_rate, found.reversal_rate) == (0.0, 0.0)
-    assert found.follow_p > 0.1
-    assert found.reach_share == pytest.approx(0.0, abs=1e-4)
-    assert found.net_follow_rate_ci[1] > 0  # that nothing was seen does not prove that nothing is there
+    swap = of(habit(48))
+    assert (swap.follow_rate, swap.reversal_rate) == (0.0, 0.0)
+    assert swap.follow_p > 0.1
+    assert swap.reach_share == pytest.approx(0.0, abs=1e-4)
+    assert swap.net_follow_rate_ci[1] > 0  # that nothing was seen does not prove that nothing is there
 
 
 def test_the_reach_of_a_policy_that_goes_to_one_side_is_the_distance_between_the_tiles() -> None:
-    found = of((np.where(np.arange(48) // 2 % 2 == np.arange(48) % 2, 0.1, -0.1), np.zeros(48)))
-    assert (found.reach, found.reach_source) == (TILES_APART, "tiles")
+    swap = of((np.where(np.arange(48) // 2 % 2 == np.arange(48) % 2, 0.1, -0.1), np.zeros(48)))
+    assert (swap.reach, swap.reach_source) == (TILES_APART, "tiles")
     assert np.subtract(SceneSpec().tile_left, SceneSpec().tile_right)[1] == pytest.approx(TILES_APART)
 
 
@@ -207,14 +209,12 @@ def test_one_group_unlike_the_others_makes_nothing_surer(
         unlike = (np.arange(64) // 2) % 16 == 0
         for part, source in zip((plain, exchanged), other(64), strict=True):
             part[unlike] = source[unlike]
-        found = of((plain, exchanged), groups=16)
+        swap = of((plain, exchanged), groups=16)
         assert (
-            found.net_follow_rate_ci[0] <= like.net_follow_rate_ci[0]
-            or found.net_follow_rate > like.net_follow_rate
+            swap.net_follow_rate_ci[0] <= like.net_follow_rate_ci[0] or swap.net_follow_rate > like.net_follow_rate
         )
         assert (
-            found.net_follow_rate_ci[1] >= like.net_follow_rate_ci[1]
-            or found.net_follow_rate < like.net_follow_rate
+            swap.net_follow_rate_ci[1] >= like.net_follow_rate_ci[1] or swap.net_follow_rate < like.net_follow_rate
         )
 
 
@@ -223,9 +223,9 @@ def test_items_that_share_pictures_do_not_add_up() -> None:
 
 
 def test_answers_are_read_back_as_they_were() -> None:
-    made = outcomes_of({"color": follower(4), "shape": habit(4)})
-    back = ConditionOutcomes(**arrays_from_bytes(made.to_bytes()))
-    assert back.to_bytes() == made.to_bytes()
-    assert back.conditions == made.conditions
-    np.testing.assert_array_equal(back.displacement, made.displacement)
+    outcomes = outcomes_of({"color": follower(4), "shape": habit(4)})
+    back = ConditionOutcomes(**arrays_from_bytes(outcomes.to_bytes()))
+    assert back.to_bytes() == outcomes.to_bytes()
+    assert back.conditions == outcomes.conditions
+    np.testing.assert_array_equal(back.displacement, outcomes.displacement)
     assert dict(back.by_category())["shape"].items.tolist() == ["shape-0", "shape-0", "shape-1", "shape-1"]

@@ -45,8 +45,8 @@ def test_an_item_asked_in_its_twins_words_does_what_its_twin_does(
     for replay_input in session.pairs(outcomes.items[0]):
         row = list(outcomes.episodes).index(replay_input.episode)
         words = session.counterparts[replay_input.item].instruction
-        asked = session.with_other_instruction(replay_input)
-        assert asked.instruction == words != replay_input.clean.instruction
+        exchanged = session.with_other_instruction(replay_input)
+        assert exchanged.instruction == words != replay_input.clean.instruction
         chunk = session.act(replace(replay_input.clean, instruction=words), replay_input.seed)
         assert outcomes.of("instruction_swap")[row] == pytest.approx(
             session.lateral_displacement(chunk, replay_input.clean), abs=0
@@ -108,8 +108,8 @@ def test_what_every_block_hands_over_is_a_place_and_all_of_it_is_the_exchange(
     assert twin.prompt_kv is not None
     blocks = twin.prompt_kv.layers - 1
     assert {row.sites for row in effects.effects} == {f"kv.{block:02d}" for block in range(blocks)}
-    for name, said in effects.certificate["edits"].items():
-        assert said["fires"] == 2 * 2, name  # keys and values, in two episodes
+    for name, counts in effects.certificate["edits"].items():
+        assert counts["fires"] == 2 * 2, name  # keys and values, in two episodes
     words = effects.certificate["edits"]["kv.00|language"]
     assert (words["no_op_fires"], words["max_action_change"]) == (
         4.0,
@@ -125,8 +125,8 @@ def test_a_memory_has_the_backbones_roles_and_no_layer_behind_its_last_block(
     mask = token_mask(session.policy, replay_input.clean, "kv", "image")
     np.testing.assert_array_equal(mask, token_mask(session.policy, replay_input.clean, "backbone", "image"))
     assert roles_of(session.policy, "kv", ("all", "image", "state")) == ["all", "image"]
-    (place,) = resolve_sites("kv.01", session.policy)
-    assert [str(site) for site in place.sites] == ["kv.01.keys", "kv.01.values"]
+    (site_group,) = resolve_sites("kv.01", session.policy)
+    assert [str(site) for site in site_group.sites] == ["kv.01.keys", "kv.01.values"]
     assert session.policy.prompt_kv is not None
     for wrong in (f"kv.{session.policy.prompt_kv.layers - 1:02d}", "kv.00@1"):
         with pytest.raises(UnknownSiteError):

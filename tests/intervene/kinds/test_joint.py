@@ -42,11 +42,13 @@ def either(cells: Cells) -> float:
     return float(bool({1, 6} & set(cells)))
 
 
-def one(cells: Cells) -> float:
+def single(cells: Cells) -> float:
     return float(8 in cells)
 
 
-@pytest.mark.parametrize(("effect", "smallest"), [(majority, {5, 7}), (both, {3, 4}), (either, {6}), (one, {8})])
+@pytest.mark.parametrize(
+    ("effect", "smallest"), [(majority, {5, 7}), (both, {3, 4}), (either, {6}), (single, {8})]
+)
 @pytest.mark.parametrize("count", [9, MOST_SINGLY + 34])
 def test_no_cell_of_the_smallest_set_can_be_left_out(
     effect: Callable[[Cells], float], smallest: set[int], count: int
@@ -82,21 +84,19 @@ SITES, ROLES = ("kv.00", "kv.01"), ("image", "language")
 
 @pytest.fixture(scope="module")
 def result(copy: Run, source: ReplaySource, twin: "Policy") -> InterventionResult:
-    asked = JointPlaces(categories=("color",), items=2, sites=SITES, roles=ROLES)
-    return run_intervention(copy, asked, source, load=lambda *_: twin)
+    intervention = JointPlaces(categories=("color",), items=2, sites=SITES, roles=ROLES)
+    return run_intervention(copy, intervention, source, load=lambda *_: twin)
 
 
 @pytest.mark.slow
 def test_one_cell_alone_is_the_interchange_at_its_place_bit_for_bit(
     copy: Run, source: ReplaySource, twin: "Policy", result: InterventionResult
 ) -> None:
-    asked = Interchange(categories=("color",), items=2, sites=SITES, roles=ROLES)
-    singly = run_intervention(copy, asked, source, load=lambda *_: twin).outcomes
-    for place in SITES:
+    intervention = Interchange(categories=("color",), items=2, sites=SITES, roles=ROLES)
+    singly = run_intervention(copy, intervention, source, load=lambda *_: twin).outcomes
+    for site in SITES:
         for role in ROLES:
-            np.testing.assert_array_equal(
-                result.outcomes.of(f"alone|{place}|{role}"), singly.of(f"{place}|{role}")
-            )
+            np.testing.assert_array_equal(result.outcomes.of(f"alone|{site}|{role}"), singly.of(f"{site}|{role}"))
 
 
 @pytest.mark.slow
@@ -113,11 +113,11 @@ def test_all_cells_but_one_are_the_other_cells_together(result: InterventionResu
 def test_it_is_stored_listed_and_shown(copy: Run, result: InterventionResult) -> None:
     rows = stored_joint_places(copy)["color"]
     assert [row.cells for row in rows if row.part == "cell"] == [
-        f"{place} {role}" for place in SITES for role in ROLES
+        f"{site} {role}" for site in SITES for role in ROLES
     ]
     assert {row.finding for row in rows} == {"n/a"}, "two items are no evidence"
     assert JointPlaces.keys_in_use(copy) == {result.key}
-    assert result.key in {one.key for one in listed_interventions(copy) if one.state == "used"}
+    assert result.key in {stored.key for stored in listed_interventions(copy) if stored.state == "used"}
     assert set(result.certificate["joint"]) == {"color"}
     with out.capture() as printed:
         out.print(result.to_rich(), width=160)
@@ -129,10 +129,10 @@ def test_it_is_stored_listed_and_shown(copy: Run, result: InterventionResult) ->
 def test_heads_of_one_block_are_cells_and_no_search_of_the_backbone(
     copy: Run, source: ReplaySource, twin: "Policy"
 ) -> None:
-    asked = {"categories": ("color",), "items": 1, "roles": ("image",)}
+    selection = {"categories": ("color",), "items": 1, "roles": ("image",)}
     heads = ("backbone.01.heads.2", "backbone.01.heads.3")
     jointly, singly = (
-        run_intervention(copy, kind(sites=heads, **asked), source, load=lambda *_: twin).outcomes
+        run_intervention(copy, kind(sites=heads, **selection), source, load=lambda *_: twin).outcomes
         for kind in (JointPlaces, Interchange)
     )
     np.testing.assert_array_equal(
@@ -150,9 +150,9 @@ def test_heads_of_one_block_are_cells_and_no_search_of_the_backbone(
 
 
 def test_heads_of_two_blocks_come_one_after_the_other(copy: Run, source: ReplaySource, twin: "Policy") -> None:
-    asked = JointPlaces(categories=("color",), items=1, sites=("backbone.*.heads.*",), roles=("image",))
+    intervention = JointPlaces(categories=("color",), items=1, sites=("backbone.*.heads.*",), roles=("image",))
     with pytest.raises(UsageError, match=r"come one after the other.*backbone\.02\.heads\.\*"):
-        run_intervention(copy, asked, source, load=lambda *_: twin)
+        run_intervention(copy, intervention, source, load=lambda *_: twin)
 
 
 def test_a_family_without_keys_and_values_is_refused_by_name() -> None:

@@ -43,9 +43,9 @@ def with_entry(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Modu
 
 
 def invoke(module: ModuleType, *arguments: str) -> tuple[int, str, str]:
-    own = typer.Typer()
-    own.command(cls=module.KindHelp)(module.intervene)
-    answer = CliRunner().invoke(own, arguments, env={"COLUMNS": "200"})
+    command = typer.Typer()
+    command.command(cls=module.KindHelp)(module.intervene)
+    answer = CliRunner().invoke(command, arguments, env={"COLUMNS": "200"})
     return answer.exit_code, answer.stdout, answer.stderr
 
 
@@ -53,29 +53,31 @@ def test_a_kind_of_its_own_runs_from_the_command_to_the_tables(
     with_entry: ModuleType, copy: Run, small_suite: Suite
 ) -> None:
     before = retention_table([copy]).to_json()
-    asked = ("--kind", NAME, "--categories", "color", "--items", "1", "--coefficients", "0,1")
+    options = ("--kind", NAME, "--categories", "color", "--items", "1", "--coefficients", "0,1")
     where = (str(copy.path), "--suite", str(small_suite.folder))
-    code, shown, said = invoke(with_entry, *where, *asked)
-    assert code == 0, said
-    assert "Is the image read?" in shown
+    code, output, message = invoke(with_entry, *where, *options)
+    assert code == 0, message
+    assert "Is the image read?" in output
     result = load_effects(copy, kind=NAME)
     dark, same = result.effects
     assert (same.condition, same.median_displacement) == ("dimmed-1", 0.0)
     assert dark.median_displacement > 0
     stored = (copy.path / "interventions" / result.key / "effects.csv").read_text(encoding="utf-8")
     assert stored.splitlines()[0] == "category,condition,n_episodes,median_displacement"
-    code, shown, said = invoke(with_entry, str(copy.path), *asked, "--format", "json")
-    assert [row["condition"] for row in json.loads(shown)["effects"]] == ["dimmed-0", "dimmed-1"]
-    assert json.loads(shown)["effects"][0]["median_displacement"] == pytest.approx(dark.median_displacement)
-    assert "loaded the stored result" in said
-    assert [(one.kind, one.state) for one in listed_interventions(copy)] == [(NAME, "used")]
+    code, output, message = invoke(with_entry, str(copy.path), *options, "--format", "json")
+    assert [row["condition"] for row in json.loads(output)["effects"]] == ["dimmed-0", "dimmed-1"]
+    assert json.loads(output)["effects"][0]["median_displacement"] == pytest.approx(dark.median_displacement)
+    assert "loaded the stored result" in message
+    assert [(listed_result.kind, listed_result.state) for listed_result in listed_interventions(copy)] == [
+        (NAME, "used")
+    ]
     assert retention_table([copy]).to_json() == before
 
 
 def test_help_names_every_kind_and_what_its_options_mean_to_it(with_entry: ModuleType) -> None:
-    code, shown, _ = invoke(with_entry, "--help-all")
+    code, output, _ = invoke(with_entry, "--help-all")
     assert code == 0
-    words = " ".join(shown.replace("│", " ").split())
+    words = " ".join(output.replace("│", " ").split())
     for kind in every_kind():
         assert f"--kind {kind.kind}" in words
         assert kind.summary in words
@@ -90,8 +92,8 @@ def test_an_option_of_another_kind_is_refused_with_the_kinds_that_take_it(
     assert code == 1
     answer = CliRunner().invoke(app, ["intervene", str(copy.path), "--kind", "erase", "--target-side", "left"])
     assert answer.exit_code == 2
-    said = " ".join(answer.stderr.split())
-    assert "--target-side does not apply to --kind erase; remove it or choose another kind: steer" in said
+    message = " ".join(answer.stderr.split())
+    assert "--target-side does not apply to --kind erase; remove it or choose another kind: steer" in message
 
 
 def test_an_option_that_the_command_lacks_is_refused_where_a_kind_is_defined() -> None:

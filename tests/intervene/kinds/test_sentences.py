@@ -69,9 +69,9 @@ def context(verdict: UseVerdict | None) -> InterventionResult:
 def test_an_image_swap_is_described_by_what_the_action_does_and_then_its_verdict(
     response: str, encoded: bool | None, control: str | None
 ) -> None:
-    found = classify_use(encoded, swap(response), control)
-    (sentence,) = ImageSwap.sentences([swap(response)], context(found))
-    assert sentence == f"Public Info (24 items): {SAID[response]} {found.sentence}"
+    use = classify_use(encoded, swap(response), control)
+    (sentence,) = ImageSwap.sentences([swap(response)], context(use))
+    assert sentence == f"Public Info (24 items): {SAID[response]} {use.sentence}"
 
 
 def test_an_instruction_swap_is_described_without_a_verdict() -> None:
@@ -88,9 +88,9 @@ COMMON: dict[str, Any] = {
 }  # fmt: skip
 
 
-def patch(place: str, effect: float | None, p: float, centimetres: float = 3.0) -> PatchEffect:
+def patch(sites: str, effect: float | None, p: float, centimetres: float = 3.0) -> PatchEffect:
     return PatchEffect(
-        **COMMON, sites=place, coefficient="", effect=effect, effect_ci=None, net=0.4, net_left=0.4, net_right=0.4,
+        **COMMON, sites=sites, coefficient="", effect=effect, effect_ci=None, net=0.4, net_left=0.4, net_right=0.4,
         mean_displacement=centimetres / 100, control_displacement=None, t=2.0, p=p, p_fwe=p,
     )  # fmt: skip
 
@@ -101,7 +101,7 @@ HAVE = "edits that have half of the image swap's effect"
 
 
 @pytest.mark.parametrize(
-    ("rows", "said"),
+    ("rows", "expected"),
     [
         (
             [patch("backbone.01", 0.97, 0.001), patch("backbone.02", 0.6, 0.01), patch("backbone.03", 0.9, 0.4)],
@@ -131,8 +131,8 @@ HAVE = "edits that have half of the image swap's effect"
         ),
     ],
 )
-def test_edits_of_sites_are_counted_and_the_largest_are_named(rows: Sequence[PatchEffect], said: str) -> None:
-    assert Interchange.sentences(rows, context(None)) == [f"Color: {said}"]
+def test_edits_of_sites_are_counted_and_the_largest_are_named(rows: Sequence[PatchEffect], expected: str) -> None:
+    assert Interchange.sentences(rows, context(None)) == [f"Color: {expected}"]
 
 
 @pytest.mark.parametrize(
@@ -146,9 +146,9 @@ def test_a_category_of_any_name_stays_in_its_own_column(category: str, title: st
     assert [heading.text for heading in table.headings[: table.names]] == ["category", "edit"]
 
 
-def closed_loop(place: str, net: float, p: float | None, disrupted: bool = False) -> ClosedLoopEffect:
+def closed_loop(sites: str, net: float, p: float | None, disrupted: bool = False) -> ClosedLoopEffect:
     return ClosedLoopEffect(
-        **COMMON, sites=place, correct=0.5, wrong=0.5, in_zone=1.0, wrong_in_zone=0.5, net=net, net_left=net,
+        **COMMON, sites=sites, correct=0.5, wrong=0.5, in_zone=1.0, wrong_in_zone=0.5, net=net, net_left=net,
         net_right=net, control_net=0.0, gained=1, lost=0, p_mcnemar=0.1, t=1.0, p=p, p_fwe=p, disrupted=disrupted,
     )  # fmt: skip
 
@@ -165,10 +165,10 @@ def test_closed_loops_say_what_is_confirmed_and_what_disrupts_the_task() -> None
     ]
 
 
-def erasure(kept: float | None, p: float) -> ErasureEffect:
+def erasure(share_left: float | None, p: float) -> ErasureEffect:
     common = COMMON | {"direction": "leace"}
     return ErasureEffect(
-        **common, sites="backbone.02", right_before=1.0, right=0.5, share_left=kept, net=0.5,
+        **common, sites="backbone.02", right_before=1.0, right=0.5, share_left=share_left, net=0.5,
         mean_displacement=0.1, control_share_left=0.9, control_net=0.0, control_displacement=0.0, p=p, p_fwe=p,
         probe_accuracy_before=1.0, probe_accuracy=0.5,
     )  # fmt: skip
@@ -178,7 +178,7 @@ TAKE = "erasures that take the answer from the action beyond their controls"
 
 
 @pytest.mark.parametrize(
-    ("row", "said"),
+    ("row", "expected"),
     [
         (erasure(0.1, 0.001), f"{TAKE}: 1 of 1 (backbone.02 image leace keeps 0.10)."),
         (erasure(0.8, 0.3), f"{TAKE}: none of 1."),
@@ -188,9 +188,9 @@ TAKE = "erasures that take the answer from the action beyond their controls"
         ),
     ],
 )
-def test_erasures_say_what_is_lost(row: ErasureEffect, said: str) -> None:
+def test_erasures_say_what_is_lost(row: ErasureEffect, expected: str) -> None:
     (sentence,) = ConceptErasure.sentences([row], context(None))
-    assert sentence == f"Color: {said}"
+    assert sentence == f"Color: {expected}"
 
 
 def joint(part: str, cells: str, finding: str) -> JointEffect:
@@ -356,24 +356,24 @@ def check_short(line: str) -> None:
     assert not re.search(r"[][()]|None|nan|\.\.$", line), line
 
 
-@pytest.mark.parametrize(("kind", "rows", "said"), FINDINGS)
+@pytest.mark.parametrize(("kind", "rows", "expected"), FINDINGS)
 def test_the_last_line_of_each_kind_is_short_and_without_brackets(
-    kind: type[Intervention], rows: Sequence[Any], said: str
+    kind: type[Intervention], rows: Sequence[Any], expected: str
 ) -> None:
     (line,) = kind.findings(rows, context(None))
-    assert line.partition("  ")[2] == said
+    assert line.partition("  ")[2] == expected
     check_short(line)
 
 
-@pytest.mark.parametrize(("row", "said"), INPUTS)
+@pytest.mark.parametrize(("row", "expected"), INPUTS)
 @pytest.mark.parametrize("kind", [ImageSwap, InstructionSwap])
 def test_the_last_line_about_an_input_of_a_run_without_sides_is_short(
-    kind: type[Intervention], row: InputEffect, said: str
+    kind: type[Intervention], row: InputEffect, expected: str
 ) -> None:
     described = context(None)
     without_sides = with_parts(described, replace(described.outcomes, sides=np.array([""])))
     (line,) = kind.findings([row], without_sides)
-    assert line == f"Public Info  {said}"
+    assert line == f"Public Info  {expected}"
     check_short(line)
 
 
@@ -400,8 +400,8 @@ def test_an_effect_below_the_resolution_of_its_measure_is_significant_of_nothing
     assert [row[table.columns.index("p")] for row in table.texts] == ["–", "–", "–"]
     assert "lengths of the file's vector" in table.all_notes[0]
     assert "significant of nothing" in table.all_notes[0]
-    found = Steering.table([replace(patch("backbone.02", 0.6, 0.004), coefficient="1")], context(None))
-    assert "significant of nothing" not in found.all_notes[0]
+    steering_table = Steering.table([replace(patch("backbone.02", 0.6, 0.004), coefficient="1")], context(None))
+    assert "significant of nothing" not in steering_table.all_notes[0]
     assert unit_of_doses("mean-difference:1") == unit_of_doses("probe") == "half class-mean differences"
 
 
@@ -413,11 +413,11 @@ def unsided() -> InterventionResult:
 def test_without_sides_sentences_name_the_input_that_is_exchanged() -> None:
     varied = replace(unsided(), settings={"kind": Interchange.kind, "vary": "instruction"})
     for rows in ([patch("backbone.02", 0.9, 0.001)], [patch("backbone.02", 0.1, 0.9)]):
-        said = [*Interchange.sentences(rows, varied), *Interchange.findings(rows, varied)]
+        sentences = [*Interchange.sentences(rows, varied), *Interchange.findings(rows, varied)]
         notes = Interchange.table(rows, varied).all_notes
-        assert "half of the exchange of the instruction's effect" in said[0]
+        assert "half of the exchange of the instruction's effect" in sentences[0]
         assert "effect: share of what the whole exchange of the instruction does" in notes[0]
-        assert "image swap" not in " ".join((*said, *notes))
+        assert "image swap" not in " ".join((*sentences, *notes))
 
 
 def test_no_noun_of_a_sentence_is_replaced_in_its_text() -> None:
@@ -428,10 +428,10 @@ def test_no_noun_of_a_sentence_is_replaced_in_its_text() -> None:
 @pytest.mark.parametrize("seed", [None, 1.0])
 def test_where_the_seed_decides_no_input_does_and_both_commands_say_so_in_one_sentence(seed: float | None) -> None:
     row = replace(input_row(1.0, 0.94, "no effect"), every=0.005, seed=seed)
-    said = "all inputs together change 0 % of the action: the seed decides it"
+    expected = "all inputs together change 0 % of the action: the seed decides it"
     (finding,) = ImageSwap.findings([row], unsided())
-    assert said in finding
-    assert said in ImageSwap.sentences([row], unsided())[0]
+    assert expected in finding
+    assert expected in ImageSwap.sentences([row], unsided())[0]
     without_noise = replace(row, seed=0.0, finding="decides")
     assert "the seed decides" not in ImageSwap.findings([without_noise], unsided())[0]
 

@@ -44,33 +44,35 @@ def test_what_is_read_is_ranked_first_and_the_anchor_holds(copied: pt.Screen) ->
 
 
 def test_chosen_cells_are_the_largest_of_each_kind_and_drawn_ones_are_others(copied: pt.Screen) -> None:
-    chosen, drawn = copied.choose(top=1, drawn=4)
-    assert str(chosen[0]) == "kv.01 language"
-    assert len(chosen) == 2
+    largest, drawn = copied.choose(top=1, drawn=4)
+    assert str(largest[0]) == "kv.01 language"
+    assert len(largest) == 2
     assert len(drawn) == 4
-    assert not set(chosen) & set(drawn)
-    assert copied.choose(top=1, drawn=4) == (chosen, drawn)
+    assert not set(largest) & set(drawn)
+    assert copied.choose(top=1, drawn=4) == (largest, drawn)
     assert len(copied.choose(top=20)[0]) == len(copied.cells) - sum(row.is_anchor for row in copied.rows)
 
 
 @pytest.mark.parametrize("name", ["blocks", pytest.param("roles", marks=pytest.mark.slow)])
 def test_a_screen_is_void_where_signs_decide(wired: WiredSession, name: str) -> None:
-    found = screened(wired, name)
-    assert found.finding == "void"
-    assert found.table["rank"].isna().all()
-    said = "screen void: gradients give 0.00 where the patch gives 1.00 (kv.* all); no order is shown"
-    assert str(found) == said
+    screen = screened(wired, name)
+    assert screen.finding == "void"
+    assert screen.table["rank"].isna().all()
+    expected = "screen void: gradients give 0.00 where the patch gives 1.00 (kv.* all); no order is shown"
+    assert str(screen) == expected
     with pytest.raises(UsageError, match=r"screen void: .*; patch cells exactly with sweep_cells"):
-        found.choose()
+        screen.choose()
 
 
 @pytest.mark.slow
 def test_its_numbers_are_those_of_the_command(wired: WiredSession, copied: pt.Screen) -> None:
-    asked = AttributionPatching(categories=("copied",), roles=ROLES)
-    conditions = asked.conditions(wired)
+    intervention = AttributionPatching(categories=("copied",), roles=ROLES)
+    conditions = intervention.conditions(wired)
     outcomes = outcomes_of(wired, ["copied"], conditions[2:])
     entries = dict(wired.certificate)
-    measurement = measured(outcomes, "suite", asked.parameters() | {"kind": asked.kind}, entries, lambda _: b"")
+    measurement = measured(
+        outcomes, "suite", intervention.parameters() | {"kind": intervention.kind}, entries, lambda _: b""
+    )
     stored = {row.name: row for row in AttributionPatching.effects(measurement)}
     assert stored.keys() == set(copied.table["cells"])
     for row in copied.rows:
@@ -81,11 +83,11 @@ def test_its_numbers_are_those_of_the_command(wired: WiredSession, copied: pt.Sc
 
 def test_there_is_no_order_where_the_source_moves_nothing(wired: WiredSession) -> None:
     pairs, cells = pt.find_pairs(wired, "noise", 6), pt.find_cells(wired.policy, "kv.01|language")
-    found = pt.attribute_cells(wired.policy, pairs, cells, wired.lateral_motion)
-    assert (found.finding, found.anchor) == ("n/a", None)
-    assert found.table["estimate"].isna().all()
+    screen = pt.attribute_cells(wired.policy, pairs, cells, wired.lateral_motion)
+    assert (screen.finding, screen.anchor) == ("n/a", None)
+    assert screen.table["estimate"].isna().all()
     with pytest.raises(UsageError, match="no anchor carries the effect"):
-        found.choose()
+        screen.choose()
 
 
 def test_a_family_without_gradients_is_refused_before_any_inference(wired: WiredSession) -> None:

@@ -15,9 +15,9 @@ def test_the_sweep_of_the_page_finds_where_the_embedded_policy_reads_colours(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (code,) = (
-        own
-        for own in re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
-        if "pt." in own
+        block_of_code
+        for block_of_code in re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+        if "pt." in block_of_code
     )
     monkeypatch.chdir(tmp_path)
     scene = pk.SceneSpec(max_steps=4)

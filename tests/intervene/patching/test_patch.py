@@ -19,9 +19,9 @@ from probe_kit.intervene.patching.patch import infer
 
 @pytest.fixture(scope="module")
 def vlm() -> AnswerModel:
-    found = load_model("vlm-tiny")
-    assert isinstance(found, AnswerModel)
-    return found
+    model = load_model("vlm-tiny")
+    assert isinstance(model, AnswerModel)
+    return model
 
 
 @pytest.fixture
@@ -35,13 +35,13 @@ def test_the_cache_holds_what_plain_hooks_read_and_the_output_is_the_plain_one(
     output, cache = pt.run_with_cache(pi0_tiny, observation, 7)
     np.testing.assert_array_equal(output, pi0_tiny.act([observation], [7])[0])
     assert set(cache) == set(pi0_tiny.sites())
-    kept: list[torch.Tensor] = []
+    recorded: list[torch.Tensor] = []
     module = pi0_tiny.tap(Site("expert", 1, iteration=0)).module
-    handle = module.register_forward_pre_hook(lambda _, inputs: kept.append(inputs[0].clone()))
+    handle = module.register_forward_pre_hook(lambda _, inputs: recorded.append(inputs[0].clone()))
     pi0_tiny.act([observation], [7])
     handle.remove()
-    for step, own in enumerate(kept):
-        assert torch.equal(cache[f"expert.01.residual@{step}"], own)
+    for step, tensor in enumerate(recorded):
+        assert torch.equal(cache[f"expert.01.residual@{step}"], tensor)
 
 
 def test_places_of_any_quantity_are_cached_by_pattern(pi0_tiny: Pi0, observation: Observation) -> None:
@@ -78,14 +78,14 @@ def test_hooks_change_what_plain_hooks_change_and_know_where_they_are(
 
 
 def test_a_hook_is_called_at_every_iteration_it_names(pi0_tiny: Pi0, observation: Observation) -> None:
-    seen: list[int | None] = []
+    iterations: list[int | None] = []
 
     def note(activation: torch.Tensor, point: pt.HookPoint) -> torch.Tensor:
-        seen.append(point.iteration)
+        iterations.append(point.iteration)
         return activation
 
     same = pt.run_with_hooks(pi0_tiny, observation, {"expert.02@3-5": note, "vision.00": note}, 7)
-    assert seen == [0, 3, 4, 5], "the first camera, then three steps"
+    assert iterations == [0, 3, 4, 5], "the first camera, then three steps"
     np.testing.assert_array_equal(same, pi0_tiny.act([observation], [7])[0])
 
 
@@ -124,16 +124,18 @@ def test_hooks_that_cannot_be_are_refused(pi0_tiny: Pi0, observation: Observatio
         UsageError, match=r"two patterns name backbone\.01\.residual; give every site one function"
     ):
         pt.run_with_hooks(
-            pi0_tiny, observation, {"backbone.*": lambda own, _: own, "backbone.01": lambda own, _: own}
+            pi0_tiny,
+            observation,
+            {"backbone.*": lambda activation, _: activation, "backbone.01": lambda activation, _: activation},
         )
     with pytest.raises(CaptureError, match=r"the edit of backbone\.01\.residual returned .*; expected"):
-        pt.run_with_hooks(pi0_tiny, observation, {"backbone.01": lambda own, _: own[:, :3]})
+        pt.run_with_hooks(pi0_tiny, observation, {"backbone.01": lambda activation, _: activation[:, :3]})
 
 
 def test_the_names_are_found_without_torch() -> None:
     code = "import sys; from probe_kit import patching as pt; print(len(pt.__all__), 'torch' in sys.modules)"
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, encoding="utf-8", check=True)
-    assert found.stdout.split() == [str(len(pt.__all__)), "False"]
+    completed = subprocess.run([sys.executable, "-c", code], capture_output=True, encoding="utf-8", check=True)
+    assert completed.stdout.split() == [str(len(pt.__all__)), "False"]
 
 
 @pytest.fixture
@@ -141,12 +143,12 @@ def pair(observation: Observation) -> pt.Pair:
     return pt.Pair(observation, replace(observation, image=255 - observation.image), seed=3)
 
 
-def read(policy: Pi0, module: nn.Module, seen: Observation, seed: int) -> list[torch.Tensor]:
-    kept: list[torch.Tensor] = []
-    handle = module.register_forward_pre_hook(lambda _, inputs: kept.append(inputs[0].clone()))
-    policy.act([seen], [seed])
+def read(policy: Pi0, module: nn.Module, observation: Observation, seed: int) -> list[torch.Tensor]:
+    recorded: list[torch.Tensor] = []
+    handle = module.register_forward_pre_hook(lambda _, inputs: recorded.append(inputs[0].clone()))
+    policy.act([observation], [seed])
     handle.remove()
-    return kept
+    return recorded
 
 
 def written(
@@ -159,15 +161,15 @@ def written(
     for module in modules:
         source = iter(read(policy, module, pair.source, pair.seed))
 
-        def write(_: object, inputs: tuple[torch.Tensor, ...], own: "object" = source) -> None:
-            inputs[0].index_copy_(axis, where, next(own).index_select(axis, where))  # type: ignore[call-overload]
+        def write(_: object, inputs: tuple[torch.Tensor, ...], replacements: "object" = source) -> None:
+            inputs[0].index_copy_(axis, where, next(replacements).index_select(axis, where))  # type: ignore[call-overload]
 
         handles.append((module, write))
     attached = [module.register_forward_pre_hook(write) for module, write in handles]
-    found = policy.act([pair.clean], [pair.seed])[0]
+    patched_action = policy.act([pair.clean], [pair.seed])[0]
     for handle in attached:
         handle.remove()
-    return found
+    return patched_action
 
 
 @pytest.mark.parametrize("role", ["all", "image", "language", "7", "7-11"])
@@ -188,7 +190,7 @@ def test_a_joint_place_of_keys_and_values_in_two_blocks(pi0_tiny: Pi0, pair: pt.
     cells = pt.find_cells(pi0_tiny, "kv.00|image", "kv.02|image")
     assert isinstance(pair.clean, Observation)
     tokens = pi0_tiny.roles([pair.clean])["backbone"][0].mask("image")
-    modules = [pi0_tiny.tap(Site("kv", n, own)).module for n in (0, 2) for own in ("keys", "values")]
+    modules = [pi0_tiny.tap(Site("kv", n, part)).module for n in (0, 2) for part in ("keys", "values")]
     expected = written(pi0_tiny, pair, modules, tokens, axis=2)
     np.testing.assert_array_equal(pt.patch_cells(pi0_tiny, pair, cells), expected)
     assert (expected != pt.patch_cells(pi0_tiny, pair, cells[0])).any()
@@ -196,7 +198,7 @@ def test_a_joint_place_of_keys_and_values_in_two_blocks(pi0_tiny: Pi0, pair: pt.
 
 @pytest.mark.slow
 def test_iterations_are_patched_where_they_are_named(pi0_tiny: Pi0, pair: pt.Pair) -> None:
-    every, none, some = (pt.find_cells(pi0_tiny, f"expert.01{own}")[0] for own in ("", "@0", "@0-9"))
+    every, none, some = (pt.find_cells(pi0_tiny, f"expert.01{suffix}")[0] for suffix in ("", "@0", "@0-9"))
     by_all = pt.patch_cells(pi0_tiny, pair, every)
     np.testing.assert_array_equal(by_all, pt.patch_cells(pi0_tiny, pair, some))
     assert (by_all != pt.patch_cells(pi0_tiny, pair, none)).any()
@@ -214,9 +216,9 @@ def test_everything_at_the_first_layer_is_the_source(pi0_tiny: Pi0, pair: pt.Pai
 @pytest.mark.slow
 def test_a_subspace_and_the_rest_of_it_are_parts_of_the_whole(pi0_tiny: Pi0, pair: pt.Pair) -> None:
     (cell,) = pt.find_cells(pi0_tiny, "backbone.02|image")
-    whole, clean = pt.patch_cells(pi0_tiny, pair, cell), pi0_tiny.act([pair.clean], [pair.seed])[0]  # type: ignore[list-item]
+    full_patch, clean = pt.patch_cells(pi0_tiny, pair, cell), pi0_tiny.act([pair.clean], [pair.seed])[0]  # type: ignore[list-item]
     every = np.eye(96)
-    np.testing.assert_allclose(pt.patch_cells(pi0_tiny, pair, cell, along=every), whole, atol=1e-5)
+    np.testing.assert_allclose(pt.patch_cells(pi0_tiny, pair, cell, along=every), full_patch, atol=1e-5)
     np.testing.assert_allclose(
         pt.patch_cells(pi0_tiny, pair, cell, along=every, complement=True), clean, atol=1e-5
     )
@@ -224,19 +226,22 @@ def test_a_subspace_and_the_rest_of_it_are_parts_of_the_whole(pi0_tiny: Pi0, pai
     within, image = torch.from_numpy(basis.T @ basis).float(), slice(0, 36)
     _, source = pt.run_with_cache(pi0_tiny, pair.source, pair.seed, ["backbone.02"])
 
-    def write(own: torch.Tensor, _: pt.HookPoint, rest: bool) -> torch.Tensor:
-        difference = source["backbone.02.residual"][:, image] - own[:, image]
+    def write(activation: torch.Tensor, _: pt.HookPoint, complement: bool) -> torch.Tensor:
+        difference = source["backbone.02.residual"][:, image] - activation[:, image]
         part = difference @ within
-        own[:, image] += difference - part if rest else part
-        return own
+        activation[:, image] += difference - part if complement else part
+        return activation
 
-    for rest in (False, True):
+    for complement in (False, True):
         by_hand = pt.run_with_hooks(
-            pi0_tiny, pair.clean, {"backbone.02": lambda own, at, rest=rest: write(own, at, rest)}, 3
+            pi0_tiny,
+            pair.clean,
+            {"backbone.02": lambda activation, at, complement=complement: write(activation, at, complement)},
+            3,
         )
-        patched = pt.patch_cells(pi0_tiny, pair, cell, along=basis, complement=rest)
+        patched = pt.patch_cells(pi0_tiny, pair, cell, along=basis, complement=complement)
         np.testing.assert_allclose(patched, by_hand, atol=1e-5)
-        assert np.abs(np.asarray(patched) - whole).max() > 1e-4
+        assert np.abs(np.asarray(patched) - full_patch).max() > 1e-4
 
 
 def test_the_last_position_of_a_model_that_answers_brings_the_sources_logits(observation: Observation) -> None:
@@ -258,13 +263,13 @@ def test_cells_are_named_in_order_and_once(pi0_tiny: Pi0) -> None:
         pi0_tiny, "backbone.*|all,image", "backbone.02|image", "backbone.01.heads.*", "kv.00|language"
     )
     assert len(cells) == len(set(cells)) == 8 + 8 + 1
-    assert [str(own) for own in cells[:2]] == ["backbone.00 all", "backbone.00 image"]
+    assert [str(cell) for cell in cells[:2]] == ["backbone.00 all", "backbone.00 image"]
     assert str(cells[8]) == "backbone.01.heads.0 all"
     assert pt.all_but(cells, cells[:16]) == (cells[16],)
 
 
 @pytest.mark.parametrize(
-    ("pattern", "error", "said"),
+    ("pattern", "error", "reason"),
     [
         ("backbone.02|state", UsageError, "no token of backbone has the role 'state'; expected one of all, image"),
         ("backbone.02|image.top", UsageError, "no token of backbone has the role 'image.top'"),
@@ -273,9 +278,9 @@ def test_cells_are_named_in_order_and_once(pi0_tiny: Pi0) -> None:
     ],
 )
 def test_a_cell_that_is_not_there_is_refused(
-    pi0_tiny: Pi0, pattern: str, error: type[Exception], said: str
+    pi0_tiny: Pi0, pattern: str, error: type[Exception], reason: str
 ) -> None:
-    with pytest.raises(error, match=said):
+    with pytest.raises(error, match=reason):
         pt.find_cells(pi0_tiny, pattern)
 
 
@@ -306,35 +311,35 @@ def test_a_source_with_another_number_of_tokens_is_refused(observation: Observat
 def test_shares_by_role_are_sums_of_weights(pi0_tiny: Pi0, observation: Observation) -> None:
     patterns = pt.attention_patterns(pi0_tiny, observation, ["expert.02.heads@9", "backbone.*.heads"], seed=1)
     assert len(patterns) == 4
-    own = patterns[Site("expert", 2, "heads", 9)]
-    assert own.weights.shape == (8, 17, 69)
-    assert own.queries is not None
-    assert own.keys is not None
-    np.testing.assert_allclose(own.weights.sum(axis=-1), 1, atol=1e-5)
-    by_hand = own.weights[:, 1:, :36].sum(axis=2).mean(axis=1)
-    np.testing.assert_allclose(own.mean_share("image", "action"), by_hand, rtol=1e-5)
+    head_pattern = patterns[Site("expert", 2, "heads", 9)]
+    assert head_pattern.weights.shape == (8, 17, 69)
+    assert head_pattern.queries is not None
+    assert head_pattern.keys is not None
+    np.testing.assert_allclose(head_pattern.weights.sum(axis=-1), 1, atol=1e-5)
+    by_hand = head_pattern.weights[:, 1:, :36].sum(axis=2).mean(axis=1)
+    np.testing.assert_allclose(head_pattern.mean_share("image", "action"), by_hand, rtol=1e-5)
     roles = ("image", "language", "special", "state", "action")
-    np.testing.assert_allclose(sum(own.mean_share(role) for role in roles), 1, atol=1e-5)
+    np.testing.assert_allclose(sum(head_pattern.mean_share(role) for role in roles), 1, atol=1e-5)
     prompt = patterns[Site("backbone", 0, "heads")]
     assert prompt.mean_share("padding").max(initial=0) == 0
     with pytest.raises(EmptyRoleError, match="no token with the role 'image' attends here"):
-        own.mean_share("language", "image")
+        head_pattern.mean_share("language", "image")
 
 
 def test_a_vision_tower_has_weights_without_roles(pi0_tiny: Pi0, observation: Observation) -> None:
-    (own,) = pt.attention_patterns(pi0_tiny, observation, ["vision.00.heads"]).values()
-    assert own.queries is own.keys is None
-    np.testing.assert_allclose(own.weights.sum(axis=-1), 1, atol=1e-5)
+    (head_pattern,) = pt.attention_patterns(pi0_tiny, observation, ["vision.00.heads"]).values()
+    assert head_pattern.queries is head_pattern.keys is None
+    np.testing.assert_allclose(head_pattern.weights.sum(axis=-1), 1, atol=1e-5)
     with pytest.raises(EmptyRoleError, match="have no roles; use weights"):
-        own.mean_share("image")
+        head_pattern.mean_share("image")
 
 
 def test_a_question_is_attended_to_by_its_answer(observation: Observation) -> None:
     vlm = load_model("vlm-tiny")
     question = Prompt(observation, "Put cube on red shape\n\nA left\nB right", ("A", "B"))
-    (own,) = pt.attention_patterns(vlm, question, ["answer.02.heads"]).values()
-    assert own.weights.shape[1] == 1
-    shares = [own.mean_share(role, "answer") for role in ("image", "language", "special", "answer")]
+    (head_pattern,) = pt.attention_patterns(vlm, question, ["answer.02.heads"]).values()
+    assert head_pattern.weights.shape[1] == 1
+    shares = [head_pattern.mean_share(role, "answer") for role in ("image", "language", "special", "answer")]
     np.testing.assert_allclose(sum(shares), 1, atol=1e-5)
 
 

@@ -30,9 +30,9 @@ def test_the_place_that_is_read_carries_everything_and_no_other_block_does(copie
     table = copied.table.set_index("cells")
     assert table.loc["kv.01 language", "share"] == pytest.approx(1, abs=0.05)
     assert table.loc["kv.01 language", "p_fwe"] < 0.01
-    others = table.loc[[name for name in table.index if name.startswith("kv") and name != "kv.01 language"]]
-    assert others["share"].abs().max() < 0.05
-    assert others["p_fwe"].min() > 0.05
+    other_cells = table.loc[[name for name in table.index if name.startswith("kv") and name != "kv.01 language"]]
+    assert other_cells["share"].abs().max() < 0.05
+    assert other_cells["p_fwe"].min() > 0.05
     assert table.loc["backbone.00 image", "share"] == pytest.approx(1, abs=0.05)
     assert table.loc["backbone.01 image", "share"] == pytest.approx(0, abs=0.05)
     assert set(table["n_pairs"]) == {24}
@@ -40,22 +40,24 @@ def test_the_place_that_is_read_carries_everything_and_no_other_block_does(copie
 
 
 def test_a_sweep_gives_the_numbers_of_the_interchange(copied: pt.Sweep, wired: WiredSession) -> None:
-    chosen = [row for row, name in enumerate(copied.names) if name.endswith(("01 image", "01 language", "01 all"))]
-    cells = [copied.cells[row][0] for row in chosen]
+    chosen_rows = [
+        row for row, name in enumerate(copied.names) if name.endswith(("01 image", "01 language", "01 all"))
+    ]
+    cells = [copied.cells[row][0] for row in chosen_rows]
     sites = tuple(dict.fromkeys(site for cell in cells for site in cell.site_group.sites))
-    stored = outcomes_of(wired, ["copied"], [patch_of(own, sites) for own in cells])
-    rows = copied.table.iloc[chosen].iterrows()
-    for at, (effect, (row, own)) in enumerate(zip(patches_of(stored, "suite"), rows, strict=True)):
-        assert f"{effect.sites} {effect.role}" == own["cells"]
-        assert own["share"] == pytest.approx(effect.effect, abs=1e-9)
-        assert own["moved"] == pytest.approx(effect.mean_displacement, abs=1e-9)
+    stored = outcomes_of(wired, ["copied"], [patch_of(cell, sites) for cell in cells])
+    rows = copied.table.iloc[chosen_rows].iterrows()
+    for at, (effect, (row, record)) in enumerate(zip(patches_of(stored, "suite"), rows, strict=True)):
+        assert f"{effect.sites} {effect.role}" == record["cells"]
+        assert record["share"] == pytest.approx(effect.effect, abs=1e-9)
+        assert record["moved"] == pytest.approx(effect.mean_displacement, abs=1e-9)
         np.testing.assert_array_equal(copied.patched[row], stored.displacement[2 + at])
 
 
 def test_a_heatmap_has_layers_by_roles(copied: pt.Sweep) -> None:
     axes = copied.heatmap("moved").axes[0]
-    assert [own.get_text() for own in axes.get_yticklabels()] == ["all", "image", "language", "state"]
-    places = [own.get_text() for own in axes.get_xticklabels()]
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["all", "image", "language", "state"]
+    places = [label.get_text() for label in axes.get_xticklabels()]
     assert places == ["backbone.00", "backbone.01", "backbone.02", "backbone.03", "kv.00", "kv.01", "kv.02"]
     (image,) = axes.images
     grid = np.ma.filled(image.get_array(), np.nan)
@@ -133,22 +135,22 @@ def test_pairs_without_a_group_are_independent(wired: WiredSession) -> None:
 
 @pytest.mark.slow
 def test_one_copy_is_read_here_and_nothing_is_needed_elsewhere(wired: WiredSession) -> None:
-    found = pt.compare_alone_and_without(
+    comparison = pt.compare_alone_and_without(
         wired.policy,
         pt.find_pairs(wired, "copied", 8),
         pt.find_cells(wired.policy, KV),
         wired.lateral_displacement,
     ).set_index("cells")
-    assert found.loc["kv.01 language", "finding"] == "read here"
-    assert set(found.drop("kv.01 language")["finding"]) == {"nothing alone"}
-    assert found.loc["kv.01 language", "needed"] == pytest.approx(1, abs=0.05)
+    assert comparison.loc["kv.01 language", "finding"] == "read here"
+    assert set(comparison.drop("kv.01 language")["finding"]) == {"nothing alone"}
+    assert comparison.loc["kv.01 language", "needed"] == pytest.approx(1, abs=0.05)
 
 
 @pytest.mark.slow
 def test_of_a_majority_of_blocks_no_single_one_carries_anything_and_two_carry_all(wired: WiredSession) -> None:
     pairs, cells = pt.find_pairs(wired, "blocks"), pt.find_cells(wired.policy, "kv.*|language", "kv.01|state")
-    found = pt.compare_alone_and_without(wired.policy, pairs, cells, wired.lateral_displacement)
-    assert set(found["finding"]) == {"nothing alone"}
+    comparison = pt.compare_alone_and_without(wired.policy, pairs, cells, wired.lateral_displacement)
+    assert set(comparison["finding"]) == {"nothing alone"}
     minimal = pt.find_minimal_cells(wired.policy, pairs, cells, wired.lateral_displacement)
     assert len(minimal.cells) == 2
     assert {cell.role for cell in minimal.cells} == {"language"}

@@ -41,23 +41,23 @@ def test_the_plain_condition_is_the_sum_of_what_the_run_commanded(
     copy: Run, effects: InterventionResult, small_suite: Suite, twin: "Policy"
 ) -> None:
     assert effects.certificate["replay"]["equal"] == EPISODES
-    found = dict(zip(effects.outcomes.episodes, effects.outcomes.of("clean"), strict=True))
+    clean_by_episode = dict(zip(effects.outcomes.episodes, effects.outcomes.of("clean"), strict=True))
     with open_session(copy, ReplaySource(small_suite.folder), lambda *_: twin) as session:
         for row, name in enumerate(copy.episodes["episode_id"]):
-            if name not in found:
+            if name not in clean_by_episode:
                 continue
             commanded = np.asarray(copy.trajectory(row).commanded, np.float64)
             (replay_input,) = (
-                one for one in session.pairs(str(copy.episodes["item_id"][row])) if one.episode == name
+                pair for pair in session.pairs(str(copy.episodes["item_id"][row])) if pair.episode == name
             )
             end = replay_input.clean.state[:2].astype(np.float64) + commanded[:, :2].sum(axis=0)
-            assert found[name] == pytest.approx(session.lateral_offset(end), abs=1e-5)
+            assert clean_by_episode[name] == pytest.approx(session.lateral_offset(end), abs=1e-5)
 
 
 def test_every_call_is_changed_and_nothing_of_it_is_carried_out(copy: Run, effects: InterventionResult) -> None:
     calls = ceil(STEPS / int(copy.settings["execute"]))
-    for said in effects.certificate["edits"].values():
-        assert said["fires"] == EPISODES * calls
+    for counts in effects.certificate["edits"].values():
+        assert counts["fires"] == EPISODES * calls
     outcomes = effects.outcomes
     assert outcomes.episode_outcomes is None
     np.testing.assert_allclose(outcomes.of("backbone.00|all"), outcomes.of("image_swap"), atol=1e-6)

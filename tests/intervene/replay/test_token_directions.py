@@ -34,29 +34,29 @@ GROUPS, POSITIONS, WIDTH = 10, 6, 12
 def marked(mark: np.ndarray, seed: int = 0) -> TokenFeatures:
     """Four episodes per group: the first half of the tokens is marked for left, the second half for right."""
     draw = np.random.default_rng(seed)
-    left = np.tile([True, False], 2 * GROUPS)
-    values = 0.05 * draw.normal(size=(left.size, POSITIONS, WIDTH))
+    is_left = np.tile([True, False], 2 * GROUPS)
+    values = 0.05 * draw.normal(size=(is_left.size, POSITIONS, WIDTH))
     first = np.arange(POSITIONS) < POSITIONS // 2
-    values += np.where(left[:, None] == first, 0.5, -0.5)[..., None] * mark
+    values += np.where(is_left[:, None] == first, 0.5, -0.5)[..., None] * mark
     groups = np.repeat([f"g{number}" for number in range(GROUPS)], 4)
-    names = tuple(f"episode-{row}" for row in range(left.size))
-    return TokenFeatures(names, groups, left, PaddedTokens(values, np.ones(values.shape[:2], bool)))
+    names = tuple(f"episode-{row}" for row in range(is_left.size))
+    return TokenFeatures(names, groups, is_left, PaddedTokens(values, np.ones(values.shape[:2], bool)))
 
 
 def test_marks_that_cancel_in_the_mean_lie_along_one_direction() -> None:
     mark = np.eye(WIDTH)[3]
-    own = marked(mark)
-    pooled = own.tokens.values.mean(axis=1)
-    difference = pooled[own.is_left].mean(axis=0) - pooled[~own.is_left].mean(axis=0)
+    features = marked(mark)
+    pooled = features.tokens.values.mean(axis=1)
+    difference = pooled[features.is_left].mean(axis=0) - pooled[~features.is_left].mean(axis=0)
     assert np.linalg.norm(difference) < 0.05
-    fits = fit_by_fold(own, CELL, Method.of("mean-difference:1"), 2, 0, "color")
-    found = by_episode(own, fits)
-    assert set(found) == {"mean-difference:1", "control-1", "control-2"}
-    for episode in own.episodes:
-        (direction,) = found["mean-difference:1"][episode].removed[0]
+    fits = fit_by_fold(features, CELL, Method.of("mean-difference:1"), 2, 0, "color")
+    directions = by_episode(features, fits)
+    assert set(directions) == {"mean-difference:1", "control-1", "control-2"}
+    for episode in features.episodes:
+        (direction,) = directions["mean-difference:1"][episode].removed[0]
         assert abs(float(direction @ mark)) > 0.99
         for name in ("control-1", "control-2"):
-            (control,) = found[name][episode].removed[0]
+            (control,) = directions[name][episode].removed[0]
             assert np.linalg.norm(control) == pytest.approx(1.0)
             assert abs(float(control @ direction)) < 1e-9
 
@@ -65,25 +65,30 @@ def test_marks_that_cancel_in_the_mean_lie_along_one_direction() -> None:
 def test_a_place_without_a_direction_is_refused_by_category_site_and_role(method: str) -> None:
     """Before a layer combines them, each picture of a balanced suite has either answer equally often."""
     values = np.random.default_rng(0).normal(size=(GROUPS, POSITIONS, WIDTH)) + 1e3
-    own = marked(np.zeros(WIDTH))
+    features = marked(np.zeros(WIDTH))
     same = TokenFeatures(
-        own.episodes, own.groups, own.is_left, PaddedTokens(np.repeat(values, 4, axis=0), own.tokens.present)
+        features.episodes,
+        features.groups,
+        features.is_left,
+        PaddedTokens(np.repeat(values, 4, axis=0), features.tokens.present),
     )
     with pytest.raises(UsageError, match=f"color, {SITE}, role image: no direction for {method}"):
         fit_by_fold(same, CELL, Method.of(method), 1, 0, "color")
 
 
 def test_an_episodes_own_group_has_no_say_in_its_directions() -> None:
-    own, method = marked(np.eye(WIDTH)[3]), Method.of("mean-difference:2")
-    before = by_episode(own, fit_by_fold(own, CELL, method, 1, 0, "color"))
-    spoilt = own.tokens.values.copy()
-    mine = own.groups == "g4"
+    features, method = marked(np.eye(WIDTH)[3]), Method.of("mean-difference:2")
+    before = by_episode(features, fit_by_fold(features, CELL, method, 1, 0, "color"))
+    spoilt = features.tokens.values.copy()
+    mine = features.groups == "g4"
     spoilt[mine] = 100 * np.random.default_rng(1).normal(size=spoilt[mine].shape)
-    other = TokenFeatures(own.episodes, own.groups, own.is_left, PaddedTokens(spoilt, own.tokens.present))
+    other = TokenFeatures(
+        features.episodes, features.groups, features.is_left, PaddedTokens(spoilt, features.tokens.present)
+    )
     after = by_episode(other, fit_by_fold(other, CELL, method, 1, 0, "color"))
     same = [
         np.array_equal(before[str(method)][name].removed, after[str(method)][name].removed)
-        for name in own.episodes
+        for name in features.episodes
     ]
     assert all(np.array(same)[mine])
     assert not all(same)
@@ -94,15 +99,15 @@ def test_they_are_the_leading_differences_of_class_means_of_the_other_folds(
 ) -> None:
     """Compared with numpy's decomposition of the tokens that the policy has there."""
     items = list(dict.fromkeys(copy.episodes.loc[copy.episodes["category"] == "color", "item_id"].astype(str)))
-    (place,) = resolve_sites("backbone.02", session.policy)
+    (site_group,) = resolve_sites("backbone.02", session.policy)
     captured: list[tuple[int, int]] = []
-    session.on_fit_progress = lambda done, total, _: captured.append((done, total))
-    asked = Interchange(
+    session.on_fit_progress = lambda finished, total, _: captured.append((finished, total))
+    intervention = Interchange(
         categories=("color",), sites=("backbone.02",), roles=("image",), direction="mean-difference:2", controls=1
     )
-    (axes,) = asked.fit_directions(session, [Cell(place, "image")], asked.sites).values()
+    (axes,) = intervention.fit_directions(session, [Cell(site_group, "image")], intervention.sites).values()
     session.on_fit_progress = None
-    assert captured == [(done, len(items)) for done in range(1, len(items) + 1)]
+    assert captured == [(finished, len(items)) for finished in range(1, len(items) + 1)]
     replay_inputs = [replay_input for item in items for replay_input in session.pairs(item)]
     rows = []
     for replay_input in replay_inputs:
@@ -110,17 +115,17 @@ def test_they_are_the_leading_differences_of_class_means_of_the_other_folds(
             session.act(replay_input.clean, replay_input.seed)
         mask = session.policy.token_roles([replay_input.clean])["backbone"][0].mask("image")
         rows.append(activations[SITE][0].double().cpu().numpy()[mask])
-    values, left = (
+    values, is_left = (
         np.array(rows),
         np.array([replay_input.side == "left" for replay_input in replay_inputs]),
     )
-    chosen = {name: axes.basis("mean-difference:2", name) for name in (q.episode for q in replay_inputs)}
+    bases = {name: axes.basis("mean-difference:2", name) for name in (q.episode for q in replay_inputs)}
     episode = replay_inputs[0].episode
-    fold = np.array([np.array_equal(chosen[q.episode], chosen[episode]) for q in replay_inputs])
+    fold = np.array([np.array_equal(bases[q.episode], bases[episode]) for q in replay_inputs])
     assert 0 < fold.sum() < fold.size
-    differences = values[~fold & left].mean(axis=0) - values[~fold & ~left].mean(axis=0)
+    differences = values[~fold & is_left].mean(axis=0) - values[~fold & ~is_left].mean(axis=0)
     _, _, expected = np.linalg.svd(differences, full_matrices=False)
-    basis = chosen[episode].astype(float)
+    basis = bases[episode].astype(float)
     np.testing.assert_allclose(basis.T @ basis, expected[:2].T @ expected[:2], atol=1e-5)
     control = axes.basis("control-1", episode)
     assert control.shape == basis.shape
@@ -136,10 +141,10 @@ def test_tokens_are_taken_over_along_them_and_along_controls(
     )  # fmt: skip
     effects = run_intervention(copy, intervention, source, load=lambda *_: twin)
     assert [row.direction for row in effects.effects] == ["mean-difference:2", "control-1"]
-    own, control = effects.effects
-    assert own.fires == control.fires == 4
-    assert min(own.relative_change, control.relative_change) > 0
-    assert own.control_displacement is not None
+    effect, control = effects.effects
+    assert effect.fires == control.fires == 4
+    assert min(effect.relative_change, control.relative_change) > 0
+    assert effect.control_displacement is not None
 
 
 @pytest.mark.parametrize("direction", ["mean-difference:0", "mean-difference:x", "leace", "inlp:2", "zap"])
@@ -159,20 +164,20 @@ def test_what_is_no_direction_is_refused_before_anything_is_loaded(intervention:
 def test_a_dose_of_two_takes_the_marks_from_one_half_of_the_tokens_to_the_other() -> None:
     """Marks are planted; the vector of every position is the difference of the class means there."""
     mark = np.eye(WIDTH)[3]
-    own, method = marked(mark), "mean-difference:1"
-    fits = fit_by_fold(own, CELL, Method.of(method), 1, 0, "color")
+    features, method = marked(mark), "mean-difference:1"
+    fits = fit_by_fold(features, CELL, Method.of(method), 1, 0, "color")
     bases = {
         (name, episode): eraser.removed[0].astype(np.float32)
-        for name, of_episode in by_episode(own, fits).items()
+        for name, of_episode in by_episode(features, fits).items()
         for episode, eraser in of_episode.items()
     }
-    axes = Directions(bases, half_differences_of(own, fits, method), ("control-1",))
+    axes = Directions(bases, half_differences_of(features, fits, method), ("control-1",))
     first = np.arange(POSITIONS) < POSITIONS // 2
-    for episode, left in zip(own.episodes, own.is_left, strict=True):
-        shift = axes.shift(method, episode, -2.0 if left else 2.0)
-        expected = np.where(first == left, -1.0, 1.0)[:, None] * mark
+    for episode, is_left in zip(features.episodes, features.is_left, strict=True):
+        shift = axes.shift(method, episode, -2.0 if is_left else 2.0)
+        expected = np.where(first == is_left, -1.0, 1.0)[:, None] * mark
         np.testing.assert_allclose(shift, expected, atol=0.1)
-        control = axes.shift("control-1", episode, -2.0 if left else 2.0)
+        control = axes.shift("control-1", episode, -2.0 if is_left else 2.0)
         np.testing.assert_allclose(
             np.linalg.norm(control, axis=1), np.linalg.norm(shift, axis=1), rtol=1e-4, err_msg=episode
         )
@@ -188,6 +193,6 @@ def test_steering_along_directions_of_tokens_moves_them_as_far_as_its_control(
     assert intervention.fits_first
     edits = run_intervention(copy, intervention, source, load=lambda *_: twin).certificate["edits"]
     assert edits["backbone.02|image|mean-difference:1|0"]["max_action_change"] == 0.0
-    own, control = (edits[f"backbone.02|image|{name}|2"] for name in ("mean-difference:1", "control-1"))
-    assert own["change"] > 0
-    assert control["change"] == pytest.approx(own["change"], rel=1e-4)
+    along, control = (edits[f"backbone.02|image|{name}|2"] for name in ("mean-difference:1", "control-1"))
+    assert along["change"] > 0
+    assert control["change"] == pytest.approx(along["change"], rel=1e-4)

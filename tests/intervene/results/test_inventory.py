@@ -29,7 +29,7 @@ def store(run: Run, intervention: ImageSwap | ConceptErasure) -> str:
     return store_outcomes(run.location, run.seed_text, settings, outcomes)
 
 
-def shown(run: Run, *options: str) -> str:
+def printed_inventory(run: Run, *options: str) -> str:
     answer = CliRunner().invoke(app, ["run", "show", str(run.path), *options])
     assert answer.exit_code == 0, answer.stderr
     return answer.stdout if "--json" in options else " ".join(answer.stdout.split())
@@ -39,16 +39,16 @@ def test_interventions_are_listed_oldest_first_with_what_was_asked(run: Run) -> 
     (first,) = listed_interventions(run)
     assert (first.kind, first.state, first.categories) == ("image-swap", "used", ("color",))
     more, erased = store(run, ImageSwap(items=12)), store(run, ConceptErasure(sites=("backbone.01",), controls=2))
-    assert [(one.key, one.state) for one in listed_interventions(run)] == [
+    assert [(intervention.key, intervention.state) for intervention in listed_interventions(run)] == [
         (first.key, "other"), (more, "used"), (erased, "used"),
     ]  # fmt: skip
-    text = shown(run)
+    text = printed_inventory(run)
     assert f"intervention {more}" in text
     assert "follow of color; 12 items each; another one stands in its place in tables; made" not in text
     assert "erase of color; controls 2; method leace; roles image; seed 0; sites backbone.01; made" in text
     assert "another one stands in its place" in text
-    listed = json.loads(shown(run, "--json"))["interventions"]
-    assert [one["key"] for one in listed] == [first.key, more, erased]
+    listed = json.loads(printed_inventory(run, "--json"))["interventions"]
+    assert [record["key"] for record in listed] == [first.key, more, erased]
     assert listed[2]["parameters"]["method"] == "leace"
 
 
@@ -59,7 +59,7 @@ def test_what_is_of_other_episodes_or_unfinished_is_said(run: Run) -> None:
     (partial / "000000.npz").write_bytes(b"")
     sorted((run.path / "commits").iterdir())[-1].unlink()
     shutil.rmtree(run.path / "sealed")  # else it is a run that lost an episode
-    text = shown(run)
+    text = printed_inventory(run)
     assert f"intervention {first.key}" in text
     assert "other episodes" in text
     assert "unfinished 0123456789ab" in text

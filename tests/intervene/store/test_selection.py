@@ -154,25 +154,25 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> ArrayRun:
     )  # fmt: skip
     blank = np.zeros((len(episodes), 1))
     path = tmp_path_factory.mktemp("standing")
-    made = ArrayRun(path, "pi0", "suite@1#0123456789ab", episodes, {(Site("backbone", 0), "mean"): blank})
+    array_run = ArrayRun(path, "pi0", "suite@1#0123456789ab", episodes, {(Site("backbone", 0), "mean"): blank})
     for name in POOL:
-        store(made, name)
-    return made
+        store(array_run, name)
+    return array_run
 
 
 def settings_of(run: ArrayRun, name: str) -> dict[str, Any]:
-    kind, own, make = POOL[name]
+    kind, options, make = POOL[name]
     categories = list(dict.fromkeys(make().categories.tolist()))
     return {
         "format": FORMAT, "kind": kind, "run_settings": run.settings_sha256, "stamp": "", "wording": None,
-        "categories": categories, "readout": "first-chunk", **own,
+        "categories": categories, "readout": "first-chunk", **options,
     }  # fmt: skip
 
 
 def store(run: ArrayRun, name: str) -> None:
     _, _, make = POOL[name]
-    outcomes, further = attention_records(*SHARES[name]) if name in SHARES else (make(), {})
-    store_outcomes(run.location, run.suite, settings_of(run, name), outcomes, further=further)
+    outcomes, extra_files = attention_records(*SHARES[name]) if name in SHARES else (make(), {})
+    store_outcomes(run.location, run.suite, settings_of(run, name), outcomes, extra_files=extra_files)
 
 
 def made_in(run: ArrayRun, names: list[str]) -> None:
@@ -185,14 +185,14 @@ def made_in(run: ArrayRun, names: list[str]) -> None:
 
 def read(run: ArrayRun) -> dict[str, Any]:
     """Every quantity that verdicts, tables and figures take from what is stored."""
-    found, encoded = stored_image_swaps(run), {"color": True, "shape": True}
+    swaps, encoded = stored_image_swaps(run), {"color": True, "shape": True}
     return {
-        "follows": found,
+        "follows": swaps,
         "maps": stored_site_effects(run),
         "along": stored_subspace_effects(run),
         "steering": stored_steering(run),
-        "attention": {name: arrays_to_bytes(own) for name, own in stored_attention(run).items()},
-        "verdicts": classify_all(found, encoded, StoredEvidence(run).places),
+        "attention": {name: arrays_to_bytes(arrays) for name, arrays in stored_attention(run).items()},
+        "verdicts": classify_all(swaps, encoded, StoredEvidence(run).places),
         "targets": best_patch_targets(run, ["color"]),
     }
 
@@ -214,7 +214,7 @@ def test_what_is_read_does_not_depend_on_the_order_in_which_it_was_stored(run: A
 
 def unkeyed(value: Any) -> Any:
     if isinstance(value, dict):
-        return {name: unkeyed(own) for name, own in value.items()}
+        return {name: unkeyed(item) for name, item in value.items()}
     if isinstance(value, list):
         return [replace(row, key="") for row in value]
     return value
@@ -222,40 +222,42 @@ def unkeyed(value: Any) -> Any:
 
 @pytest.mark.slow
 def test_every_quantity_is_of_what_it_is_about(run: ArrayRun) -> None:
-    seen = read(run)
-    verdict = seen["verdicts"]["color"]
+    quantities = read(run)
+    verdict = quantities["verdicts"]["color"]
     assert verdict.behaviour == "used"
     assert verdict.where == (
         "passes at backbone.02; read at kv.02; carried by mean-difference at backbone.02 image"
     )
-    assert seen["verdicts"]["shape"].behaviour == "not used"
-    assert (seen["follows"]["color"].follow_rate, seen["follows"]["color"].n_episodes) == (1.0, MANY)
-    cells = [(row.sites, row.role, row.net) for row in seen["maps"]["color"]]
+    assert quantities["verdicts"]["shape"].behaviour == "not used"
+    assert (quantities["follows"]["color"].follow_rate, quantities["follows"]["color"].n_episodes) == (1.0, MANY)
+    cells = [(row.sites, row.role, row.net) for row in quantities["maps"]["color"]]
     assert cells == [
         ("backbone.00", "all", 1.0), ("backbone.00", "image", 1.0), ("backbone.02", "all", 1.0),
         ("backbone.02", "image", 1.0), ("backbone.02", "image.left", 0.0), ("backbone.10", "all", 0.0),
         ("backbone.10", "image", 0.0), ("expert.03@0", "all", 0.0), ("kv.00", "all", 0.0),
         ("kv.02", "all", 1.0),
     ]  # fmt: skip
-    assert {row.n_episodes for row in seen["maps"]["color"]} == {MANY}
-    assert [row.direction for row in seen["along"]["color"]] == [
+    assert {row.n_episodes for row in quantities["maps"]["color"]} == {MANY}
+    assert [row.direction for row in quantities["along"]["color"]] == [
         "control-1", "mean-difference", "control-1", "probe",
     ]  # fmt: skip
-    coefficients = {name: [row.coefficient for row in rows] for name, rows in seen["steering"]["color"].items()}
+    coefficients = {
+        name: [row.coefficient for row in rows] for name, rows in quantities["steering"]["color"].items()
+    }
     assert coefficients == {
         "backbone.01 image, toward left": ["2"], "backbone.01 image": ["0", "2", "4"], "backbone.02 image": ["2"],
     }  # fmt: skip
     assert stored_attention(run)["color"].roles == ("all", "image")
-    assert seen["targets"] == ("backbone.02|image",)
+    assert quantities["targets"] == ("backbone.02|image",)
 
 
 @pytest.mark.slow
 def test_those_of_which_nothing_is_read_are_listed_so(run: ArrayRun) -> None:
     made_in(run, [*(name for name in POOL if name != "map"), "map"])
     names = {key_of(settings_of(run, name)): name for name in POOL}
-    states = {names[one.key]: one.state for one in listed_interventions(run)}
-    others = {"follow, few", "map, few", "map, shadow", "steer, few", "attention, few"}
-    assert {name for name, state in states.items() if state == "other"} == {*others, "attention, a role"}
+    states = {names[intervention.key]: intervention.state for intervention in listed_interventions(run)}
+    unread = {"follow, few", "map, few", "map, shadow", "steer, few", "attention, few"}
+    assert {name for name, state in states.items() if state == "other"} == {*unread, "attention, a role"}
 
 
 @pytest.mark.slow
@@ -263,14 +265,14 @@ def test_the_verdict_says_first_chunk_and_whole_episode_whichever_is_asked_for(r
     """Color follows in the first chunk; the stored episodes along which each step was evaluated do not move."""
     for name, readout in (("image-swap", "first-chunk"), ("follow, shadow", "per-step")):
         key = key_of(settings_of(run, name))
-        shown = InterventionResult.of_stored(find_stored(run, key))
-        found = shown.verdicts["color"]
-        assert (found.readout, shown.effects[0].readout) == (readout, readout)
-        assert found.verdict == "first chunk used; episode undecided"
-        assert found.sentence.startswith(
+        result = InterventionResult.of_stored(find_stored(run, key))
+        verdict = result.verdicts["color"]
+        assert (verdict.readout, result.effects[0].readout) == (readout, readout)
+        assert verdict.verdict == "first chunk used; episode undecided"
+        assert verdict.sentence.startswith(
             "The answer is used in the first chunk; whether it is used over the whole episode is undecided: "
         )
-        assert f'"verdict": "{found.verdict}"' in shown.to_json()
+        assert f'"verdict": "{verdict.verdict}"' in result.to_json()
     assert verdicts_of(run)["shape"].sentence.startswith("The answer is not used in the first chunk: ")
 
 
@@ -282,7 +284,7 @@ def test_a_follow_that_is_asked_for_by_its_key_has_its_own_verdict(run: ArrayRun
 
 
 @pytest.mark.parametrize(
-    ("names", "said"),
+    ("names", "expected"),
     [
         (["tiles"], None),
         (["expert"], None),
@@ -295,10 +297,10 @@ def test_a_follow_that_is_asked_for_by_its_key_has_its_own_verdict(run: ArrayRun
     ],
 )
 def test_a_category_is_searched_where_all_tokens_of_the_backbone_were_exchanged(
-    tmp_path: Path, run: ArrayRun, names: list[str], said: tuple[str, ...] | None
+    tmp_path: Path, run: ArrayRun, names: list[str], expected: tuple[str, ...] | None
 ) -> None:
     """A null result for one role, iteration, block or direction does not rule out the others."""
     alone = replace(run, path=tmp_path)
     for name in names:
         store(alone, name)
-    assert localised_by_category(stored_site_effects(alone)).get("color") == said
+    assert localised_by_category(stored_site_effects(alone)).get("color") == expected

@@ -102,17 +102,17 @@ def test_a_guesser_with_a_fixed_preference_per_item_is_not_called_knowing() -> N
     """Over episodes, which repeat the preference, it was in 9 % of categories."""
     generator = np.random.default_rng(0)
     regimes = [success_rate(doubles(75, lambda *_: bool(generator.random() < 0.5))).regime for _ in range(150)]
-    assert np.mean([found is Regime.KNOWLEDGE for found in regimes]) <= 0.025 + 3 * 0.0128
+    assert np.mean([verdict is Regime.KNOWLEDGE for verdict in regimes]) <= 0.025 + 3 * 0.0128
 
 
 def test_knowledge_never_stands_beside_an_interval_that_includes_one_half() -> None:
     generator = np.random.default_rng(1)
-    found = [
+    rates = [
         success_rate(doubles(groups, lambda *_, ability=ability: bool(generator.random() < ability)))
         for groups in range(4, 40)
         for ability in (generator.uniform(0.5, 1.0),)
     ]
-    lows = [rate.ci[0] for rate in found if rate.regime is Regime.KNOWLEDGE and rate.ci is not None]
+    lows = [rate.ci[0] for rate in rates if rate.regime is Regime.KNOWLEDGE and rate.ci is not None]
     assert len(lows) > 5
     assert all(low is not None and low > 0.5 for low in lows)
 
@@ -159,20 +159,20 @@ def test_a_table_without_distances_has_no_sensitivity(outcome_table: Outcomes) -
 
 
 def test_twelve_groups_of_four_that_are_all_right_are_known_like_twelve_tosses() -> None:
-    found = success_rate(doubles(12, lambda *_: True)).ci
+    interval = success_rate(doubles(12, lambda *_: True)).ci
     exact = binomtest(12, 12).proportion_ci(0.95, "exact")
-    assert found == pytest.approx((exact.low, exact.high))
-    assert found == pytest.approx((0.735, 1), abs=5e-4)
+    assert interval == pytest.approx((exact.low, exact.high))
+    assert interval == pytest.approx((0.735, 1), abs=5e-4)
 
 
 def test_the_interval_is_korn_and_graubards() -> None:
     """Clopper and Pearson's, with as many episodes as count where groups answer alike."""
-    found = success_rate(doubles(40, lambda group, item: group % 5 < 2 or (group % 5 == 2 and item == 0)))
+    rate = success_rate(doubles(40, lambda group, item: group % 5 < 2 or (group % 5 == 2 and item == 0)))
     hits = np.array([4.0, 4, 2, 0, 0] * 8)
     variance = np.sum((hits - 4 * 0.5) ** 2) * 40 / 39 / 160**2
     count = 0.25 / variance * (t.ppf(0.975, 159) / t.ppf(0.975, 39)) ** 2
-    wanted = beta.ppf(0.025, count / 2, count / 2 + 1), beta.ppf(0.975, count / 2 + 1, count / 2)
-    assert (found.sr, found.ci) == (0.5, pytest.approx(wanted))
+    expected = beta.ppf(0.025, count / 2, count / 2 + 1), beta.ppf(0.975, count / 2 + 1, count / 2)
+    assert (rate.sr, rate.ci) == (0.5, pytest.approx(expected))
 
 
 @pytest.mark.parametrize(
@@ -187,7 +187,7 @@ def test_an_interval_has_a_width_even_where_all_episodes_agree(
         for item in range(10)
         for layout, side in (("original", "left"), ("swapped", "right"))
     ]
-    found = success_rate(pd.DataFrame(rows)).ci
-    assert found == pytest.approx(expected)
+    interval = success_rate(pd.DataFrame(rows)).ci
+    assert interval == pytest.approx(expected)
     exact = binomtest(10 if outcome == "correct" else 0, 10).proportion_ci(0.95, "exact")
-    assert found == pytest.approx((exact.low, exact.high))
+    assert interval == pytest.approx((exact.low, exact.high))

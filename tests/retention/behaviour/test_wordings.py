@@ -55,8 +55,8 @@ def test_pairs_count_what_one_wording_alone_got_right_on_the_same_episodes(ladde
 
 def test_several_categories_have_a_mean(ladder):
     shape = ladder.assign(category="shape", item_id="s" + ladder["item_id"], group_id="s" + ladder["group_id"])
-    found = pairs(pd.concat([ladder, shape]), "knowledge", "side")
-    assert [(p.category, p.n_items) for p in found] == [("color", 6), ("shape", 6), ("mean", 12)]
+    compared = pairs(pd.concat([ladder, shape]), "knowledge", "side")
+    assert [(p.category, p.n_items) for p in compared] == [("color", 6), ("shape", 6), ("mean", 12)]
 
 
 def test_success_rates_and_probes_take_one_wording(ladder):
@@ -68,8 +68,8 @@ def test_success_rates_and_probes_take_one_wording(ladder):
 
 def test_a_pair_that_shares_no_episode_is_left_out(ladder):
     apart = ladder[(ladder["wording"] == "knowledge") == (ladder["item_id"] < "color-3")]
-    found = pairs(apart, "knowledge", "named", "side")
-    assert {(p.group, p.minus) for p in found} == {("named", "side")}
+    compared = pairs(apart, "knowledge", "named", "side")
+    assert {(p.group, p.minus) for p in compared} == {("named", "side")}
 
 
 def test_the_wordings_are_a_table(ladder):

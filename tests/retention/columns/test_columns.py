@@ -26,7 +26,7 @@ from probe_kit.retention.displays import (
 from probe_kit.retention.report import report_html
 from probe_kit.retention.report.page import words_of
 from probe_kit.train import ArrayRun, Controls, ControlScore, UntrainedScore, load_results, save_results
-from tests.retention.asked_runs import SaidRun, acted, asked, probes
+from tests.retention.asked_runs import SaidRun, acted, answer_run, probes
 
 ProbedRun = Callable[..., ArrayRun]
 
@@ -53,7 +53,7 @@ def field_of(path: str) -> Any:
     """The type of `part.field` of a row. Raises KeyError where there is none."""
     kind: Any = RetentionRow
     for name in path.split("."):
-        kind = next((one for one in (kind, *get_args(kind)) if is_dataclass(one)), kind)
+        kind = next((candidate for candidate in (kind, *get_args(kind)) if is_dataclass(candidate)), kind)
         kind = get_type_hints(kind)[name] if is_dataclass(kind) else kind
     return kind
 
@@ -65,9 +65,9 @@ def test_a_new_column_is_one_declaration_and_stands_in_every_format(
     new = share("success.layout_mean", "layout mean %", "Mean of the success rates of both layouts.")
     for text in every_form(table).values():
         assert "layout mean" not in text
-    first, *others = TABLES["Success rate"]
+    first, *other_groups = TABLES["Success rate"]
     group = ColumnGroup(first.title, (*first.columns, new))
-    monkeypatch.setitem(TABLES, "Success rate", (group, *others))  # type: ignore[misc]
+    monkeypatch.setitem(TABLES, "Success rate", (group, *other_groups))  # type: ignore[misc]
     again = retention_table([probed_run({"color": ([0.5, 0.9, 0.7], [[0.6, 0.7]])})])
     for form, text in every_form(again).items():
         assert "layout mean" in text, form
@@ -118,7 +118,7 @@ def test_parts_are_frames_keyed_by_run_category_and_view(table: RetentionTable) 
     assert table.answers.empty
     assert table.interventions.empty
     assert "sr_answered" in table.rules
-    assert {one.name for one in fields(table.rows[0].success)} - {"paired", "ci"} <= set(table.success)
+    assert {field.name for field in fields(table.rows[0].success)} - {"paired", "ci"} <= set(table.success)
 
 
 RIGHT = {"color": np.random.default_rng(0).random((20, 2)) < 0.85}
@@ -128,7 +128,7 @@ OF_POLICIES = re.compile(
 
 
 def vlm(path: Path) -> SaidRun:
-    run = asked(path, RIGHT)
+    run = answer_run(path, RIGHT)
     save_results(probes(run, {"color": [0.5, 0.9]}), run.location)
     return run
 
@@ -136,7 +136,7 @@ def vlm(path: Path) -> SaidRun:
 def text_of(page: str) -> str:
     """What a reader can see or point at; the page's own code serves both kinds of run."""
     page = re.sub(r"<style>.*?</style>|<script>.*?</script>", "", page, flags=re.DOTALL)
-    return html.unescape(page)
+    return html.unescape(page).replace("\u00a0", " ")
 
 
 def formats(runs: list[SaidRun]) -> Mapping[str, str]:
@@ -150,8 +150,8 @@ def formats(runs: list[SaidRun]) -> Mapping[str, str]:
         "latex": table.to_latex("all"),
         "notebook": table._repr_html_(),
         "report": text_of(report_html(runs, table)),
-        "captions": "\n".join(f"{one.title}: {one.reading}" for one in exhibits),
-        "figures": "\n".join(words for one in exhibits for words in written(one.draw())),
+        "captions": "\n".join(f"{exhibit.title}: {exhibit.reading}" for exhibit in exhibits),
+        "figures": "\n".join(words for exhibit in exhibits for words in written(exhibit.draw())),
     }
 
 
@@ -159,33 +159,33 @@ def written(figure) -> list[str]:  # type: ignore[no-untyped-def]
     """All words of a figure."""
     from matplotlib.text import Text
 
-    return [found.get_text() for found in figure.findobj(Text)]
+    return [text.get_text() for text in figure.findobj(Text)]
 
 
 @pytest.fixture(scope="module")
-def shown(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, str]:
+def printed_formats(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, str]:
     """One with probes, and one without, of which a note says so."""
     folder = tmp_path_factory.mktemp("asked")
-    return formats([vlm(folder), asked(folder / "plain", RIGHT, "vlm-tiny")])
+    return formats([vlm(folder), answer_run(folder / "plain", RIGHT, "vlm-tiny")])
 
 
 FORMATS = ("terminal", "markdown", "latex", "notebook", "report", "captions", "figures")
 
 
 @pytest.mark.parametrize("name", FORMATS)
-def test_a_run_of_answers_is_never_described_as_acting(shown: Mapping[str, str], name: str) -> None:
-    assert shown[name]
-    assert [line for line in shown[name].splitlines() if OF_POLICIES.search(line)] == []
+def test_a_run_of_answers_is_never_described_as_acting(printed_formats: Mapping[str, str], name: str) -> None:
+    assert printed_formats[name]
+    assert [line for line in printed_formats[name].splitlines() if OF_POLICIES.search(line)] == []
 
 
 @pytest.mark.parametrize("name", FORMATS)
-def test_a_run_of_answers_is_described_as_answering(shown: Mapping[str, str], name: str) -> None:
-    assert re.search(r"accuracy of answers|answers right", shown[name], re.I)
+def test_a_run_of_answers_is_described_as_answering(printed_formats: Mapping[str, str], name: str) -> None:
+    assert re.search(r"accuracy of answers|answers right", printed_formats[name], re.I)
 
 
-def test_the_summary_says_how_many_answers_are_right(shown: Mapping[str, str]) -> None:
+def test_the_summary_says_how_many_answers_are_right(printed_formats: Mapping[str, str]) -> None:
     share = 100 * RIGHT["color"].mean()
-    assert f"the VLM answers right in {share:.0f}\u00a0%" in shown["report"]
+    assert f"the VLM answers right in {share:.0f} %" in printed_formats["report"]
 
 
 @pytest.mark.slow
@@ -212,7 +212,7 @@ def test_axes_and_titles_name_the_share_they_show(tmp_path: Path) -> None:
 
 
 def test_answers_that_cannot_be_read_are_no_cube_that_missed(tmp_path: Path) -> None:
-    run = asked(tmp_path, RIGHT)
+    run = answer_run(tmp_path, RIGHT)
     run.episodes["outcome"] = "oob"
     run.episodes["side_placed"] = "none"
     page = text_of(report_html([run]))

@@ -47,9 +47,11 @@ RATES = {
 }
 
 
-def part(found: Literal["shown", "not shown", "absent"], score: float, most: float, **exceeds: bool | None) -> Any:
+def part(
+    stream_verdict: Literal["shown", "not shown", "absent"], score: float, most: float, **exceeds: bool | None
+) -> Any:
     limits = (score - 0.1, min(1.0, score + 0.05))
-    found_: dict[str, Any] = {"score": score, "ci": limits, "at_most": most, "verdict": found}
+    found_: dict[str, Any] = {"score": score, "ci": limits, "at_most": most, "verdict": stream_verdict}
     return {**found_, "exceeds": {"chance": False, "random-features": None, "untrained": None, **exceeds}}
 
 
@@ -112,11 +114,11 @@ def combination(
         category="color", view="mean", run=replace(RUN, capture_only=rate_ == "none"), success=RATES[rate_],
         backbone=BackbonePart(**PARTS[backbone]), action=ActionPart(**PARTS[action]),
     )  # fmt: skip
-    own = SWAPS[swapped]
-    found = {} if own is None else {"color": own, **(CONTROL if control else {})}
+    swap_effect = SWAPS[swapped]
+    swaps = {} if swap_effect is None else {"color": swap_effect, **(CONTROL if control else {})}
     evidence = StoredEvidence(None)  # type: ignore[arg-type]
     places = {} if located is None else {"color": Places(located)}
-    evidence.__dict__.update(swaps=found, other_readouts={}, places=places)
+    evidence.__dict__.update(swaps=swaps, other_readouts={}, places=places)
     return add_image_swap(row, evidence)
 
 
@@ -280,15 +282,19 @@ net follow rate 0.02 [-0.10, 0.12]; whether the readable copy is the one used wa
 
 def conclusions() -> Iterator[tuple[str, ...]]:
     for record in CONCLUSIONS.strip().split("\n\n"):
-        names, _, said = record.partition("\n")
-        yield (*names.split(" | "), said.replace("\n", " "))
+        names, _, sentence = record.partition("\n")
+        yield (*names.split(" | "), sentence.replace("\n", " "))
 
 
-@pytest.mark.parametrize(("rate_", "backbone", "swapped", "found", "said"), list(conclusions()))
-def test_each_verdict_has_its_conclusion(rate_: str, backbone: str, swapped: str, found: str, said: str) -> None:
+@pytest.mark.parametrize(
+    ("rate_", "backbone", "swapped", "expected_verdict", "expected_conclusion"), list(conclusions())
+)
+def test_each_verdict_has_its_conclusion(
+    rate_: str, backbone: str, swapped: str, expected_verdict: str, expected_conclusion: str
+) -> None:
     row = combination(rate_, backbone, "not probed", swapped)
-    assert verdict(row) == found
-    assert conclusion(row) == said
+    assert verdict(row) == expected_verdict
+    assert conclusion(row) == expected_conclusion
 
 
 def test_an_open_verdict_says_what_is_missing_where_items_are_not() -> None:
@@ -361,10 +367,10 @@ ASKED = {"": None, "known": answers("public-info", 0.96), "not known": answers("
 
 
 def test_every_sentence_is_short_and_has_no_brackets_whatever_the_verdicts() -> None:
-    for backbone, action, use, rate, asked in product(STREAMS, STREAMS, USES, RATES_FINDINGS, ASKED):
-        text = finding(policy(backbone, action, use, rate), ASKED[asked])
-        named = f"Color {text}"
-        assert count_words(named) <= MOST_WORDS, (count_words(named), named)
+    for backbone, action, use, rate, vlm_finding in product(STREAMS, STREAMS, USES, RATES_FINDINGS, ASKED):
+        text = finding(policy(backbone, action, use, rate), ASKED[vlm_finding])
+        full_sentence = f"Color {text}"
+        assert count_words(full_sentence) <= MOST_WORDS, (count_words(full_sentence), full_sentence)
         assert len(re.findall(r"\d+", text)) <= MOST_NUMBERS, text
         assert re.fullmatch(r"[a-z][a-z ,]*: .*[a-z%]\.", text), text
         assert not re.search(r"[][()]|None|–|nan|  |; ;|\.\.", text), text
@@ -376,31 +382,31 @@ def table() -> list[list[str]]:
     return [[cell.strip() for cell in line[1:-1].split("|")] for line in text.splitlines()[4:]]
 
 
-@pytest.mark.parametrize(("asked", "backbone", "use", "rate", "sentence"), table())
+@pytest.mark.parametrize(("vlm_finding", "backbone", "use", "rate", "sentence"), table())
 def test_each_combination_of_verdicts_has_this_sentence(
-    asked: str, backbone: str, use: str, rate: str, sentence: str
+    vlm_finding: str, backbone: str, use: str, rate: str, sentence: str
 ) -> None:
     action = "shown" if backbone == "shown" else "not probed"
-    assert finding(policy(backbone, action, use, rate), ASKED[asked]) == sentence
+    assert finding(policy(backbone, action, use, rate), ASKED[vlm_finding]) == sentence
 
 
 def test_the_sentences_say_where_the_answer_is_lost_between_backbone_and_action() -> None:
     actions = ("shown", "absent", "not shown")
-    held, lost, open_ = (finding(policy("shown", action, "not used", "guessing")) for action in actions)
-    assert "in the backbone and the action expert, the action does not follow it" in held
+    in_both, lost, open_ = (finding(policy("shown", action, "not used", "guessing")) for action in actions)
+    assert "in the backbone and the action expert, the action does not follow it" in in_both
     assert "in the backbone, absent in the action expert, the action does not follow it" in lost
     assert "in the backbone, not shown in the action expert, the action does not follow it" in open_
 
 
 @pytest.mark.parametrize(
-    ("sr", "said"),
+    ("sr", "expected"),
     [
         (1.0, "known: the VLM answers right in 100 %."),
         (0.5, "not shown: the VLM answers right in 50 %, which guessing can reach."),
     ],
 )
-def test_a_vlm_alone_knows_or_is_not_shown_to_know(sr: float, said: str) -> None:
-    assert finding(answers("color", sr)) == said
+def test_a_vlm_alone_knows_or_is_not_shown_to_know(sr: float, expected: str) -> None:
+    assert finding(answers("color", sr)) == expected
 
 
 def test_the_next_step_is_the_command_for_what_is_open() -> None:
@@ -411,7 +417,7 @@ def test_the_next_step_is_the_command_for_what_is_open() -> None:
     names = ("not shown", "few permutations", "shown")
     unshown, untestable, decided = (policy(name, name, "not used", "success") for name in names)
     rows = (unprobed, untested, unshown, untestable, decided)
-    assert [next_step([one]).partition("  ")[0] for one in rows] == [
+    assert [next_step([row]).partition("  ")[0] for row in rows] == [
         "next: probe-kit train acts", "next: probe-kit intervene acts", "next: probe-kit power",
         "next: probe-kit train acts --permutations 200", "next: probe-kit view acts",
     ]  # fmt: skip

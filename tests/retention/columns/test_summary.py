@@ -46,20 +46,20 @@ def answers(category: str, sr: float = 1.0, picture: str | None = None, **run: A
 def acts(
     category: str, backbone: float | None, used: Behaviour | None, sr: float | None = 0.5, **run: Any
 ) -> RetentionRow:
-    shown = backbone is not None and backbone > 0.7
+    exceeds = backbone is not None and backbone > 0.7
     part: dict[str, Any] = {
         "score": backbone,
         "ci": (0.4, 1.0),
         "at_most": 0.78,
-        "exceeds": {"chance": shown, "random-features": True},
+        "exceeds": {"chance": exceeds, "random-features": True},
     }
-    part["verdict"] = None if backbone is None else "shown" if shown else "not shown"
+    part["verdict"] = None if backbone is None else "shown" if exceeds else "not shown"
     return replace(
         row("acts", category, sr, **run),
         view="mean",
         backbone=BackbonePart(**part),
         action=ActionPart(**part),
-        retention=RetentionPart(value=1.0, ci=(0.8, 1.2), defined=shown),
+        retention=RetentionPart(value=1.0, ci=(0.8, 1.2), defined=exceeds),
         image_swap=SwapEffect(
             follow_rate=0.04, net_follow_rate_ci=(-0.1, 0.12), use=UseVerdict(behaviour=used, reason="by the swap")
         )
@@ -81,21 +81,21 @@ BLIND = [answers(name, picture="none") for name in ("color", MEAN)]
 
 @pytest.mark.parametrize("rows", [ACTED, [*ACTED, *ELSEWHERE], [*ACTED, *BLIND]])
 def test_a_policy_stands_alone_where_no_vlm_was_asked_the_same(rows: list[RetentionRow]) -> None:
-    found = next(one for one in summarise_runs(rows) if one.run == "pi0-tiny")
-    assert found.vlm == ""
-    assert all("VLM" not in sentence for sentence in found.sentences)
+    summary = next(summarised for summarised in summarise_runs(rows) if summarised.run == "pi0-tiny")
+    assert summary.vlm == ""
+    assert all("VLM" not in sentence for sentence in summary.sentences)
 
 
 def test_a_vlm_without_a_policy_is_described_as_answering() -> None:
-    (found,) = summarise_runs(ASKED)
-    assert found.sentences[0] == "Color     known: the VLM answers right in 100 %."
-    assert found.categories[0].details == "Color: The VLM knows the answer."
-    assert summary_table([found]).columns == ("category", "VLM %", "verdict")
+    (summary,) = summarise_runs(ASKED)
+    assert summary.sentences[0] == "Color     known: the VLM answers right in 100 %."
+    assert summary.categories[0].details == "Color: The VLM knows the answer."
+    assert summary_table([summary]).columns == ("category", "VLM %", "verdict")
 
 
 def test_every_number_has_its_interval_and_a_mark_where_it_exceeds_every_control() -> None:
-    (found,) = summarise_runs([*ASKED, *ACTED])
-    table = summary_table([found])
+    (summary,) = summarise_runs([*ASKED, *ACTED])
+    table = summary_table([summary])
     assert table.columns == ("category", *HEADINGS[3:])
     color, _, counting, mean = table.texts
     assert color == (
@@ -110,15 +110,17 @@ def test_every_number_has_its_interval_and_a_mark_where_it_exceeds_every_control
 def test_nothing_is_marked_where_no_control_was_run_and_a_warning_names_the_run() -> None:
     bare = [
         replace(
-            one,
-            backbone=replace(one.backbone, exceeds={"chance": True, "random-features": None, "untrained": None}),
-            action=replace(one.action, exceeds={"chance": True}),
-            run=replace(one.run, location="bare", label="bare"),
+            acted_row,
+            backbone=replace(
+                acted_row.backbone, exceeds={"chance": True, "random-features": None, "untrained": None}
+            ),
+            action=replace(acted_row.action, exceeds={"chance": True}),
+            run=replace(acted_row.run, location="bare", label="bare"),
         )
-        for one in ACTED
+        for acted_row in ACTED
     ]
-    (found,) = summarise_runs(bare)
-    table = summary_table([found])
+    (summary,) = summarise_runs(bare)
+    table = summary_table([summary])
     backbone, action, success = (table.columns.index(name) for name in ("backbone %", "action %", "success %"))
     assert MARK not in table.texts[0][backbone] + table.texts[0][action]
     assert MARK in table.texts[0][success]
@@ -127,24 +129,26 @@ def test_nothing_is_marked_where_no_control_was_run_and_a_warning_names_the_run(
     assert "No control was run for bare:" in " ".join(both.notes)
     assert "No control" not in " ".join(summary_table(summarise_runs(ACTED)).notes)
     deep = [
-        replace(one, backbone=replace(one.backbone, depth=0.5), action=replace(one.action, depth=1.0))
-        for one in bare
+        replace(
+            bare_row, backbone=replace(bare_row.backbone, depth=0.5), action=replace(bare_row.action, depth=1.0)
+        )
+        for bare_row in bare
     ]
     assert any("No control was run" in warning for warning in warnings_of(deep[-1], deep[:-1]))
 
 
 def test_several_runs_stand_in_one_table_by_category() -> None:
-    again = [replace(one, run=replace(one.run, location="b", label="early")) for one in ACTED]
-    found = summarise_runs([*ACTED, *again])
-    table = summary_table(found)
+    again = [replace(acted_row, run=replace(acted_row.run, location="b", label="early")) for acted_row in ACTED]
+    summaries = summarise_runs([*ACTED, *again])
+    table = summary_table(summaries)
     assert [cells[:2] for cells in table.texts[:2]] == [("Color", "pi0-tiny"), ("Color", "early")]
 
 
 @pytest.mark.parametrize("width", [80, 100, 120, 200])
 def test_the_terminal_shows_one_table_at_any_width_and_ends_on_the_sentences(width: int) -> None:
     everything = [*ASKED, *ACTED]
-    rows = [one for one in everything if one.category != MEAN]
-    means = [one for one in everything if one.category == MEAN]
+    rows = [category_row for category_row in everything if category_row.category != MEAN]
+    means = [category_row for category_row in everything if category_row.category == MEAN]
     console = Console(width=width, record=True)
     with console.capture() as printed:
         console.print(RetentionTable(rows, means).to_rich())
@@ -156,7 +160,7 @@ def test_the_terminal_shows_one_table_at_any_width_and_ends_on_the_sentences(wid
 
 
 @pytest.mark.parametrize(
-    ("first", "second", "readouts", "said", "legend"),
+    ("first", "second", "readouts", "expected", "legend"),
     [
         ("used", None, "first-chunk", "used in the first chunk", "of the first chunk; --readout per-step gives"),
         ("used", None, "per-step", "used over the whole episode", "of the whole episode"),
@@ -172,12 +176,12 @@ def test_the_terminal_shows_one_table_at_any_width_and_ends_on_the_sentences(wid
     ],
 )
 def test_terminal_markdown_and_json_say_the_same_of_first_chunk_and_whole_episode(
-    first: Behaviour, second: Behaviour | None, readouts: str, said: str, legend: str
+    first: Behaviour, second: Behaviour | None, readouts: str, expected: str, legend: str
 ) -> None:
     """first: of the verdict's own readout, second: of the other one."""
     other = {"first-chunk": "per-step", "per-step": "first-chunk"}[readouts]
-    further = None if second is None else UseVerdict(behaviour=second, reason="by the swap", readout=other)
-    use = UseVerdict(behaviour=first, reason="by the swap", readout=readouts, other=further)
+    second_use = None if second is None else UseVerdict(behaviour=second, reason="by the swap", readout=other)
+    use = UseVerdict(behaviour=first, reason="by the swap", readout=readouts, other=second_use)
     color = acts("color", 1.0, "used")
     rows = [replace(color, image_swap=replace(color.image_swap, use=use))]
     table = RetentionTable(rows, [acts(MEAN, 1.0, None)])
@@ -187,25 +191,27 @@ def test_terminal_markdown_and_json_say_the_same_of_first_chunk_and_whole_episod
         console.print(table.to_rich("all"))
     text, (stored, _) = " ".join(printed.get().split()), json.loads(table.to_json())
     assert stored["verdict"] == verdict
-    assert said in stored["conclusion"]
-    for shown in (text, " ".join(table.to_markdown().split())):
-        assert verdict in shown
-        assert stored["conclusion"] in shown
-        assert legend in shown
+    assert expected in stored["conclusion"]
+    for rendering in (text, " ".join(table.to_markdown().split())):
+        assert verdict in rendering
+        assert stored["conclusion"] in rendering
+        assert legend in rendering
 
 
 def test_of_a_model_that_did_not_act_nothing_is_said_of_acting() -> None:
-    found = (acts(name, score, None, None, capture_only=True) for name, score in (("color", 1.0), ("shape", 0.5)))
-    rows = [*found, acts(MEAN, 0.75, None, None, capture_only=True)]
-    (found,) = summarise_runs(rows)
-    color, shape = (one.details for one in found.categories)
+    summarised = (
+        acts(name, score, None, None, capture_only=True) for name, score in (("color", 1.0), ("shape", 0.5))
+    )
+    rows = [*summarised, acts(MEAN, 0.75, None, None, capture_only=True)]
+    (summarised,) = summarise_runs(rows)
+    color, shape = (category.details for category in summarised.categories)
     assert color == "Color: Shown in the backbone."
     assert shape.endswith(
         "Not shown in the backbone: `probe-kit power` simulates how many items would show it."
     ), "the groups of items are not known"
-    assert "success" not in " ".join(cell for line in summary_table([found]).texts for cell in line)
+    assert "success" not in " ".join(cell for line in summary_table([summarised]).texts for cell in line)
 
 
 def test_a_category_goes_by_its_title() -> None:
-    (found,) = summarise_runs([answers("public-info"), answers("ripe-fruit"), answers(MEAN)])
-    assert [one.name for one in found.categories] == ["Public Info", "Ripe fruit"]
+    (summary,) = summarise_runs([answers("public-info"), answers("ripe-fruit"), answers(MEAN)])
+    assert [category.name for category in summary.categories] == ["Public Info", "Ripe fruit"]

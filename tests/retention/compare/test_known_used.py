@@ -27,7 +27,7 @@ from probe_kit.retention.displays import KnownUsedDisplay, collect_figures
 from probe_kit.retention.report import report_html
 from probe_kit.runs import Run
 from probe_kit.suite import Suite
-from tests.retention.asked_runs import SaidRun, acted, asked, probes
+from tests.retention.asked_runs import SaidRun, acted, answer_run, probes
 
 SIZES = {"color": 14, "shape": 12}
 
@@ -39,7 +39,7 @@ def by_chance(seed: int, share: float) -> dict[str, np.ndarray]:
 
 @pytest.fixture
 def runs(tmp_path: Path) -> tuple[SaidRun, SaidRun]:
-    return asked(tmp_path, by_chance(1, 0.9)), acted(tmp_path, by_chance(2, 0.6))
+    return answer_run(tmp_path, by_chance(1, 0.9)), acted(tmp_path, by_chance(2, 0.6))
 
 
 # -- the same, by loops ----------------------------------------------------------------------------------
@@ -47,22 +47,28 @@ def runs(tmp_path: Path) -> tuple[SaidRun, SaidRun]:
 
 def recount(vlm: SaidRun, policy: SaidRun, encoded: dict[str, bool], category: str) -> dict:
     """Every number of a row of the join by counting, without any of the package's functions."""
-    said = dict(zip(vlm.episodes["episode_id"], vlm.episodes["outcome"], strict=True))
+    answers = dict(zip(vlm.episodes["episode_id"], vlm.episodes["outcome"], strict=True))
     items: dict[str, list[tuple[bool, bool, bool]]] = {}
     group: dict[str, str] = {}
     for row in policy.episodes.to_dict("records"):
         if category in (row["category"], "all"):
-            marks = (said[row["episode_id"]] == "correct", encoded[row["episode_id"]], row["outcome"] == "correct")
+            marks = (
+                answers[row["episode_id"]] == "correct",
+                encoded[row["episode_id"]],
+                row["outcome"] == "correct",
+            )
             items.setdefault(row["item_id"], []).append(marks)
             group[row["item_id"]] = row["group_id"]
-    both = {item: tuple(all(one[k] for one in marks) for k in range(3)) for item, marks in items.items()}
+    both = {item: tuple(all(mark[k] for mark in marks) for k in range(3)) for item, marks in items.items()}
     tests = {}
     for first, second in ((0, 2), (1, 2), (0, 1)):
         gain = {item: int(marks[first]) - int(marks[second]) for item, marks in both.items()}
         tests[first, second] = (gain, {item: group[item] for item in gain})
     return {
         "counts": Counter("".join(str(int(mark)) for mark in marks) for marks in both.values()),
-        "episodes": Counter("".join(str(int(m)) for m in marks) for own in items.values() for marks in own),
+        "episodes": Counter(
+            "".join(str(int(m)) for m in marks) for layouts in items.values() for marks in layouts
+        ),
         "tests": {pair: (binomial(gain), flips(gain, groups)) for pair, (gain, groups) in tests.items()},
         "kept": [marks[2] for marks in both.values() if marks[0] and marks[1]],
         "linked": hypergeometric([(marks[0], marks[2]) for marks in both.values() if marks[1]]),
@@ -82,22 +88,22 @@ def flips(gain: dict[str, int], groups: dict[str, str]) -> float:
         sums[groups[item]] += value
     values = [value for value in sums.values() if value]
     total = abs(sum(values))
-    found = [
+    flipped_sums = [
         abs(sum(s * v for s, v in zip(signs, values, strict=True)))
         for signs in product((1, -1), repeat=len(values))
     ]
-    return sum(one >= total for one in found) / len(found)
+    return sum(flipped >= total for flipped in flipped_sums) / len(flipped_sums)
 
 
 def hypergeometric(marks: list[tuple[bool, bool]]) -> float:
     """Fisher's two-sided p: all tables of these margins that are no likelier."""
-    n, known, used = len(marks), sum(k for k, _ in marks), sum(u for _, u in marks)
+    n, known_count, used = len(marks), sum(k for k, _ in marks), sum(u for _, u in marks)
     chance = {
-        x: math.comb(known, x) * math.comb(n - known, used - x) / math.comb(n, used)
-        for x in range(max(0, used - (n - known)), min(known, used) + 1)
+        x: math.comb(known_count, x) * math.comb(n - known_count, used - x) / math.comb(n, used)
+        for x in range(max(0, used - (n - known_count)), min(known_count, used) + 1)
     }
-    seen = chance[sum(k and u for k, u in marks)]
-    return sum(p for p in chance.values() if p <= seen * (1 + 1e-7))
+    observed = chance[sum(k and u for k, u in marks)]
+    return sum(p for p in chance.values() if p <= observed * (1 + 1e-7))
 
 
 def interval(hits: int, n: int) -> tuple[float, float]:
@@ -122,26 +128,28 @@ def test_the_join_is_what_an_independent_count_gives(runs: tuple[SaidRun, SaidRu
     encoded: dict[str, bool] = {}
     for curve in results.curves.values():
         encoded |= dict(zip(curve.episodes, encoded_decisions(curve), strict=True))
-    found = match_runs(vlm, policy, results)
-    assert [row.category for row in found.rows] == ["color", "shape", "all"]
-    for row in found.rows:
+    join = match_runs(vlm, policy, results)
+    assert [row.category for row in join.rows] == ["color", "shape", "all"]
+    for row in join.rows:
         expected = recount(vlm, policy, encoded, row.category)
         assert {code: n for code, n in row.counts.items() if n} == dict(expected["counts"])
         assert {code: n for code, n in row.episodes.items() if n} == dict(expected["episodes"])
-        for one, (pair, (binomial_p, flip)) in zip(row.comparisons, expected["tests"].items(), strict=True):
-            assert (one.first, one.second) == tuple(("answered", "encoded", "acted")[k] for k in pair)
-            assert one.p_mcnemar == pytest.approx(binomial_p)
-            assert one.p_groups == pytest.approx(flip)
-            assert one.p == max(one.p_mcnemar, one.p_groups)
+        for comparison, (pair, (binomial_p, flip)) in zip(row.comparisons, expected["tests"].items(), strict=True):
+            assert (comparison.first, comparison.second) == tuple(
+                ("answered", "encoded", "acted")[k] for k in pair
+            )
+            assert comparison.p_mcnemar == pytest.approx(binomial_p)
+            assert comparison.p_groups == pytest.approx(flip)
+            assert comparison.p == max(comparison.p_mcnemar, comparison.p_groups)
         lost = expected["kept"].count(False)
         assert (row.answered_and_encoded, row.not_acted_on) == (len(expected["kept"]), lost)
         assert row.share_not_acted_on_ci == pytest.approx(interval(lost, len(expected["kept"])), abs=1e-6)
         if row.category != "all":
             assert row.p_linked == pytest.approx(expected["linked"])
-    singles = [one.p for row in found.rows[:2] for one in row.comparisons]
+    singles = [comparison.p for row in join.rows[:2] for comparison in row.comparisons]
     order = np.argsort(singles)
     stepped = np.maximum.accumulate([(6 - rank) * singles[at] for rank, at in enumerate(order)]).clip(max=1)
-    holm = [one.p_holm for row in found.rows[:2] for one in row.comparisons]
+    holm = [comparison.p_holm for row in join.rows[:2] for comparison in row.comparisons]
     np.testing.assert_allclose(np.array(holm)[order], stepped)
 
 
@@ -157,8 +165,8 @@ def test_encoded_decisions_are_chosen_on_other_groups(tmp_path: Path) -> None:
 
 def test_a_habit_is_neither_known_nor_used_and_a_coin_is_expected_in_a_quarter(tmp_path: Path) -> None:
     one_side = {"color": np.array([[True, False], [False, True]] * 10)}
-    found = match_runs(asked(tmp_path, one_side), acted(tmp_path, one_side))
-    (row,) = found.rows
+    join = match_runs(answer_run(tmp_path, one_side), acted(tmp_path, one_side))
+    (row,) = join.rows
     assert (row.answered_correctly, row.acted_correctly, row.encoded) == (0, 0, None)
     assert row.counts == {"1-1": 0, "1-0": 0, "0-1": 0, "0-0": 20}
     assert row.guessed == pytest.approx({"1-1": 1.25, "1-0": 3.75, "0-1": 3.75, "0-0": 11.25})
@@ -182,13 +190,13 @@ def test_a_run_that_is_scored_again_is_read_by_the_last_score_alone(runs: tuple[
 
 def test_probes_that_beat_nothing_are_said_to_encode_nothing(runs: tuple[SaidRun, SaidRun]) -> None:
     vlm, policy = runs
-    found = match_runs(vlm, policy, probes(policy, {"color": [0.95], "shape": [0.5]}, null_top=0.75))
-    assert [row.has_signal for row in found.rows] == [True, False, None]
-    assert any(note.startswith("In shape probes are not shown to exceed") for note in found.notes)
-    color, shape, whole = found.rows
+    join = match_runs(vlm, policy, probes(policy, {"color": [0.95], "shape": [0.5]}, null_top=0.75))
+    assert [row.has_signal for row in join.rows] == [True, False, None]
+    assert any(note.startswith("In shape probes are not shown to exceed") for note in join.notes)
+    color, shape, total_row = join.rows
     assert (shape.answered_and_encoded, shape.share_not_acted_on) == (None, None)
     for name in ("answered_and_encoded", "not_acted_on", "share_not_acted_on", "share_not_acted_on_ci"):
-        assert getattr(whole, name) == getattr(color, name), "shape's guesses do not count"
+        assert getattr(total_row, name) == getattr(color, name), "shape's guesses do not count"
 
 
 def test_frames_that_differ_or_have_no_hash_are_refused(runs: tuple[SaidRun, SaidRun]) -> None:
@@ -220,24 +228,24 @@ def test_runs_of_the_wrong_kind_or_of_other_questions_are_refused(runs: tuple[Sa
 def test_what_is_left_out_is_said(runs: tuple[SaidRun, SaidRun]) -> None:
     vlm, policy = runs
     fewer = replace(vlm, episodes=vlm.episodes[vlm.episodes["category"] == "color"])
-    found = match_runs(fewer, policy, probes(policy, {"color": [0.9]}))
-    assert [row.category for row in found.rows] == ["color"]
-    assert any(note.startswith("24 episodes of") for note in found.notes)
+    join = match_runs(fewer, policy, probes(policy, {"color": [0.9]}))
+    assert [row.category for row in join.rows] == ["color"]
+    assert any(note.startswith("24 episodes of") for note in join.notes)
 
 
 def test_it_reads_on_a_console_as_a_frame_and_as_plain_values(runs: tuple[SaidRun, SaidRun]) -> None:
     vlm, policy = runs
-    found = match_runs(vlm, policy, probes(policy, {"color": [0.9], "shape": [0.9]}))
+    join = match_runs(vlm, policy, probes(policy, {"color": [0.9], "shape": [0.9]}))
     console = Console(width=150, record=True, file=StringIO())
-    console.print(*known_used_tables(found))
+    console.print(*known_used_tables(join))
     text = console.export_text()
     titles = ("Answer, probe, success", "of these without success", "Single episodes", "answer − success")
     for words in (*titles, "V P s"):
         assert words in text
-    frame = found.to_frame()
+    frame = join.to_frame()
     assert frame.groupby("category")["items"].sum().to_dict() == {"color": 14, "shape": 12, "all": 26}
-    assert found.to_json()["rows"][0]["counts"] == found.rows[0].counts
-    assert isinstance(found.rows[0], CategoryCounts)
+    assert join.to_json()["rows"][0]["counts"] == join.rows[0].counts
+    assert isinstance(join.rows[0], CategoryCounts)
     assert isinstance(frame, pd.DataFrame)
 
 
@@ -246,7 +254,7 @@ USED = {"color": np.array([[1, 1], [0, 1], [1, 1], [0, 0]], bool)}
 
 
 def pair(folder: Path) -> tuple[object, SaidRun]:
-    return scored(asked(folder, KNOWN), "text"), acted(folder, USED)
+    return scored(answer_run(folder, KNOWN), "text"), acted(folder, USED)
 
 
 def test_bars_are_the_counts_of_the_join(tmp_path: Path) -> None:
@@ -272,7 +280,9 @@ def test_the_report_of_an_asked_and_an_acting_run_holds_their_join(tmp_path: Pat
     runs = [vlm, policy]
     table = retention_table(runs)  # type: ignore[arg-type]
     (joined,) = join_runs(table.runs, table.results).tables
-    assert [one.name for one in collect_figures(runs, table) if one.subject == "join"] == ["known-used-1"]  # type: ignore[arg-type]
+    assert [exhibit.name for exhibit in collect_figures(runs, table) if exhibit.subject == "join"] == [
+        "known-used-1"
+    ]  # type: ignore[arg-type]
     page = report_html(runs, table)  # type: ignore[arg-type]
     section = page.split('<details class="part" id="join">')[1].split("</details>")[0]
     for plain in known_used_tables(joined):
@@ -308,23 +318,23 @@ def runs_stages_command(small_suite: Suite, tmp_path_factory: pytest.TempPathFac
     folder = tmp_path_factory.mktemp("stages")
     scene = SceneSpec(max_steps=4)
     subset = {"suite": small_suite.folder, "categories": ("color",), "items": 4, "scene": scene}
-    asked = ask_run(
+    answer_run = ask_run(
         AskSettings("vlm-tiny", random_weights=True, prompt=TEMPLATES["p1"], **subset), folder / "asked"
     )
     acted = extract_run(ExtractSettings("expert", **subset), folder / "acted")
-    return asked, acted
+    return answer_run, acted
 
 
 @pytest.mark.slow
 def test_it_prints_the_counts_of_match_runs_and_draws_their_figure(
     runs_stages_command: tuple[Run, Run], tmp_path: Path
 ) -> None:
-    asked, acted = runs_stages_command
-    command = ["retention", str(asked.path), str(acted.path), "--compare", "stages"]
+    answer_run, acted = runs_stages_command
+    command = ["retention", str(answer_run.path), str(acted.path), "--compare", "stages"]
     answer = CliRunner().invoke(app, [*command, "--format", "json"])
     assert answer.exit_code == 0, answer.output
     assert json.loads(answer.stdout) == json.loads(
-        json.dumps(match_runs(scored(asked, "text", False), acted).to_json())
+        json.dumps(match_runs(scored(answer_run, "text", False), acted).to_json())
     )
     drawn = CliRunner().invoke(app, [*command, "--figures", str(tmp_path / "figures")])
     assert "Answer, probe, success" in drawn.stdout

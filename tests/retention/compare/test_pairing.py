@@ -14,7 +14,7 @@ import pytest
 from rich.console import Console
 from scipy import stats
 
-from probe_kit._tables.numbers import points, signed
+from probe_kit._tables.numbers import points, with_sign
 from probe_kit.errors import UsageError
 from probe_kit.retention import RetentionTable, retention_table
 from probe_kit.retention.behaviour import TableRun, distinct_labels
@@ -22,7 +22,7 @@ from probe_kit.retention.columns.text import models_test
 from probe_kit.retention.compare.compare import Difference, ModelTest
 from probe_kit.retention.compare.models import origins_of
 from probe_kit.train import ArrayRun, load_results, save_results
-from tests.retention.asked_runs import SUITE, SaidRun, asked, episodes
+from tests.retention.asked_runs import SUITE, SaidRun, answer_run, episodes
 from tests.retention.paired_limits import mover
 
 ProbedRun = Callable[..., ArrayRun]
@@ -44,8 +44,8 @@ def run(folder: Path, right: Hits, suite: str = SUITE, called: str = "", **setti
 
 def difference(table: RetentionTable, side: str, category: str) -> Difference:
     """The difference of this category that `side` is the minuend or the subtrahend of."""
-    (found,) = [row for row in table.differences if side in (row.group, row.minus) and row.category == category]
-    return found
+    (matching,) = [row for row in table.differences if side in (row.group, row.minus) and row.category == category]
+    return matching
 
 
 # -- against an oracle of its own ----------------------------------------------------------------------------
@@ -64,41 +64,46 @@ def oracle(gains: pd.Series, groups: pd.Series) -> tuple[float, float, float, fl
     sums = [values.sum() for values in of_group.values() if values.sum()]
     observed = abs(sum(sums))
     flips = [
-        abs(sum(sign * one for sign, one in zip(signs, sums, strict=True)))
+        abs(sum(sign * group_sum for sign, group_sum in zip(signs, sums, strict=True)))
         for signs in product((1, -1), repeat=len(sums))
     ]
-    return float(gains.mean()), float(low), float(high), float(np.mean([one >= observed - 1e-9 for one in flips]))
+    return (
+        float(gains.mean()),
+        float(low),
+        float(high),
+        float(np.mean([flipped >= observed - 1e-9 for flipped in flips])),
+    )
 
 
 def test_a_success_rate_less_another_is_what_a_plain_loop_over_groups_says(tmp_path: Path) -> None:
-    one, other = run(tmp_path / "one", hits(0.8, 0)), run(tmp_path / "other", hits(0.5, 1))
-    table = retention_table([other, one])
+    first, other = run(tmp_path / "one", hits(0.8, 0)), run(tmp_path / "other", hits(0.5, 1))
+    table = retention_table([other, first])
     for category in ("color", "shape"):
-        mine, theirs = (r.episodes[r.episodes["category"] == category].reset_index() for r in (one, other))
+        mine, theirs = (r.episodes[r.episodes["category"] == category].reset_index() for r in (first, other))
         gains = (mine["outcome"] == "correct").astype(float) - (theirs["outcome"] == "correct")
         value, low, high, p = oracle(gains, mine["group_id"])
-        found = difference(table, "other", category)
-        assert (found.group, found.paired) == ("one", True)
-        assert found.sr == pytest.approx(value)
-        assert found.sr_ci == pytest.approx(mover(mine, theirs))
-        assert found.sr_ci is not None
-        assert found.sr_ci[0] < low + 0.03 < high - 0.03 < found.sr_ci[1]  # type: ignore[operator]
-        assert found.p == pytest.approx(p)
+        row = difference(table, "other", category)
+        assert (row.group, row.paired) == ("one", True)
+        assert row.sr == pytest.approx(value)
+        assert row.sr_ci == pytest.approx(mover(mine, theirs))
+        assert row.sr_ci is not None
+        assert row.sr_ci[0] < low + 0.03 < high - 0.03 < row.sr_ci[1]  # type: ignore[operator]
+        assert row.p == pytest.approx(p)
 
 
 @pytest.mark.slow
 def test_an_accuracy_less_another_is_what_a_plain_loop_over_groups_says(probed_run: ProbedRun) -> None:
-    one, other = probed_run({"color": SIGNAL}, "one"), probed_run({"color": WEAK}, "other")
-    found = difference(retention_table([other, one]), "other", "color")
+    first, other = probed_run({"color": SIGNAL}, "one"), probed_run({"color": WEAK}, "other")
+    row = difference(retention_table([other, first]), "other", "color")
     best = []
-    for probed in (one, other):
+    for probed in (first, other):
         curve = load_results(probed).curves["color", "mean"]
         backbone = [at for at, site in enumerate(curve.sites) if site.stream == "backbone"]
         right = (curve.decisions[backbone] > 0) == curve.labels
         best.append(right[right.mean(axis=1).argmax()].astype(float))
     value, low, high, _ = oracle(pd.Series(best[0] - best[1]), pd.Series(curve.groups))
-    assert found.backbone == pytest.approx(value, abs=1e-3)
-    assert found.backbone_ci == (pytest.approx(low, abs=0.015), pytest.approx(high, abs=0.015))
+    assert row.backbone == pytest.approx(value, abs=1e-3)
+    assert row.backbone_ci == (pytest.approx(low, abs=0.015), pytest.approx(high, abs=0.015))
 
 
 def test_pairing_makes_intervals_narrower_where_runs_agree(tmp_path: Path) -> None:
@@ -107,7 +112,10 @@ def test_pairing_makes_intervals_narrower_where_runs_agree(tmp_path: Path) -> No
     nearly = {name: array.copy() for name, array in right.items()}
     nearly["color"][0, 0] ^= True
     table = retention_table(
-        [run(tmp_path / name, own) for name, own in (("one", right), ("nearly", nearly), ("other", other))]
+        [
+            run(tmp_path / name, outcomes)
+            for name, outcomes in (("one", right), ("nearly", nearly), ("other", other))
+        ]
     )
     widths = []
     for name in ("nearly", "other"):
@@ -136,9 +144,9 @@ def test_a_group_of_runs_is_tested_by_its_mean_on_the_same_items(tmp_path: Path)
     of_color = first.episodes["category"] == "color"
     gains = ((right[0] + right[1]) / 2 - right[2])[of_color]
     value, _, _, p = oracle(gains, first.episodes["group_id"][of_color])
-    found = difference(table, "one", "color")
-    assert (found.sr, found.p) == (pytest.approx(value), pytest.approx(p))
-    assert found.run is None
+    row = difference(table, "one", "color")
+    assert (row.sr, row.p) == (pytest.approx(value), pytest.approx(p))
+    assert row.run is None
 
 
 # -- which are compared --------------------------------------------------------------------------------------
@@ -161,17 +169,17 @@ def test_every_other_run_is_compared_with_the_first_or_with_the_one_named(tmp_pa
 
 def test_pairs_that_are_named_are_compared_as_one_family(tmp_path: Path) -> None:
     runs = [run(tmp_path / name, hits(0.9 - 0.2 * at, at)) for at, name in enumerate("abc")]
-    first, second, third = (str(one.location) for one in runs)
+    first, second, third = (str(side_run.location) for side_run in runs)
     table = retention_table(runs, pairs=[(second, first), (third, second)])
     assert pairs(table) == [("b", "a"), ("c", "b")]
     alone = retention_table(runs, pairs=[(second, first)])
-    one, both = (difference(own, "a", "color") for own in (alone, table))
-    assert (one.p, one.sr, one.sr_ci) == (both.p, both.sr, both.sr_ci)
+    alone_row, both = (difference(compared_table, "a", "color") for compared_table in (alone, table))
+    assert (alone_row.p, alone_row.sr, alone_row.sr_ci) == (both.p, both.sr, both.sr_ci)
     tested = sorted(row.p for row in table.differences if row.category != "mean" and row.p is not None)
     assert len(tested) == 4
     assert both.p_holm is not None
-    assert one.p_holm is not None
-    assert both.p_holm >= one.p_holm
+    assert alone_row.p_holm is not None
+    assert both.p_holm >= alone_row.p_holm
     assert retention_table(runs, pairs=()).differences == []
     with pytest.raises(UsageError, match="elsewhere is none of the runs"):
         retention_table(runs, pairs=[("elsewhere", first)])
@@ -190,9 +198,9 @@ def test_a_name_that_is_no_run_or_several_is_refused(tmp_path: Path) -> None:
 
 
 def test_one_run_twice_is_refused(tmp_path: Path) -> None:
-    one = run(tmp_path / "one", hits(0.5, 0))
+    first = run(tmp_path / "one", hits(0.5, 0))
     with pytest.raises(UsageError, match="given twice"):
-        retention_table([one, one])
+        retention_table([first, first])
 
 
 @pytest.mark.parametrize(
@@ -212,8 +220,10 @@ def test_runs_on_other_questions_have_no_differences_and_every_form_says_why(
 ) -> None:
     from rich.console import Console
 
-    there = {"right": hits(0.5, 1), "seed": 0} | other
-    table = retention_table([run(tmp_path / "other", **there), run(tmp_path / "one", hits(0.5, 0), seed=0)])
+    changed_settings = {"right": hits(0.5, 1), "seed": 0} | other
+    table = retention_table(
+        [run(tmp_path / "other", **changed_settings), run(tmp_path / "one", hits(0.5, 0), seed=0)]
+    )
     assert table.differences == []
     assert table.unpaired == (f"one and other are not compared: {why}.",)
     console = Console(width=200, record=True, file=StringIO())
@@ -223,28 +233,28 @@ def test_runs_on_other_questions_have_no_differences_and_every_form_says_why(
 
 
 def test_other_words_are_other_questions(tmp_path: Path) -> None:
-    one, other = run(tmp_path / "one", hits(0.5, 0)), run(tmp_path / "other", hits(0.5, 1))
+    first, other = run(tmp_path / "one", hits(0.5, 0)), run(tmp_path / "other", hits(0.5, 1))
     side = replace(other, episodes=other.episodes.assign(wording="side"))
-    assert "other wordings (knowledge and side)" in retention_table([side, one]).unpaired[0]
-    own = replace(other, episodes=other.episodes.assign(wording="knowledge"))
-    assert retention_table([own, one]).differences
+    assert "other wordings (knowledge and side)" in retention_table([side, first]).unpaired[0]
+    worded = replace(other, episodes=other.episodes.assign(wording="knowledge"))
+    assert retention_table([worded, first]).differences
 
 
-def with_content(one: SaidRun, changed: frozenset[str] = frozenset()) -> SaidRun:
+def with_content(said_run: SaidRun, changed: frozenset[str] = frozenset()) -> SaidRun:
     """The run with hashes of its items; those of `changed` show something else."""
-    content = [f"{item}{'!' * (item in changed)}" for item in one.episodes["item_id"]]
-    return replace(one, episodes=one.episodes.assign(item_content_sha256=content))
+    content = [f"{item}{'!' * (item in changed)}" for item in said_run.episodes["item_id"]]
+    return replace(said_run, episodes=said_run.episodes.assign(item_content_sha256=content))
 
 
 def test_items_that_only_one_run_has_are_left_out_and_counted(tmp_path: Path) -> None:
-    one = run(tmp_path / "one", hits(0.8, 0))
+    first = run(tmp_path / "one", hits(0.8, 0))
     other = run(tmp_path / "other", hits(0.5, 1, {"color": 20, "shape": 10}))
-    table = retention_table([other, one])
+    table = retention_table([other, first])
     assert [row.category for row in table.differences] == ["color", "shape", "mean"]
     shape = difference(table, "other", "shape")
     assert (shape.paired, shape.n_items, shape.of_items) == (True, 10, 24)
     theirs = other.episodes[other.episodes["category"] == "shape"].set_index("episode_id")
-    mine = one.episodes.set_index("episode_id").loc[theirs.index]
+    mine = first.episodes.set_index("episode_id").loc[theirs.index]
     gains = (mine["outcome"] == "correct").astype(float) - (theirs["outcome"] == "correct")
     value, _, _, p = oracle(gains, theirs["group_id"])
     assert (shape.sr, shape.p) == (pytest.approx(value), pytest.approx(p))
@@ -252,60 +262,64 @@ def test_items_that_only_one_run_has_are_left_out_and_counted(tmp_path: Path) ->
     mean = difference(table, "other", "mean")
     assert (mean.n_items, mean.of_items) == (30, 44)
     assert mean.sr == pytest.approx((value + (difference(table, "other", "color").sr or 0)) / 2)
-    (said,) = table.unpaired
-    assert said.startswith("one and other are compared on the items in common: 10 of 24 in shape. Probes are not")
+    (sentence,) = table.unpaired
+    assert sentence.startswith(
+        "one and other are compared on the items in common: 10 of 24 in shape. Probes are not"
+    )
     assert "one − other (10 of 24 items)" in table.to_markdown()
 
 
 def test_a_category_without_an_item_in_common_alone_is_left_out(tmp_path: Path) -> None:
-    one, other = (with_content(run(tmp_path / name, hits(0.5, at))) for at, name in enumerate(("one", "other")))
+    first, other = (with_content(run(tmp_path / name, hits(0.5, at))) for at, name in enumerate(("one", "other")))
     new = with_content(other, frozenset(other.episodes.loc[other.episodes["category"] == "shape", "item_id"]))
-    table = retention_table([new, one])
+    table = retention_table([new, first])
     assert [row.category for row in table.differences] == ["color", "mean"]
     assert table.differences[1].categories == ("color",)
     assert table.unpaired == ("one and other are not compared in shape: no item in common.",)
 
 
 def test_selections_of_one_suite_are_pairs_by_what_their_items_hold(tmp_path: Path) -> None:
-    right, left = hits(0.8, 0), hits(0.5, 1)
-    whole, part = (
+    right, left_hits = hits(0.8, 0), hits(0.5, 1)
+    full, part = (
         with_content(run(tmp_path / "whole", right)),
-        with_content(run(tmp_path / "part", {"color": left["color"]}, suite="suite@1#ba9876543210")),
+        with_content(run(tmp_path / "part", {"color": left_hits["color"]}, suite="suite@1#ba9876543210")),
     )
-    found = retention_table([part, whole])
-    same = retention_table([with_content(run(tmp_path / "same", {"color": left["color"]})), whole])
-    both = [difference(table, name, "color") for table, name in ((found, "part"), (same, "same"))]
+    partial_table = retention_table([part, full])
+    same = retention_table([with_content(run(tmp_path / "same", {"color": left_hits["color"]})), full])
+    both = [difference(table, name, "color") for table, name in ((partial_table, "part"), (same, "same"))]
     assert both[0].paired
     assert replace(both[0], minus="", minus_run="") == replace(both[1], minus="", minus_run="")
     changed = with_content(part, frozenset({"color-0", "color-1"}))
-    fewer = difference(retention_table([changed, whole]), "part", "color")
+    fewer = difference(retention_table([changed, full]), "part", "color")
     assert (fewer.n_items, fewer.of_items) == (18, 22)  # two items of one id are two items
 
 
 def test_probes_on_the_same_items_of_another_selection_are_pairs(probed_run: ProbedRun) -> None:
-    def hashed(one: ArrayRun) -> ArrayRun:
-        return replace(one, episodes=one.episodes.assign(item_content_sha256=one.episodes["item_id"]))
+    def hashed(array_run: ArrayRun) -> ArrayRun:
+        return replace(
+            array_run, episodes=array_run.episodes.assign(item_content_sha256=array_run.episodes["item_id"])
+        )
 
-    one = hashed(probed_run({"color": SIGNAL}, "one"))
+    first = hashed(probed_run({"color": SIGNAL}, "one"))
     same, part = (
         hashed(probed_run({"color": SIGNAL}, name, suite=suite))
-        for name, suite in (("same", one.suite), ("part", "suite@1#ba9876543210"))
+        for name, suite in (("same", first.suite), ("part", "suite@1#ba9876543210"))
     )
     apart = replace(part, episodes=part.episodes.drop(columns="item_content_sha256"))
-    tables = [retention_table([other, one]) for other in (same, part)]
-    found = [difference(table, name, "color") for table, name in zip(tables, ("same", "part"), strict=True)]
-    widths = [(row.backbone_ci or (0, 0))[1] - (row.backbone_ci or (0, 0))[0] for row in found]  # type: ignore[operator]
+    tables = [retention_table([other, first]) for other in (same, part)]
+    differences = [difference(table, name, "color") for table, name in zip(tables, ("same", "part"), strict=True)]
+    widths = [(row.backbone_ci or (0, 0))[1] - (row.backbone_ci or (0, 0))[0] for row in differences]  # type: ignore[operator]
     assert widths[1] == pytest.approx(widths[0], rel=0.05)
     rows = tables[1].rows
-    assert found[1].backbone == pytest.approx(rows[1].backbone.score - rows[0].backbone.score)  # type: ignore[operator]
-    assert retention_table([apart, one]).differences == []
+    assert differences[1].backbone == pytest.approx(rows[1].backbone.score - rows[0].backbone.score)  # type: ignore[operator]
+    assert retention_table([apart, first]).differences == []
 
 
 def test_probes_are_not_compared_where_items_differ(probed_run: ProbedRun) -> None:
-    one, other = probed_run({"color": SIGNAL}, "one"), probed_run({"color": WEAK}, "other")
+    first, other = probed_run({"color": SIGNAL}, "one"), probed_run({"color": WEAK}, "other")
     fewer = replace(other, episodes=other.episodes.iloc[:160], features={})
     save_results(load_results(other), fewer.path)
-    row = difference(retention_table([fewer, one], keys=[load_results(other).key, None]), "other", "color")
+    row = difference(retention_table([fewer, first], keys=[load_results(other).key, None]), "other", "color")
     assert (row.n_items, row.of_items, row.backbone, row.retention) == (80, 100, None, None)
 
 
@@ -322,7 +336,7 @@ def test_groups_are_pairs_on_the_items_that_most_of_their_runs_have(tmp_path: Pa
 
 @pytest.mark.slow
 def test_asked_runs_are_compared_with_asked_ones_and_acting_with_acting(tmp_path: Path) -> None:
-    vlms = [asked(tmp_path / str(at), hits(0.7, at), f"vlm-{at}") for at in range(2)]
+    vlms = [answer_run(tmp_path / str(at), hits(0.7, at), f"vlm-{at}") for at in range(2)]
     policies = [run(tmp_path / f"policy-{at}", hits(0.5, at)) for at in range(2)]
     mixed = [policies[0], vlms[0], policies[1], vlms[1]]
     table = retention_table(mixed)
@@ -374,16 +388,16 @@ def test_no_two_runs_have_one_name(tmp_path: Path) -> None:
 
 
 def test_json_of_plain_runs_is_a_list_whose_rows_hold_their_differences(tmp_path: Path) -> None:
-    one, other = run(tmp_path / "one", hits(0.5, 0)), run(tmp_path / "other", hits(0.5, 1))
-    alone = json.loads(retention_table([one]).to_json())
+    first, other = run(tmp_path / "one", hits(0.5, 0)), run(tmp_path / "other", hits(0.5, 1))
+    alone = json.loads(retention_table([first]).to_json())
     assert all("differences" not in row for row in alone)
-    both = json.loads(retention_table([one, other]).to_json())
+    both = json.loads(retention_table([first, other]).to_json())
     assert [row["run"]["location"] for row in both] == [str(tmp_path / "one")] * 3 + [str(tmp_path / "other")] * 3
     assert [{name: row[name] for name in alone[0]} for row in both[:3]] == alone
-    (found,) = both[3]["differences"]
-    assert found["minus_run"] == str(tmp_path / "one")
-    assert found["category"] == both[3]["category"] == "color"
-    assert found["sr"] == pytest.approx(both[3]["success"]["sr"] - both[0]["success"]["sr"])
+    (stored_difference,) = both[3]["differences"]
+    assert stored_difference["minus_run"] == str(tmp_path / "one")
+    assert stored_difference["category"] == both[3]["category"] == "color"
+    assert stored_difference["sr"] == pytest.approx(both[3]["success"]["sr"] - both[0]["success"]["sr"])
     assert [row["differences"] for row in both[:3]] == [[], [], []]
 
 
@@ -401,10 +415,10 @@ def test_a_difference_is_the_later_group_minus_the_earlier(table: RetentionTable
     color, shape, mean = table.differences
     assert [row.category for row in table.differences] == ["color", "shape", "mean"]
     assert (color.group, color.minus, color.view) == ("with VQA", "without", "mean")
-    other, weaker, one, _ = table.rows
+    other, weaker, base, _ = table.rows
     assert color.backbone == pytest.approx(0.9 - 0.8, abs=1e-3)
-    assert color.action == pytest.approx(one.action.score - other.action.score)  # type: ignore[operator]
-    assert color.retention == pytest.approx(one.retention.value - other.retention.value)  # type: ignore[operator]
+    assert color.action == pytest.approx(base.action.score - other.action.score)  # type: ignore[operator]
+    assert color.retention == pytest.approx(base.retention.value - other.retention.value)  # type: ignore[operator]
     assert weaker.backbone.score is not None
     assert mean.backbone == pytest.approx((0.1 + 0.9 - weaker.backbone.score) / 2, abs=1e-3)
     assert shape.backbone_ci is not None
@@ -433,9 +447,9 @@ def test_equal_behaviour_on_the_same_items_is_no_proof_of_equality(table: Retent
 
 
 def test_other_suites_are_compared_without_pairing(probed_run: ProbedRun) -> None:
-    one = probed_run({"color": SIGNAL}, "one")
+    first = probed_run({"color": SIGNAL}, "one")
     other = probed_run({"color": SIGNAL}, "other", suite="other@1#ba9876543210")
-    row = retention_table({"a": [one], "b": [other]}).differences[0]
+    row = retention_table({"a": [first], "b": [other]}).differences[0]
     assert not row.paired
     assert row.p is None
     assert row.sr == 0.0
@@ -485,17 +499,17 @@ def test_groups_of_models_have_a_p_over_models_and_the_least_that_so_few_allow(p
     }
     table = retention_table(groups)
     color, mean = table.differences
-    own = {row.run.model: row.retention.value for row in table.rows}
-    values = [[float(own[f"{name}{at}"] or 0) for at in range(3)] for name in groups]
+    retentions = {row.run.model: row.retention.value for row in table.rows}
+    values = [[float(retentions[f"{name}{at}"] or 0) for at in range(3)] for name in groups]
     for row in (color, mean):
-        found = row.retention_models
-        assert found is not None
-        assert (found.n, found.n_minus) == (3, 3)
-        assert found.p == pytest.approx(0.1), "the most extreme of 20 ways, either way round"
-        assert found.smallest_p == pytest.approx(0.1)
-        assert found.difference == pytest.approx(np.mean(values[1]) - np.mean(values[0]))
+        over_models = row.retention_models
+        assert over_models is not None
+        assert (over_models.n, over_models.n_minus) == (3, 3)
+        assert over_models.p == pytest.approx(0.1), "the most extreme of 20 ways, either way round"
+        assert over_models.smallest_p == pytest.approx(0.1)
+        assert over_models.difference == pytest.approx(np.mean(values[1]) - np.mean(values[0]))
         welch = stats.ttest_ind(*values[::-1], equal_var=False).confidence_interval()
-        assert found.ci == pytest.approx((welch.low, welch.high))
+        assert over_models.ci == pytest.approx((welch.low, welch.high))
     assert color.sr_models is not None
     assert (color.sr_models.p, color.sr_models.difference) == (1, 0), "all did the same"
 
@@ -505,9 +519,9 @@ def test_a_single_model_against_another_has_no_p_over_models(table: RetentionTab
 
 
 def test_a_group_with_a_model_without_probes_has_no_p_of_retention(probed_run: ProbedRun, tmp_path: Path) -> None:
-    one, other = (probed_run({"color": SIGNAL}, name) for name in ("one", "other"))
-    bare = ArrayRun(tmp_path / "bare", "bare", one.suite, one.episodes, {})
-    rows = retention_table({"b": [bare], "a": [one, other]}).differences
+    first, other = (probed_run({"color": SIGNAL}, name) for name in ("one", "other"))
+    bare = ArrayRun(tmp_path / "bare", "bare", first.suite, first.episodes, {})
+    rows = retention_table({"b": [bare], "a": [first, other]}).differences
     assert all(row.retention is None and row.retention_models is None for row in rows)
     assert all(row.sr_models is not None and row.sr_models.n_minus == 1 for row in rows)
 
@@ -573,8 +587,8 @@ def sisters(probed_run: ProbedRun) -> list[ArrayRun]:
 def test_a_checkpoint_and_what_grew_from_it_are_one_model_as_their_lineage_says(probed_run: ProbedRun) -> None:
     runs = sisters(probed_run)
     names = ("openvla/openvla-7b@abc", "gen-robot/openvla-7b-rlvla-sft_16k", "gen-robot/openvla-7b-rlvla-rl@def")
-    others = ("me/openvla-7b-of-my-own", "", "lerobot/pi0")
-    for run, checkpoint in zip(runs, (*names, *others), strict=True):
+    other_names = ("me/openvla-7b-of-my-own", "", "lerobot/pi0")
+    for run, checkpoint in zip(runs, (*names, *other_names), strict=True):
         object.__setattr__(run, "certificate", {"policy": {"family": "openvla", "checkpoint": checkpoint}})
     assert list(origins_of(runs).values()) == ["openvla/openvla-7b"] * 3 + ["d", "e", "f"]
     assert list(origins_of(runs[1:3]).values()) == ["openvla/openvla-7b"] * 2
@@ -622,7 +636,7 @@ def test_a_smaller_group_with_a_larger_spread_has_an_interval_and_no_p() -> None
     test = ModelTest.of(few, many)
     assert test is not None
     assert (test.p, test.smallest_p) == (None, None)
-    assert models_test(test, signed).text.startswith("– ")
+    assert models_test(test, with_sign).text.startswith("– ")
     alike = ModelTest.of(many, [0.53, 0.5, 0.52, 0.51, 0.49, 0.5])
     assert alike is not None
     assert alike.p is not None

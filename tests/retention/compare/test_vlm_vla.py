@@ -21,7 +21,7 @@ from probe_kit.models.embedded import embedded_checkpoint
 from probe_kit.retention import retention_table
 from probe_kit.retention.compare.models import grew_from
 from probe_kit.retention.report import report_html
-from tests.retention.asked_runs import SaidRun, acted, asked
+from tests.retention.asked_runs import SaidRun, acted, answer_run
 from tests.retention.paired_limits import mover
 
 
@@ -32,7 +32,7 @@ def by_chance(seed: int, share: float) -> dict[str, np.ndarray]:
 
 @pytest.fixture
 def runs(tmp_path: Path) -> list[SaidRun]:
-    return [acted(tmp_path, by_chance(2, 0.5)), asked(tmp_path, by_chance(1, 0.9))]
+    return [acted(tmp_path, by_chance(2, 0.5)), answer_run(tmp_path, by_chance(1, 0.9))]
 
 
 def test_asked_rows_stand_first_and_say_what_they_are(runs: list[SaidRun]) -> None:
@@ -91,7 +91,7 @@ def test_a_constant_answer_has_one_right_per_item_and_no_paired_evidence(runs: l
 
 
 def test_items_with_a_side_in_their_name_are_left_out_unless_asked_for(tmp_path: Path) -> None:
-    run = asked(tmp_path, by_chance(1, 0.9), worded=True)
+    run = answer_run(tmp_path, by_chance(1, 0.9), worded=True)
     table = retention_table([run])
     assert table.rows[0].success.n_items == 19
     assert any("4 episodes are left out because a side stands in the name" in note for note in table.notes)
@@ -103,21 +103,23 @@ def test_the_gap_is_what_an_independent_count_gives(runs: list[SaidRun]) -> None
     policy, vlm = (run.episodes.set_index("episode_id") for run in runs)
     ps = []
     for gap in table.vlm_vla[:2]:
-        here = vlm[vlm["category"] == gap.category]["outcome"] == "correct"
-        there = (policy["outcome"] == "correct")[here.index]
-        assert gap.sr == pytest.approx(sum(here) / len(here) - sum(there) / len(there))
+        answered_right = vlm[vlm["category"] == gap.category]["outcome"] == "correct"
+        acted_right = (policy["outcome"] == "correct")[answered_right.index]
+        assert gap.sr == pytest.approx(
+            sum(answered_right) / len(answered_right) - sum(acted_right) / len(acted_right)
+        )
         gains: dict[str, int] = {}
-        for name in here.index:
+        for name in answered_right.index:
             group = vlm.loc[name, "group_id"]
-            gains[group] = gains.get(group, 0) + int(here[name]) - int(there[name])
+            gains[group] = gains.get(group, 0) + int(answered_right[name]) - int(acted_right[name])
         values = [value for value in gains.values() if value]
         sums = [
             abs(sum(map(math.prod, zip(signs, values, strict=True))))
             for signs in product((1, -1), repeat=len(values))
         ]
-        ps.append(sum(one >= abs(sum(values)) for one in sums) / len(sums))
+        ps.append(sum(flipped >= abs(sum(values)) for flipped in sums) / len(sums))
         assert gap.p == pytest.approx(ps[-1])
-        tables = [run.loc[here.index].reset_index() for run in (vlm, policy)]
+        tables = [run.loc[answered_right.index].reset_index() for run in (vlm, policy)]
         assert gap.sr_ci == pytest.approx(mover(*tables))
         assert (gap.paired, gap.same_frames) == (True, True)
     smaller, larger = sorted(ps)
@@ -135,14 +137,14 @@ def test_only_items_in_common_are_compared_and_counted(runs: list[SaidRun]) -> N
     asked_too = replace(vlm, episodes=vlm.episodes[vlm.episodes["item_id"] != "color-0"])
     assert replace(color, of_items=19) == retention_table([asked_too, fewer], vlm_vla=True).vlm_vla[0]
     assert (color.n_items, color.of_items, mean.n_items, mean.of_items) == (19, 20, 35, 36)
-    shown = retention_table([vlm, fewer], vlm_vla=True).further_tables[-1]
-    assert [line[-1] for line in shown.texts] == ["19 of 20", "16", "35 of 36"]
+    gap_table = retention_table([vlm, fewer], vlm_vla=True).further_tables[-1]
+    assert [line[-1] for line in gap_table.texts] == ["19 of 20", "16", "35 of 36"]
 
 
 def test_other_items_are_not_paired_and_have_no_p(runs: list[SaidRun]) -> None:
     policy, vlm = runs
-    others = policy.episodes.assign(item_id="new " + policy.episodes["item_id"])
-    color = retention_table([vlm, replace(policy, episodes=others)], vlm_vla=True).vlm_vla[0]
+    renamed_episodes = policy.episodes.assign(item_id="new " + policy.episodes["item_id"])
+    color = retention_table([vlm, replace(policy, episodes=renamed_episodes)], vlm_vla=True).vlm_vla[0]
     assert (color.paired, color.p) == (False, None)
     other = replace(policy, episodes=policy.episodes.assign(first_frame_sha256="another"))
     assert retention_table([vlm, other], vlm_vla=True).vlm_vla[0].same_frames is False
@@ -151,8 +153,8 @@ def test_other_items_are_not_paired_and_have_no_p(runs: list[SaidRun]) -> None:
 
 
 def test_a_policy_is_compared_with_the_vlm_it_grew_from(tmp_path: Path) -> None:
-    qwen = asked(tmp_path / "a", by_chance(1, 0.9), "qwen3-vl")
-    gemma = asked(tmp_path / "b", by_chance(3, 0.8), "paligemma")
+    qwen = answer_run(tmp_path / "a", by_chance(1, 0.9), "qwen3-vl")
+    gemma = answer_run(tmp_path / "b", by_chance(3, 0.8), "paligemma")
     weights = {"family": "paligemma", "checkpoint": "google/paligemma-3b-pt-224"}
     gemma = replace(gemma, certificate={"policy": weights})
     qwen = replace(qwen, certificate={"policy": {"family": "qwen3-vl", "checkpoint": "Qwen/Qwen3-VL-8B-Instruct"}})
@@ -170,26 +172,30 @@ def test_a_gap_needs_both_kinds(runs: list[SaidRun]) -> None:
 
 
 def test_runs_of_one_name_prompt_and_size_have_a_line_each_however_many(tmp_path: Path) -> None:
-    same = [asked(tmp_path / str(seed), by_chance(seed, 0.7), called=f"seed {seed}") for seed in range(4)]
-    (sizes,) = [own for own in retention_table(same).further_tables if own.columns[:2] == ("model", "prompt")]
+    same = [answer_run(tmp_path / str(seed), by_chance(seed, 0.7), called=f"seed {seed}") for seed in range(4)]
+    (sizes,) = [
+        extra_table
+        for extra_table in retention_table(same).further_tables
+        if extra_table.columns[:2] == ("model", "prompt")
+    ]
     assert len({cells[0] for cells in sizes.texts}) == len(sizes.texts) == 4
 
 
 @pytest.mark.slow
 def test_every_format_shows_answers_sizes_and_gaps(runs: list[SaidRun], tmp_path: Path) -> None:
-    larger = asked(tmp_path / "large", by_chance(5, 0.7), called="large", picture_size="560x480")
-    other = asked(tmp_path / "other", by_chance(6, 0.7), called="other", prompt="seen")
+    larger = answer_run(tmp_path / "large", by_chance(5, 0.7), called="large", picture_size="560x480")
+    other = answer_run(tmp_path / "other", by_chance(6, 0.7), called="other", prompt="seen")
     table = retention_table([*runs, larger, other], vlm_vla=True)
     console = Console(width=200, record=True, file=StringIO())
     console.print(table.to_rich("all"))
-    shown = console.export_text()
+    printed = console.export_text()
     for words in (
         "Accuracy of answers",
         "VLM − VLA",
         "560x480",
         "letter bias",
     ):
-        assert words in shown
+        assert words in printed
     markdown = table.to_markdown()
     for words in ("accuracy % [95 %]", "**Accuracy of answers", "**VLM − VLA: ", "| qwen3-vl | seen |"):
         assert words in markdown
@@ -200,7 +206,9 @@ def test_every_format_shows_answers_sizes_and_gaps(runs: list[SaidRun], tmp_path
     assert len(content["vlm_vla"]) == 9
     assert {"difference", "difference_ci", "accuracy", "sr", "p_holm", "paired"} <= content["vlm_vla"][0].keys()
     assert isinstance(json.loads(retention_table(runs).to_json()), list)
-    sizes = next(own for own in table.further_tables if own.columns[:2] == ("model", "prompt"))
+    sizes = next(
+        extra_table for extra_table in table.further_tables if extra_table.columns[:2] == ("model", "prompt")
+    )
     assert sizes.columns == ("model", "prompt", "224x224", "560x480")
     assert [cells[:2] for cells in sizes.texts] == [("qwen3-vl", "p1"), ("qwen3-vl", "seen")]
 
@@ -210,7 +218,7 @@ RIGHT = {"color": np.random.default_rng(0).random((12, 2)) < 0.7}
 
 
 def vlm(path: Path, card: ModelCard, called: str = "") -> SaidRun:
-    return replace(asked(path, RIGHT, card.family, called), certificate={"policy": card.to_json()})
+    return replace(answer_run(path, RIGHT, card.family, called), certificate={"policy": card.to_json()})
 
 
 def policy(path: Path, card: ModelCard) -> SaidRun:
@@ -260,31 +268,35 @@ def test_runs_of_before_whose_cards_hold_a_family_only_are_unknown(tmp_path: Pat
     """Their `source` is a name; a run without a certificate has an unknown source."""
     old = acted(tmp_path / "p", RIGHT, "xiaomi-r0", source="qwen3-vl")
     assert grew_from(old, vlm(tmp_path, QWEN_4B)) == "unknown"
-    assert grew_from(old, asked(tmp_path / "r", RIGHT)) == "unknown"
+    assert grew_from(old, answer_run(tmp_path / "r", RIGHT)) == "unknown"
     assert grew_from(acted(tmp_path / "p", RIGHT), vlm(tmp_path, QWEN_4B)) == "unknown"
 
 
 @pytest.mark.slow
 def test_the_embedded_policies_grew_from_the_embedded_vlm_and_only_from_it(tmp_path: Path) -> None:
-    own = vlm(tmp_path / "r", load_model("vlm-tiny").card)
+    source_vlm = vlm(tmp_path / "r", load_model("vlm-tiny").card)
     untrained = vlm(tmp_path / "t", load_model("vlm-tiny", random_weights=True).card)
-    place = tmp_path / "copy of the VLM"
-    shutil.copytree(embedded_checkpoint("vlm-tiny"), place)
-    copied = vlm(tmp_path / "c", load_model("paligemma", str(place)).card)
+    copy_folder = tmp_path / "copy of the VLM"
+    shutil.copytree(embedded_checkpoint("vlm-tiny"), copy_folder)
+    copied = vlm(tmp_path / "c", load_model("paligemma", str(copy_folder)).card)
     for name in ("pi0-tiny", "pi0-tiny-early", "pi0-tiny-state"):
         acting = policy(tmp_path / name, load_model(name).card)
-        assert [grew_from(acting, one) for one in (own, untrained, copied)] == ["yes", "no", "yes"]
-    assert grew_from(policy(tmp_path / "x", load_model("pi0-tiny", random_weights=True).card), own) == "no"
+        assert [grew_from(acting, candidate) for candidate in (source_vlm, untrained, copied)] == [
+            "yes",
+            "no",
+            "yes",
+        ]
+    assert grew_from(policy(tmp_path / "x", load_model("pi0-tiny", random_weights=True).card), source_vlm) == "no"
 
 
 def test_the_early_policy_holds_the_weights_that_its_family_declares() -> None:
     """It was stored in half precision before any training."""
-    there = load_file(embedded_checkpoint("pi0-tiny-early") / "model.safetensors")
+    policy_weights = load_file(embedded_checkpoint("pi0-tiny-early") / "model.safetensors")
     source = load_file(embedded_checkpoint("vlm-tiny") / "model.safetensors")
     prefix = "model.paligemma_with_expert.paligemma."
-    shared = [name for name in source if prefix + name in there]
+    shared = [name for name in source if prefix + name in policy_weights]
     assert len(shared) > 70
-    assert all(torch.equal(source[name].half(), there[prefix + name].half()) for name in shared)
+    assert all(torch.equal(source[name].half(), policy_weights[prefix + name].half()) for name in shared)
 
 
 @pytest.mark.parametrize("name", GROWN)
@@ -303,10 +315,10 @@ def test_the_declared_source_is_a_released_size_of_its_family(name: str) -> None
 
 
 def test_a_policy_whose_source_was_asked_is_not_compared_with_other_weights(tmp_path: Path) -> None:
-    vlms = [vlm(tmp_path / str(n), one, f"vlm {n}") for n, one in enumerate((QWEN_4B, QWEN_32B))]
+    vlms = [vlm(tmp_path / str(n), model_card, f"vlm {n}") for n, model_card in enumerate((QWEN_4B, QWEN_32B))]
     grown = policy(tmp_path / "p", xiaomi())
-    found = retention_table([*vlms, grown], vlm_vla=True).vlm_vla
-    assert {(gap.group, gap.source) for gap in found} == {("vlm 0", "yes")}
+    gaps = retention_table([*vlms, grown], vlm_vla=True).vlm_vla
+    assert {(gap.group, gap.source) for gap in gaps} == {("vlm 0", "yes")}
     assert {(gap.group, gap.source) for gap in retention_table([vlms[1], grown], vlm_vla=True).vlm_vla} == {
         ("vlm 1", "no")
     }

@@ -99,14 +99,14 @@ def test_aligned_accuracies_pool_the_calls_at_one_distance_from_the_event(
     assert line is not None
     assert line.offsets.tolist() == [-2, -1, 0, 1, 2, 3]
     assert line.episodes.tolist() == [100, 100, 200, 200, 100, 100]
-    probed = {call: one.curves["color", "mean"] for call, one in by_call.items()}
+    probed = {call: call_results.curves["color", "mean"] for call, call_results in by_call.items()}
     right = {call: curve.nested_correct(curve.stream("backbone")) for call, curve in probed.items()}
     early, late = slice(None, 100), slice(100, None)
-    wanted = [
+    expected = [
         right[0][late].mean(), right[1][late].mean(), (right[0][early].sum() + right[2][late].sum()) / 200,
         (right[1][early].sum() + right[3][late].sum()) / 200, right[2][early].mean(), right[3][early].mean(),
     ]  # fmt: skip
-    np.testing.assert_allclose(line.accuracy, wanted)
+    np.testing.assert_allclose(line.accuracy, expected)
     assert curves.aligned("backbone", "release") is None
     (times,) = curves.event_times()
     assert (times.event, times.median, times.low, times.high, times.share) == ("grasp", 1.0, 0.0, 2.0, 1.0)

@@ -81,10 +81,10 @@ def with_accuracies(table: RetentionTable, accuracies: dict[str, tuple[float, fl
 def test_the_mean_of_retention_is_over_all_categories_those_without_a_signal_too() -> None:
     rates = {"color": 90.0, "shape": 50.0}
     table = retention_table([run_of("model", rates, {name: {"episodes": 300} for name in rates})])
-    found = with_accuracies(table, {"color": (0.9, 0.7), "shape": (0.6, 0.7)}).as_paper.numbers
-    assert [row["retention"] for row in found] == pytest.approx([0.5, 2.0, 1.25], rel=1e-4)
-    assert [row["backbone"] for row in found] == pytest.approx([0.9, 0.6, 0.75])
-    assert found[2]["normalised_score"] == pytest.approx(40)
+    numbers = with_accuracies(table, {"color": (0.9, 0.7), "shape": (0.6, 0.7)}).as_paper.numbers
+    assert [row["retention"] for row in numbers] == pytest.approx([0.5, 2.0, 1.25], rel=1e-4)
+    assert [row["backbone"] for row in numbers] == pytest.approx([0.9, 0.6, 0.75])
+    assert numbers[2]["normalised_score"] == pytest.approx(40)
 
 
 def test_every_format_prints_the_same_cells() -> None:

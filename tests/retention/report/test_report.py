@@ -52,9 +52,9 @@ def plain_run(folder: Path, episodes: pd.DataFrame, model: str = "pi0") -> Array
 
 
 def cards(page: str) -> list[dict[str, Any]]:
-    found = re.search(r'<script type="application/json" id="cards"[^>]*>(.*?)</script>', page, re.DOTALL)
-    assert found
-    listed: list[dict[str, Any]] = json.loads(found[1])
+    match = re.search(r'<script type="application/json" id="cards"[^>]*>(.*?)</script>', page, re.DOTALL)
+    assert match
+    listed: list[dict[str, Any]] = json.loads(match[1])
     return listed
 
 
@@ -156,21 +156,21 @@ def titled(rows: Any, title: str) -> Table | None:
 
 def test_cells_sort_by_the_rows_numbers_and_show_them_in_percent(probed_run: ProbedRun) -> None:
     table = retention_table([probed_run({"color": SIGNAL, "shape": NOISE})])
-    made = titled(table.all_rows, "Success rate")
-    assert made is not None
-    assert made.columns[:2] == ("category", "SR % [95 %]"), "one run: no model"
-    success = made.rows[0].cells[1]
+    titled_table = titled(table.all_rows, "Success rate")
+    assert titled_table is not None
+    assert titled_table.columns[:2] == ("category", "SR % [95 %]"), "one run: no model"
+    success = titled_table.rows[0].cells[1]
     assert success.sort == table.rows[0].success.sr == 0.6
     assert success.text.startswith("60.0 [")
     assert not success.strong, "its interval holds one half"
-    assert [row.cells[0].text for row in made.rows if row.is_mean] == ["Mean"]
+    assert [row.cells[0].text for row in titled_table.rows if row.is_mean] == ["Mean"]
 
 
 def test_retention_without_backbone_signal_is_shown_as_such_and_sorts_last(probed_run: ProbedRun) -> None:
-    made = titled(retention_table([probed_run({"color": SIGNAL, "shape": NOISE})]).all_rows, "Retention")
-    assert made is not None
-    position = made.columns.index("retention [95 %]")
-    color, shape, _ = (row.cells[position] for row in made.rows)
+    titled_table = titled(retention_table([probed_run({"color": SIGNAL, "shape": NOISE})]).all_rows, "Retention")
+    assert titled_table is not None
+    position = titled_table.columns.index("retention [95 %]")
+    color, shape, _ = (row.cells[position] for row in titled_table.rows)
     assert color.heat is not None
     assert (shape.text, shape.sort, shape.heat) == ("n/a", None, None)
     assert shape.note.startswith("n/a (backbone absent, at most ")
@@ -180,17 +180,17 @@ def test_a_leak_is_red_and_named_in_the_warnings(probed_run: ProbedRun) -> None:
     table = retention_table([probed_run({"color": SIGNAL})])
     leaking = {"baselines": {"pixels": 0.8}, "leaks": ("pixels",)}
     rows = [replace(row, controls=replace(row.controls, **leaking)) for row in table.all_rows]
-    made = titled(rows, "Controls")
-    assert made is not None
-    assert any(cell.alarm and cell.text.startswith("80.0") for cell in made.rows[0].cells)
+    titled_table = titled(rows, "Controls")
+    assert titled_table is not None
+    assert any(cell.alarm and cell.text.startswith("80.0") for cell in titled_table.rows[0].cells)
     assert any("pixels" in warning for warning in warnings_of(rows[-1], rows[:-1]))
     assert titled(table.all_rows, "Controls") is None
 
 
 def test_every_heading_says_what_it_means(probed_run: ProbedRun) -> None:
     rows = retention_table([probed_run({"color": SIGNAL, "shape": NOISE})]).all_rows
-    for made in retention_tables(rows).values():
-        assert all(len(heading.help) > 10 for heading in made.headings)
+    for titled_table in retention_tables(rows).values():
+        assert all(len(heading.help) > 10 for heading in titled_table.headings)
 
 
 def test_the_mean_of_scores_is_free_of_the_luck_of_the_best_site(probed_run: ProbedRun) -> None:
@@ -205,13 +205,13 @@ def test_why_there_is_no_retention_is_the_reason_that_there_is(probed_run: Probe
     run = probed_run({"color": SIGNAL, "shape": SIGNAL})
     results = load_results(run)
     only = replace(results.settings, categories=("color",), seed=1)
-    curves = {place: curve for place, curve in results.curves.items() if place[0] == "color"}
+    curves = {curve_key: curve for curve_key, curve in results.curves.items() if curve_key[0] == "color"}
     some = replace(results, settings=only, curves=curves, controls=Controls())
     save_results(some, run.path)
     table = retention_table([run])
     note = {row.category: row.retention.note for row in table.rows}
     assert note["shape"] == f"n/a (probes {some.key} are of color)"
-    untested = {place: replace(curve, null=curve.null[:, :0]) for place, curve in results.curves.items()}
+    untested = {curve_key: replace(curve, null=curve.null[:, :0]) for curve_key, curve in results.curves.items()}
     save_results(replace(results, settings=replace(results.settings, seed=2), curves=untested), run.path)
     assert retention_table([run]).rows[0].retention.note == "n/a (no permutations)"
 
@@ -220,8 +220,12 @@ def test_every_mark_of_evidence_is_said_to_need_the_controls_too(probed_run: Pro
     """A caption that asks for chance alone calls an untrained conjunction evidence."""
     runs = [probed_run({"color": SIGNAL, "shape": NOISE}, name) for name in ("one", "other")]
     table = retention_table(runs)
-    said = [one.reading for one in collect_figures(runs, table) if one.subject == "probes"]
-    marked = [reading for reading in said if "illed marker" in reading or "Dots" in reading]
+    readings = [
+        shown_exhibit.reading
+        for shown_exhibit in collect_figures(runs, table)
+        if shown_exhibit.subject == "probes"
+    ]
+    marked = [reading for reading in readings if "illed marker" in reading or "Dots" in reading]
     assert len(marked) > 4
     assert all("every control" in reading for reading in marked)
     assert "every control" in TERMS["n/a"]
@@ -284,8 +288,8 @@ def test_above_the_limit_whole_items_keep_their_pictures_and_the_page_says_so(
 ) -> None:
     run = framed_run(tmp_path, outcome_table(6, 4, 2))
     grid = episode_grid([run], ["run"], pictures=5)
-    kept = [card["id"].split(":")[0] for card in grid.cards if card["picture"] is not None]
-    assert kept == ["color-0", "color-0", "color-3", "color-3"]
+    pictured_items = [card["id"].split(":")[0] for card in grid.cards if card["picture"] is not None]
+    assert pictured_items == ["color-0", "color-0", "color-3", "color-3"]
     assert len(grid.cards) == 12
     assert grid.note.startswith("Pictures of 4 of 12 episodes")
 
@@ -306,14 +310,14 @@ def test_pictures_of_all_episodes_together_are_bounded_in_bytes(tmp_path: Path, 
 def test_the_page_holds_pictures_in_blocks_that_cards_point_to(tmp_path: Path, outcome_table: Any) -> None:
     run = framed_run(tmp_path, outcome_table(BLOCK, 4, 2))
     page = report_html([run])
-    found = re.findall(r'<script type="application/json" class="pictures">(.*?)</script>', page, re.DOTALL)
-    blocks = [json.loads(block) for block in found]
+    scripts = re.findall(r'<script type="application/json" class="pictures">(.*?)</script>', page, re.DOTALL)
+    blocks = [json.loads(block) for block in scripts]
     assert [len(block) for block in blocks] == [BLOCK, 6]
     assert f'data-block="{BLOCK}"' in page
     for card in cards(page):
-        block, place = divmod(card["picture"], BLOCK)
+        block, position = divmod(card["picture"], BLOCK)
         number = int(run.episodes.index[run.episodes["episode_id"] == card["id"]][0])
-        assert b64decode(blocks[block][place]) == read_thumbnail(tmp_path, number)
+        assert b64decode(blocks[block][position]) == read_thumbnail(tmp_path, number)
 
 
 def test_runs_without_frames_say_so(tmp_path: Path, outcome_table: Any) -> None:
@@ -349,8 +353,8 @@ def test_page_terminal_markdown_and_json_say_the_same_sentence_of_both_readouts(
     with (console := Console(width=400)).capture() as printed:
         console.print(table.to_rich("all"))
     page = unescape(re.sub(r"<[^>]+>", " ", report_html([run])))
-    for shown in (printed.get(), table.to_markdown(), page):
-        text = " ".join(shown.replace("\u00a0", " ").split())
+    for rendering in (printed.get(), table.to_markdown(), page):
+        text = " ".join(rendering.replace("\u00a0", " ").split())
         assert sentence in text
         assert verdict in text
 
@@ -380,8 +384,8 @@ def svg_of(figure: Figure) -> bytes:
 
 
 def numbers(svg: ElementTree.Element, name: str) -> list[float]:
-    texts = [one.attrib[name] for one in svg.iter() if name in one.attrib]
-    return [float(found) for text in texts for found in re.findall(r"-?\d+(?:\.\d+)?", text)]
+    texts = [element.attrib[name] for element in svg.iter() if name in element.attrib]
+    return [float(number) for text in texts for number in re.findall(r"-?\d+(?:\.\d+)?", text)]
 
 
 def test_a_compact_drawing_has_the_same_shapes_places_and_words() -> None:
@@ -389,11 +393,13 @@ def test_a_compact_drawing_has_the_same_shapes_places_and_words() -> None:
     after = compact_svg(before)
     assert len(after) < 0.8 * len(before)
     old, new = ElementTree.fromstring(before), ElementTree.fromstring(after)
-    drawn = [one.tag for one in old.iter() if "metadata" not in one.tag and one.tag.startswith(SVG)]
-    assert [one.tag for one in new.iter()] == drawn
+    drawn = [
+        element.tag for element in old.iter() if "metadata" not in element.tag and element.tag.startswith(SVG)
+    ]
+    assert [element.tag for element in new.iter()] == drawn
     for name in ("d", "x", "y"):
         assert numbers(new, name) == pytest.approx(numbers(old, name), abs=0.0051)
-    words = [[one.text for one in svg.iter(f"{SVG}text")] for svg in (old, new)]
+    words = [[element.text for element in svg.iter(f"{SVG}text")] for svg in (old, new)]
     assert words[0] == words[1] != []
 
 
@@ -410,9 +416,9 @@ def test_a_figure_is_vectors_with_a_transparent_ground_and_no_path() -> None:
     assert kind == "data:image/svg+xml"
     assert '"' not in text
     root = ElementTree.fromstring(unquote(text))
-    assert "checkpoint of mine & more" in [one.text for one in root.iter(f"{SVG}text")]
+    assert "checkpoint of mine & more" in [element.text for element in root.iter(f"{SVG}text")]
     assert "/home" not in unquote(text)
-    ground = next(one for one in root.iter(f"{SVG}path"))
+    ground = next(element for element in root.iter(f"{SVG}path"))
     assert "fill: none" in ground.attrib["style"] or "opacity: 0" in ground.attrib["style"]
     assert data_uri(exhibit())[0] == source, "the same figure, the same bytes"
 

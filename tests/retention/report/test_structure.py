@@ -23,7 +23,7 @@ from probe_kit.retention.report.episodes import episode_grid
 from probe_kit.runs.store import locate
 from probe_kit.runs.thumbnails import as_thumbnail, thumbnail_key
 from probe_kit.train import ArrayRun
-from tests.retention.asked_runs import acted, asked
+from tests.retention.asked_runs import acted, answer_run
 from tests.retention.conftest import runs_in
 
 SIGNAL = ([0.5, 0.9, 0.7], [[0.6, 0.7], [0.5, 0.65]])
@@ -56,26 +56,26 @@ class Page(HTMLParser):
         assert self._open == []
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        found = Element(tag, {name: value or "" for name, value in attrs}, tuple(self._open))
-        self.elements.append(found)
+        element = Element(tag, {name: value or "" for name, value in attrs}, tuple(self._open))
+        self.elements.append(element)
         if self._open:
-            self._open[-1].children.append(found)
+            self._open[-1].children.append(element)
         if tag not in VOID:
-            self._open.append(found)
+            self._open.append(element)
 
     def handle_endtag(self, tag: str) -> None:
         assert self._open.pop().tag == tag
 
     def handle_data(self, data: str) -> None:
-        for one in self._open:
-            one.text += data
+        for element in self._open:
+            element.text += data
 
     def all(self, tag: str) -> list[Element]:
-        return [one for one in self.elements if one.tag == tag]
+        return [element for element in self.elements if element.tag == tag]
 
-    def named(self, name: str) -> Element:
-        (found,) = [one for one in self.elements if one.attributes.get("id") == name]
-        return found
+    def element_with_id(self, name: str) -> Element:
+        (matching,) = [element for element in self.elements if element.attributes.get("id") == name]
+        return matching
 
 
 @pytest.fixture(scope="module")
@@ -89,65 +89,69 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Page:
 
 
 def test_every_link_leads_somewhere_and_every_place_is_named_once(page: Page) -> None:
-    places = [one.attributes["id"] for one in page.elements if "id" in one.attributes]
+    places = [element.attributes["id"] for element in page.elements if "id" in element.attributes]
     assert len(places) == len(set(places))
-    links = [one.attributes["href"] for one in page.all("a")]
+    links = [element.attributes["href"] for element in page.all("a")]
     assert len(links) > 20
     assert [link for link in links if link.removeprefix("#") not in places] == []
 
 
 def test_the_first_screen_is_question_summary_sentences_one_picture_and_one_curve(page: Page) -> None:
     before = page.elements[: page.elements.index(page.all("details")[0])]
-    lead = next(one.text for one in before if one.attributes.get("class") == "lead")
+    lead = next(element.text for element in before if element.attributes.get("class") == "lead")
     assert lead.startswith("What does it know")
-    (table,) = [one for one in before if one.tag == "table"]
+    (table,) = [element for element in before if element.tag == "table"]
     assert "verdict" in table.text
-    assert [one.text.partition(" ")[0] for one in before if one.tag == "li" and not one.inside("nav")] == [
+    assert [
+        element.text.partition(" ")[0] for element in before if element.tag == "li" and not element.inside("nav")
+    ] == [
         "Shape",
         "Color",
     ]
-    picture, curve = [one for one in before if one.tag == "img"]
+    picture, curve = [element for element in before if element.tag == "img"]
     assert picture.attributes["src"].startswith("data:image/webp")
     assert curve.attributes["src"].startswith("data:image/svg+xml")
     assert "Color" in curve.attributes["alt"], "the category that has something to show"
 
 
 def test_everything_else_is_folded_under_headings(page: Page) -> None:
-    sections = [one for one in page.all("details") if one.attributes.get("class") == "part"]
-    assert [one.attributes["id"] for one in sections][-4:] == ["episodes", "settings", "words", "cite"]
+    sections = [element for element in page.all("details") if element.attributes.get("class") == "part"]
+    assert [element.attributes["id"] for element in sections][-4:] == ["episodes", "settings", "words", "cite"]
     for section in sections:
         assert "open" not in section.attributes
         summary = section.children[0]
-        assert (summary.tag, [one.tag for one in summary.children]) == ("summary", ["h2"])
-    main = [one for one in page.all("h2") if not one.inside("details")]
-    assert [one.text for one in main] == ["Summary"]
+        assert (summary.tag, [element.tag for element in summary.children]) == ("summary", ["h2"])
+    main = [element for element in page.all("h2") if not element.inside("details")]
+    assert [element.text for element in main] == ["Summary"]
 
 
 def test_a_heading_and_a_verdict_lead_to_their_meaning(page: Page) -> None:
-    headings = [one for one in page.all("th") if one.attributes.get("scope") == "col"]
-    links = [link for one in headings for link in one.children[0].children if link.tag == "a"]
+    headings = [element for element in page.all("th") if element.attributes.get("scope") == "col"]
+    links = [link for element in headings for link in element.children[0].children if link.tag == "a"]
     assert len(links) > len(headings) / 2
     for link in links:
-        entry = page.named(link.attributes["href"].removeprefix("#"))
+        entry = page.element_with_id(link.attributes["href"].removeprefix("#"))
         assert entry.tag == "dt"
-        assert entry.text.replace(" ", "") == link.text.replace("\u00a0", "").replace(" ", "")
-    (verdict,) = [one for one in page.all("a") if one.inside("td") and one.text == "shown, success not shown"]
-    place = page.named(verdict.attributes["href"].removeprefix("#"))
-    siblings = place.parents[-1].children
-    assert siblings[siblings.index(place) + 1].text == VERDICT_HELP["shown, success not shown"]
+        assert "".join(entry.text.split()) == "".join(link.text.split())
+    (verdict,) = [
+        element for element in page.all("a") if element.inside("td") and element.text == "shown, success not shown"
+    ]
+    target = page.element_with_id(verdict.attributes["href"].removeprefix("#"))
+    siblings = target.parents[-1].children
+    assert siblings[siblings.index(target) + 1].text == VERDICT_HELP["shown, success not shown"]
 
 
 def test_keyboard_and_screen_readers_reach_everything(page: Page) -> None:
     body = page.all("body")[0]
     skip = body.children[0]
     assert (skip.tag, skip.attributes["href"]) == ("a", "#summary")
-    assert "tabindex" in page.named("summary").attributes
-    assert all(one.attributes["alt"] for one in page.all("img"))
-    assert all(one.text.strip() or one.attributes.get("aria-label") for one in page.all("button"))
-    assert all(one.inside("label") for one in page.elements if one.tag in ("select", "input"))
-    scrolled = [one for one in page.elements if "scroll" in one.attributes.get("class", "").split()]
+    assert "tabindex" in page.element_with_id("summary").attributes
+    assert all(element.attributes["alt"] for element in page.all("img"))
+    assert all(element.text.strip() or element.attributes.get("aria-label") for element in page.all("button"))
+    assert all(element.inside("label") for element in page.elements if element.tag in ("select", "input"))
+    scrolled = [element for element in page.elements if "scroll" in element.attributes.get("class", "").split()]
     assert scrolled
-    assert all(one.attributes["tabindex"] == "0" and one.attributes["aria-label"] for one in scrolled)
+    assert all(element.attributes["tabindex"] == "0" and element.attributes["aria-label"] for element in scrolled)
 
 
 def test_the_page_has_rules_for_the_dark_for_narrow_screens_and_for_print(page: Page) -> None:
@@ -155,7 +159,7 @@ def test_the_page_has_rules_for_the_dark_for_narrow_screens_and_for_print(page: 
     assert "@media screen and (prefers-color-scheme: dark)" in style, "paper is white, whatever the screen is"
     assert "@media print" in style
     assert "@media (max-width: 40rem)" in style
-    (scheme,) = [one for one in page.all("meta") if one.attributes.get("name") == "color-scheme"]
+    (scheme,) = [element for element in page.all("meta") if element.attributes.get("name") == "color-scheme"]
     assert scheme.attributes["content"] == "light dark"
 
 
@@ -163,20 +167,24 @@ RIGHT = {"color": np.random.default_rng(0).random((20, 2)) < 0.85}
 
 
 def test_a_model_that_only_answers_lacks_nothing_and_moves_no_cube(tmp_path: Path) -> None:
-    run = asked(tmp_path, RIGHT)
+    run = answer_run(tmp_path, RIGHT)
     assert retention_table([run]).notes == ()
     page = Page(report_html([run]))
-    assert [one.text for one in page.elements if one.attributes.get("class") in ("warning", "remark")] == []
-    seen = "".join(one.text for one in page.all("main") if one).replace(page.all("script")[0].text, "")
-    assert "the VLM answers right in" in seen
+    assert [
+        element.text for element in page.elements if element.attributes.get("class") in ("warning", "remark")
+    ] == []
+    page_text = "".join(element.text for element in page.all("main") if element).replace(
+        page.all("script")[0].text, ""
+    )
+    assert "the VLM answers right in" in page_text
     assert "cube" not in "".join(
-        one.text for one in page.elements if one.tag in ("li", "p", "dd", "figcaption", "th")
+        element.text for element in page.elements if element.tag in ("li", "p", "dd", "figcaption", "th")
     )
 
 
 def test_an_episode_of_both_kinds_of_model_shares_its_picture(tmp_path: Path) -> None:
     """The VLM's frame is the left half of the policy's picture, which stands in the page once."""
-    vlm, policy = asked(tmp_path, RIGHT), acted(tmp_path, RIGHT)
+    vlm, policy = answer_run(tmp_path, RIGHT), acted(tmp_path, RIGHT)
     for number in range(len(policy.episodes)):
         first, last = (np.full((12, 16, 3), shade, np.uint8) for shade in (3 * number, 255))
         locate(vlm.path).write(thumbnail_key(number), as_thumbnail((first,)))
@@ -184,9 +192,14 @@ def test_an_episode_of_both_kinds_of_model_shares_its_picture(tmp_path: Path) ->
     grid = episode_grid([vlm, policy], ["vlm", "policy"])
     count = len(policy.episodes)
     assert sum(map(len, grid.pictures)) == count
-    for said, done in zip(grid.cards[:count], grid.cards[count:], strict=True):
-        assert (said["frames"], said["half"], done["frames"], done["half"]) == (1, True, 2, False)
-        assert grid.picture(said) == grid.picture(done)
+    for answer_card, action_card in zip(grid.cards[:count], grid.cards[count:], strict=True):
+        assert (answer_card["frames"], answer_card["half"], action_card["frames"], action_card["half"]) == (
+            1,
+            True,
+            2,
+            False,
+        )
+        assert grid.picture(answer_card) == grid.picture(action_card)
     alone = episode_grid([vlm], ["vlm"])
     assert {(card["frames"], card["half"]) for card in alone.cards} == {(1, False)}
 
@@ -221,12 +234,12 @@ def console(table: RetentionTable) -> str:
 
 def every_form(table: RetentionTable) -> dict[str, str]:
     """Text from the retention table on, by form; the one of a page is its headings and cells."""
-    made = retention_tables(table.all_rows, table.differences)["Retention"]
+    titled_table = retention_tables(table.all_rows, table.differences)["Retention"]
     return {
         "console": console(table).split("Retention, view")[1],
         "markdown": table.to_markdown().split("**Retention, view")[1],
         "latex": table.to_latex("all").split(r"\caption{Retention")[1],
-        "page": text_of(made),
+        "page": text_of(titled_table),
     }
 
 
@@ -242,12 +255,12 @@ def test_every_table_leads_with_the_one_retention_and_the_published_ratio_beside
     numbers = [f"{row.value:.2f}", f"{row.published:.2f}"]
     assert len(set(numbers)) == 2, "the two can be told apart"
     for form, text in every_form(table).items():
-        shown = text.lower()
-        places = [shown.find(name) for name in ("retention [95", "published ratio", "backbone")]
+        lowered = text.lower()
+        places = [lowered.find(name) for name in ("retention [95", "published ratio", "backbone")]
         assert -1 not in places, (form, places)
         assert places[0] < places[1], form
         assert -1 < text.find(numbers[0]) < text.find(numbers[1]), form
-        assert not [name for name in FORMER if name in shown], form
+        assert not [name for name in FORMER if name in lowered], form
 
 
 def test_every_table_names_the_call_the_first_iteration_and_ties(table: RetentionTable) -> None:
@@ -282,17 +295,17 @@ def test_the_margin_that_decides_stands_before_the_papers(table: RetentionTable)
 
 def test_the_summary_quotes_the_retention_of_the_mean(table: RetentionTable) -> None:
     rows = [row for row in table.all_rows if row.group == "first"]
-    found = rows[-1].retention
-    assert found.value is not None
-    assert f"{found.value:.2f}" != f"{found.published:.2f}"
+    mean_retention = rows[-1].retention
+    assert mean_retention.value is not None
+    assert f"{mean_retention.value:.2f}" != f"{mean_retention.published:.2f}"
     first = next(run for run in table.summary if run.mean.row.group == "first")
-    assert first.mean.cells[HEADINGS.index("retention")].text.startswith(f"{found.value:.2f} [")
+    assert first.mean.cells[HEADINGS.index("retention")].text.startswith(f"{mean_retention.value:.2f} [")
 
 
 def test_differences_hold_one_retention_and_the_call(table: RetentionTable) -> None:
     (row, mean) = table.differences
     assert isinstance(row, Difference)
-    first, second = (one.retention.value for one in table.rows if one.category == "color")
+    first, second = (color_row.retention.value for color_row in table.rows if color_row.category == "color")
     assert row.retention == pytest.approx(first - second)  # type: ignore[operator]
     assert row.retention_ci is not None
     assert (row.call, mean.call) == (0, 0)

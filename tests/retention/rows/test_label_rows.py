@@ -49,10 +49,12 @@ RUN = RunInfo(
 
 def measured(results: ProbeResults, view: str = "mean", iterations: int | Literal["all"] = "all") -> RetentionRow:
     """The row of a label."""
-    own = results.settings
+    settings = results.settings
     success = SuccessRate(n_episodes=GROUPS, n_items=GROUPS)
-    row = RetentionRow(category="all", view=view, target=own.target, task=own.task, run=RUN, success=success)
-    return with_probes(row, results, iterations, seed_text=own.seed_text)[0]
+    row = RetentionRow(
+        category="all", view=view, target=settings.target, task=settings.task, run=RUN, success=success
+    )
+    return with_probes(row, results, iterations, seed_text=settings.seed_text)[0]
 
 
 def controls(name: str, score: float, p: float, view: str = "mean") -> Controls:
@@ -66,14 +68,14 @@ def controls(name: str, score: float, p: float, view: str = "mean") -> Controls:
 
 def test_of_one_site_each_it_is_the_ratio_of_scores_minus_the_chance_of_that_site() -> None:
     results = label_results({BACKBONE[0]: (0.8, 0.3), ACTION[0]: (0.5, 0.4)}, GROUPS, EACH)
-    found = measured(results)
-    assert found.retention.defined
-    assert found.backbone.above == pytest.approx(0.8 - 0.3)
-    assert found.action.above == pytest.approx(0.5 - 0.4)
-    assert found.retention.value == pytest.approx((0.5 - 0.4) / (0.8 - 0.3))
-    assert found.retention.published is None, "the paper's ratio is of accuracies above one half"
-    assert (found.backbone.peak, found.backbone.chance) == pytest.approx((0.8, 0.3))
-    low, high = found.backbone.above_ci
+    row = measured(results)
+    assert row.retention.defined
+    assert row.backbone.above == pytest.approx(0.8 - 0.3)
+    assert row.action.above == pytest.approx(0.5 - 0.4)
+    assert row.retention.value == pytest.approx((0.5 - 0.4) / (0.8 - 0.3))
+    assert row.retention.published is None, "the paper's ratio is of accuracies above one half"
+    assert (row.backbone.peak, row.backbone.chance) == pytest.approx((0.8, 0.3))
+    low, high = row.backbone.above_ci
     assert low is not None
     assert high is not None
     assert low < 0.5 < high
@@ -82,28 +84,28 @@ def test_of_one_site_each_it_is_the_ratio_of_scores_minus_the_chance_of_that_sit
 def test_its_variance_is_that_of_group_means_and_its_limits_are_fiellers() -> None:
     """With one site per stream nothing is chosen: the variance is that of a mean over groups."""
     results = label_results({BACKBONE[0]: (0.8, 0.3), ACTION[0]: (0.5, 0.4)}, 60, EACH, noise=0.3)
-    found = measured(results)
+    row = measured(results)
     each = results.curves["all", "mean"].scores.reshape(2, 60, EACH).mean(axis=2)
     errors = each.std(axis=1, ddof=1) / np.sqrt(60)
     quantile = stats.t.ppf(0.975, 59)
-    for peak, error in zip((found.backbone, found.action), errors, strict=True):
+    for peak, error in zip((row.backbone, row.action), errors, strict=True):
         assert peak.above_ci[1] is not None
         assert (peak.above_ci[1] - peak.above) / quantile == pytest.approx(error)
     # Fieller: ratios r at which |a - r b| is t standard errors, from the variances above and their covariance
     covariance = np.cov(each) / 60
-    a, b = found.action.above, found.backbone.above
+    a, b = row.action.above, row.backbone.above
     V, square = covariance[::-1, ::-1], (quantile * OTHER_TRAINING) ** 2
     limits = np.sort(np.roots([b**2 - square * V[1, 1], -2 * (a * b - square * V[0, 1]), a**2 - square * V[0, 0]]))
-    assert found.retention.ci == pytest.approx(tuple(limits))
+    assert row.retention.ci == pytest.approx(tuple(limits))
 
 
 def test_a_site_is_chosen_by_what_it_has_above_its_own_chance() -> None:
     results = label_results(
         {BACKBONE[0]: (0.95, 0.9), BACKBONE[1]: (0.6, 0.1), ACTION[0]: (0.5, 0.4)}, GROUPS, EACH
     )
-    found = measured(results)
-    assert found.backbone.site == str(BACKBONE[1])
-    assert found.backbone.above == pytest.approx(0.5)
+    row = measured(results)
+    assert row.backbone.site == str(BACKBONE[1])
+    assert row.backbone.above == pytest.approx(0.5)
 
 
 def test_with_chance_one_half_it_is_retention_of_sides(
@@ -116,19 +118,19 @@ def test_with_chance_one_half_it_is_retention_of_sides(
     results = label_results(dict.fromkeys(curve.sites, (0.5, 0.5)), 100, 2, suite="")
     scores = curve.correct.astype(float)
     null = np.full((len(curve.sites), 59), 0.5)
-    own = replace(
+    side_curve = replace(
         results.curves["all", "mean"], sample_scores=scores, null=null, inner=curve.inner, groups=curve.groups,
         fold_of=curve.fold_of,
     )  # fmt: skip
     settings = replace(results.settings, seed_text="")
-    found = measured(replace(results, curves={("all", "mean"): own}, settings=settings))
-    assert found.retention.value == pytest.approx(sides.value)
-    assert found.retention.ci == pytest.approx((sides.interval.low, sides.interval.high))
-    assert found.backbone.above == pytest.approx(0.4)
+    row = measured(replace(results, curves={("all", "mean"): side_curve}, settings=settings))
+    assert row.retention.value == pytest.approx(sides.value)
+    assert row.retention.ci == pytest.approx((sides.interval.low, sides.interval.high))
+    assert row.backbone.above == pytest.approx(0.4)
 
 
 @pytest.mark.parametrize(
-    ("planted", "task", "given", "note", "reason"),
+    ("planted", "task", "control_results", "note", "reason"),
     [
         (0.8, "binary", controls("state", 0.79, 0.4), "not shown to exceed state", "state 0.79"),
         (0.31, "binary", controls("state", 0.2, 0.001), "not shown to exceed chance", "chance 0.30, p "),
@@ -136,18 +138,18 @@ def test_with_chance_one_half_it_is_retention_of_sides(
     ],
 )
 def test_without_signal_in_the_backbone_it_is_refused_by_what_is_missing(
-    planted: float, task: str, given: Controls, note: str, reason: str
+    planted: float, task: str, control_results: Controls, note: str, reason: str
 ) -> None:
     spread = 0.02 if note.startswith("not shown to exceed chance") else 0.0
     results = label_results(
         {BACKBONE[0]: (planted, 0.3), ACTION[0]: (0.5, 0.4)}, GROUPS, EACH, task=task, null_spread=spread
     )  # fmt: skip
-    found = measured(replace(results, controls=given))
-    assert not found.retention.defined
-    assert note in found.retention.note
-    assert reason in found.retention.reason
-    assert str(BACKBONE[0]) in found.retention.reason
-    assert "abel" in found.retention.reason, "what to do"
+    row = measured(replace(results, controls=control_results))
+    assert not row.retention.defined
+    assert note in row.retention.note
+    assert reason in row.retention.reason
+    assert str(BACKBONE[0]) in row.retention.reason
+    assert "abel" in row.retention.reason, "what to do"
 
 
 def test_labels_that_change_within_episodes_need_the_control_step() -> None:
@@ -160,17 +162,17 @@ def test_labels_that_change_within_episodes_need_the_control_step() -> None:
 
 def test_without_permutations_there_is_no_chance_and_no_retention() -> None:
     results = label_results({BACKBONE[0]: (0.8, 0.3), ACTION[0]: (0.5, 0.4)}, GROUPS, EACH, permutations=0)
-    found = measured(results)
-    assert found.retention.note == "n/a (no permutations)"
-    assert "--permutations 200" in found.retention.reason
+    row = measured(results)
+    assert row.retention.note == "n/a (no permutations)"
+    assert "--permutations 200" in row.retention.reason
 
 
 def test_a_run_without_an_action_stream_has_no_retention_and_an_unknown_iteration_is_refused() -> None:
-    found = measured(label_results({BACKBONE[0]: (0.8, 0.3)}, GROUPS, EACH))
-    assert not found.retention.defined
-    assert "no site of the action was probed" in found.retention.reason
-    assert found.backbone.peak == pytest.approx(0.8), "what the backbone holds is shown all the same"
-    assert label_finding(found) == "open: no site of the action was probed."
+    row = measured(label_results({BACKBONE[0]: (0.8, 0.3)}, GROUPS, EACH))
+    assert not row.retention.defined
+    assert "no site of the action was probed" in row.retention.reason
+    assert row.backbone.peak == pytest.approx(0.8), "what the backbone holds is shown all the same"
+    assert label_finding(row) == "open: no site of the action was probed."
     both = label_results({BACKBONE[0]: (0.8, 0.3), Site("expert", 0, iteration=1): (0.5, 0.4)}, GROUPS, EACH)
     with pytest.raises(UsageError, match="iterations"):
         measured(both, iterations=7)
@@ -189,17 +191,17 @@ def trained(labelled_run: Path, tmp_path: Path) -> Run:
 @pytest.mark.slow
 def test_what_was_planted_in_the_backbone_alone_does_not_reach_the_action(trained: Run) -> None:
     table = retention_table([trained], target="sim.tool_y")
-    (found,) = table.rows
-    assert found.retention.defined
-    assert found.backbone.site == "backbone.01.residual"
-    assert found.backbone.has_signal
-    assert not found.action.has_signal
-    assert abs(found.retention.value) < 0.2
-    assert found.retention.ci[0] is not None
-    assert found.retention.ci[1] is not None
-    assert found.retention.ci[0] < found.retention.value < found.retention.ci[1]
+    (row,) = table.rows
+    assert row.retention.defined
+    assert row.backbone.site == "backbone.01.residual"
+    assert row.backbone.has_signal
+    assert not row.action.has_signal
+    assert abs(row.retention.value) < 0.2
+    assert row.retention.ci[0] is not None
+    assert row.retention.ci[1] is not None
+    assert row.retention.ci[0] < row.retention.value < row.retention.ci[1]
     frame = table.to_frame()
-    assert frame.loc[0, "retention.value"] == found.retention.value
+    assert frame.loc[0, "retention.value"] == row.retention.value
     stored = json.loads(table.to_json())
     assert stored[0]["backbone"]["site"] == "backbone.01.residual"
     assert "%" in stored[0]["finding"] or "not beyond" in stored[0]["finding"]
@@ -209,20 +211,20 @@ def test_what_was_planted_in_the_backbone_alone_does_not_reach_the_action(traine
 
 @pytest.mark.slow
 def test_the_command_prints_it_in_every_format_and_names_what_a_label_does_not_have(trained: Run) -> None:
-    place = str(trained.path)
+    run_path = str(trained.path)
     for style in ("table", "json", "csv", "markdown", "latex"):
-        done = CliRunner().invoke(app, ["retention", place, "--target", "sim.tool_y", "--format", style])
-        assert done.exit_code == 0, done.output
-        assert "sim.tool" in done.stdout.replace("\\", "")
-    done = CliRunner().invoke(app, ["retention", place, "--target", "sim.tool_y", "--rule", "box"])
-    assert done.exit_code == 2
-    assert "--rule is not for labels of your own" in " ".join(done.stderr.split())
-    done = CliRunner().invoke(app, ["retention", place, "--family", "table"])
-    assert done.exit_code == 2
-    assert "--family is for labels of your own" in " ".join(done.stderr.split())
-    done = CliRunner().invoke(app, ["retention", place, "--target", "sim.tool_z"])
-    assert done.exit_code == 2
-    assert "'sim.tool_z'" in done.stderr
+        result = CliRunner().invoke(app, ["retention", run_path, "--target", "sim.tool_y", "--format", style])
+        assert result.exit_code == 0, result.output
+        assert "sim.tool" in result.stdout.replace("\\", "")
+    result = CliRunner().invoke(app, ["retention", run_path, "--target", "sim.tool_y", "--rule", "box"])
+    assert result.exit_code == 2
+    assert "--rule is not for labels of your own" in " ".join(result.stderr.split())
+    result = CliRunner().invoke(app, ["retention", run_path, "--family", "table"])
+    assert result.exit_code == 2
+    assert "--family is for labels of your own" in " ".join(result.stderr.split())
+    result = CliRunner().invoke(app, ["retention", run_path, "--target", "sim.tool_z"])
+    assert result.exit_code == 2
+    assert "'sim.tool_z'" in result.stderr
 
 
 def test_runs_whose_labels_differ_are_not_put_into_one_table(trained: Run, tmp_path: Path) -> None:
@@ -254,9 +256,9 @@ NAMES = ["even", "kind", "sim.tool_y"]
 
 def test_one_table_has_a_binary_label_one_of_classes_and_a_continuous_one_and_no_mean_of_them(three: Run) -> None:
     command = ["retention", str(three.path), *(part for name in NAMES for part in ("--target", name))]
-    done = CliRunner().invoke(app, [*command, "--format", "json"])
-    assert done.exit_code == 0, done.output
-    rows = json.loads(done.stdout)
+    result = CliRunner().invoke(app, [*command, "--format", "json"])
+    assert result.exit_code == 0, result.output
+    rows = json.loads(result.stdout)
     assert [(row["target"], row["task"]) for row in rows] == [
         ("even", "binary"), ("kind", "classes"), ("sim.tool_y", "continuous"),
     ]  # fmt: skip
@@ -269,9 +271,9 @@ def test_one_table_has_a_binary_label_one_of_classes_and_a_continuous_one_and_no
         assert [cells[1] for cells in text.texts] == ["balanced accuracy", "balanced accuracy", "R²"]
         assert len(text.rows) == len(NAMES), "no row is a mean over tasks"
     for style in ("table", "csv", "markdown", "latex"):
-        done = CliRunner().invoke(app, [*command, "--format", style], env={"COLUMNS": "250"})
-        assert done.exit_code == 0, done.output
-        assert all(name.replace("_", "") in done.stdout.replace("\\", "").replace("_", "") for name in NAMES)
+        result = CliRunner().invoke(app, [*command, "--format", style], env={"COLUMNS": "250"})
+        assert result.exit_code == 0, result.output
+        assert all(name.replace("_", "") in result.stdout.replace("\\", "").replace("_", "") for name in NAMES)
 
 
 @pytest.mark.slow
@@ -304,14 +306,14 @@ def holm_by_hand(family: list[float], p: float) -> float:
 
 def test_a_site_that_is_above_chance_alone_may_not_be_among_several_labels() -> None:
     results = label_results({BACKBONE[0]: (0.8, 0.3), ACTION[0]: (0.5, 0.4)}, GROUPS, EACH)
-    found = measured(results)
-    assert found.retention.defined
-    corrected = with_corrected_p(found, results, 0.06, None, 2)
+    row = measured(results)
+    assert row.retention.defined
+    corrected = with_corrected_p(row, results, 0.06, None, 2)
     assert not corrected.retention.defined
     assert corrected.retention.note == "n/a (backbone not shown to exceed chance)"
     assert "p 0.060" in corrected.retention.reason
-    assert corrected.action.p_fwe == found.action.p_fwe
-    assert corrected.retention.value == found.retention.value
+    assert corrected.action.p_fwe == row.action.p_fwe
+    assert corrected.retention.value == row.retention.value
 
 
 @pytest.mark.slow
@@ -320,28 +322,30 @@ def test_stored_probes_are_chosen_by_key_for_one_target_that_they_are_of(three: 
     other = train_probes(three, target=labels, permutations=19, controls=("step",))
     newest = retention_table([three], target="sim.tool_y")
     assert newest.rows[0].run.probes == other.key
-    first = next(one for one in stored_probes(three) if one.permutations == 39 and "tool_y" in str(one.target))
-    place = str(three.path)
+    first = next(
+        stored for stored in stored_probes(three) if stored.permutations == 39 and "tool_y" in str(stored.target)
+    )
+    run_path = str(three.path)
 
-    def asked(*further: str) -> tuple[int, str, str]:
-        done = CliRunner().invoke(app, ["retention", place, *further, "--format", "csv"])
-        return done.exit_code, done.stdout, " ".join(done.stderr.split())
+    def retention_csv(*options: str) -> tuple[int, str, str]:
+        result = CliRunner().invoke(app, ["retention", run_path, *options, "--format", "csv"])
+        return result.exit_code, result.stdout, " ".join(result.stderr.split())
 
-    code, said, _ = asked("--target", "sim.tool_y", "--probes", f"{place}={first.key}")
+    code, csv_text, _ = retention_csv("--target", "sim.tool_y", "--probes", f"{run_path}={first.key}")
     assert code == 0
-    assert first.key in said
-    code, _, error = asked("--target", "kind", "--probes", f"{place}={first.key}")
+    assert first.key in csv_text
+    code, _, error = retention_csv("--target", "kind", "--probes", f"{run_path}={first.key}")
     assert code == 2
     assert f"the probes {first.key} are of 'sim.tool_y', not of 'kind'" in error
-    code, _, error = asked("--target", "kind", "--target", "even", "--probes", f"{place}={first.key}")
+    code, _, error = retention_csv("--target", "kind", "--target", "even", "--probes", f"{run_path}={first.key}")
     assert code == 2
     assert "a key is of one" in error
-    code, _, error = asked("--probes", f"{place}={first.key}")
+    code, _, error = retention_csv("--probes", f"{run_path}={first.key}")
     assert code == 2, "without --target a key of a label is none of sides"
     assert first.key in error
     with pytest.raises(UsageError, match="'kind' is given twice"):
         retention_table([three], target=["kind", "kind"])
-    code, _, error = asked(place, "--target", "kind")
+    code, _, error = retention_csv(run_path, "--target", "kind")
     assert code == 2
     assert "is given twice" in error
 
@@ -355,19 +359,19 @@ def test_recordings_have_a_table_and_a_page_though_they_have_no_success_rate(tmp
     train_probes(
         run, target=Target.of_run(run, "dataset.state.x"), permutations=39, controls=("step", "instruction")
     )
-    found = retention_table([run], target="dataset.state.x")
-    assert found.rows[0].run.name == "shown (capture only)"
-    assert found.rows[0].retention.defined
+    table = retention_table([run], target="dataset.state.x")
+    assert table.rows[0].run.name == "shown (capture only)"
+    assert table.rows[0].retention.defined
     page = tmp_path / "report.html"
-    done = CliRunner().invoke(
+    result = CliRunner().invoke(
         app, ["retention", str(run.path), "--target", "dataset.state.x", "--html", str(page)]
     )
-    assert done.exit_code == 0, done.output
+    assert result.exit_code == 0, result.output
     assert "kitchen#" in page.read_text(encoding="utf-8")
     assert "data:image/webp" not in page.read_text(encoding="utf-8"), "no picture of a recording"
-    done = CliRunner().invoke(app, ["retention", str(run.path)])
-    assert done.exit_code == 2
-    assert f"probe-kit targets {run.path}" in " ".join(done.stderr.split())
+    result = CliRunner().invoke(app, ["retention", str(run.path)])
+    assert result.exit_code == 2
+    assert f"probe-kit targets {run.path}" in " ".join(result.stderr.split())
 
 
 def test_runs_without_outcomes_have_a_name(trained: Run) -> None:
@@ -377,10 +381,10 @@ def test_runs_without_outcomes_have_a_name(trained: Run) -> None:
 
 
 def test_runs_of_one_name_are_told_apart(probed_run: Callable[..., ArrayRun], tmp_path: Path) -> None:
-    one = probed_run({"color": ([0.5, 0.8], [[0.6]])})
-    features = {key: np.ones_like(values) for key, values in one.features.items()}
-    other = ArrayRun(tmp_path / "other", one.model, one.suite, one.episodes, features)
-    table = retention_table([one, other])
+    first = probed_run({"color": ([0.5, 0.8], [[0.6]])})
+    features = {key: np.ones_like(values) for key, values in first.features.items()}
+    other = ArrayRun(tmp_path / "other", first.model, first.suite, first.episodes, features)
+    table = retention_table([first, other])
     labels = {row.run.label for row in table.rows}
     assert len(labels) == 2
     assert all(label.startswith("pi0 · ") for label in labels)
@@ -396,13 +400,13 @@ def test_a_run_alone_keeps_its_name(probed_run: Callable[..., ArrayRun]) -> None
 def test_labels_that_are_given_name_runs_in_tables_figures_and_differences(
     probed_run: Callable[..., ArrayRun],
 ) -> None:
-    one, other = (probed_run({"color": ([0.5, 0.8], [[0.6]])}, name) for name in ("one", "other"))
-    table = retention_table([one, other], labels={str(one.location): "π0", str(other.location): "π0 (SFT)"})
+    first, other = (probed_run({"color": ([0.5, 0.8], [[0.6]])}, name) for name in ("one", "other"))
+    table = retention_table([first, other], labels={str(first.location): "π0", str(other.location): "π0 (SFT)"})
     assert [row.run.label for row in table.rows] == ["π0", "π0 (SFT)"]
     assert {(row.group, row.minus) for row in table.differences} == {("π0 (SFT)", "π0")}
-    assert {own.label for own in table.results.values()} == {"π0", "π0 (SFT)"}
-    assert one.label == "one"
-    alike = retention_table([one, other], labels={str(other.location): "one"})
+    assert {results.label for results in table.results.values()} == {"π0", "π0 (SFT)"}
+    assert first.label == "one"
+    alike = retention_table([first, other], labels={str(other.location): "one"})
     assert len({row.run.label for row in alike.rows}) == 2
     with pytest.raises(UsageError, match="labels are given for elsewhere; the runs are"):
-        retention_table([one], labels={"elsewhere": "π0"})
+        retention_table([first], labels={"elsewhere": "π0"})

@@ -150,9 +150,9 @@ def mmbench_root(tmp_path: Path) -> Path:
 @pytest.fixture
 def okvqa_root(tmp_path: Path) -> Path:
     """Eight pictures of animals and plants, one answer without agreement, one question about food."""
-    named = ["horse", "cow", "sheep", "zebra", "roses", "tulip", "horse", "bear"]
+    names = ["horse", "cow", "sheep", "zebra", "roses", "tulip", "horse", "bear"]
     questions, annotations = [], []
-    for number, noun in enumerate(named):
+    for number, noun in enumerate(names):
         save(picture(200 + number), tmp_path / "train2014" / f"COCO_train2014_{number:012d}.jpg")
         text = "What type of flower is this?" if number in (4, 5) else "What animal is in the picture?"
         answers = [noun] * 8 + ["thing"] * 2

@@ -15,7 +15,7 @@ from probe_kit.errors import SuiteError, UnknownCategoryError, UsageError
 from probe_kit.suite import load_suite, validate_suite
 from probe_kit.suite.converters import convert
 from probe_kit.suite.converters.act2answer import BoundingBoxWarning, object_of, read_tile
-from probe_kit.suite.converters.candidates import trimmed
+from probe_kit.suite.converters.candidates import trim
 from probe_kit.suite.converters.vlthink import upright_board
 from tests.conftest import SHARED
 from tests.support.act2answer_tiles import THICKNESS, WIDTH, art, write_tile
@@ -41,13 +41,13 @@ def test_every_way_a_picture_can_lie_on_a_tile_is_read_from_its_mesh(
 ) -> None:
     """All eight, mirrored ones included: every corner of the tile keeps its colour as seen from above."""
     picture = art(1)
-    seen = np.asarray(read_tile(write_tile(tmp_path / "tile.glb", picture, along_u, down_v)).picture)
+    pixels_read = np.asarray(read_tile(write_tile(tmp_path / "tile.glb", picture, along_u, down_v)).picture)
     pixels, side = np.asarray(picture), picture.width
     for x, y in product((-1, 1), (-1, 1)):
         u, v = ((x * d[0] + y * d[1] + 1) // 2 for d in (along_u, down_v))
         column, row = (u * (side - 1), v * (side - 1))
-        shown = seen[0 if y > 0 else -1, -1 if x > 0 else 0]
-        np.testing.assert_array_equal(shown, pixels[row, column])
+        corner = pixels_read[0 if y > 0 else -1, -1 if x > 0 else 0]
+        np.testing.assert_array_equal(corner, pixels[row, column])
 
 
 def test_the_scenes_turn_of_the_tile_turns_the_picture(tmp_path: Path) -> None:
@@ -65,8 +65,8 @@ def test_the_picture_of_the_top_is_taken_and_not_the_first_of_the_file(tmp_path:
 
 def test_transparency_lies_over_white(tmp_path: Path) -> None:
     clear = Image.new("RGBA", (64, 64), (200, 10, 10, 0))
-    seen = np.asarray(read_tile(write_tile(tmp_path / "tile.glb", clear)).picture)
-    assert (seen == 255).all()
+    pixels_read = np.asarray(read_tile(write_tile(tmp_path / "tile.glb", clear)).picture)
+    assert (pixels_read == 255).all()
 
 
 @pytest.mark.slow
@@ -78,10 +78,10 @@ def test_the_authors_boards_are_upright_as_their_scene_turns_them() -> None:
     for board in boards:
         tile = read_tile(board, yaw=0)
         np.testing.assert_allclose(tile.size, (0.11, 0.11, 0.006), atol=1e-6)
-        known = upright_board(board)
-        ours = trimmed(tile.picture)
+        upright = upright_board(board)
+        ours = trim(tile.picture)
         ours.thumbnail((600, 600), Image.Resampling.LANCZOS)
-        np.testing.assert_array_equal(np.asarray(ours), np.asarray(known), err_msg=str(board))
+        np.testing.assert_array_equal(np.asarray(ours), np.asarray(upright), err_msg=str(board))
         released = np.asarray(read_tile(board).picture)
         np.testing.assert_array_equal(released, np.rot90(np.asarray(tile.picture)), err_msg=str(board))
 
@@ -177,18 +177,20 @@ def test_questions_that_share_a_picture_share_a_group_whatever_its_name(folder: 
 
 
 def test_the_same_set_gives_the_same_bytes(folder: Path, tmp_path: Path) -> None:
-    one, other = (convert("act2answer", folder, tmp_path / name, seed=seed) for seed, name in ((0, "a"), (1, "b")))
-    assert one.identity == other.identity
-    files = [path.relative_to(one.folder) for path in sorted(one.folder.rglob("*")) if path.is_file()]
+    first, other = (
+        convert("act2answer", folder, tmp_path / name, seed=seed) for seed, name in ((0, "a"), (1, "b"))
+    )
+    assert first.identity == other.identity
+    files = [path.relative_to(first.folder) for path in sorted(first.folder.rglob("*")) if path.is_file()]
     assert files
     for file in files:
-        assert (one.folder / file).read_bytes() == (other.folder / file).read_bytes(), file
+        assert (first.folder / file).read_bytes() == (other.folder / file).read_bytes(), file
 
 
-def _change(place: int, **values: Any) -> Callable[[Path], None]:
+def _change(position: int, **values: Any) -> Callable[[Path], None]:
     def apply(folder: Path) -> None:
         pairs = json.loads((folder / "pairs.json").read_text(encoding="utf-8"))
-        pairs[place].update(values)
+        pairs[position].update(values)
         (folder / "pairs.json").write_text(json.dumps(pairs), encoding="utf-8")
 
     return apply

@@ -66,8 +66,8 @@ def test_split_files_are_united_and_types_sorted_into_state_and_attribute(
 
 
 def test_a_whole_file_is_preferred_to_its_parts(compbench_root: Path, tmp_path: Path) -> None:
-    whole = json.loads((compbench_root / f"{STATES}_test.json").read_text(encoding="utf-8"))[:2]
-    (compbench_root / f"{STATES}.json").write_text(json.dumps(whole), encoding="utf-8")
+    all_records = json.loads((compbench_root / f"{STATES}_test.json").read_text(encoding="utf-8"))[:2]
+    (compbench_root / f"{STATES}.json").write_text(json.dumps(all_records), encoding="utf-8")
     suite = convert("mllm-compbench", compbench_root, tmp_path / "suite", categories=["attribute", "state"])
     assert sum(suite.card["counts"].values()) == 2
 
@@ -124,11 +124,12 @@ def test_the_command_counts_by_name_what_it_leaves_out(compbench_root: Path, tmp
     records = json.loads(path.read_text(encoding="utf-8"))
     records[0]["answer"], records[1]["answer"] = "Same", "left"
     path.write_text(json.dumps(records), encoding="utf-8")
-    place = str(tmp_path / "suite")
-    options = ["--root", str(compbench_root), "--out", place, "--categories", "emotion"]
-    said = " ".join(CliRunner().invoke(app, ["suite", "convert", "mllm-compbench", *options]).stderr.split())
+    out = str(tmp_path / "suite")
+    options = ["--root", str(compbench_root), "--out", out, "--categories", "emotion"]
+    message = " ".join(CliRunner().invoke(app, ["suite", "convert", "mllm-compbench", *options]).stderr.split())
     assert (
-        "records left out: answer is 'Same', not Left or Right 1×; answer is 'left', not Left or Right 1×" in said
+        "records left out: answer is 'Same', not Left or Right 1×; answer is 'left', not Left or Right 1×"
+        in message
     )
 
 
@@ -307,8 +308,8 @@ def test_a_file_that_ends_inside_a_row_is_refused(mmbench_root: Path, tmp_path: 
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (lambda whole: whole[: len(whole) // 2 // 4 * 4], "image: not a picture that Pillow can decode"),
-        (lambda whole: whole[:-3], "image: not base64"),
+        (lambda content: content[: len(content) // 2 // 4 * 4], "image: not a picture that Pillow can decode"),
+        (lambda content: content[:-3], "image: not base64"),
         (lambda _: base64.b64encode(b"II*\0" + bytes(60)).decode(), "image: is TIFF"),
     ],
 )

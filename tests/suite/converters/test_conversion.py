@@ -19,9 +19,9 @@ def test_two_conversions_are_equal_byte_for_byte(vlthink_root: Path, tmp_path: P
 
 
 def test_another_seed_gives_another_sample(vlthink_root: Path, tmp_path: Path) -> None:
-    one = convert("vl-think", vlthink_root, tmp_path / "one", n=6, seed=0)
+    first = convert("vl-think", vlthink_root, tmp_path / "one", n=6, seed=0)
     other = convert("vl-think", vlthink_root, tmp_path / "other", n=6, seed=1)
-    assert {item.pair_id for item in one.items} != {item.pair_id for item in other.items}
+    assert {item.pair_id for item in first.items} != {item.pair_id for item in other.items}
 
 
 @pytest.mark.slow

@@ -44,10 +44,10 @@ class EncoderVLA(nn.Module):
         image = functional.interpolate(image, (64, 64), mode="bilinear")
         tokens = torch.cat([self.patches(image).flatten(2).mT, self.letters(letters)], 1) + self.places.weight
         padding = functional.pad(letters == 0, (PATCHES, 0), value=False)
-        kept = self.backbone(tokens, src_key_padding_mask=padding) * ~padding[..., None]
-        known = kept.sum(1) / (~padding).sum(1)[:, None]
+        hidden = self.backbone(tokens, src_key_padding_mask=padding) * ~padding[..., None]
+        pooled = hidden.sum(1) / (~padding).sum(1)[:, None]
         for step in range(STEPS):
-            prefix = torch.stack([known, self.state(state)], 1)
+            prefix = torch.stack([pooled, self.state(state)], 1)
             x = torch.cat([prefix, self.noisy(action) + self.when.weight[step]], 1)
             action = action + self.velocity(self.expert(x))[:, 2:] / STEPS
         return action
@@ -67,17 +67,19 @@ class EncoderPolicy(Policy):
     def __init__(self, network: EncoderVLA, card: ModelCard) -> None:
         self.network, self.card = network, card
 
-    def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
-        self.check(seen, seeds)
-        image = torch.stack([torch.from_numpy(one.image).permute(2, 0, 1) / 255 for one in seen])
-        state = torch.from_numpy(np.stack([one.state for one in seen]))
+    def act(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+        self.check(observations, seeds)
+        image = torch.stack(
+            [torch.from_numpy(observation.image).permute(2, 0, 1) / 255 for observation in observations]
+        )
+        state = torch.from_numpy(np.stack([observation.state for observation in observations]))
         noise = [torch.randn(CHUNK, 7, generator=torch.Generator().manual_seed(seed)) for seed in seeds]
         with torch.inference_mode():
-            raw = self.network(image, self._letters(seen), state, torch.stack(noise))
+            raw = self.network(image, self._letters(observations), state, torch.stack(noise))
         return np.asarray(torch.cat([0.02 * raw[..., :6], raw[..., 6:].sigmoid()], -1).numpy())
 
-    def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
-        lengths = (self._letters(seen) > 0).sum(1).tolist()
+    def roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
+        lengths = (self._letters(observations) > 0).sum(1).tolist()
         rows = [["image.primary"] * PATCHES + ["language"] * n + ["padding"] * (LETTERS - n) for n in lengths]
         suffix = Roles.from_labels(["special", "state", *["action"] * CHUNK])
         return {"backbone": [Roles.from_labels(row) for row in rows], "expert": [suffix] * len(rows)}
@@ -95,8 +97,8 @@ class EncoderPolicy(Policy):
         return Tap(block.dropout1 if site.quantity == "attention" else block.dropout2, fires, "output")
 
     @staticmethod
-    def _letters(seen: Sequence[Observation]) -> Tensor:
-        texts = [one.instruction.encode() for one in seen]
+    def _letters(observations: Sequence[Observation]) -> Tensor:
+        texts = [observation.instruction.encode() for observation in observations]
         if too_long := [text.decode() for text in texts if len(text) > LETTERS]:
             raise InstructionError(f"{too_long[0]!r} has more than {LETTERS} letters; shorten it")
         return torch.tensor([list(text) + [0] * (LETTERS - len(text)) for text in texts])

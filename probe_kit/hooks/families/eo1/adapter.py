@@ -35,7 +35,7 @@ from probe_kit.hooks.families.shared.lerobot.flow import PackedPolicy, Tokens, c
 from probe_kit.hooks.families.shared.lerobot.pipelines import check_same, step_fields
 from probe_kit.hooks.families.shared.lerobot.policy import checked_steps
 from probe_kit.hooks.families.shared.taps import Stack, kept_prompt, token_stack
-from probe_kit.models.building import build_empty, building_device, fill_rotary, replaced
+from probe_kit.models.building import build_empty, building_device, fill_rotary, replace_attributes
 from probe_kit.models.checkpoint_files import load_pretrained
 from probe_kit.models.decoding import PromptKV
 from probe_kit.models.qwen import qwen2_5_vl_config
@@ -83,7 +83,7 @@ def chat_step(folder: Path, fields: Mapping[str, Any]) -> EO1QwenProcessorStep:
     """
     logging.getLogger("transformers.processing_utils").addFilter(_is_news)
     safely = SimpleNamespace(from_pretrained=partial(load_pretrained, Qwen2_5_VLProcessor))
-    with replaced(processor_eo1, {"Qwen2_5_VLProcessor": safely}):
+    with replace_attributes(processor_eo1, {"Qwen2_5_VLProcessor": safely}):
         step = EO1QwenProcessorStep(**{**fields, "processor_name": str(folder)})
     if step._processor.chat_template is None:
         raise CheckpointError(f"{folder} has no chat_template, and EO-1 reads a chat. Take Qwen2.5-VL's own files")
@@ -216,6 +216,6 @@ class Eo1(PackedPolicy):
         shared = (decoder.layers, decoder.norm, int(decoder.config.hidden_size))
         return {"backbone": token_stack(*shared, None), "expert": token_stack(*shared, steps, first=1)}
 
-    def watched(self) -> dict[str, nn.Module]:
+    def recorded_modules(self) -> dict[str, nn.Module]:
         """Return the module of the velocity."""
         return {"velocity": self.network.model.action_out_proj}

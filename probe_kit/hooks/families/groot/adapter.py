@@ -261,7 +261,7 @@ class Groot(PackedPolicy):
 
     # -- verification ------------------------------------------------------------------------------------
 
-    def watched(self) -> dict[str, nn.Module]:
+    def recorded_modules(self) -> dict[str, nn.Module]:
         """Return the module of the velocity."""
         return {"velocity": self._head.action_decoder}
 

@@ -38,7 +38,7 @@ from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE
 from probe_kit.hooks.checkpoints.folders import inside_or_hub
 from probe_kit.hooks.families.groot.packing import check_widths, processor_settings, read_state_fields
 from probe_kit.hooks.families.shared.kinds import IMAGES, STATE, Evaluation
-from probe_kit.models.building import build_empty, building_device, replaced
+from probe_kit.models.building import build_empty, building_device, replace_attributes
 
 VLM = GROOT_N1_7_BACKBONE_MODEL
 """The model whose configuration lerobot holds itself; any other is read from its folder."""
@@ -81,8 +81,10 @@ def build_groot(config: GrootConfig, network: GR00TN17Config, device: str = "cpu
         return model
 
     with (
-        replaced(modeling_groot, {"GR00TN17": SimpleNamespace(from_pretrained=built)}),
-        replaced(groot_n1_7, {"get_backbone_cls": lambda _: Qwen3Backbone}),  # which warns of every other name
+        replace_attributes(modeling_groot, {"GR00TN17": SimpleNamespace(from_pretrained=built)}),
+        replace_attributes(
+            groot_n1_7, {"get_backbone_cls": lambda _: Qwen3Backbone}
+        ),  # which warns of every other name
     ):
         policy = GrootPolicy(config)
     policy.eval()
@@ -105,7 +107,7 @@ def flow_actions(policy: Any, inputs: Mapping[str, Tensor], noise: Tensor) -> Te
         noise: (B, H, D), of the network's own horizon H and widest action D.
     """
     model, head = policy._groot_model, policy._groot_model.action_head
-    placed = {name: _placed(tensor, model) for name, tensor in inputs.items()}
+    placed = {name: _place_tensor(tensor, model) for name, tensor in inputs.items()}
     with _precision(policy, noise.device.type):
         prompt = model.backbone(BatchFeature(placed))
         features = head._encode_features(prompt, BatchFeature(placed))
@@ -129,7 +131,7 @@ def flow_actions(policy: Any, inputs: Mapping[str, Tensor], noise: Tensor) -> Te
     return actions
 
 
-def _placed(tensor: Tensor, model: Any) -> Tensor:
+def _place_tensor(tensor: Tensor, model: Any) -> Tensor:
     """Return a tensor as the network's own `prepare_input` does: numbers in the precision of its weights."""
     return tensor.to(model.device, model.dtype if tensor.is_floating_point() else tensor.dtype)
 

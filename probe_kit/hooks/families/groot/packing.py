@@ -227,7 +227,7 @@ class NvidiasPictures(GrootN17VLMEncodeStep):  # type: ignore[misc]
 
     def resized(self, picture: NDArray[np.uint8]) -> Tensor:
         """Resize a picture (H, W, 3) uint8 to (3, H, W) uint8."""
-        square = _letterboxed(picture) if self.letter_box_transform else picture
+        square = _letterbox(picture) if self.letter_box_transform else picture
         if self.use_albumentations:
             return torch.from_numpy(np.ascontiguousarray(self._by_area(square))).permute(2, 0, 1)
         tensor = torch.from_numpy(square).permute(2, 0, 1)
@@ -290,7 +290,7 @@ def lerobots_rule(step: GrootN17VLMEncodeStep) -> str:
     return f"{kind}, as lerobot {version('lerobot')}; NVIDIA's code differs (-M resize=nvidia)"
 
 
-def _letterboxed(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def _letterbox(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Pad a picture (H, W, 3) to (side, side, 3), with black bars on both ends."""
     height, width = picture.shape[:2]
     side = max(height, width)
@@ -370,13 +370,13 @@ def _nvidias_steps(folder: Path, config: GrootConfig, settings: Mapping[str, Any
 def _lerobots_steps(folder: Path, config: GrootConfig) -> Steps:
     check_pipelines(folder)
     saved = [(name, step) for name in (PREPROCESSOR, POSTPROCESSOR) for step in saved_steps(folder, name)]
-    steps = [_built(folder, name, step) for name, step in saved if step.name not in _HARMLESS]
+    steps = [_build_step(folder, name, step) for name, step in saved if step.name not in _HARMLESS]
     # What the configuration says of the gripper counts, as in lerobot, not what the step was saved with.
     _apply_groot_action_decode_transform(SimpleNamespace(steps=steps), config.action_decode_transform)
     return _select_steps(steps, "policy_preprocessor.json and policy_postprocessor.json")
 
 
-def _built(folder: Path, pipeline: str, saved: SavedStep) -> Any:
+def _build_step(folder: Path, pipeline: str, saved: SavedStep) -> Any:
     """Build lerobot's object of a saved step of a pipeline; never by the name of a class, which could be any.
 
     Raises:

@@ -106,7 +106,7 @@ def action_units(
             of their own.
     """
     if isinstance(step, GrootN17ActionDecodeStep):
-        return _grouped(step, numbers, source, () if fields is None else fields.action_deviations)
+        return _group_statistics(step, numbers, source, () if fields is None else fields.action_deviations)
     if not step.normalize_min_max:
         raise CheckpointError(f"{source} does not normalise actions: their units are unknown")
     stored = (step.stats or {}).get("action", {})
@@ -196,7 +196,7 @@ def _mode(names: tuple[str, str], scored: NDArray[np.bool_]) -> str:
     return bounds_mode if not scored.any() else "MEAN_STD" if scored.all() else f"{bounds_mode} and MEAN_STD"
 
 
-def _grouped(
+def _group_statistics(
     step: GrootN17ActionDecodeStep, numbers: int, source: str, scored: Collection[str] = ()
 ) -> Normaliser:
     """Return the groups of NVIDIA's statistics side by side, in the order of the configuration.

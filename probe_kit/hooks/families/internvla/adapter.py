@@ -35,16 +35,16 @@ from probe_kit.hooks.families.shared.qwen import BACKBONE_ROLES, QwenVLA, record
 from probe_kit.hooks.families.shared.taps import decoder_tap
 from probe_kit.hooks.families.shared.token_decoder import seeded_noise
 from probe_kit.hooks.outputs import Arrays, Outputs, Produce, numpy_of, stream_outputs, watch
-from probe_kit.models.checkpoint_files import STATISTICS_FILE, renamed
+from probe_kit.models.checkpoint_files import STATISTICS_FILE, rename_tensor
 from probe_kit.models.internvla import (
     VLM_PREFIX,
     InternVLANetwork,
     Schedule,
     build_internvla,
     dino_pixels,
-    guided,
     look,
     prompt,
+    uses_guidance,
 )
 from probe_kit.models.qwen import QWEN2_5_NAMES, QwenInputs
 
@@ -87,7 +87,7 @@ class InternVLA(QwenVLA):
         }
         expert = ("condition", "action")
         self.role_names = {"backbone": BACKBONE_ROLES, "bridge": ("query",), "expert": expert}
-        if guided(guidance):
+        if uses_guidance(guidance):
             self.role_names[_UNCONDITIONAL] = expert
         units = self.units_or_reason()
         key, numbers = ("none", "none") if isinstance(units, str) else (units.key, units.sha256)
@@ -117,7 +117,7 @@ class InternVLA(QwenVLA):
             Stream("bridge", query.last - query.first + 1, query.width, part="bridge", quantities=_BLOCK),
             Stream("expert", head.blocks + 1, head.width, steps, part="action", heads=head.heads),
         ]
-        if guided(self.guidance):
+        if uses_guidance(self.guidance):
             label = "action expert without condition"
             streams.append(
                 Stream(
@@ -238,7 +238,7 @@ class InternVLA(QwenVLA):
 
     def _expert_tap(self, site: Site) -> Tap:
         head, parts = self.network.head, {"attention": "attn", "heads": "attn.proj", "mlp": "mlp"}
-        rows = Rows(1 if site.stream == _UNCONDITIONAL else 0, 2 if guided(self.guidance) else 1)
+        rows = Rows(1 if site.stream == _UNCONDITIONAL else 0, 2 if uses_guidance(self.guidance) else 1)
         norm, steps = head.final_layer.norm_final, len(self.schedule)
         return decoder_tap(head.blocks, norm, site, steps, "norm1", parts, rows=rows)
 
@@ -300,7 +300,7 @@ def load_internvla(
 def _name_in_module(name: str) -> str:
     """The network's name of a tensor; runs on transformers before 4.52 have other ones of Qwen2.5-VL."""
     inside = name.removeprefix(VLM_PREFIX)
-    return name if inside == name else f"{VLM_PREFIX}{renamed(inside, QWEN2_5_NAMES)}"
+    return name if inside == name else f"{VLM_PREFIX}{rename_tensor(inside, QWEN2_5_NAMES)}"
 
 
 # -- verification ---------------------------------------------------------------------------------------------

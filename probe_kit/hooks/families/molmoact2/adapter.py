@@ -43,8 +43,8 @@ from probe_kit.hooks.families.shared.lerobot.pipelines import Inert
 from probe_kit.hooks.families.shared.lerobot.policy import checked_steps
 from probe_kit.hooks.families.shared.loading import DTYPES
 from probe_kit.hooks.families.shared.taps import TOWER, Note, Stack, recording_weights, shares
-from probe_kit.hooks.outputs import Produce, RecordedRun, stacked
-from probe_kit.models.building import Gate, build_empty, building_device, replaced
+from probe_kit.hooks.outputs import Produce, RecordedRun, stack_layers
+from probe_kit.models.building import Gate, build_empty, building_device, replace_attributes
 from probe_kit.models.checkpoint_files import load_pretrained
 from probe_kit.models.decoding import PromptKV
 
@@ -126,7 +126,7 @@ def lerobots_policy(
         "MolmoAct2ForConditionalGeneration": SimpleNamespace(from_pretrained=built),
         "_strict_load_safetensors_weights": lambda *_: None,
     }
-    with replaced(modeling_molmoact2, replacements):
+    with replace_attributes(modeling_molmoact2, replacements):
         policy = MolmoAct2Policy(config)
     policy.eval()
     policy._set_inference_cuda_graph_enabled(False)
@@ -327,10 +327,10 @@ class MolmoAct2(PackedPolicy):
         is_state = kind == "STATE"
         numbers = self.state_numbers if is_state else self._action_numbers
         stored = load_file(self.folder / units.source) if units.mode != "IDENTITY" else {}
-        plain = _of_width(~stored.get(f"{feature}.mask", np.ones(0, bool)).astype(bool), numbers)
+        plain = _mask_of_width(~stored.get(f"{feature}.mask", np.ones(0, bool)).astype(bool), numbers)
         clamped = np.full(numbers, config.clamps_state if is_state else config.clamps_action)
         if is_state:
-            clamped &= ~(plain if config.unclamped is None else _of_width(config.unclamped, numbers))
+            clamped &= ~(plain if config.unclamped is None else _mask_of_width(config.unclamped, numbers))
         frame = config.state_frame if is_state else config.action_frame
         statistics = (units.mode, units.low, units.high, units.eps, units.source)
         return FramedUnits(*statistics, plain=plain, clamped=clamped, frame=frame, stored=units.stored)
@@ -406,13 +406,13 @@ class MolmoAct2(PackedPolicy):
 
     # -- verification ------------------------------------------------------------------------------------
 
-    def watched(self) -> dict[str, nn.Module]:
+    def recorded_modules(self) -> dict[str, nn.Module]:
         """Return the module of the velocity."""
         return {"velocity": self.network._backbone().action_expert.final_layer}
 
     def further_outputs(self, run: RecordedRun) -> dict[str, Produce]:
         """Return the backbone without its end, which only its final norm reads."""
-        return {"backbone_resid": lambda: stacked(run.activations, self.streams["backbone"])[0, :-1]}
+        return {"backbone_resid": lambda: stack_layers(run.activations, self.streams["backbone"])[0, :-1]}
 
 
 def _on_the_prompt(attention: Any, inputs: tuple[Any, ...], keywords: dict[str, Any], _: Any) -> Tensor:
@@ -424,6 +424,6 @@ def _on_the_prompt(attention: Any, inputs: tuple[Any, ...], keywords: dict[str, 
     return shares(queries, keys, attention.head_dim**-0.5, {"attention_mask": keywords.get("attn_mask")})
 
 
-def _of_width(marked: NDArray[np.bool_], numbers: int) -> NDArray[np.bool_]:
+def _mask_of_width(marked: NDArray[np.bool_], numbers: int) -> NDArray[np.bool_]:
     """Return a mask (numbers,), or nothing marked where it is of another width, as in lerobot."""
     return marked if marked.shape == (numbers,) else np.zeros(numbers, bool)

@@ -18,7 +18,7 @@ _VLM_TINY = SourceWeights(
 )
 
 
-def _embedded(name: str, summary: str, notes: str) -> Family:
+def _embedded_family(name: str, summary: str, notes: str) -> Family:
     """Return one of the embedded policies."""
     return Family(
         name,
@@ -38,17 +38,17 @@ def _embedded(name: str, summary: str, notes: str) -> Family:
 
 
 FAMILIES = (
-    _embedded(
+    _embedded_family(
         "pi0-tiny",
         "pi0 at 0.84 million parameters, the embedded default: vlm-tiny's backbone, acts on Color and Shape",
         "State is readable in its backbone and not acted on; nothing else was trained",
     ),
-    _embedded(
+    _embedded_family(
         "pi0-tiny-early",
         "the embedded default before its training: vlm-tiny's backbone, an expert with random weights",
         "a model organism: see `probe-kit demo --compare`",
     ),
-    _embedded(
+    _embedded_family(
         "pi0-tiny-state",
         "the embedded default, but that it was trained to act on State too",
         "a model organism: see `probe-kit demo --compare`",

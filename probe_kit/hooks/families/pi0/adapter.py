@@ -45,8 +45,8 @@ from probe_kit.hooks.families.shared.lerobot.normaliser import (
 )
 from probe_kit.hooks.families.shared.lerobot.pipelines import CROP, Inert
 from probe_kit.hooks.families.shared.lerobot.policy import LerobotPolicy
-from probe_kit.hooks.families.shared.lerobot.window import PictureWindow, padded_top_left, squashed
-from probe_kit.hooks.families.shared.taps import Note, Stack, flow_stacks, recording_weights, returned
+from probe_kit.hooks.families.shared.lerobot.window import PictureWindow, padded_top_left, squash
+from probe_kit.hooks.families.shared.taps import Note, Stack, flow_stacks, recording_weights, returned_weights
 from probe_kit.models.embedded import embedded_checkpoint
 from probe_kit.models.pi0 import Pi0Size, build_pi0, build_pi05, current_pi0_keys, current_pi05_keys
 
@@ -189,7 +189,7 @@ class Pi0(PaliGemmaPolicy, LerobotFlow):
             )
         height, width = self.config.image_resolution
         if self.picture == "squashed":
-            return super().look(camera, [squashed(image, (height, width)) for image in images])
+            return super().look(camera, [squash(image, (height, width)) for image in images])
         return padded_top_left(super().look(camera, images), (height, width))
 
     def laid_out(self, states: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -243,7 +243,7 @@ class Pi0(PaliGemmaPolicy, LerobotFlow):
             note(block, iteration, weights[:, :, acting, : weights.shape[-1] - len(acting)])
 
         return recording_weights(
-            [layer.self_attn for layer in self._joint.gemma_expert.model.layers], note_acting, returned
+            [layer.self_attn for layer in self._joint.gemma_expert.model.layers], note_acting, returned_weights
         )
 
 

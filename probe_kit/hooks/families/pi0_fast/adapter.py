@@ -51,14 +51,14 @@ from probe_kit.hooks.families.shared.taps import (
     LAST,
     Note,
     Stack,
+    decoder_attention,
     flow_stacks,
     kept_prompt,
-    of_decoder,
     token_stack,
 )
 from probe_kit.hooks.families.shared.token_decoder import chooser
 from probe_kit.hooks.outputs import Arrays, Produce, RecordedRun, numpy_of
-from probe_kit.models.building import replaced
+from probe_kit.models.building import replace_attributes
 from probe_kit.models.decoding import PromptKV
 from probe_kit.models.pi0 import EMBEDDING, LM_HEAD, PaliGemmaSize, build_resized, current_keys
 
@@ -224,7 +224,7 @@ _NO_TOKENIZER = SimpleNamespace(from_pretrained=lambda *_, **__: None)
 
 def build_pi0_fast(config: PI0FastConfig, size: PaliGemmaSize | None = None, device: str = "cpu") -> PI0FastPolicy:
     """Build a `PI0FastPolicy` without tokenizers; see `build_resized`."""
-    with replaced(modeling_pi0_fast, {"AutoProcessor": _NO_TOKENIZER, "AutoTokenizer": _NO_TOKENIZER}):
+    with replace_attributes(modeling_pi0_fast, {"AutoProcessor": _NO_TOKENIZER, "AutoTokenizer": _NO_TOKENIZER}):
         policy = build_resized(PI0FastPolicy, config, size, device)
     joint: Any = policy.model.paligemma_with_expert
     joint.prompt_kv = PromptKV(len(joint.paligemma.model.language_model.layers))
@@ -426,7 +426,7 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
 
     def record_attention(self, note: Note) -> AbstractContextManager[None]:
         """Record attention that is computed once more for the position that chooses a token."""
-        return of_decoder(self._decoder.layers, note)
+        return decoder_attention(self._decoder.layers, note)
 
     # -- capture -----------------------------------------------------------------------------------------
 
@@ -462,7 +462,7 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
         ids = self.tokens(batch, range(len(batch[TOKENS])))
         return {"actions": np.stack([chunk.values for chunk in self.chunks(ids)]), "tokens": numpy_of(ids)}
 
-    def watched(self) -> dict[str, nn.Module]:
+    def recorded_modules(self) -> dict[str, nn.Module]:
         """Return the module of the logits."""
         return {"logits": self.network.model.paligemma_with_expert.paligemma.lm_head}
 

@@ -22,7 +22,7 @@ from probe_kit.hooks.checkpoints.weights import (
     Weights,
     check_kinds,
     read_weights,
-    unpickled,
+    unpickle_weights,
     with_adapter,
 )
 from probe_kit.hooks.families.shared.loading import DTYPES, Loaded, load_network
@@ -56,10 +56,10 @@ def quantise(network: "PrismaticNetwork", bits: int) -> None:
     for block in network.language_model.model.layers:
         for name, linear in [(n, m) for n, m in block.named_modules() if isinstance(m, nn.Linear)]:
             parent, _, child = name.rpartition(".")
-            setattr(block.get_submodule(parent), child, _packed(library.nn, linear, bits))
+            setattr(block.get_submodule(parent), child, _pack_network(library.nn, linear, bits))
 
 
-def _packed(layers: Any, linear: nn.Linear, bits: int) -> nn.Module:
+def _pack_network(layers: Any, linear: nn.Linear, bits: int) -> nn.Module:
     sizes, bias = (linear.in_features, linear.out_features), linear.bias is not None
     packed: nn.Module
     if bits == 8:
@@ -99,7 +99,7 @@ def read_release(file: Path, config: PrismaticConfig) -> Weights:
         WeightsError: For a file of another layout.
         CheckpointError: For a tower that cannot be fetched.
     """
-    content = unpickled(file)
+    content = unpickle_weights(file)
     parts = content.get("model") if isinstance(content, dict) else None
     filled = {name for name, part in parts.items() if part} if isinstance(parts, dict) else set()
     if not isinstance(parts, dict) or not filled >= _PARTS or filled - _PARTS - {_TOWERS}:
@@ -107,21 +107,21 @@ def read_release(file: Path, config: PrismaticConfig) -> Weights:
             f"{file} holds {', '.join(sorted(filled)) or type(content).__name__} under `model`; expected "
             f"{', '.join(sorted(_PARTS))} and perhaps {_TOWERS}. Download the checkpoint again"
         )
-    tensors = dict(_renamed(parts["projector"], _LAYERS, file))
-    tensors |= _renamed(parts["llm_backbone"], {"llm.": "language_model."}, file)
+    tensors = dict(_rename_tensors(parts["projector"], _LAYERS, file))
+    tensors |= _rename_tensors(parts["llm_backbone"], {"llm.": "language_model."}, file)
     source = str(file)
     if _TOWERS in filled:
-        tensors |= _renamed(parts[_TOWERS], _tower_names(parts[_TOWERS], config, file), file)
+        tensors |= _rename_tensors(parts[_TOWERS], _tower_names(parts[_TOWERS], config, file), file)
     else:
         for name, tower in zip(_FEATURIZERS, config.towers, strict=False):
-            tensors |= {f"vision_backbone.{name}.{key}": value for key, value in _published(tower).items()}
+            tensors |= {f"vision_backbone.{name}.{key}": value for key, value in _published_weights(tower).items()}
         source += f" and {', '.join(map(published_name, config.towers))}"
     tensors = {_scale_name(name): tensor for name, tensor in tensors.items()}
     check_kinds(tensors, file)
     return Weights(tensors, source, random=False)
 
 
-def _renamed(part: Any, names: Mapping[str, str], file: Path) -> Iterator[tuple[str, Tensor]]:
+def _rename_tensors(part: Any, names: Mapping[str, str], file: Path) -> Iterator[tuple[str, Tensor]]:
     """The tensors of a part with the beginnings of their names replaced.
 
     Raises:
@@ -150,7 +150,7 @@ def _tower_names(part: Any, config: PrismaticConfig, file: Path) -> dict[str, st
     return {f"{theirs}.": f"vision_backbone.{ours}." for theirs, ours in zip(order, _FEATURIZERS, strict=False)}
 
 
-def _published(tower: TowerConfig) -> dict[str, Tensor]:
+def _published_weights(tower: TowerConfig) -> dict[str, Tensor]:
     """The state dict of timm's published weights, at the side of the model's pictures."""
     timm = require("timm", "openvla")
     name = published_name(tower)

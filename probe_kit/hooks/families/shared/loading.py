@@ -16,7 +16,7 @@ from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.checkpoints.weights import Weights, WeightsAudit, doubles, load_weights, read_weights
 from probe_kit.hooks.contract.card import ModelCard
 from probe_kit.models.building import initialise, without_precision
-from probe_kit.models.checkpoint_files import Renames, describe_picture_conflict, renamed, renamed_tensors
+from probe_kit.models.checkpoint_files import Renames, describe_picture_conflict, rename_tensor, renamed_tensors
 
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 
@@ -279,5 +279,5 @@ def load_vlm(
         dtype,
         random_weights,
         weights_seed,
-        name_in_module=lambda name: renamed(name, recipe.names),
+        name_in_module=lambda name: rename_tensor(name, recipe.names),
     )

@@ -210,7 +210,7 @@ def recording_weights(attentions: Sequence[nn.Module], note: Note, weights: Weig
         yield
 
 
-def returned(_: Any, __: tuple[Any, ...], ___: dict[str, Any], output: Any) -> Tensor:
+def returned_weights(_: Any, __: tuple[Any, ...], ___: dict[str, Any], output: Any) -> Tensor:
     """Return the weights (B, H, S, K) that eager attention returns beside what it read.
 
     Raises:
@@ -222,7 +222,7 @@ def returned(_: Any, __: tuple[Any, ...], ___: dict[str, Any], output: Any) -> T
     return weights
 
 
-def recomputed(attention: Any, inputs: tuple[Any, ...], keywords: dict[str, Any], _: Any) -> Tensor:
+def recompute_weights(attention: Any, inputs: tuple[Any, ...], keywords: dict[str, Any], _: Any) -> Tensor:
     """Return the weights (B, H, 1, K) of the last position of an attention of Llama's kind.
 
     Its fast kernels return no weights, so they are computed once more from the module's inputs and the keys it
@@ -283,7 +283,7 @@ def on_the_prompt(note: Note) -> Note:
     return note_prompt
 
 
-def of_decoder(layers: Sequence[Any], note: Note, eager: bool = False) -> AbstractContextManager[None]:
+def decoder_attention(layers: Sequence[Any], note: Note, eager: bool = False) -> AbstractContextManager[None]:
     """Return a context over the attention of a decoder that puts out tokens.
 
     Args:
@@ -292,5 +292,7 @@ def of_decoder(layers: Sequence[Any], note: Note, eager: bool = False) -> Abstra
         eager: Whether the attention returns its weights; else they are computed once more.
     """
     return recording_weights(
-        [layer.self_attn for layer in layers], on_the_prompt(note), returned if eager else recomputed
+        [layer.self_attn for layer in layers],
+        on_the_prompt(note),
+        returned_weights if eager else recompute_weights,
     )

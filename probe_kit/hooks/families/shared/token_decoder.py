@@ -18,7 +18,7 @@ from probe_kit.hooks.contract.model import Model, Tap, Unembedding
 from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import IMAGE_ROLE, PADDING, Site, Stream
 from probe_kit.hooks.families.shared.loading import Loaded
-from probe_kit.hooks.families.shared.taps import ALL_BUT_LAST, LAST, Note, decoder_tap, kv_tap, of_decoder
+from probe_kit.hooks.families.shared.taps import ALL_BUT_LAST, LAST, Note, decoder_attention, decoder_tap, kv_tap
 from probe_kit.models.decoding import Choose, greedy
 
 # What `generate` of transformers 4 keeps of the distribution by default.
@@ -187,7 +187,7 @@ class TokenDecoder(Model):
 
     def record_attention(self, note: Note) -> AbstractContextManager[None]:
         """Record attention that is computed once more for the position that chooses a token."""
-        return of_decoder(self.decoder.layers, note)
+        return decoder_attention(self.decoder.layers, note)
 
     @property
     def positions(self) -> int:

@@ -482,12 +482,12 @@ def questions_of(folder: Path, recorded: Arrays, model: VisionLanguageModel) -> 
     letters = tuple(model.lead + letter for letter in LETTERS)
     pictures = [recorded[f"in_picture_{int(number)}"] for number in recorded["in_rows_picture"]]
     return [
-        Prompt(Observation(picture, np.zeros(8, np.float32), ""), _between(text, model), letters)
+        Prompt(Observation(picture, np.zeros(8, np.float32), ""), _question_between(text, model), letters)
         for text, picture in zip(recorded_texts(folder), pictures, strict=True)
     ]
 
 
-def _between(text: str, model: VisionLanguageModel) -> str:
+def _question_between(text: str, model: VisionLanguageModel) -> str:
     """The question in a whole prompt: behind the picture's placeholder, before the frame's end."""
     end = model.frame.end
     body = text.removesuffix(end) if end.strip() else text

@@ -30,7 +30,7 @@ from probe_kit.hooks.contract.sites import PADDING
 from probe_kit.hooks.families.shared.lerobot.flow import LerobotFlow
 from probe_kit.hooks.families.shared.lerobot.pipelines import CROP, tokenizer_folder, tokenizer_name
 from probe_kit.hooks.families.shared.taps import Note, Stack, flow_stacks, shares
-from probe_kit.models.building import building_device, replaced
+from probe_kit.models.building import building_device, replace_attributes
 from probe_kit.models.checkpoint_files import load_pretrained
 from probe_kit.models.pi0 import STATISTICS
 
@@ -55,7 +55,11 @@ def build_smolvla(config: SmolVLAConfig, folder: Path, device: str = "cpu") -> S
     config.vlm_model_name = locate_vlm(config, folder)
     try:
         # lerobot prints while it builds; stdout belongs to results.
-        with torch.device(device), redirect_stdout(sys.stderr), replaced(smolvlm_with_expert, _without_code()):
+        with (
+            torch.device(device),
+            redirect_stdout(sys.stderr),
+            replace_attributes(smolvlm_with_expert, _without_code()),
+        ):
             policy = SmolVLAPolicy(config)
     except OSError as error:
         raise CheckpointError(
@@ -120,7 +124,7 @@ def _released_vlm() -> Iterator[None]:
         "AutoConfig": SimpleNamespace(from_pretrained=lambda _, **__: config),
         "AutoProcessor": SimpleNamespace(from_pretrained=lambda _, **__: SimpleNamespace(tokenizer=tokenizer)),
     }
-    with replaced(smolvlm_with_expert, answers):
+    with replace_attributes(smolvlm_with_expert, answers):
         yield
 
 

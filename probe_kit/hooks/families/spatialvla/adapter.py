@@ -33,10 +33,10 @@ from probe_kit.hooks.families.prismatic.adapter import FileTokenizer, find_token
 from probe_kit.hooks.families.shared.action_statistics import ActionStatistics, open_or_closed
 from probe_kit.hooks.families.shared.kinds import TOKENS
 from probe_kit.hooks.families.shared.loading import DTYPES, Loaded, load_network
-from probe_kit.hooks.families.shared.taps import Note, decoder_tap, kept_prompt, of_decoder
+from probe_kit.hooks.families.shared.taps import Note, decoder_attention, decoder_tap, kept_prompt
 from probe_kit.hooks.families.shared.text import SLOT, template_of
 from probe_kit.hooks.families.shared.token_decoder import TokenDecoder, warn_of_unknown
-from probe_kit.models.checkpoint_files import SIGLIP_TOWER, renamed, stored_statistics
+from probe_kit.models.checkpoint_files import SIGLIP_TOWER, rename_tensor, stored_statistics
 from probe_kit.models.decoding import Decoded, Packed
 from probe_kit.models.spatialvla import (
     Intrinsics,
@@ -115,7 +115,7 @@ def load_checkpoint(
         chosen_dtype(dtype, config.dtype, DTYPES),
         random_weights,
         weights_seed,
-        name_in_module=lambda name: renamed(name, SIGLIP_TOWER),
+        name_in_module=lambda name: rename_tensor(name, SIGLIP_TOWER),
         finish=lambda network: network.embed_actions(),
     )
     return LoadedSpatialVLA(**vars(loaded), processor=processor)
@@ -401,7 +401,7 @@ class SpatialVLA(TokenDecoder, Policy):
 
     def record_attention(self, note: Note) -> AbstractContextManager[None]:
         """Record the weights that Gemma-2's attention returns, which is eager for its soft cap."""
-        return of_decoder(self.decoder.layers, note, eager=True)
+        return decoder_attention(self.decoder.layers, note, eager=True)
 
     # -- capture -----------------------------------------------------------------------------------------
 

@@ -31,7 +31,7 @@ from probe_kit.hooks.outputs import (
     generation_outputs,
     numpy_of,
     pass_outputs,
-    stacked,
+    stack_layers,
     watch,
 )
 from probe_kit.models.spatialvla import Sight, depth_input, known_cameras, point_places, prepare_picture
@@ -92,7 +92,9 @@ class _Reference:
             "pixel_values": lambda: _numpy(self.pictures),
             "pixel_values_224": lambda: prepare_picture(image, replace(settings, side=224))[None],
             "intrinsic": lambda: _numpy(self.cameras[0]),
-            "siglip_hidden_states": lambda: stacked(self._spoken[1], self.policy.further_streams["vision"])[0],
+            "siglip_hidden_states": lambda: stack_layers(self._spoken[1], self.policy.further_streams["vision"])[
+                0
+            ],
             "siglip_last_hidden_state": lambda: _numpy(self._sight_of_pictures.tower),
             # The original divides by what Gemma-2 multiplies with; see `SpatialVLANetwork.embed`.
             "image_features": lambda: _numpy(self._sight_of_pictures.features) / np.sqrt(config.text.hidden_size),

@@ -350,7 +350,7 @@ def xiaomi_outputs(load: Callable[..., Xiaomi], folder: Path, recorded: Arrays) 
         "x_t": lambda: euler_path(noise, calls["velocity"], lambda velocity: velocity * (1.0 / steps)),
         "denoise_times": lambda: np.array([step / steps for step in range(steps)], np.float32),
         "actions": lambda: numpy_of(actions),
-        "actions_unnormalized": lambda: _restored(policy, numpy_of(actions), recorded),
+        "actions_unnormalized": lambda: _restore_actions(policy, numpy_of(actions), recorded),
     }
     return Outputs(produced, inputs=_NORMS, valid=_valid(policy, recorded["in_attention_mask"].astype(bool)))
 
@@ -369,7 +369,7 @@ def _valid(policy: Xiaomi, mask: NDArray[np.bool_]) -> dict[str, NDArray[np.bool
     return dict.fromkeys(streams, mask) | dict.fromkeys(("kv_keys", "kv_values"), cached)
 
 
-def _restored(policy: Xiaomi, actions: NDArray[Any], recorded: Arrays) -> NDArray[Any]:
+def _restore_actions(policy: Xiaomi, actions: NDArray[Any], recorded: Arrays) -> NDArray[Any]:
     """Return actions in units of the recorded statistics, where there are some; else of the checkpoint's."""
     if not set(_NORMS) <= set(recorded):
         return policy.units.restore(actions)

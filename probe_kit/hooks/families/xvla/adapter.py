@@ -410,7 +410,7 @@ class Xvla(DenoisingPolicy):
 
     # -- verification ------------------------------------------------------------------------------------
 
-    def watched(self) -> dict[str, nn.Module]:
+    def recorded_modules(self) -> dict[str, nn.Module]:
         """Return the module whose output is the chunk that every step predicts."""
         return {"predicted": self.network.model.transformer.action_decoder}
 

@@ -16,7 +16,7 @@ from torch.nn import functional
 from transformers import AutoTokenizer
 
 from probe_kit.errors import CheckpointError
-from probe_kit.hooks.capturing.capture_context import frozen
+from probe_kit.hooks.capturing.capture_context import freeze_weights
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.contract.observation import ARM_NUMBERS, Observation
 from probe_kit.hooks.contract.roles import Roles
@@ -66,7 +66,7 @@ class DenoisingPolicy(LerobotPolicy):
         """The actions of `act`, bit for bit, with a graph of every step; see the contract."""
         self.interventions.check("gradients", self.card.family)
         self.check_acting(observations, seeds)
-        with frozen(self.network):
+        with freeze_weights(self.network):
             return self.restored(self.denoise(self.batch(observations), self.noise(seeds)))
 
     def noise(self, seeds: Sequence[int]) -> Tensor:
@@ -114,12 +114,12 @@ class LerobotFlow(DenoisingPolicy):
         """
         self.check_pictures(batch)
         with _with_graph(self.network.model):
-            chunk: Tensor = undecorated(self.network.predict_action_chunk)(batch, noise=noise)
+            chunk: Tensor = without_decorator(self.network.predict_action_chunk)(batch, noise=noise)
         return chunk
 
     # -- verification ------------------------------------------------------------------------------------
 
-    def watched(self) -> dict[str, nn.Module]:
+    def recorded_modules(self) -> dict[str, nn.Module]:
         """Return the velocity, and the connector of a backbone that has one."""
         model = self.network.model
         connected = hasattr(model, "vlm_with_expert")
@@ -159,7 +159,7 @@ class LerobotFlow(DenoisingPolicy):
         return produced
 
 
-def undecorated(method: Callable[..., Any]) -> Callable[..., Any]:
+def without_decorator(method: Callable[..., Any]) -> Callable[..., Any]:
     """Return a bound method without the decorator that turns gradients off; itself if it has none."""
     inner = getattr(getattr(method, "__func__", method), "__wrapped__", None)
     return method if inner is None else partial(inner, getattr(method, "__self__", None))
@@ -169,7 +169,7 @@ def undecorated(method: Callable[..., Any]) -> Callable[..., Any]:
 def _with_graph(model: Any) -> Iterator[None]:
     """Run the body with lerobot's sampling of a flow without the decorator of its own."""
     # An attribute of the instance hides the method of its class; `del` uncovers it again.
-    model.sample_actions = undecorated(model.sample_actions)
+    model.sample_actions = without_decorator(model.sample_actions)
     try:
         yield
     finally:

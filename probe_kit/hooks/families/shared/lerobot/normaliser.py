@@ -310,7 +310,7 @@ class StatisticsFile:
             CheckpointError: If `name` is neither or the file is no JSON.
         """
         if name in SHIPPED:
-            return cls._of(f"{name} statistics shipped with probe_kit", _shipped(name))
+            return cls._of(f"{name} statistics shipped with probe_kit", _shipped_file(name))
         path = Path(name).expanduser()
         if not path.is_file():
             raise CheckpointError(
@@ -349,7 +349,7 @@ class StatisticsFile:
         return Bounds("BOUNDS", low.astype(np.float32), high.astype(np.float32), 0.0, self.name)
 
 
-def _shipped(name: str) -> bytes:
+def _shipped_file(name: str) -> bytes:
     return (files("probe_kit.models") / f"{name}_statistics.json").read_bytes()
 
 

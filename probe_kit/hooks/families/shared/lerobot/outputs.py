@@ -34,17 +34,17 @@ def lerobot_outputs(load: Callable[..., LerobotPolicy], folder: Path, recorded: 
     policy = load(str(folder / "checkpoint"), dtype="float32")
     if "in_lang_tokens" in recorded:
         policy = policy.with_cameras([camera for camera in policy.cameras if f"in_image_{camera}" in recorded])
-        batch = _prepared(policy, recorded)
+        batch = _prepare_inputs(policy, recorded)
     else:
         batch = policy.batch(_observations(policy, recorded))
     replayed, activations, calls = watch(
-        policy, lambda: policy.replay(batch, recorded), policy.watched(), policy.watched_inputs()
+        policy, lambda: policy.replay(batch, recorded), policy.recorded_modules(), policy.watched_inputs()
     )
     run = RecordedRun(batch, recorded, activations, calls)
     produced: dict[str, Produce] = {
         **{name: partial(numpy_of, values) for name, values in batch.items()},
         **stream_outputs(policy, activations),
-        **{name: partial(run.outputs, name) for name in policy.watched() if calls[name]},
+        **{name: partial(run.outputs, name) for name in policy.recorded_modules() if calls[name]},
         **{name: partial(np.asarray, values) for name, values in replayed.items()},
         "actions_unnormalized": lambda: policy.action_units.restore(np.asarray(replayed["actions"], np.float32)),
         **policy.further_outputs(run),
@@ -55,7 +55,7 @@ def lerobot_outputs(load: Callable[..., LerobotPolicy], folder: Path, recorded: 
     return Outputs(produced, valid={} if valid is None else dict.fromkeys(_MASKED, valid))
 
 
-def _prepared(policy: LerobotPolicy, recorded: Arrays) -> dict[str, Tensor]:
+def _prepare_inputs(policy: LerobotPolicy, recorded: Arrays) -> dict[str, Tensor]:
     images = {
         f"{IMAGES}{camera}": torch.from_numpy(recorded[f"in_image_{camera}"]) for camera in policy.shown_cameras
     }

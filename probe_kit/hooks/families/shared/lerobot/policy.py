@@ -717,7 +717,7 @@ class LerobotPolicy(Policy):
         These are `actions` (B, chunk, action numbers), and quantities that only this inference has.
         """
 
-    def watched(self) -> dict[str, nn.Module]:
+    def recorded_modules(self) -> dict[str, nn.Module]:
         """Return modules whose outputs a golden reference holds, by the name of the quantity."""
         return {}
 

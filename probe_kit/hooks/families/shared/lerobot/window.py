@@ -73,7 +73,7 @@ def read_window(folder: Path, camera: str, size: tuple[int, int] | None = None) 
         raise CheckpointError(f"{folder / PREPROCESSOR}.json: {CROP} cannot be read: {error}") from error
 
 
-def squashed(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
+def squash(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
     """Resize (H, W, 3) uint8 to `size` (height, width), proportions given up.
 
     The filter is that of INT-ACT's client.
