@@ -22,6 +22,7 @@ SMALLEST: dict[str, list[str]] = {
     "intervention_cost": ["--pairs", "2"],
     "intervention_null": ["OUT", "--networks", "1", "--inside", "1", "--items", "6", "--categories", "color"],
     "joint_probes": ["--episodes", "20", "--tokens", "4", "--width", "16"],
+    "knockout_organisms": ["OUT", "--draws", "1", "--organisms", "nothing"],
     "label_cost": ["--permutations", "2"],
     "label_coverage": ["--draws", "2", "--only", "12 white"],
     "label_null": ["--labels", "1", "--tasks", "binary", "--jobs", "1"],

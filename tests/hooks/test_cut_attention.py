@@ -209,7 +209,10 @@ class ReadingPolicy(Policy):
     def act(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
         self.check(observations, seeds)
         with torch.inference_mode():
-            hidden = [float(self.network(torch.from_numpy(picture_of(one)).float())) for one in observations]
+            hidden = [
+                float(self.network(torch.from_numpy(picture_of(observation)).float()))
+                for observation in observations
+            ]
         return np.array(hidden, np.float32)[:, None, None] * np.ones((1, 1, 7), np.float32)
 
     def roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:

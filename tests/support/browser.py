@@ -127,11 +127,11 @@ class Page:
 
         An address with a token leads to the viewer's page, and from there a person goes to a place in it.
         """
-        entrance, mark, place = address.partition("#")
+        entrance, mark, fragment = address.partition("#")
         if "?token=" in entrance:
             self.call("Page.navigate", url=entrance)
             self.wait(f"location.search === '' && {_READY}")
-            address = str(self.read("location.href")).partition("#")[0] + mark + place
+            address = str(self.read("location.href")).partition("#")[0] + mark + fragment
         self.call("Page.navigate", url=address)
         self.wait(_READY)
 

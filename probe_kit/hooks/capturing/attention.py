@@ -20,7 +20,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
-from weakref import WeakKeyDictionary, ref
+from weakref import WeakKeyDictionary, WeakSet, ref
 
 import numpy as np
 import torch
@@ -342,8 +342,8 @@ class _Attention:
     values: Tensor
 
 
-_ATTENDS_INSIDE: "WeakKeyDictionary[nn.Module, bool]" = WeakKeyDictionary()
-"""Networks that were watched as a whole, and whether all attention was computed inside the modules that own it."""
+_ATTENDS_INSIDE: "WeakSet[nn.Module]" = WeakSet()
+"""Output projections whose attention was computed inside the module that owns them, whenever it was asked for."""
 
 
 _OWNERS: "WeakKeyDictionary[nn.Module, WeakKeyDictionary[nn.Module, ref[nn.Module]]]" = WeakKeyDictionary()
@@ -358,7 +358,7 @@ class _AttentionCalls(TorchFunctionMode):
         taps: Taps of the sites whose attention is asked for.
         last: Latest attention.
         is_inside: Whether that was computed while a module ran that owns an output projection of a site.
-        are_inside: Whether all attention that was asked for was.
+        projections: By output projection, whether all its attention that was asked for was.
     """
 
     def __init__(self, model: Model, sites: Iterable[Site]) -> None:
@@ -366,7 +366,8 @@ class _AttentionCalls(TorchFunctionMode):
         self.model = model
         self.taps = {site: model.tap(site) for site in sites}
         self.last: _Attention | None = None
-        self.is_inside, self.are_inside = False, True
+        self.is_inside = False
+        self.projections: dict[nn.Module, bool] = {}
         self._shares: Tensor | None = None
         self._depth = 0
 
@@ -374,8 +375,8 @@ class _AttentionCalls(TorchFunctionMode):
     def watching(self) -> Iterator[None]:
         """Watch the calls of the model while it runs.
 
-        Seeing each call costs as much as a third of a small model's inference. A network that was watched once,
-        and computed all attention inside its attention modules, is watched there alone.
+        Seeing each call costs as much as a third of a small model's inference. Where attention was computed
+        inside its own modules once, only these are watched.
         """
         network = getattr(self.model, "network", None)
         owners = _owners(network, {tap.module for tap in self.taps.values()})
@@ -383,7 +384,7 @@ class _AttentionCalls(TorchFunctionMode):
             with self:
                 yield
             return
-        is_known = _ATTENDS_INSIDE.get(network, False)
+        is_known = all(tap.module in _ATTENDS_INSIDE for tap in self.taps.values())
         with ExitStack() as stack:
             for owner in owners:
                 enter, leave = partial(self._enter, is_known), partial(self._leave, is_known)
@@ -392,8 +393,7 @@ class _AttentionCalls(TorchFunctionMode):
             if not is_known:
                 stack.enter_context(self)
             yield
-        if not is_known and self.last is not None:
-            _ATTENDS_INSIDE[network] = self.are_inside
+        _ATTENDS_INSIDE.update(projection for projection, is_inside in self.projections.items() if is_inside)
 
     def at(self, site: Site, read: Tensor) -> tuple[Tensor, Tensor]:
         """Return the pattern (B, H, S, T) of the positions of a site, whose heads read `read` (B, S, H · E).
@@ -409,12 +409,12 @@ class _AttentionCalls(TorchFunctionMode):
                 f"{site}: no attention that torch computes came before the output projection. Load the model with "
                 "the attention sdpa or eager; kernels of other libraries do not show what they weigh"
             )
-        self.are_inside = self.are_inside and self.is_inside
         with torch._C.DisableTorchFunction():
             weights = last.weights()
             values = _repeat_for_heads(last.values, weights.shape[1]).float().to(weights.device)
             computed = tap.rows.of((weights @ values).transpose(1, 2).flatten(2))[:, tap.tokens]
         _check_reading(site, self.model.stream_of(site), weights.shape[1], computed, read)
+        self.projections[tap.module] = self.projections.get(tap.module, True) and self.is_inside
         return tap.rows.of(weights)[:, :, tap.tokens], tap.rows.of(values)
 
     def _enter(self, watches: bool, *_: Any) -> None:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from probe_kit._tables.content import Cell as TableCell
 from probe_kit._tables.numbers import NONE as NO_NUMBER
-from probe_kit._tables.numbers import Write, number, percent, signed
+from probe_kit._tables.numbers import Write, number, percent, with_sign
 from probe_kit.env.scoring import DEFAULT_RULE
 from probe_kit.errors import UsageError
 from probe_kit.extract.sources.inputs import INSTRUCTION
@@ -614,7 +614,7 @@ def interval_cell(value: float | None, limits: tuple[float, float] | None, write
 
 def signed_interval(value: float | None, limits: tuple[float, float] | None) -> TableCell:
     """Return a value with its sign and its interval; a dash without an interval."""
-    return interval_cell(value, limits, signed)
+    return interval_cell(value, limits, with_sign)
 
 
 def count_edits(names: Sequence[str], tried: int, most: int = 3) -> str:

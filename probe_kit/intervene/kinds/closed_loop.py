@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 import numpy as np
 
 from probe_kit._tables.content import Cell as TableCell
-from probe_kit._tables.numbers import signed
+from probe_kit._tables.numbers import with_sign
 from probe_kit.errors import UsageError
 from probe_kit.hooks.capturing.edits import EditLog, Identity, apply_patch
 from probe_kit.hooks.contract.sites import Site
@@ -361,9 +361,9 @@ _COMPARED = (
     ),
     EffectColumn[ClosedLoopEffect](
         "left / right",
-        _cell_of_edits(lambda row: TableCell(row.net_left, signed, after=f" / {signed(row.net_right)}")),
+        _cell_of_edits(lambda row: TableCell(row.net_left, with_sign, after=f" / {with_sign(row.net_right)}")),
     ),
-    EffectColumn[ClosedLoopEffect]("controls", _cell_of_edits(lambda row: TableCell(row.control_net, signed))),
+    EffectColumn[ClosedLoopEffect]("controls", _cell_of_edits(lambda row: TableCell(row.control_net, with_sign))),
     EffectColumn[ClosedLoopEffect](
         "only with : only without", _cell_of_edits(lambda row: TableCell(row.gained, after=f" : {row.lost}"))
     ),

@@ -32,7 +32,7 @@ from probe_kit._system.bounded_files import parse_json
 from probe_kit._system.escaping import as_argument
 from probe_kit._tables.content import Cell as TableCell
 from probe_kit._tables.content import absent
-from probe_kit._tables.numbers import number, percent, signed
+from probe_kit._tables.numbers import number, percent, with_sign
 from probe_kit.errors import EmptyRoleError, UnsupportedInterventionError, UsageError
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.declared import InterventionKind
@@ -162,8 +162,8 @@ class Knockout(Intervention):
 
     def parameters(self) -> dict[str, Any]:
         """Return its own settings; the readout of a closed loop is where the cube ends."""
-        own = super().parameters() | {"untrained": "" if self.untrained is None else self.untrained.key}
-        return {**own, "readout": "episode"} if self.closed_loop else own
+        settings = super().parameters() | {"untrained": "" if self.untrained is None else self.untrained.key}
+        return {**settings, "readout": "episode"} if self.closed_loop else settings
 
     def check_run(self, run: Run) -> None:
         """Refuse a run that cannot be played, or without anything to compare with; raises as the base does too.
@@ -239,8 +239,8 @@ class Knockout(Intervention):
                 seed = derive_seed(
                     "knockout", self.seed, context.pair.episode, context.pair.step, str(cell), *window
                 )
-                wanted, keys = keys.sum(), random_tokens(keys, tokens.mask(backbone, ALL), seed)
-                if not has_sides(context.session.run) and 2 * keys.sum() < wanted:
+                count, keys = keys.sum(), random_tokens(keys, tokens.mask(backbone, ALL), seed)
+                if not has_sides(context.session.run) and 2 * keys.sum() < count:
                     return ConditionResult(context.act())  # no control of that size: nothing is cut
             cut = AttentionCut(keys, readers, self.heads or None)
             with cut_attention(context.session.policy, dict.fromkeys(sites, cut)) as log:
@@ -266,8 +266,8 @@ class Knockout(Intervention):
         if self.untrained is None:
             return {}
         rows = [row.to_json() for row in self.untrained.rows(knockout_effects) if not row.is_control]
-        kept = ("category", "role", "first", "last", "lost", "size")
-        return {UNTRAINED_FILE: as_json({"effects": [{name: row[name] for name in kept} for row in rows]})}
+        columns = ("category", "role", "first", "last", "lost", "size")
+        return {UNTRAINED_FILE: as_json({"effects": [{name: row[name] for name in columns} for row in rows]})}
 
     @staticmethod
     def effects(measurement: Measurement) -> "list[KnockoutEffect]":
@@ -277,12 +277,12 @@ class Knockout(Intervention):
             return rows
         stored = parse_json(measurement.read(UNTRAINED_FILE))["effects"]
         twin = {(row["category"], row["role"], row["first"], row["last"]): row for row in stored}
-        beside = [twin.get((row.category, row.role, row.first, row.last), {}) for row in rows]
+        twins = [twin.get((row.category, row.role, row.first, row.last), {}) for row in rows]
         return [
             row
             if row.is_control
             else replace(row, untrained_lost=other.get("lost"), untrained_size=other.get("size"))
-            for row, other in zip(rows, beside, strict=True)
+            for row, other in zip(rows, twins, strict=True)
         ]
 
     @staticmethod
@@ -364,11 +364,11 @@ def stored_twin(kind: Knockout, run: Run, untrained: Run) -> Measurement:
         )
     if untrained.suite != run.suite:
         raise UsageError(f"--untrained {untrained.location} is on {untrained.suite}; expected {run.suite}")
-    wanted = {name: kind.parameters()[name] for name in _SAME}
+    settings = {name: kind.parameters()[name] for name in _SAME}
     stored = [
         result
         for result in stored_interventions(untrained, Knockout.kind)
-        if {name: result.settings.get(name) for name in _SAME} == wanted
+        if {name: result.settings.get(name) for name in _SAME} == settings
     ]
     if not stored:
         raise UsageError(
@@ -675,7 +675,7 @@ def _columns(rows: "Sequence[KnockoutEffect]", has_sides: bool) -> list[EffectCo
         *twins,
         EffectColumn(
             "wrong side",
-            lambda row: TableCell(row.net, signed),
+            lambda row: TableCell(row.net, with_sign),
             "wrong side: share of episodes whose action leaves the correct picture's side, minus those that come",
         ),
         p,

@@ -562,7 +562,7 @@ def dose_figures(source: FigureSource) -> Iterator[ReportFigure]:
 
 @dataclass(frozen=True)
 class CutCurve:
-    """What cuts of one role lose, by the layer at which their windows begin or end.
+    """Losses by cuts of one role, by the layer at which their windows begin or end.
 
     Attributes:
         role: Role of the tokens that are cut.

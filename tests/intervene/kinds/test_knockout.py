@@ -210,7 +210,7 @@ def test_the_same_cut_in_an_untrained_network_is_shown_beside_it(
     """The recorded run has random weights; a trained policy plays the same items."""
     command = ["--kind", "knockout", "--window", "3", "--controls", "0", "--roles", "image"]
     trained = tmp_path / "trained"
-    settings = ExtractSettings("pi0-tiny", suite=small_suite.folder, items=2, max_steps=2, env_workers=0)
+    settings = ExtractSettings("pi0-tiny", suite=small_suite.folder, items=6, max_steps=2, env_workers=0)
     extract_run(settings, trained)
     runner = CliRunner()
     before = runner.invoke(app, ["intervene", str(trained), *command, "--untrained", str(copy.path)])
@@ -227,5 +227,5 @@ def test_the_same_cut_in_an_untrained_network_is_shown_beside_it(
 
 def knockout_effects_of(run: Run) -> list[KnockoutEffect]:
     """Of the newest stored knockout that plays no episodes."""
-    results = [one for one in stored_interventions(run) if not one.settings.get("closed_loop")]
-    return list(InterventionResult.of_stored(max(results, key=lambda one: one.newest)).effects)
+    results = [stored for stored in stored_interventions(run) if not stored.settings.get("closed_loop")]
+    return list(InterventionResult.of_stored(max(results, key=lambda stored: stored.newest)).effects)
