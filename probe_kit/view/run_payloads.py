@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from probe_kit._system.escaping import terminal_safe, without_folders
 from probe_kit._tables.numbers import p_text, percent, with_limits
@@ -19,6 +19,7 @@ from probe_kit.env.scoring import RULES
 from probe_kit.errors import RunDamagedError
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.intervene.inventory import listed_interventions
+from probe_kit.intervene.kinds.knockout import Knockout
 from probe_kit.intervene.results import InterventionResult
 from probe_kit.intervene.stored import stored_interventions
 from probe_kit.retention import RetentionRow
@@ -33,6 +34,7 @@ from probe_kit.retention.columns.columns import (
     USED,
     Column,
 )
+from probe_kit.retention.displays.interventions import cut_curves, measure_of_cuts
 from probe_kit.retention.rows.row import StreamPart
 from probe_kit.runs.action_errors import action_error_table, compare_actions, why_not_compared
 from probe_kit.runs.environment_success import EnvironmentSuccess
@@ -445,7 +447,36 @@ def _interventions(viewed: ViewedRun) -> Iterator[dict[str, Any]]:
     for stored in stored_interventions(viewed.run):
         if stored.key in used:
             result = InterventionResult.of_stored(stored)
-            yield _result_table(f"intervention {result.kind}", stored.key, result.to_rich(), result.findings)
+            table = _result_table(f"intervention {result.kind}", stored.key, result.to_rich(), result.findings)
+            yield table | {"curves": _cut_charts(result) if result.kind == Knockout.kind else []}
+
+
+def _cut_charts(result: InterventionResult) -> list[dict[str, Any]]:
+    """Return a chart for every category and growth of windows, with a line a role and one of the controls."""
+    charts = []
+    for category in dict.fromkeys(row.category for row in result.effects):
+        effects = [row for row in result.effects if row.category == category]
+        curves = cut_curves(effects)
+        for growth in dict.fromkeys(curve.growth for curve in curves):
+            lines = [curve for curve in curves if curve.growth == growth]
+            charts.append(
+                {
+                    "title": f"{category_of(category).title}: cut {growth} the layer",
+                    "unit": measure_of_cuts(effects),
+                    "layers": lines[0].layers.tolist(),
+                    "lines": [
+                        {"name": line.role, "values": line.lost.tolist(), "read": line.is_read.tolist()}
+                        for line in lines
+                    ],
+                    "controls": _finite(np.nanmean([line.controls for line in lines], axis=0)),
+                }
+            )
+    return charts
+
+
+def _finite(values: NDArray[np.float64]) -> list[float | None]:
+    """Return numbers, None in place of those that are missing."""
+    return [None if np.isnan(value) else float(value) for value in values]
 
 
 def _targets(viewed: ViewedRun) -> Iterator[dict[str, Any]]:

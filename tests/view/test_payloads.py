@@ -19,6 +19,7 @@ from probe_kit.errors import RunDamagedError, UsageError
 from probe_kit.hashing import sha256_json
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.intervene.kinds.image_swap import ImageSwap, stored_image_swaps
+from probe_kit.intervene.kinds.knockout import Knockout
 from probe_kit.intervene.outcomes import ConditionOutcomes
 from probe_kit.intervene.results import save
 from probe_kit.intervene.settings import settings_of
@@ -38,6 +39,7 @@ from probe_kit.train.results.store import load_results_by_call
 from probe_kit.view import write_viewer
 from probe_kit.view.catalogue import Catalogue
 from probe_kit.view.run_payloads import pack_floats, pack_log_odds, payload_script
+from tests.intervene.kinds.test_knockout import played
 from tests.retention.asked_runs import ASK
 from tests.support.little_run import certify, episode, little_plan, little_settings, little_writer
 from tests.support.recorded_run import CALLS, EVERY, write_recorded_run
@@ -485,6 +487,19 @@ def test_what_is_stored_is_shown_as_the_tables_of_the_commands(source_catalogue:
     assert swap["findings"] == ["All  decides: the action follows the picture, by 0.50 of what all inputs do."]
     assert kinds["diagnosis of the inputs"]["rows"][0][2]["text"] == "decides"
     assert [row[0]["text"] for row in kinds["predicted actions"]["rows"]] == ["dx", "grip"]
+
+
+def test_a_knockout_has_a_chart_for_each_growth_of_its_windows(tmp_path: Path) -> None:
+    run = write_recorded_run(tmp_path / "run")
+    save(run, settings_of(Knockout(), run), played({"image": [{2}], "language": []}, 0), {"replay": {}})
+    _, results = read_payload(Catalogue([open_run(run.path)]).script("run/results"))
+    (charts,) = [table["curves"] for table in results["tables"] if table["kind"] == "intervention knockout"]
+    assert [chart["title"] for chart in charts] == ["Color: cut up to the layer", "Color: cut from the layer"]
+    lines = {line["name"]: line for line in charts[0]["lines"]}
+    assert lines["image"]["read"] == [False, False, True, True, True, True]
+    assert not any(lines["language"]["read"])
+    assert charts[0]["layers"] == [0, 1, 2, 3, 4, 5]
+    assert len(charts[0]["controls"]) == 6
 
 
 @pytest.mark.slow

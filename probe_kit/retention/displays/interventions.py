@@ -615,17 +615,11 @@ class KnockoutDisplay(Display):
                 f"{run.location} has no stored knockout of {category!r}. Run "
                 f"`probe-kit intervene {as_argument(run.location)} --kind knockout`"
             )
-        is_share = any(row.lost is not None for row in effects)
-        curves = [
-            _cut_curve(role, growth, rows, is_share)
-            for role, of_role in by_role(effects).items()
-            for growth, rows in windows_by_growth(of_role).items()
-        ]
         return cls(
             title=title_of(category),
-            measure=cls.measure if is_share else "change of the action, in spreads",
+            measure=measure_of_cuts(effects),
             category=category,
-            curves=tuple(curves),
+            curves=cut_curves(effects),
             readable=effects[0].readable,
             certificates=(ProvenanceLine.of_run(run),),
         )
@@ -649,6 +643,22 @@ class KnockoutDisplay(Display):
             label = f"{curve.role}, {curve.growth} the layer"
             draw_series(axes, line, curve.layers, curve.lost, curve.is_read, label)
         layer_axis(axes, self.readable)
+
+
+def measure_of_cuts(effects: Sequence[KnockoutEffect]) -> str:
+    """Return the measure of the cuts of one category: the picture's effect, or the action where that has none."""
+    is_share = any(row.lost is not None for row in effects)
+    return KnockoutDisplay.measure if is_share else "change of the action, in spreads"
+
+
+def cut_curves(effects: Sequence[KnockoutEffect]) -> tuple[CutCurve, ...]:
+    """Return a curve for every role and growth of windows, of the cuts of one category."""
+    is_share = any(row.lost is not None for row in effects)
+    return tuple(
+        _cut_curve(role, growth, rows, is_share)
+        for role, of_role in by_role(effects).items()
+        for growth, rows in windows_by_growth(of_role).items()
+    )
 
 
 def _layer_drawn(row: KnockoutEffect, growth: str) -> float:

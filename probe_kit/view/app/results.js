@@ -12,7 +12,16 @@ function StoredTable({ table }) {
       <thead>${groups.some((g) => g.group) && html`<tr class="layouts">${groups.map((g) => html`<th colspan=${g.span}>${g.group}</th>`)}</tr>`}<tr>${table.headings.map((heading) => html`<th title=${heading.help || null}>${heading.text}</th>`)}</tr></thead>
       <tbody>${rows.map((cells) => html`<tr>${cells.map((cell, i) => { const text = html`<${Text}>${cell.text}<//>`, words = cell.strong ? html`<b>${text}</b>` : text; return i < table.names ? html`<th scope="row">${words}</th>` : html`<td title=${cell.note || null}>${words}</td>`; })}</tr>`)}</tbody></table></div>
     ${table.rows.length > rows.length && html`<p class="note"><button type="button" class="plain" onClick=${() => showAll(true)}>all ${table.rows.length} rows</button></p>`}
+    ${(table.curves ?? []).map((chart) => html`<${CutChart} key=${chart.title} chart=${chart} />`)}
     ${table.notes.map((note) => html`<p class="note"><${Text}>${note}<//></p>`)}</section>`;
+}
+/* What is lost when layers no longer read the tokens of a role: a line a role, and the controls. Open dots: no more than by chance. */
+function CutChart({ chart }) {
+  const last = Math.max(...chart.layers), [now, setNow] = useState(last), numbers = (values) => values.map((v) => v ?? NaN);
+  const lines = chart.lines.map((line, i) => ({ name: line.name, x: chart.layers, y: numbers(line.values), kind: ["expert", "backbone", "done"][i % 3], dots: true, weak: (at) => !line.read[at] }));
+  const all = [...lines, { name: "controls", x: chart.layers, y: numbers(chart.controls), kind: "refitted" }], values = all.flatMap((line) => line.y).filter((v) => !Number.isNaN(v));
+  const low = Math.min(...values, 0), high = Math.max(...values, 0), room = (high - low || 1) * 0.08;
+  return html`<${Series} title=${chart.title} unit=${chart.unit} steps=${last} now=${now} onNow=${setNow} low=${low - room} high=${high + room} lines=${all} />`;
 }
 function Results({ run }) {
   const [[results], trouble] = useLoaded(`${run.key}/results`);
