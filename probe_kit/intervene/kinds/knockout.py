@@ -505,7 +505,8 @@ def knockout_effects(outcomes: ConditionOutcomes) -> list[KnockoutEffect]:
     readable = 1 + max(last for _, last in spans)
     clean, correct = outcomes.of(CLEAN), outcomes.correct_sign
     moved = outcomes.displacement[rows] - clean
-    size = outcomes.size[rows] if outcomes.size is not None else np.abs(moved)
+    # Of an episode that was played the change is where the cube ends.
+    size = outcomes.size[rows] if outcomes.size is not None else np.abs(moved) / (clean.std() or 1.0)
     exchange = outcomes.exchange() if outcomes.has_sides else None
     shares = [None if exchange is None else exchange.share(away) for away in moved]
     # A control that cut nothing is none.
