@@ -283,7 +283,7 @@ def test_the_report_of_an_asked_and_an_acting_run_holds_their_join(tmp_path: Pat
     assert [exhibit.name for exhibit in collect_figures(runs, table) if exhibit.subject == "join"] == [
         "known-used-1"
     ]  # type: ignore[arg-type]
-    page = report_html(runs, table)  # type: ignore[arg-type]
+    page = report_html(runs, table).replace("\u00a0", " ")  # type: ignore[arg-type]
     section = page.split('<details class="part" id="join">')[1].split("</details>")[0]
     for plain in known_used_tables(joined):
         assert plain.title in section
