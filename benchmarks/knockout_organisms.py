@@ -4,8 +4,8 @@
 
 A draw is a run of its own seed and controls of its own. Organisms are edits of the embedded policy, see
 `tests/support/organisms.py`: it reads the picture in block 2, words only, the picture through the words, nothing.
-A verdict is right if it names the first and last layer of every role, and *not read* where nothing is. Finished
-draws in FOLDER are read. A draw takes about 45 seconds of one core. Exits with 1 if any verdict is wrong.
+A verdict is right if a role is said to be read where it is, in the right layers where the edit decides them.
+Finished draws in FOLDER are read. A draw takes about 45 seconds of one core. Exits with 1 if any verdict is wrong.
 """
 
 import argparse
@@ -16,7 +16,7 @@ import tests_of_checkout  # noqa: F401
 
 from probe_kit.intervene import Knockout, run_intervention
 from probe_kit.intervene.kinds.knockout import by_role, layers_read
-from tests.support.organisms import READERS, reader_run
+from tests.support.organisms import READERS, is_true_of, reader_run
 
 
 def main() -> None:
@@ -38,7 +38,7 @@ def main() -> None:
             read = {role: layers_read(rows) for role, rows in by_role(result.effects).items()}
             print(f"{draw} {name}: {read}", flush=True)
             for role, layers in truth.items():
-                verdict = "right" if read[role] == layers else f"wrong: {read[role]}"
+                verdict = "right" if is_true_of(layers, read[role]) else f"wrong: {read[role]}"
                 tally.setdefault((name, role), Counter())[verdict] += 1
     for (name, role), counts in tally.items():
         print(f"{name:30} {role:10} " + ", ".join(f"{count} {verdict}" for verdict, count in counts.items()))

@@ -154,15 +154,20 @@ def read_nothing(policy: Any) -> None:
     _hide_from_blocks(policy, (0, 1, 2), words=True)
 
 
-Reading = Mapping[str, tuple[int, int] | None]
-"""By role, the first and last layer in which it is read; None where it is not."""
+Reading = Mapping[str, tuple[int, int] | bool]
+"""By role whether it is read; the first and last layer, where the edit and not the weights decide them."""
 READERS: Mapping[str, tuple[Edit, Reading]] = {
     "the picture in block 2": (read_pictures_in_the_last_block, {"image": (2, 2)}),
-    "words only": (read_words_only, {"image": None, "language": (0, 2)}),
-    "the picture through the words": (read_pictures_through_words, {"image": None, "language": (2, 2)}),
-    "nothing": (read_nothing, {"image": None, "language": None}),
+    "words only": (read_words_only, {"image": False, "language": True}),
+    "the picture through the words": (read_pictures_through_words, {"image": False, "language": True}),
+    "nothing": (read_nothing, {"image": False, "language": False}),
 }
 """Policies for a knockout, and what they read of the instructions and pictures of Color."""
+
+
+def is_true_of(truth: tuple[int, int] | bool, layers: tuple[int, int] | None) -> bool:
+    """Whether the layers in which a role is said to be read, None for none, are the truth."""
+    return layers == truth if isinstance(truth, tuple) else (layers is not None) == truth
 
 
 def reader_run(edit: Edit, out: Path, seed: int, items: int = 12) -> tuple[Run, LoadPolicy]:
