@@ -510,8 +510,8 @@ def knockout_effects(outcomes: ConditionOutcomes) -> list[KnockoutEffect]:
     exchange = outcomes.exchange() if outcomes.has_sides else None
     shares = [None if exchange is None else exchange.share(away) for away in moved]
     # A control that cut nothing is none.
-    is_cut = outcomes.edit_log[rows, :, 0].sum(axis=1) > 0
-    broken = {at for at, cell in enumerate(cells) if cell.is_control and not is_cut[at]}
+    is_cut = outcomes.edit_log[rows, :, 0] > 0
+    broken = {at for at, cell in enumerate(cells) if cell.is_control and not is_cut[at].any()}
     # Where a picture has an effect, a loss is a move away from the correct one; else any change counts.
     if any(share is not None for share in shares):
         tested = -correct * moved
@@ -519,6 +519,9 @@ def knockout_effects(outcomes: ConditionOutcomes) -> list[KnockoutEffect]:
         lonely = [at for at in range(len(cells)) if not _has_control(cells, at, broken)]
         tested = size.copy()
         tested[lonely] -= NOTHING
+        # Frames whose words are too few have no control, though others have: the same limit counts there.
+        controls = [at for at, cell in enumerate(cells) if cell.is_control and at not in broken]
+        tested[controls] = np.where(is_cut[controls], tested[controls], NOTHING)
     tests = compare_with_controls(np.asarray(tested), cells, outcomes, broken_controls=broken)
     ends = None if outcomes.episode_outcomes is None else (outcomes.episode_outcomes == CORRECT).mean(axis=1)
     effects = []
@@ -537,7 +540,7 @@ def knockout_effects(outcomes: ConditionOutcomes) -> list[KnockoutEffect]:
                 lost_ci=None if share is None else (2 * share.low, 2 * share.high),
                 size=float(size[at].mean()),
                 control_lost=mean_of(np.array(of_controls)),
-                control_size=mean_of(size[test.controls]),
+                control_size=mean_of(size[test.controls][is_cut[test.controls]]),
                 p=test.p,
                 p_fwe=test.p_fwe,
                 success=None if ends is None else float(ends[row]),

@@ -155,6 +155,25 @@ def test_without_a_control_of_that_size_a_tenth_of_the_spread_counts(change: flo
     assert rows[0].control_size is None
 
 
+@pytest.mark.parametrize(("change", "is_read"), [(0.05, False), (0.5, True)])
+@pytest.mark.parametrize("share", [0.25, 0.5, 0.75])
+def test_frames_without_a_control_do_not_weaken_that_of_the_others(
+    change: float, is_read: bool, share: float
+) -> None:
+    """Cut and control change 0.05 alike, or the cut ten times as much; short instructions leave no control."""
+    outcomes = unmoved_by_pictures(played({"image": []}, 0), {"image": change})
+    assert outcomes.size is not None
+    size, log = outcomes.size.copy(), outcomes.edit_log.copy()
+    size += np.random.default_rng(0).normal(0, 0.005, size.shape)
+    is_control = np.array([cell.is_control for cell in outcomes.cells])
+    is_short = np.arange(EPISODES) < share * EPISODES
+    size[np.ix_(is_control, ~is_short)] += 0.05
+    log[np.ix_(is_control, is_short)] = 0
+    rows = read_by(replace(outcomes, size=size, edit_log=log))["image"]
+    assert (layers_read(rows) is not None) == is_read
+    assert rows[0].control_size == pytest.approx(0.05, abs=0.005)
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
