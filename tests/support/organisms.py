@@ -31,6 +31,11 @@ def _backbone(policy: Any) -> Any:
     return policy.network.model.paligemma_with_expert.paligemma.model
 
 
+def _count_patches(policy: Any) -> int:
+    """The number of picture tokens, which come first among those of the backbone."""
+    return int(_backbone(policy).vision_tower.vision_model.embeddings.position_embedding.weight.shape[0])
+
+
 def make_blind(policy: Any) -> None:
     """Every picture token is zero."""
     projector = _backbone(policy).multi_modal_projector.linear
@@ -58,7 +63,7 @@ def _hide(policy: Any, *, pictures: bool) -> None:
     """Hide keys of the backbone from the expert: of the words, and of the pictures too."""
     joint = policy.network.model.paligemma_with_expert
     forward = joint.forward
-    patches = _backbone(policy).vision_tower.vision_model.embeddings.position_embedding.weight.shape[0]
+    patches = _count_patches(policy)
     prefix = 0
 
     def masked(attention_mask: Any = None, inputs_embeds: Any = None, **keywords: Any) -> Any:
@@ -77,7 +82,7 @@ def _hide(policy: Any, *, pictures: bool) -> None:
 def _hide_from_blocks(policy: Any, blocks: Sequence[int], *, words: bool = False) -> None:
     """Hide the picture's tokens from these blocks of the action expert, and the words too where `words`."""
     joint = policy.network.model.paligemma_with_expert
-    patches = _backbone(policy).vision_tower.vision_model.embeddings.position_embedding.weight.shape[0]
+    patches = _count_patches(policy)
 
     def masked(module: Any, arguments: tuple[Any, ...], keywords: dict[str, Any]) -> Any:
         del module
@@ -110,7 +115,7 @@ def _change_prefix(policy: Any, change: Callable[[Any], Any] | None, cached: Cal
 
 def keep_words_from_pictures(policy: Any) -> None:
     """No word reads a picture token in the backbone."""
-    patches = _backbone(policy).vision_tower.vision_model.embeddings.position_embedding.weight.shape[0]
+    patches = _count_patches(policy)
 
     def masked(mask: Any) -> Any:
         mask[:, :, patches:, :patches] = torch.finfo(mask.dtype).min
@@ -137,7 +142,7 @@ TILE_TOKENS = (3, 5, 6, 7, 8, 9, 10, 11)
 
 def read_pictures_through_words(policy: Any) -> None:
     """The words' keys and values are those of the tiles, and the expert reads no picture token itself."""
-    patches = _backbone(policy).vision_tower.vision_model.embeddings.position_embedding.weight.shape[0]
+    patches = _count_patches(policy)
     words = slice(patches, patches + len(TILE_TOKENS))
 
     def relay(cache: Any) -> None:

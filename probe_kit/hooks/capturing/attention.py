@@ -20,7 +20,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
-from weakref import WeakKeyDictionary, WeakSet, ref
+from weakref import WeakKeyDictionary, ref
 
 import numpy as np
 import torch
@@ -342,12 +342,8 @@ class _Attention:
     values: Tensor
 
 
-_ATTENDS_INSIDE: "WeakSet[nn.Module]" = WeakSet()
-"""Output projections whose attention was computed inside the module that owns them, whenever it was asked for."""
-
-
-_OWNERS: "WeakKeyDictionary[nn.Module, WeakKeyDictionary[nn.Module, ref[nn.Module]]]" = WeakKeyDictionary()
-"""By network and module, the module that has it as a child."""
+_ATTENDING: "WeakKeyDictionary[nn.Module, ref[nn.Module]]" = WeakKeyDictionary()
+"""By output projection the module that owns it, if all attention that was asked for was computed inside of it."""
 
 
 class _AttentionCalls(TorchFunctionMode):
@@ -378,22 +374,23 @@ class _AttentionCalls(TorchFunctionMode):
         Seeing each call costs as much as a third of a small model's inference. Where attention was computed
         inside its own modules once, only these are watched.
         """
-        network = getattr(self.model, "network", None)
-        owners = _owners(network, {tap.module for tap in self.taps.values()})
-        if network is None or owners is None:
-            with self:
-                yield
-            return
-        is_known = all(tap.module in _ATTENDS_INSIDE for tap in self.taps.values())
+        projections = {tap.module for tap in self.taps.values()}
+        attending = {module: _ATTENDING[module]() for module in projections if module in _ATTENDING}
+        owners = {module: owner for module, owner in attending.items() if owner is not None}
+        is_known = len(owners) == len(projections)
+        if not is_known:
+            owners = _owners(getattr(self.model, "network", None), projections)
         with ExitStack() as stack:
-            for owner in owners:
+            for owner in dict.fromkeys(owners.values()):
                 enter, leave = partial(self._enter, is_known), partial(self._leave, is_known)
                 stack.callback(owner.register_forward_pre_hook(enter, prepend=True).remove)
                 stack.callback(owner.register_forward_hook(leave, always_call=True).remove)
             if not is_known:
                 stack.enter_context(self)
             yield
-        _ATTENDS_INSIDE.update(projection for projection, is_inside in self.projections.items() if is_inside)
+        for module, is_inside in self.projections.items():
+            if is_inside and module in owners:
+                _ATTENDING[module] = ref(owners[module])
 
     def at(self, site: Site, read: Tensor) -> tuple[Tensor, Tensor]:
         """Return the pattern (B, H, S, T) of the positions of a site, whose heads read `read` (B, S, H · E).
@@ -449,17 +446,11 @@ class _AttentionCalls(TorchFunctionMode):
         return result
 
 
-def _owners(network: object, modules: Collection[nn.Module]) -> list[nn.Module] | None:
-    """Return the modules that own others as direct children; None if one of these has no owner in the network."""
+def _owners(network: object, modules: Collection[nn.Module]) -> dict[nn.Module, nn.Module]:
+    """Return by module the one of a network that has it as a child; modules without any are left out."""
     if not isinstance(network, nn.Module):
-        return None
-    if network not in _OWNERS:
-        _OWNERS[network] = WeakKeyDictionary(
-            {child: ref(module) for module in network.modules() for child in module.children()}
-        )
-    owners = [_OWNERS[network][module]() for module in modules if module in _OWNERS[network]]
-    present = [owner for owner in dict.fromkeys(owners) if owner is not None]
-    return present if len(owners) == len(modules) and None not in owners else None
+        return {}
+    return {child: owner for owner in network.modules() for child in owner.children() if child in modules}
 
 
 def _is_reading(shares: Tensor, weights: Tensor, values: Tensor) -> bool:
