@@ -137,6 +137,15 @@ class Intervention(Choice, ABC):
         """Whether items are inferred beforehand, for directions of tokens, erasers or a search."""
         return self.fits_always or ":" in getattr(self, "direction", "")
 
+    @property
+    def plays_episodes(self) -> bool:
+        """Whether whole episodes are played again; the readout is then where the cube ends."""
+        return False
+
+    def parameters(self) -> dict[str, Any]:
+        """Return its own settings as plain JSON; with the run they decide its numbers."""
+        return super().parameters() | ({"readout": "episode"} if self.plays_episodes else {})
+
     def check_run(self, run: Run) -> None:
         """Refuse a run that the intervention does not fit.
 
@@ -159,6 +168,11 @@ class Intervention(Choice, ABC):
             )
         elif self.instructions:
             self._check_instructions(run)
+        if self.plays_episodes and run.rule != DEFAULT_RULE:
+            raise UsageError(
+                f"{run.location} is read by the rule {run.rule!r}; a closed loop repeats outcomes as they were "
+                f"recorded: open the run without another rule ({DEFAULT_RULE})"
+            )
 
     def _check_instructions(self, run: Run) -> None:
         """Raise UsageError for further instructions that nothing exchanges, or that the run has already."""
@@ -188,7 +202,11 @@ class Intervention(Choice, ABC):
     def play(
         self, session: "ReplaySession", pairs: Sequence[Pair], conditions: Sequence[Condition]
     ) -> ConditionOutcomes:
-        """Play the conditions on some pairs, as the readout demands."""
+        """Play the conditions on some pairs, as the readout demands, or their episodes from first to last step."""
+        if self.plays_episodes:
+            from probe_kit.intervene.rollout import play_episodes
+
+            return play_episodes(session, pairs, conditions)
         if self.readout == PER_STEP:
             from probe_kit.intervene.rollout import evaluate_per_step
 
@@ -250,19 +268,6 @@ class Intervention(Choice, ABC):
         """Return keys of the stored interventions that tables and figures read; None if none is preferred."""
         del run
         return None
-
-
-def check_recorded_rule(run: Run) -> None:
-    """Refuse a run whose outcomes are read by another rule than they were recorded by; a closed loop repeats them.
-
-    Raises:
-        UsageError: For another rule.
-    """
-    if run.rule != DEFAULT_RULE:
-        raise UsageError(
-            f"{run.location} is read by the rule {run.rule!r}; a closed loop repeats outcomes as they were "
-            f"recorded: open the run without another rule ({DEFAULT_RULE})"
-        )
 
 
 NONE = "none"

@@ -25,7 +25,6 @@ from probe_kit.intervene.kinds.base import (
     AlongDirection,
     EffectColumn,
     EffectRow,
-    check_recorded_rule,
     common_columns,
     compare_with_controls,
     count_edits,
@@ -40,7 +39,6 @@ from probe_kit.intervene.kinds.base import (
 )
 from probe_kit.intervene.kinds.interchange import best_patch_targets, patch_of, patches_within
 from probe_kit.intervene.outcomes import CLEAN, UNCHANGED, ConditionOutcomes
-from probe_kit.intervene.pairs import Pair
 from probe_kit.intervene.patching.patch import Cell, sites_of_cells
 from probe_kit.intervene.places import ALL, TILES, resolve_sites
 from probe_kit.intervene.replay import SOURCE_RUN, Condition, ConditionContext, ConditionResult
@@ -139,20 +137,10 @@ class ClosedLoop(AlongDirection):
         targets = (target.split(SEPARATOR) for target in self.targets)
         return tuple((site, (role,)) for site, role in targets)
 
-    def parameters(self) -> dict[str, Any]:
-        """Return its own settings; the readout is where the cube ends."""
-        return {**super().parameters(), "readout": "episode"}
-
-    def check_run(self, run: Run) -> None:
-        """Refuse a run that the intervention does not fit.
-
-        Raises as `Intervention.check_run` too.
-
-        Raises:
-            UsageError: For outcomes by another rule than they were recorded by.
-        """
-        super().check_run(run)
-        check_recorded_rule(run)
+    @property
+    def plays_episodes(self) -> bool:
+        """Whether whole episodes are played again: always."""
+        return True
 
     def conditions(self, session: "ReplaySession") -> Sequence[Condition]:
         """Return the identity patch, the image swap and every target.
@@ -180,14 +168,6 @@ class ClosedLoop(AlongDirection):
             if cell in bases:
                 conditions += patches_within(self.direction, bases[cell], cell, source_sites)
         return conditions
-
-    def play(
-        self, session: "ReplaySession", pairs: Sequence[Pair], conditions: Sequence[Condition]
-    ) -> ConditionOutcomes:
-        """Play the episodes of the pairs, each under every condition, from its first step to its last."""
-        from probe_kit.intervene.rollout import play_episodes
-
-        return play_episodes(session, pairs, conditions)
 
     @staticmethod
     def effects(measurement: Measurement) -> "list[ClosedLoopEffect]":

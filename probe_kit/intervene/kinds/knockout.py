@@ -45,7 +45,6 @@ from probe_kit.intervene.kinds.base import (
     EffectColumn,
     EffectRow,
     Intervention,
-    check_recorded_rule,
     common_columns,
     compare_with_controls,
     effect_table,
@@ -57,11 +56,10 @@ from probe_kit.intervene.kinds.base import (
 )
 from probe_kit.intervene.kinds.closed_loop import CORRECT
 from probe_kit.intervene.outcomes import CLEAN, UNCHANGED, ConditionOutcomes
-from probe_kit.intervene.pairs import Pair
 from probe_kit.intervene.places import ALL, TILES, roles_of
 from probe_kit.intervene.replay import CLEAN_RUN, SOURCE_RUN, Condition, ConditionContext, ConditionResult
 from probe_kit.intervene.settings import FIRST_CHUNK, has_sides
-from probe_kit.intervene.stored import Measurement, StoredResult, stored_interventions, stored_results
+from probe_kit.intervene.stored import Measurement, preferred_by_category, stored_interventions
 from probe_kit.runs.reader import RunReader
 from probe_kit.runs.records import as_json
 from probe_kit.runs.run import Run
@@ -160,17 +158,21 @@ class Knockout(Intervention):
 
         return replace(kind, untrained=stored_twin(kind, run, open_run(folder)))
 
+    @property
+    def plays_episodes(self) -> bool:
+        """Whether whole episodes are played again."""
+        return self.closed_loop
+
     def parameters(self) -> dict[str, Any]:
-        """Return its own settings; the readout of a closed loop is where the cube ends."""
-        settings = super().parameters() | {"untrained": "" if self.untrained is None else self.untrained.key}
-        return {**settings, "readout": "episode"} if self.closed_loop else settings
+        """Return its own settings; the untrained network's knockout by its key."""
+        return super().parameters() | {"untrained": "" if self.untrained is None else self.untrained.key}
 
     def check_run(self, run: Run) -> None:
         """Refuse a run that cannot be played, or without anything to compare with; raises as the base does too.
 
         Raises:
-            UsageError: For no control in a run without sides, and for episodes of a closed loop that are not of
-                the scene or are read by another rule than they were recorded by.
+            UsageError: For no control in a run without sides, and for a closed loop of episodes that are not of
+                the scene.
         """
         super().check_run(run)
         if self.closed_loop and not has_sides(run):
@@ -178,8 +180,6 @@ class Knockout(Intervention):
                 f"--closed-loop plays episodes again, and {run.location} is no run of the scene. Leave it out, or "
                 "take a run of the scene"
             )
-        if self.closed_loop:
-            check_recorded_rule(run)
         if not has_sides(run) and not self.controls:
             raise UsageError(
                 "--controls 0 leaves nothing to compare with: any cut changes an action. Take 1 or more"
@@ -247,16 +247,6 @@ class Knockout(Intervention):
                 return ConditionResult(context.act(), log)
 
         return Condition(str(cell), play, cell=cell)
-
-    def play(
-        self, session: "ReplaySession", pairs: Sequence[Pair], conditions: Sequence[Condition]
-    ) -> ConditionOutcomes:
-        """Play the first inferences of the pairs under every condition, or whole episodes in a closed loop."""
-        if not self.closed_loop:
-            return super().play(session, pairs, conditions)
-        from probe_kit.intervene.rollout import play_episodes
-
-        return play_episodes(session, pairs, conditions)
 
     def extra_files(
         self, session: "ReplaySession", conditions: Sequence[Condition], outcomes: ConditionOutcomes
@@ -336,7 +326,7 @@ class Knockout(Intervention):
         Raises:
             RunDamagedError: If a stored intervention was changed.
         """
-        return {result.stored.key for result in _preferred(run).values()}
+        return {result.stored.key for result in preferred_by_category(run, Knockout.kind, FIRST_CHUNK).values()}
 
 
 KIND = Knockout
@@ -386,12 +376,8 @@ def stored_knockouts(run: RunReader) -> dict[str, list["KnockoutEffect"]]:
     Raises:
         RunDamagedError: If a stored intervention was changed.
     """
-    return {category: knockout_effects(result.outcomes) for category, result in _preferred(run).items()}
-
-
-def _preferred(run: RunReader) -> dict[str, StoredResult]:
-    results = stored_results(run, Knockout.kind)
-    return {result.category: result for result in results if not result.stored.settings.get("closed_loop")}
+    preferred = preferred_by_category(run, Knockout.kind, FIRST_CHUNK)
+    return {category: knockout_effects(result.outcomes) for category, result in preferred.items()}
 
 
 def acting_stream(policy: "Policy") -> str:
