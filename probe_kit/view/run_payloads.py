@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from probe_kit._system.escaping import terminal_safe, without_folders
 from probe_kit._tables.numbers import p_text, percent, with_limits
@@ -346,8 +346,8 @@ def target_map_payload(viewed: ViewedRun, number: int) -> dict[str, Any]:
         "sites": _site_entries(results.curves[category, view].sites),
         "headings": (f"{metric} [95 %]", "chance", "p of this site", "p, family-wise", "verdict"),
         "cells": [_target_cells(row) for row in scores.to_dict("records")],
-        "score": [round_number(value) for value in scores["score"]],
-        "chance": [round_number(value) for value in scores["chance"]],
+        "score": _numbers(scores["score"]),
+        "chance": _numbers(scores["chance"]),
         "signal": [bool(value) for value in scores["signal"]],
     }
 
@@ -384,7 +384,7 @@ def _scores(results: ProbeResults, category: str, view: str | None) -> pd.DataFr
 
 def _shades(scores: pd.DataFrame) -> dict[str, Any]:
     return {
-        "accuracy": [round_number(value) for value in scores["accuracy"]],
+        "accuracy": _numbers(scores["accuracy"]),
         "signal": [bool(value) for value in scores["signal"]],
     }
 
@@ -465,18 +465,18 @@ def _cut_charts(result: InterventionResult) -> list[dict[str, Any]]:
                     "unit": measure_of_cuts(effects),
                     "layers": lines[0].layers.tolist(),
                     "lines": [
-                        {"name": line.role, "values": line.lost.tolist(), "read": line.is_read.tolist()}
+                        {"name": line.role, "values": _numbers(line.lost), "read": line.is_read.tolist()}
                         for line in lines
                     ],
-                    "controls": _finite(np.nanmean([line.controls for line in lines], axis=0)),
+                    # A role may have no control, and a layer none of any role.
+                    "controls": _numbers(pd.DataFrame([line.controls for line in lines]).mean()),
                 }
             )
     return charts
 
 
-def _finite(values: NDArray[np.float64]) -> list[float | None]:
-    """Return numbers, None in place of those that are missing."""
-    return [None if np.isnan(value) else float(value) for value in values]
+def _numbers(values: Iterable[float]) -> list[float | None]:
+    return [round_number(value) for value in values]
 
 
 def _targets(viewed: ViewedRun) -> Iterator[dict[str, Any]]:

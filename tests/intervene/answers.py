@@ -9,8 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.intervene import ConditionOutcomes, InterventionResult, UseVerdict
+from probe_kit.intervene.edited_cells import NO_CELL, EditedCell, columns_of
 from probe_kit.intervene.kinds.image_swap import ImageSwapEffect, image_swap_effects
 from probe_kit.intervene.kinds.interchange import PatchEffect, patch_effects
+from probe_kit.intervene.kinds.knockout import windows
 from probe_kit.intervene.outcomes import IMAGE_SWAP
 from probe_kit.intervene.results import save
 from probe_kit.intervene.settings import FIRST_CHUNK
@@ -19,6 +21,8 @@ from probe_kit.runs import Location
 from probe_kit.runs.records import as_json
 
 Cell = NDArray[np.float64]
+KNOCKOUT_LAYERS, KNOCKOUT_EPISODES = 6, 48
+"""Layers that can be cut, and episodes, of `knockout_of`."""
 
 
 def outcomes_of(signs: Mapping[str, tuple[Cell, Cell]], groups: int | None = None) -> ConditionOutcomes:
@@ -58,6 +62,38 @@ def habit(episodes: int) -> tuple[Cell, Cell]:
     displacements = np.where([(n // 2 + n % 2) % 2 == 0 for n in range(episodes)], 0.1, -0.1)
     nudge = np.repeat(draw.permutation([1e-5, -1e-5] * (episodes // 4)), 2)
     return displacements, displacements - nudge
+
+
+def knockout_of(reads: dict[str, list[set[int]]], seed: int, window: str = "both") -> ConditionOutcomes:
+    """A follower with the loss that its reading implies: a role is lost if all layers of one of its sets are cut.
+
+    Actions of every condition have noise of their own, and a control loses nothing.
+    """
+    plain = outcomes_of({"color": follower(KNOCKOUT_EPISODES)})
+    draw = np.random.default_rng(seed)
+    names, rows = list(plain.conditions), [plain.displacement[0], plain.displacement[1]]
+    cells = [NO_CELL] * 2
+    for role, sets in reads.items():
+        for first, last in windows(window, KNOCKOUT_LAYERS):
+            cut = set(range(first, last + 1))
+            is_lost = bool(sets) and all(needed & cut for needed in sets)
+            for name in ("cut", "control-1", "control-2"):
+                cells.append(EditedCell(f"expert.{first:02d}-{last:02d}.heads", role, name))
+                names.append(str(cells[-1]))
+                remaining = 0.1 if is_lost and name == "cut" else 1.0
+                rows.append(remaining * plain.displacement[0])
+    moved = np.array(rows)
+    moved[2:] += draw.normal(0, 0.03, moved[2:].shape)
+    change = np.abs(moved - moved[0])
+    return replace(
+        plain,
+        conditions=tuple(names),
+        **columns_of(cells),
+        displacement=moved,
+        max_action_change=change,
+        size=change,
+        edit_log=np.ones((*moved.shape, 5)),
+    )
 
 
 def store_outcomes(

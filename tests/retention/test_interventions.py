@@ -28,8 +28,7 @@ from probe_kit.retention.displays import (
 from probe_kit.retention.displays.interventions import _share
 from probe_kit.runs.thumbnails import as_thumbnail, thumbnail_key
 from probe_kit.train import ArrayRun, load_results
-from tests.intervene.answers import follower, habit, outcomes_of, store_outcomes
-from tests.intervene.kinds.test_knockout import played
+from tests.intervene.answers import follower, habit, knockout_of, outcomes_of, store_outcomes
 
 mpl.use("agg")
 SIGNAL = ([0.5, 0.9], [[0.7]])
@@ -349,7 +348,7 @@ def test_small_changes_of_the_tokens_are_not_written_as_none(ratio: float, text:
 
 def test_a_knockout_shows_a_curve_a_role_over_its_controls(run: ArrayRun) -> None:
     reads = {"image": [{2}], "language": []}
-    answers = played(reads, 0)
+    answers = knockout_of(reads, 0)
     store(run, "knockout", answers)
     display = KnockoutDisplay.from_run(run, "color")
     curves = {(curve.role, curve.growth): curve for curve in display.curves}

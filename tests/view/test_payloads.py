@@ -39,7 +39,7 @@ from probe_kit.train.results.store import load_results_by_call
 from probe_kit.view import write_viewer
 from probe_kit.view.catalogue import Catalogue
 from probe_kit.view.run_payloads import pack_floats, pack_log_odds, payload_script
-from tests.intervene.kinds.test_knockout import played
+from tests.intervene.answers import knockout_of
 from tests.retention.asked_runs import ASK
 from tests.support.little_run import certify, episode, little_plan, little_settings, little_writer
 from tests.support.recorded_run import CALLS, EVERY, write_recorded_run
@@ -491,7 +491,7 @@ def test_what_is_stored_is_shown_as_the_tables_of_the_commands(source_catalogue:
 
 def test_a_knockout_has_a_chart_for_each_growth_of_its_windows(tmp_path: Path) -> None:
     run = write_recorded_run(tmp_path / "run")
-    save(run, settings_of(Knockout(), run), played({"image": [{2}], "language": []}, 0), {"replay": {}})
+    save(run, settings_of(Knockout(), run), knockout_of({"image": [{2}], "language": []}, 0), {"replay": {}})
     _, results = read_payload(Catalogue([open_run(run.path)]).script("run/results"))
     (charts,) = [table["curves"] for table in results["tables"] if table["kind"] == "intervention knockout"]
     assert [chart["title"] for chart in charts] == ["Color: cut up to the layer", "Color: cut from the layer"]
@@ -500,6 +500,17 @@ def test_a_knockout_has_a_chart_for_each_growth_of_its_windows(tmp_path: Path) -
     assert not any(lines["language"]["read"])
     assert charts[0]["layers"] == [0, 1, 2, 3, 4, 5]
     assert len(charts[0]["controls"]) == 6
+
+
+def test_a_knockout_without_controls_has_a_chart_without_them(tmp_path: Path) -> None:
+    run = write_recorded_run(tmp_path / "run")
+    outcomes = knockout_of({"image": [{2}]}, 0)
+    log = outcomes.edit_log.copy()
+    log[[cell.is_control for cell in outcomes.cells]] = 0  # they cut nothing
+    save(run, settings_of(Knockout(), run), replace(outcomes, edit_log=log), {"replay": {}})
+    _, results = read_payload(Catalogue([open_run(run.path)]).script("run/results"))
+    (charts,) = [table["curves"] for table in results["tables"] if table["kind"] == "intervention knockout"]
+    assert [chart["controls"] for chart in charts] == [[None] * 6] * 2
 
 
 @pytest.mark.slow

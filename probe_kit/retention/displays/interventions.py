@@ -627,15 +627,16 @@ class KnockoutDisplay(Display):
     def draw(self, axes: "Axes") -> None:
         """Draw a line for every role and growth, over the band of the controls of all of them."""
         axes.axhline(0, color="0.45", lw=1, ls=(0, (1, 1)))
-        every = np.array(
-            [(x, y) for curve in self.curves for x, y in zip(curve.layers, curve.controls, strict=True)]
-        )
-        if (every := every[~np.isnan(every[:, 1])]).size:
-            places = np.unique(every[:, 0])
-            least, most = (np.array([of(every[every[:, 0] == x, 1]) for x in places]) for of in (np.min, np.max))
+        controls: dict[float, list[float]] = {}
+        for curve in self.curves:
+            for layer, control in zip(curve.layers, curve.controls, strict=True):
+                if not np.isnan(control):
+                    controls.setdefault(layer, [0.0]).append(control)
+        if controls:
+            layers = sorted(controls)
             axes.fill_between(
-                places, np.minimum(least, 0), np.maximum(most, 0), color=GREY, alpha=0.35, lw=0,
-                label="as many random tokens of other roles",
+                layers, [min(controls[layer]) for layer in layers], [max(controls[layer]) for layer in layers],
+                color=GREY, alpha=0.35, lw=0, label="as many random tokens of other roles",
             )  # fmt: skip
         roles = list(dict.fromkeys(curve.role for curve in self.curves))
         for curve in self.curves:
@@ -647,18 +648,21 @@ class KnockoutDisplay(Display):
 
 def measure_of_cuts(effects: Sequence[KnockoutEffect]) -> str:
     """Return the measure of the cuts of one category: the picture's effect, or the action where that has none."""
-    is_share = any(row.lost is not None for row in effects)
-    return KnockoutDisplay.measure if is_share else "change of the action, in spreads"
+    return KnockoutDisplay.measure if _are_shares(effects) else "change of the action, in spreads"
 
 
 def cut_curves(effects: Sequence[KnockoutEffect]) -> tuple[CutCurve, ...]:
     """Return a curve for every role and growth of windows, of the cuts of one category."""
-    is_share = any(row.lost is not None for row in effects)
+    are_shares = _are_shares(effects)
     return tuple(
-        _cut_curve(role, growth, rows, is_share)
+        _cut_curve(role, growth, rows, are_shares)
         for role, of_role in by_role(effects).items()
         for growth, rows in windows_by_growth(of_role).items()
     )
+
+
+def _are_shares(effects: Sequence[KnockoutEffect]) -> bool:
+    return any(row.lost is not None for row in effects)
 
 
 def _layer_drawn(row: KnockoutEffect, growth: str) -> float:
@@ -667,33 +671,32 @@ def _layer_drawn(row: KnockoutEffect, growth: str) -> float:
     return float(ends.get(growth, (row.first + row.last) / 2))
 
 
-def _cut_curve(role: str, growth: str, rows: Sequence[KnockoutEffect], is_share: bool) -> CutCurve:
-    by_layer = sorted((_layer_drawn(row, growth), at) for at, row in enumerate(rows))
-    rows = [rows[at] for _, at in by_layer]
-
-    def column(values: list[float | None], factor: float) -> NDArray[np.float64]:
-        return np.array([np.nan if value is None else factor * value for value in values])
-
-    lost = [row.lost if is_share else row.size for row in rows]
-    controls = [row.control_lost if is_share else row.control_size for row in rows]
-    factor = 100.0 if is_share else 1.0
+def _cut_curve(role: str, growth: str, rows: Sequence[KnockoutEffect], are_shares: bool) -> CutCurve:
+    rows = sorted(rows, key=lambda row: _layer_drawn(row, growth))
+    lost = [row.lost if are_shares else row.size for row in rows]
+    controls = [row.control_lost if are_shares else row.control_size for row in rows]
+    factor = 100.0 if are_shares else 1.0
     return CutCurve(
         role,
         growth,
-        np.array([layer for layer, _ in by_layer]),
-        column(lost, factor),
-        column(controls, factor),
-        np.array([row.matters for row in rows], bool),
+        layers=np.array([_layer_drawn(row, growth) for row in rows]),
+        lost=factor * np.array(lost, np.float64),  # None becomes NaN
+        controls=factor * np.array(controls, np.float64),
+        is_read=np.array([row.matters for row in rows], bool),
     )
 
 
-def knockout_curve(run: RunReader) -> "Figure":
+def knockout_curve(run: RunReader, stored: Mapping[str, Sequence[KnockoutEffect]] | None = None) -> "Figure":
     """Return a figure with a panel per category of which a knockout is stored.
+
+    Args:
+        run: The run that stores the knockouts.
+        stored: Result of `stored_knockouts`; None reads it from the run.
 
     Raises:
         NoInterventionsError: If there is none.
     """
-    stored = stored_knockouts(run)
+    stored = stored_knockouts(run) if stored is None else stored
     return in_panels([KnockoutDisplay.from_run(run, category, stored) for category in stored or ["any"]])
 
 
@@ -701,12 +704,12 @@ def knockout_curve(run: RunReader) -> "Figure":
 def knockout_figures(source: FigureSource) -> Iterator[ReportFigure]:
     """Yield a figure per run that stores a knockout."""
     for drawn in source.runs:
-        if stored_knockouts(drawn.run):
+        if stored := stored_knockouts(drawn.run):
             yield ReportFigure(
                 f"{drawn.stem}-knockout", "From which tokens the action reads", "interventions",
                 "What is lost when the acting part cannot attend to the tokens of one role, by the layers in "
                 "which they are cut: from the first up to this one, or from this one to the last. Filled: more "
                 "than as many random tokens of other roles (the band). What other tokens of the backbone carried "
                 "on is not cut.",
-                drawn.position, partial(knockout_curve, drawn.run),
+                drawn.position, partial(knockout_curve, drawn.run, stored),
             )  # fmt: skip

@@ -13,7 +13,6 @@ from probe_kit.cli import app
 from probe_kit.errors import UsageError
 from probe_kit.extract import ExtractSettings, extract_run
 from probe_kit.intervene import ConditionOutcomes, InterventionResult, Knockout, run_intervention
-from probe_kit.intervene.edited_cells import NO_CELL, EditedCell, columns_of
 from probe_kit.intervene.kinds.knockout import (
     KnockoutEffect,
     by_role,
@@ -26,10 +25,9 @@ from probe_kit.intervene.kinds.knockout import (
 from probe_kit.intervene.stored import stored_interventions
 from probe_kit.runs import Run, open_run
 from probe_kit.suite import Suite
-from tests.intervene.answers import follower, outcomes_of
+from tests.intervene.answers import KNOCKOUT_EPISODES, KNOCKOUT_LAYERS, knockout_of
 from tests.support.organisms import READERS, is_true_of, reader_run
 
-LAYERS, EPISODES = 6, 48
 Losses = NDArray[np.float64]
 
 
@@ -51,45 +49,13 @@ def test_controls_are_as_many_tokens_of_other_roles() -> None:
     assert random_tokens(~keys, every, 3).sum() == 6  # there are no more
 
 
-def played(reads: dict[str, list[set[int]]], seed: int, window: str = "both") -> ConditionOutcomes:
-    """A follower with the loss that its reading implies: a role is lost if all layers of one of its sets are cut.
-
-    Actions of every condition have noise of their own, and a control loses nothing.
-    """
-    plain = outcomes_of({"color": follower(EPISODES)})
-    draw = np.random.default_rng(seed)
-    names, rows = list(plain.conditions), [plain.displacement[0], plain.displacement[1]]
-    cells = [NO_CELL] * 2
-    for role, sets in reads.items():
-        for first, last in windows(window, LAYERS):
-            cut = set(range(first, last + 1))
-            is_lost = bool(sets) and all(needed & cut for needed in sets)
-            for name in ("cut", "control-1", "control-2"):
-                cells.append(EditedCell(f"expert.{first:02d}-{last:02d}.heads", role, name))
-                names.append(str(cells[-1]))
-                remaining = 0.1 if is_lost and name == "cut" else 1.0
-                rows.append(remaining * plain.displacement[0])
-    moved = np.array(rows)
-    moved[2:] += draw.normal(0, 0.03, moved[2:].shape)
-    change = np.abs(moved - moved[0])
-    return replace(
-        plain,
-        conditions=tuple(names),
-        **columns_of(cells),
-        displacement=moved,
-        max_action_change=change,
-        size=change,
-        edit_log=np.ones((*moved.shape, 5)),
-    )
-
-
 def read_by(outcomes: ConditionOutcomes) -> dict[str, list[KnockoutEffect]]:
     return by_role(knockout_effects(outcomes))
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_reading_in_one_layer_is_found_there_and_words_that_are_unread_are_not(seed: int) -> None:
-    roles = read_by(played({"image": [{2}], "language": []}, seed))
+    roles = read_by(knockout_of({"image": [{2}], "language": []}, seed))
     assert layers_read(roles["image"]) == (2, 2)
     assert layers_read(roles["language"]) is None
     assert re.fullmatch(
@@ -102,20 +68,23 @@ def test_reading_in_one_layer_is_found_there_and_words_that_are_unread_are_not(s
 
 @pytest.mark.parametrize(("layer", "outer"), [(0, (0, 1)), (2, (1, 3)), (5, (4, 5))])
 def test_windows_that_slide_give_the_outer_limits_of_all_that_lose(layer: int, outer: tuple[int, int]) -> None:
-    assert layers_read(read_by(played({"image": [{layer}]}, 0, "2"))["image"]) == outer
+    assert layers_read(read_by(knockout_of({"image": [{layer}]}, 0, "2"))["image"]) == outer
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_layers_that_are_each_enough_are_named_together(seed: int) -> None:
     """Reading in layer 1 or in layer 4 is enough: only a cut of both loses."""
-    roles = read_by(played({"image": [{1}, {4}]}, seed))
+    roles = read_by(knockout_of({"image": [{1}, {4}]}, seed))
     assert layers_read(roles["image"]) == (4, 1)
     assert "in layers 1 to 4, where a part is enough" in reading_of(roles["image"])
 
 
 def test_what_nothing_reads_is_read_in_one_of_twenty_cases_at_most() -> None:
     alarms = [
-        any(layers_read(part) is not None for part in read_by(played({"image": [], "state": []}, seed)).values())
+        any(
+            layers_read(part) is not None
+            for part in read_by(knockout_of({"image": [], "state": []}, seed)).values()
+        )
         for seed in range(60)
     ]
     assert np.mean(alarms) <= 0.05 + 2 * np.sqrt(0.05 * 0.95 / 60)
@@ -123,8 +92,8 @@ def test_what_nothing_reads_is_read_in_one_of_twenty_cases_at_most() -> None:
 
 def test_the_loss_is_twice_the_share_of_the_swap() -> None:
     """An action that no longer tells both orders apart lies half way between clean and swapped."""
-    roles = read_by(played({"image": [{0}]}, 0))
-    widest = next(row for row in roles["image"] if (row.first, row.last) == (0, LAYERS - 1))
+    roles = read_by(knockout_of({"image": [{0}]}, 0))
+    widest = next(row for row in roles["image"] if (row.first, row.last) == (0, KNOCKOUT_LAYERS - 1))
     assert widest.lost == pytest.approx(0.9, abs=0.05)
     assert widest.lost_ci is not None
     assert widest.lost_ci[0] < 0.9 < widest.lost_ci[1]
@@ -138,16 +107,16 @@ def unmoved_by_pictures(outcomes: ConditionOutcomes, changes: dict[str, float]) 
 
 
 def test_where_the_picture_moves_nothing_any_change_counts() -> None:
-    roles = read_by(unmoved_by_pictures(played({"image": [], "language": []}, 0), {"language": 2.0}))
+    roles = read_by(unmoved_by_pictures(knockout_of({"image": [], "language": []}, 0), {"language": 2.0}))
     assert layers_read(roles["image"]) is None
-    assert layers_read(roles["language"]) == (0, LAYERS - 1)
+    assert layers_read(roles["language"]) == (0, KNOCKOUT_LAYERS - 1)
     assert "(change of 2.00 spreads)" in reading_of(roles["language"])
 
 
 @pytest.mark.parametrize(("change", "is_read"), [(0.05, False), (0.5, True)])
 def test_without_a_control_of_that_size_a_tenth_of_the_spread_counts(change: float, is_read: bool) -> None:
     """A control that cut nothing is none."""
-    outcomes = unmoved_by_pictures(played({"image": []}, 0), {"image": change})
+    outcomes = unmoved_by_pictures(knockout_of({"image": []}, 0), {"image": change})
     log = outcomes.edit_log.copy()
     log[[cell.is_control for cell in outcomes.cells]] = 0
     rows = read_by(replace(outcomes, edit_log=log))["image"]
@@ -161,12 +130,12 @@ def test_frames_without_a_control_do_not_weaken_that_of_the_others(
     change: float, is_read: bool, share: float
 ) -> None:
     """Cut and control change 0.05 alike, or the cut ten times as much; short instructions leave no control."""
-    outcomes = unmoved_by_pictures(played({"image": []}, 0), {"image": change})
+    outcomes = unmoved_by_pictures(knockout_of({"image": []}, 0), {"image": change})
     assert outcomes.size is not None
     size, log = outcomes.size.copy(), outcomes.edit_log.copy()
     size += np.random.default_rng(0).normal(0, 0.005, size.shape)
     is_control = np.array([cell.is_control for cell in outcomes.cells])
-    is_short = np.arange(EPISODES) < share * EPISODES
+    is_short = np.arange(KNOCKOUT_EPISODES) < share * KNOCKOUT_EPISODES
     size[np.ix_(is_control, ~is_short)] += 0.05
     log[np.ix_(is_control, is_short)] = 0
     rows = read_by(replace(outcomes, size=size, edit_log=log))["image"]
