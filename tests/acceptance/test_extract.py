@@ -101,10 +101,10 @@ def test_a_captured_run_has_activations_of_the_same_first_frames_and_no_success_
 
 @pytest.mark.slow
 def test_asking_stores_the_answers_to_the_same_first_frames(run: pk.Run, tmp_path: Path) -> None:
-    printed = probe_kit("ask", "--model", "vlm-tiny", *FEW, "--prompt", "p1,seen", "--out", tmp_path / "asked")
+    asked = probe_kit("ask", "--model", "vlm-tiny", *FEW, "--prompt", "p1,seen", "--out", tmp_path / "asked")
     folders = sorted(path for path in (tmp_path / "asked").iterdir() if path.is_dir())
     assert len(folders) == 2, "a run per prompt"
-    assert "p1" in printed.text
+    assert "p1" in asked.text
     played = run.episodes.set_index("episode_id")
     for folder in folders:
         answers = pk.open_run(folder).episodes.set_index("episode_id")
@@ -118,7 +118,7 @@ def test_asking_stores_the_answers_to_the_same_first_frames(run: pk.Run, tmp_pat
 
 
 @pytest.mark.parametrize(
-    ("words", "code", "mention"),
+    ("words", "code", "named"),
     [
         (("--model", "pi0-tny"), 2, "pi0-tiny"),
         (("--model", "pi0-tiny", "--categories", "colour"), 2, "color"),
@@ -126,10 +126,10 @@ def test_asking_stores_the_answers_to_the_same_first_frames(run: pk.Run, tmp_pat
     ],
 )
 def test_a_wrong_setting_is_named_with_what_is_possible_and_nothing_is_left(
-    words: tuple[str, ...], code: int, mention: str, tmp_path: Path
+    words: tuple[str, ...], code: int, named: str, tmp_path: Path
 ) -> None:
     refused = probe_kit("extract", *words, "--out", tmp_path / "run", code=code)
-    assert mention in refused.text
+    assert named in refused.text
     assert list(tmp_path.iterdir()) == []
 
 

@@ -22,8 +22,8 @@ def play(file: Path, *options: str) -> dict[str, Any]:
     """Play in a process of its own: the number of threads is decided before numpy is imported."""
     environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")}
     command = [sys.executable, str(SCRIPT), *options, str(file)]
-    completed = subprocess.run(command, env=environment, capture_output=True, encoding="utf-8", check=False)
-    assert completed.returncode == 0, completed.stderr[-4000:] + completed.stdout[-2000:]
+    done = subprocess.run(command, env=environment, capture_output=True, encoding="utf-8", check=False)
+    assert done.returncode == 0, done.stderr[-4000:] + done.stdout[-2000:]
     return read(file)
 
 

@@ -172,7 +172,7 @@ def test_the_same_command_loads_what_is_stored_and_python_gives_the_same_numbers
 
 
 @pytest.mark.parametrize(
-    ("words", "mention"),
+    ("words", "named"),
     [
         (("--kind", "wish"), "image-swap"),
         (("--kind", "interchange", "--sites", "backbone.09"), "backbone"),
@@ -181,7 +181,7 @@ def test_the_same_command_loads_what_is_stored_and_python_gives_the_same_numbers
         (("--categories", "colour"), "color"),
     ],
 )
-def test_a_wrong_setting_is_refused_by_name(intervened: Path, words: tuple[str, ...], mention: str) -> None:
+def test_a_wrong_setting_is_refused_by_name(intervened: Path, words: tuple[str, ...], named: str) -> None:
     refused = probe_kit("intervene", intervened, *words, code=None)
     assert refused.code in (2, 3)
-    assert mention in refused.text
+    assert named in refused.text

@@ -87,7 +87,7 @@ def test_ctrl_c_is_exit_code_130_and_one_line_and_keeps_what_is_done(tmp_path: P
 
 def results(run: Path, kind: str) -> dict[str, bytes]:
     """Stored results of a kind, without the records of times."""
-    return {name: stored for name, stored in content(run / kind).items() if not name.endswith("times.json")}
+    return {name: held for name, held in content(run / kind).items() if not name.endswith("times.json")}
 
 
 COMMANDS = {

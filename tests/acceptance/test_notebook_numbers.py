@@ -27,8 +27,8 @@ TIMED = re.compile(r"\d[\d.,]* ?(?:s|ms|min|MB|kB|GB)\b|in \d+(?:\.\d+)? ?s|/[\w
 
 
 def cells(name: str) -> list[dict[str, Any]]:
-    notebook = json.loads((NOTEBOOKS / f"{name}.ipynb").read_text(encoding="utf-8"))
-    return [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    held = json.loads((NOTEBOOKS / f"{name}.ipynb").read_text(encoding="utf-8"))
+    return [cell for cell in held["cells"] if cell["cell_type"] == "code"]
 
 
 def text_of(cell: Any) -> str:

@@ -67,9 +67,9 @@ class Table:
 def _datasets_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """No cache of the user is read or filled by the `datasets` package."""
     config = pytest.importorskip("datasets.config", reason="the extra `datasets` is not installed")
-    cache = tmp_path_factory.mktemp("datasets-cache")
+    place = tmp_path_factory.mktemp("datasets-cache")
     before = config.HF_DATASETS_CACHE, os.environ.get("HF_DATASETS_CACHE")
-    config.HF_DATASETS_CACHE, os.environ["HF_DATASETS_CACHE"] = cache, str(cache)
+    config.HF_DATASETS_CACHE, os.environ["HF_DATASETS_CACHE"] = place, str(place)
     yield
     config.HF_DATASETS_CACHE = before[0]
     os.environ.pop("HF_DATASETS_CACHE")
@@ -85,11 +85,7 @@ def recording(_datasets_cache: None, tmp_path_factory: pytest.TempPathFactory) -
     folder, draw = tmp_path_factory.mktemp("recorded") / "kitchen", np.random.default_rng(0)
     features = {
         CAMERA: {"dtype": "image", "shape": (48, 64, 3), "names": ["height", "width", "channels"]},
-        "observation.state": {
-            "dtype": "float32",
-            "shape": (8,),
-            "names": [f"s{position}" for position in range(8)],
-        },
+        "observation.state": {"dtype": "float32", "shape": (8,), "names": [f"s{place}" for place in range(8)]},
         "action": {"dtype": "float32", "shape": (7,), "names": None},
     }
     data = LeRobotDataset.create("local/kitchen", 5, features, root=folder, use_videos=False)
@@ -121,7 +117,7 @@ def recorded_action(episode: int, frame: int) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def shown_run(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def shown(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("shown") / "run"
     probe_kit("extract", *recording_words(recording), "--episodes", f"0:{EPISODES}", "--out", folder)
     return folder
@@ -161,9 +157,9 @@ def test_the_command_that_shows_a_data_set_names_its_cameras_and_tasks(recording
 
 
 def test_a_recording_is_shown_frame_by_frame_and_its_numbers_are_stored_beside_the_activations(
-    shown_run: Path,
+    shown: Path,
 ) -> None:
-    run = pk.open_run(shown_run)
+    run = pk.open_run(shown)
     assert run.recorded
     assert len(run.episodes) == EPISODES
     assert set(run.episodes["instruction"]) == {"Put the cube on the red shape", "Put the cube on the gray shape"}
@@ -183,43 +179,43 @@ def test_a_recording_is_shown_frame_by_frame_and_its_numbers_are_stored_beside_t
 
 @pytest.mark.slow
 def test_showing_the_same_frames_again_from_python_gives_the_same_activations(
-    recording: Path, shown_run: Path, tmp_path: Path
+    recording: Path, shown: Path, tmp_path: Path
 ) -> None:
     source = pk.LeRobotSource(str(recording), episodes=range(2), cameras={"base": CAMERA})
     again = pk.extract_run(pk.ExtractSettings("pi0-tiny", source=source), tmp_path / "again")
     for site in (LAST, pk.Site("expert", 3, iteration=9)):
-        assert np.array_equal(again.column(site, "mean", 1), pk.open_run(shown_run).column(site, "mean", 1)[:2])
+        assert np.array_equal(again.column(site, "mean", 1), pk.open_run(shown).column(site, "mean", 1)[:2])
 
 
-def test_errors_of_predicted_actions_are_those_of_the_stored_numbers(shown_run: Path) -> None:
-    rows = json.loads(probe_kit("run", "show", shown_run, "--action-errors", "--json").out)
+def test_errors_of_predicted_actions_are_those_of_the_stored_numbers(shown: Path) -> None:
+    rows = json.loads(probe_kit("run", "show", shown, "--action-errors", "--json").out)
     assert rows
     assert "NaN" not in json.dumps(rows)
 
 
 @pytest.mark.slow
-def test_a_recorded_number_is_decoded_with_the_recorded_action_as_a_control(shown_run: Path) -> None:
+def test_a_recorded_number_is_decoded_with_the_recorded_action_as_a_control(shown: Path) -> None:
     probe_kit(
-        *("train", shown_run, "--target", "dataset.state.s1", "--permutations", "5", "--task", "continuous"),
+        *("train", shown, "--target", "dataset.state.s1", "--permutations", "5", "--task", "continuous"),
         *("--controls", "step,state,action,instruction,pixels,random-features"),
     )
-    text = probe_kit("retention", shown_run, "--target", "dataset.state.s1").text
+    text = probe_kit("retention", shown, "--target", "dataset.state.s1").text
     assert "dataset.state.s1" in text
 
 
 @pytest.mark.slow
 def test_probes_of_one_run_are_scored_on_another_with_other_episodes(
-    recording: Path, shown_run: Path, tmp_path: Path
+    recording: Path, shown: Path, tmp_path: Path
 ) -> None:
-    more_episodes = ("--episodes", f"{EPISODES}:{EPISODES + FURTHER}")
-    probe_kit("extract", *recording_words(recording), *more_episodes, "--out", tmp_path / "others")
+    further = ("--episodes", f"{EPISODES}:{EPISODES + FURTHER}")
+    probe_kit("extract", *recording_words(recording), *further, "--out", tmp_path / "others")
     typed = ("--target", "dataset.state.s1", "--task", "continuous", "--permutations", "3")
-    before = sorted(shown_run.rglob("settings.json"))
-    text = probe_kit("train", shown_run, *typed, "--test-on", tmp_path / "others").text
+    before = sorted(shown.rglob("settings.json"))
+    text = probe_kit("train", shown, *typed, "--test-on", tmp_path / "others").text
     for word in ("chance", "recentred", "backbone"):
         assert word in text
-    assert sorted(shown_run.rglob("settings.json")) == before, "nothing is stored"
-    with_itself = probe_kit("train", shown_run, *typed, "--test-on", shown_run, code=None)
+    assert sorted(shown.rglob("settings.json")) == before, "nothing is stored"
+    with_itself = probe_kit("train", shown, *typed, "--test-on", shown, code=None)
     assert with_itself.code != 0, "the groups of a run do not test its own probes"
 
 

@@ -23,18 +23,16 @@ def test_a_captured_inference_gives_the_actions_of_one_without_hooks_bit_for_bit
     policy = pk.load_policy("pi0-tiny")
     picture = np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8)
     state = np.array([0.29, 0, 0.16, 0, 0, 0, 0, 1], np.float32)
-    observations = [
-        Observation(picture, state, f"Put the cube on the {colour} shape") for colour in ("red", "blue")
-    ]
-    plain = np.asarray(policy.act(observations, [0, 1]))
+    asked = [Observation(picture, state, f"Put the cube on the {colour} shape") for colour in ("red", "blue")]
+    plain = np.asarray(policy.act(asked, [0, 1]))
     with pk.capture(policy, policy.sites()) as tape:
-        captured = np.asarray(policy.act(observations, [0, 1]))
+        captured = np.asarray(policy.act(asked, [0, 1]))
     assert np.array_equal(plain, captured)
-    assert np.array_equal(plain, np.asarray(policy.act(observations, [0, 1]))), "hooks stay behind"
-    assert not np.array_equal(plain, np.asarray(policy.act(observations, [7, 8]))), "the actions ignore noise"
+    assert np.array_equal(plain, np.asarray(policy.act(asked, [0, 1]))), "hooks stay behind"
+    assert not np.array_equal(plain, np.asarray(policy.act(asked, [7, 8]))), "the actions ignore noise"
     for site in policy.sites():
         values = tape[site]
-        assert values.shape[0] == len(observations), site
+        assert values.shape[0] == len(asked), site
         assert np.isfinite(np.asarray(values.float())).all(), site
     assert {site.stream for site in policy.sites()} == {"backbone", "expert"}
     assert tape[pk.Site("backbone", 3)].shape == tape["backbone.03.residual"].shape

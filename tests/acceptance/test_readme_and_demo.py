@@ -99,13 +99,13 @@ def test_the_two_commands_are_there() -> None:
 
 
 def test_every_line_of_a_study_is_a_command_that_asks_only_for_the_run_of_the_first(tmp_path: Path) -> None:
-    _, first, *other_lines = lines_of("README.md", TYPED)
+    _, first, *others = lines_of("README.md", TYPED)
     assert first.startswith("probe-kit extract")
-    assert len(other_lines) == 4
+    assert len(others) == 4
     with contextlib.chdir(tmp_path):
         fewer = ("--categories", "color", "--items", "2")
         assert "episodes" in probe_kit(*first.split()[1:], *fewer, "--dry-run").text
-        for line in other_lines:
+        for line in others:
             assert "runs/mine" in probe_kit(*line.split()[1:], code=2).text
     assert list(tmp_path.iterdir()) == []
 

@@ -120,7 +120,7 @@ def rates(study: Path) -> dict[str, float]:
 def test_a_table_holds_the_success_of_the_runs_in_every_format(study: Path) -> None:
     expected = rates(study)
     assert expected == {"expert": 1.0, "idle": 0.0}
-    table_text = json.dumps(probe_kit("study", "table", study, "main", "--format", "json").json())
+    held = json.dumps(probe_kit("study", "table", study, "main", "--format", "json").json())
     for style in ("table", "markdown", "latex"):
         text = probe_kit("study", "table", study, "main", "--format", style).out
         for name, rate in (("expert", 100), ("Idle", 0)):
@@ -128,7 +128,7 @@ def test_a_table_holds_the_success_of_the_runs_in_every_format(study: Path) -> N
             first = re.search(r"-?\d+(?:\.\d+)?", line.replace("−", "-").partition(name)[2])
             assert first is not None, text
             assert float(first.group()) == rate, text
-    assert all(name in table_text for name in ("expert", "Idle", "color"))
+    assert all(name in held for name in ("expert", "Idle", "color"))
     both = probe_kit("study", "table", study).out
     assert "expert" in both
     assert "short" in both
@@ -138,8 +138,8 @@ def test_a_table_holds_the_success_of_the_runs_in_every_format(study: Path) -> N
 
 def test_an_ablation_subtracts_one_condition_from_another_on_the_same_items(study: Path) -> None:
     """The expert needs more than one action: all of its success is lost."""
-    table = probe_kit("study", "table", study, "time", "--format", "json").json()
-    numbers = {abs(value) for value in numeric_leaves(table["numbers"])}
+    held = probe_kit("study", "table", study, "time", "--format", "json").json()
+    numbers = {abs(value) for value in numeric_leaves(held["numbers"])}
     assert numbers & {1.0, 100.0}
     text = probe_kit("study", "table", study, "time", "--format", "markdown").out.replace("−", "-")
     row = next(line for line in text.splitlines() if line.startswith("|") and "expert" in line)

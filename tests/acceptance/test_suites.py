@@ -104,10 +104,10 @@ def lose_picture(suite: Path) -> None:
 def turn_answer(suite: Path) -> None:
     """Exchange left and right of one item by hand."""
     metadata = suite / "items" / "metadata.jsonl"
-    first, *other_lines = metadata.read_text(encoding="utf-8").splitlines()
+    first, *others = metadata.read_text(encoding="utf-8").splitlines()
     item = json.loads(first)
     item["correct_side"] = {"left": "right", "right": "left"}[item["correct_side"]]
-    metadata.write_text("\n".join((json.dumps(item), *other_lines)) + "\n", encoding="utf-8")
+    metadata.write_text("\n".join((json.dumps(item), *others)) + "\n", encoding="utf-8")
 
 
 def name_side(suite: Path) -> None:

@@ -26,8 +26,8 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     entries = project["entry-points"]["probe_kit.policies"]
     information = folder / "my_vla-0.1.0.dist-info"
     information.mkdir()
-    metadata_text = f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n"
-    (information / "METADATA").write_text(metadata_text, encoding="utf-8")
+    named = f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n"
+    (information / "METADATA").write_text(named, encoding="utf-8")
     lines = ["[probe_kit.policies]", *(f"{name} = {target}" for name, target in entries.items())]
     (information / "entry_points.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
     sys.path.insert(0, str(folder))
@@ -96,7 +96,7 @@ def test_the_contract_is_kept_as_it_is_written(checkpoint: Path) -> None:
 
 @pytest.mark.slow
 def test_the_written_tests_run_the_same_contract(installed: Path) -> None:
-    completed = subprocess.run(
+    done = subprocess.run(
         [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "tests"],
         cwd=installed,
         env=environment(PYTHONPATH=str(installed)),
@@ -105,8 +105,8 @@ def test_the_written_tests_run_the_same_contract(installed: Path) -> None:
         check=False,
         timeout=900,
     )
-    assert completed.returncode == 0, completed.stdout + completed.stderr
-    assert int(completed.stdout.strip().rpartition("\n")[2].split()[0]) > 20, completed.stdout
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert int(done.stdout.strip().rpartition("\n")[2].split()[0]) > 20, done.stdout
 
 
 def test_weights_that_the_network_does_not_have_are_refused_by_name(checkpoint: Path) -> None:

@@ -58,10 +58,10 @@ def table(played: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     probe_kit("labels", played, "--out", file.with_name("all.csv"))
     lines = pd.read_csv(file.with_name("all.csv"))
     assert {"episode_id", "inference", "sim.tool_y", "sim.held", "item.named", "item.left"} <= set(lines.columns)
-    endings = lines.groupby("episode_id", sort=False).agg(end_y=("sim.tool_y", "last")).reset_index()
-    endings["goes_left"] = endings["end_y"] > 0
-    endings["kind"] = [("warm", "cold", "neutral")[row % 3] for row in range(len(endings))]
-    endings.to_csv(file, index=False)
+    own = lines.groupby("episode_id", sort=False).agg(end_y=("sim.tool_y", "last")).reset_index()
+    own["goes_left"] = own["end_y"] > 0
+    own["kind"] = [("warm", "cold", "neutral")[row % 3] for row in range(len(own))]
+    own.to_csv(file, index=False)
     return file
 
 
@@ -186,7 +186,7 @@ def test_a_built_in_label_by_inference_is_decoded_beside_its_controls(played: Pa
 
 
 @pytest.mark.parametrize(
-    ("typed", "mention"),
+    ("typed", "named"),
     [
         (("--target", "sim.tool_w"), "sim.tool_y"),
         (("--views", "mean:words"), "language"),
@@ -194,10 +194,8 @@ def test_a_built_in_label_by_inference_is_decoded_beside_its_controls(played: Pa
         (("--controls", "luck"), "position"),
     ],
 )
-def test_a_wrong_name_is_refused_with_the_possible_ones(
-    played: Path, typed: tuple[str, ...], mention: str
-) -> None:
-    assert mention in probe_kit("train", played, *typed, code=2).text
+def test_a_wrong_name_is_refused_with_the_possible_ones(played: Path, typed: tuple[str, ...], named: str) -> None:
+    assert named in probe_kit("train", played, *typed, code=2).text
 
 
 def test_a_table_with_a_key_that_the_run_lacks_is_refused_by_its_line(

@@ -37,8 +37,8 @@ def distances(run: pk.Run, mirrored: bool = False) -> np.ndarray:
 def rules(run: pk.Run, *words: object) -> dict[str, Any]:
     """Success rates by rule and by radius, as JSON."""
     answer = probe_kit("retention", run.path, *words, "--format", "json").json()
-    zone_rules: dict[str, Any] = next(row for row in answer if row["category"] == "color")["rules"]
-    return zone_rules
+    held: dict[str, Any] = next(row for row in answer if row["category"] == "color")["rules"]
+    return held
 
 
 @pytest.mark.slow

@@ -36,7 +36,7 @@ def differences(answer: Any) -> list[dict[str, Any]]:
 def test_two_runs_are_compared_on_their_common_items_with_a_corrected_p(runs: StoredRuns) -> None:
     answer = probe_kit("retention", runs.trained, runs.untrained, "--format", "json").json()
     rows = {(row["run"]["label"], row["category"]): row for row in rows_of(answer)}
-    (color,) = [difference for difference in differences(answer) if difference["category"] == "color"]
+    (color,) = [one for one in differences(answer) if one["category"] == "color"]
     first, second = correct(runs.trained, "color"), correct(runs.untrained, "color")
     assert sorted(first.index) == sorted(second.index)
     assert color["sr"] == pytest.approx(second.mean() - first.mean())  # the other run minus the first
@@ -47,7 +47,7 @@ def test_two_runs_are_compared_on_their_common_items_with_a_corrected_p(runs: St
         assert color[part] == pytest.approx(expected, abs=1e-9)
     assert color["n_items"] == 12
     assert color["p"] <= color["p_holm"] <= 1
-    assert not [difference for difference in differences(answer) if difference["category"] == "state"], (
+    assert not [one for one in differences(answer) if one["category"] == "state"], (
         "State was played by one run only"
     )
 
@@ -55,7 +55,7 @@ def test_two_runs_are_compared_on_their_common_items_with_a_corrected_p(runs: St
 def test_against_names_the_run_that_is_subtracted_and_the_table_prints_the_difference(runs: StoredRuns) -> None:
     def color(*words: object) -> dict[str, Any]:
         answer = probe_kit("retention", *words, "--format", "json").json()
-        return next(difference for difference in differences(answer) if difference["category"] == "color")
+        return next(one for one in differences(answer) if one["category"] == "color")
 
     straight = color(runs.trained, runs.untrained)
     turned = color(runs.untrained, runs.trained)
@@ -72,7 +72,7 @@ def test_a_group_of_models_is_compared_with_another_with_the_exact_p_over_models
     groups = (f"right={runs.expert}", f"wrong={runs.mirrored},{runs.idle}")
     typed = ("--compare", "groups", *groups)
     answer = probe_kit("retention", *typed, "--format", "json").json()
-    (color,) = [difference for difference in differences(answer) if difference["category"] == "color"]
+    (color,) = [one for one in differences(answer) if one["category"] == "color"]
     assert (color["group"], color["minus"]) == ("wrong", "right")
     rates = {row["run"]["label"]: row["success"]["sr"] for row in rows_of(answer) if row["category"] == "color"}
     assert color["sr"] == pytest.approx((rates["expert-mirrored"] + rates["idle"]) / 2 - rates["expert"])
@@ -126,8 +126,8 @@ def test_stages_count_items_by_answered_encoded_and_acted(runs: StoredRuns) -> N
 def test_wordings_of_one_run_are_compared_on_the_same_seeds_and_chosen_by_name(tmp_path: Path) -> None:
     run = tmp_path / "run"
     policy = ("--model", "pi0-tiny", "--random-weights", "--max-steps", "6", "--execute", "3")
-    typed = ("--items", "12", "--categories", "color", "--wordings", "knowledge,named", "--env-workers", "0")
-    probe_kit("extract", *policy, *typed, "--out", run)
+    asked = ("--items", "12", "--categories", "color", "--wordings", "knowledge,named", "--env-workers", "0")
+    probe_kit("extract", *policy, *asked, "--out", run)
     episodes = pk.open_run(run).episodes
     rates = (episodes["outcome"] == "correct").groupby(episodes["wording"]).mean()
     assert set(rates.index) == {"knowledge", "named"}
@@ -135,7 +135,7 @@ def test_wordings_of_one_run_are_compared_on_the_same_seeds_and_chosen_by_name(t
         answer = probe_kit("retention", run, "--wording", wording, "--format", "json").json()
         assert rows_of(answer)[0]["success"]["sr"] == pytest.approx(rate)
     answer = probe_kit("retention", run, "--format", "json").json()
-    (pair,) = [comparison for comparison in answer["wordings"] if comparison["category"] == "color"]
+    (pair,) = [one for one in answer["wordings"] if one["category"] == "color"]
     assert {pair["wording"], pair["other"]} == {"knowledge", "named"}
     assert pair["sr"] == pytest.approx(rates[pair["wording"]])
     assert pair["other_sr"] == pytest.approx(rates[pair["other"]])

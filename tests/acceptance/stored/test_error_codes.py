@@ -101,8 +101,8 @@ def other_frames(room: Room) -> tuple[object, ...]:
         "frontal",
     )
     probe_kit("ask", *settings, "--out", room.folder / "asked")
-    asked_run = next((room.folder / "asked").glob("*/run.json")).parent
-    return ("retention", asked_run, room.runs.trained, "--compare", "stages")
+    asked = next((room.folder / "asked").glob("*/run.json")).parent
+    return ("retention", asked, room.runs.trained, "--compare", "stages")
 
 
 def too_few_groups(room: Room) -> tuple[object, ...]:
