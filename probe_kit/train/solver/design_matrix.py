@@ -120,8 +120,8 @@ def _orthogonal(axes: Array) -> Array:
 # -- samples along them --------------------------------------------------------------------------------------
 
 
-WORTH_CONVERTING = 2**17
-"""Entries from which on products in float32 gain more than their operands cost to convert: 1 MB of float64."""
+WORTH_CONVERTING = 2**13
+"""Entries from which on products in float32 gain more than their operands cost to convert: 64 kB of float64."""
 
 
 class _OfAllColumns:
