@@ -1,5 +1,6 @@
 """Imports: lazy names of packages, entry points, optional libraries, and the command that installs one."""
 
+import csv
 import shlex
 import shutil
 import sys
@@ -8,6 +9,7 @@ from contextlib import contextmanager
 from functools import cache, lru_cache
 from importlib import import_module, metadata
 from importlib.util import find_spec
+from inspect import getmodulename
 from pathlib import Path
 from typing import Any
 
@@ -56,16 +58,43 @@ def _read(_path: tuple[tuple[str, int], ...]) -> metadata.EntryPoints:
 def one_scan_of_packages() -> Iterator[None]:
     """Let all imports of the body share one scan of the installed packages.
 
-    transformers and diffusers each map every module to its package when they are imported. That reads the list of
-    files of every installed package, nearly a second each time.
+    transformers and diffusers each map every module to its package when they are imported. Python's own scan asks
+    the disk for every file of every package, which takes about a second each time; `packages_by_module` asks for
+    none.
     """
     scan = metadata.packages_distributions
-    shared = cache(scan)
+    shared = cache(packages_by_module)
     metadata.packages_distributions = lambda: dict(shared())
     try:
         yield
     finally:
         metadata.packages_distributions = scan
+
+
+def packages_by_module() -> dict[str, list[str]]:
+    """Return the names of the installed packages that hold each top-level module, by the name of the module.
+
+    These are those of `importlib.metadata.packages_distributions` (Python 3.12), and those of modules that a
+    package lists although they are missing on the disk.
+    """
+    packages: dict[str, list[str]] = {}
+    for package in metadata.distributions():
+        for module in _top_level_modules(package):
+            packages.setdefault(module, []).append(package.metadata["Name"])
+    return packages
+
+
+def _top_level_modules(package: metadata.Distribution) -> set[str]:
+    """Return the modules that a package declares, or else those among the files that it lists."""
+    if declared := (package.read_text("top_level.txt") or "").split():
+        return set(declared)
+    if (listed := package.read_text("RECORD")) is None:
+        paths = [str(path) for path in package.files or ()]
+    else:
+        paths = [row[0] for row in csv.reader(listed.splitlines()) if row]
+    parts = {path.partition("/")[:2] for path in paths}
+    names = {name if folder else getmodulename(name) or name for name, folder in parts}
+    return {name for name in names if "." not in name}
 
 
 def _modification_time(folder: str) -> int:

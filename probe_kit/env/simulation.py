@@ -310,7 +310,9 @@ def wooden_table(camera: Camera) -> Picture:
         to_wall = np.where(rays[..., 0] > 0, (TABLE_END - eye[0]) / rays[..., 0], np.inf)
     nearest = np.minimum(np.minimum(to_table, to_wall), 10.0)  # a ray may meet neither, and is wall
     points = eye + nearest[..., None] * rays
-    color = np.where((to_table < to_wall)[..., None], _wood(points), _wall(points))
+    is_table = to_table < to_wall
+    color = np.empty_like(points)
+    color[is_table], color[~is_table] = _wood(points[is_table]), _wall(points[~is_table])
     picture = Image.fromarray(np.clip(color, 0, 255).astype(np.uint8))
     return np.asarray(picture.resize((camera.spec.width, camera.spec.height), Image.Resampling.LANCZOS))
 
@@ -322,7 +324,8 @@ def _wood(points: Array) -> Array:
     shift = 7.3 * plank
     rings = np.sin(2 * np.pi * (9 * x + 1.6 * _noise(3 * x + shift, 1.5 * y, 1) + shift))
     fibre = _noise(260 * x, 9 * y + shift, 2)
-    tone = _noise(5.7 * plank, 0 * y, 3)
+    planks = np.arange(plank.min(initial=0.0), plank.max(initial=0.0) + 1)
+    tone = _noise(5.7 * planks, 0 * planks, 3).take((plank - planks[0]).astype(np.int32))
     lightness = 0.45 + 0.16 * rings + 0.30 * (fibre - 0.5) + 0.35 * (tone - 0.5)
     seam = np.abs(x / PLANK_WIDTH - plank - 0.5) > 0.49
     shade = (1.06 - 0.35 * np.hypot(x - 0.3, y - 0.1)) * np.where(seam, 0.62, 1.0)
@@ -337,11 +340,13 @@ def _wall(points: Array) -> Array:
 
 def _noise(u: Array, v: Array, seed: int) -> Array:
     """Return smooth noise in [0, 1] on the plane: random values on a grid that repeats every 64 cells."""
-    grid: NDArray[np.float64] = np.random.default_rng(seed).random((64, 64))
-    cell_u, cell_v = np.floor(u).astype(int), np.floor(v).astype(int)
+    grid: NDArray[np.float64] = np.random.default_rng(seed).random((64, 64)).ravel()
+    cell_u, cell_v = np.floor(u).astype(np.int32), np.floor(v).astype(np.int32)
     s, t = _ease(u - cell_u), _ease(v - cell_v)
-    near = (1 - s) * grid[cell_u % 64, cell_v % 64] + s * grid[(cell_u + 1) % 64, cell_v % 64]
-    far = (1 - s) * grid[cell_u % 64, (cell_v + 1) % 64] + s * grid[(cell_u + 1) % 64, (cell_v + 1) % 64]
+    row, next_row = cell_u % 64 * 64, (cell_u + 1) % 64 * 64
+    column, next_column = cell_v % 64, (cell_v + 1) % 64
+    near = (1 - s) * grid.take(row + column) + s * grid.take(next_row + column)
+    far = (1 - s) * grid.take(row + next_column) + s * grid.take(next_row + next_column)
     return np.asarray((1 - t) * near + t * far)
 
 
