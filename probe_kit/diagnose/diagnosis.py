@@ -23,7 +23,6 @@ from probe_kit.diagnose.results import (
     Diagnosis,
     InputDiagnosis,
     Knowledge,
-    Limits,
     SiteKnowledge,
     SitePassage,
     check_names,
@@ -39,7 +38,7 @@ from probe_kit.intervene.open_session import check_readable
 from probe_kit.intervene.pairs import Chunk, Given, Pair, PairRow
 from probe_kit.intervene.patching.patch import Cell, patched
 from probe_kit.intervene.places import ALL, SiteGroup, resolve_sites
-from probe_kit.intervene.settings import has_sides, key_of
+from probe_kit.intervene.settings import key_of
 from probe_kit.intervene.tokens import PairTokens, roles_of_tokens
 from probe_kit.runs.layout import DIAGNOSES, UNITS
 from probe_kit.runs.reader import origin_of
@@ -52,7 +51,7 @@ if TYPE_CHECKING:
     from probe_kit.hooks.contract.observation import Observation
     from probe_kit.intervene.sessions import LoadPolicy, ReplaySession, ReplaySource
     from probe_kit.runs.run import Run
-    from probe_kit.train import ProbeResults, Target
+    from probe_kit.train import Target
 
 
 # -- the knowledge of a target -------------------------------------------------------------------------------
@@ -63,6 +62,7 @@ def measure_knowledge(run: "Run", target: "Target | str", seed: int = 0) -> Know
 
     Raises as `train_probes`, such as TooFewGroupsError.
     """
+    from probe_kit.retention.estimators import retention_of
     from probe_kit.train import train_probes
 
     results = train_probes(run, [EVERYWHERE], target=target, seed=seed)
@@ -76,24 +76,12 @@ def measure_knowledge(run: "Run", target: "Target | str", seed: int = 0) -> Know
             *(best[name] for name in ("stream", "layer", "part", "score", "chance", "signal")), strict=True
         )
     )
-    value, limits, note = _retention(run, results)
+    retained = retention_of(results, EVERYWHERE, results.settings.views[0])
+    low, high = (retained.interval.low, retained.interval.high) if retained.interval.bounded else (nan, nan)
     metric = str(frame["metric"].iloc[0])
-    return Knowledge(results.settings.target, results.key, metric, sites, value, limits, note)
-
-
-def _retention(run: "Run", results: "ProbeResults") -> tuple[float, Limits, str]:
-    from probe_kit.retention.behaviour import TableRun
-    from probe_kit.retention.rows.build import target_row
-
-    retained = target_row(
-        TableRun.of(run, with_behaviour=False), results, EVERYWHERE, results.settings.views[0]
-    ).retention
-    low, high = retained.ci or (None, None)
-    return _or_nan(retained.value), (_or_nan(low), _or_nan(high)), retained.note
-
-
-def _or_nan(value: float | None) -> float:
-    return nan if value is None else value
+    return Knowledge(
+        results.settings.target, results.key, metric, sites, retained.value, (low, high), retained.note
+    )
 
 
 # -- the passage of an input ---------------------------------------------------------------------------------
@@ -248,7 +236,7 @@ def diagnose_run(
         else:
             drawn, rows = frames_of(session, frames, paraphrases), []
         exchange = InputExchange(_inference(session), drawn, seed, rows, instructions)
-        diagnosed = with_units(run, _measure(session, exchange, inputs, inside, progress))
+        diagnosed = _measure(session, exchange, inputs, inside, progress)
         if base_policy is not None:
             progress("inputs of the base")
             diagnosed = exchange.against(_inference(session, base_policy), diagnosed)
@@ -259,7 +247,7 @@ def diagnose_run(
         run.label,
         len(clean),
         groups,
-        diagnosed,
+        with_units(run, diagnosed),
         base or "",
         weights_sha256=str(run.weights_sha256),
         checkpoint=str(run.certificate["policy"]["checkpoint"]),
@@ -287,14 +275,15 @@ def check_diagnosis(
     The frames of a table of pairs are looked up when the source is open, see `open_session`.
     """
     check_network(run)
-    check_names(inputs, names_of(cameras_of(run)))
+    cameras = cameras_of(run)
+    check_names(inputs, names_of(cameras))
     if not pairs:
-        check_groups(run.episodes, frames, has_sides(run), lambda: f"{run.location} has")
+        check_groups(run.episodes, frames, run.source.is_scene, lambda: f"{run.location} has")
     if instructions:
         check_words(instructions, run.episodes["instruction"].astype(str), bool(pairs))
         check_readable(run, source, instructions)
     if base is not None:
-        check_base(run, source, base)
+        check_base(run, source, base, cameras)
 
 
 def check_words(instructions: Sequence[str], of_frames: Iterable[str], tabled: bool) -> None:
@@ -341,11 +330,11 @@ def load_diagnosis(run: "Run", key: str) -> Diagnosis:
         raise bundle.damaged(FILE, "has other fields: another version of probe_kit made it") from error
 
 
-def check_base(run: "Run", source: "ReplaySource", base: str) -> None:
+def check_base(run: "Run", source: "ReplaySource", base: str, cameras: Sequence[str]) -> None:
     """Check the base against the run's checkpoint by the files of both; raises as `check_base_files`."""
     origin = origin_of(run)
     checkpoint, options = source.checkpoint or origin.checkpoint, {**origin.options, **source.options}
-    check_base_files(run.model, checkpoint, base, options, cameras_of(run))
+    check_base_files(run.model, checkpoint, base, options, cameras)
 
 
 def check_base_files(

@@ -290,10 +290,10 @@ def intervene(
     result = _run(opened, intervention, source)
     print_result(result, style, details)
     if style == "table":
-        has_sides = result.outcomes.has_sides
+        is_scene = result.outcomes.is_scene
         location = as_argument(run)
-        following = f"retention {location}" if has_sides else f"run show {location}"
-        what = "use beside probes and success" if has_sides else "what the run stores"
+        following = f"retention {location}" if is_scene else f"run show {location}"
+        what = "use beside probes and success" if is_scene else "what the run stores"
         say(markup("next: [bold]probe-kit {}[/]  {}", following, what))
     say(markup("stored as {}", result.key))
 

@@ -14,7 +14,7 @@ from probe_kit.intervene.frame_session import Frames, FrameSession
 from probe_kit.intervene.pairs import Pair, PairRow
 from probe_kit.intervene.scene_session import SceneSession
 from probe_kit.intervene.sessions import LoadPolicy, ReplaySession, ReplaySource
-from probe_kit.intervene.settings import Choice, has_sides, items_of
+from probe_kit.intervene.settings import Choice, items_of
 from probe_kit.runs.reader import origin_of
 from probe_kit.runs.run import Run
 
@@ -61,8 +61,10 @@ def check_readable(run: Run, source: ReplaySource, instructions: Sequence[str]) 
     """Raise InstructionError for further instructions that the policy cannot read in full; no weights are read."""
     from probe_kit.hooks.registry import get_family
 
-    if instructions and (family := get_family(run.model)) is not None:
-        checkpoint, options = checkpoint_of(run, source)
+    if not instructions:
+        return
+    checkpoint, options = checkpoint_of(run, source)
+    if (family := get_family(run.model)) is not None:
         family.check_words(instructions, checkpoint)
         family.check_instructions(checkpoint, instructions, options, fetch=False)
 
@@ -148,7 +150,7 @@ def open_session(
     check_readable(run, source, instructions or (() if choice is None else choice.instructions))
     with ExitStack() as on_failure:
         session: ReplaySession
-        if has_sides(run):
+        if run.source.is_scene:
             check_pairs(table, {(str(episode), 0) for episode in run.episodes["episode_id"]})
             session = SceneSession.of(run, source, policy)
             on_failure.callback(session.close)

@@ -187,9 +187,14 @@ class ConditionOutcomes:
         return tuple(EditedCell(*cell) for cell in zip(*(getattr(self, name) for name in COLUMNS), strict=True))
 
     @property
-    def has_sides(self) -> bool:
+    def is_scene(self) -> bool:
         """Whether the correct picture lies on a side; else displacements are toward the source's action."""
         return bool(self.sides.size) and bool(self.sides[0])
+
+    @property
+    def has_sides(self) -> bool:
+        """The same as `is_scene`."""
+        return self.is_scene
 
     def of(self, condition: str) -> NDArray[np.float64]:
         """Return the displacement (E,) of one condition."""
@@ -236,7 +241,7 @@ class ConditionOutcomes:
         references = [name for name in (DONOR, IMAGE_SWAP) if name in self.conditions]
         toward = displacements_toward(self.chunks, self.conditions.index(references[0])) if references else None
         displacement = self.displacement
-        if toward is not None and not self.has_sides:
+        if toward is not None and not self.is_scene:
             # Where no inference gave another action, a displacement is none, or was estimated.
             displacement = np.where(self.max_action_change > 0, toward, displacement)
         return replace(self, displacement=displacement, toward=toward, size=sizes(self.chunks))

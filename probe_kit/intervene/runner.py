@@ -18,7 +18,7 @@ from probe_kit.intervene.places import ALL, resolve_all, roles_of, unread_note, 
 from probe_kit.intervene.replay import Condition
 from probe_kit.intervene.results import InterventionResult, load_effects, save
 from probe_kit.intervene.sessions import LoadPolicy, Progress, ReplaySession, ReplaySource
-from probe_kit.intervene.settings import check_run_fits, has_sides, key_of, settings_of
+from probe_kit.intervene.settings import check_run_fits, key_of, settings_of
 from probe_kit.intervene.stored import is_stored
 from probe_kit.runs.layout import INTERVENTIONS
 from probe_kit.runs.provenance import provenance_here
@@ -146,7 +146,7 @@ def too_few_groups(run: Run, intervention: Intervention) -> dict[str, int]:
 
     Empty for other kinds; see `groups_for_not_used`.
     """
-    if not isinstance(intervention, ImageSwap) or not has_sides(run):
+    if not isinstance(intervention, ImageSwap) or not run.source.is_scene:
         return {}
     episodes = run.episodes[run.episodes["item_id"].isin(intervention.items_in(run))]
     counts = episodes.groupby("category", sort=False)["group_id"].nunique()

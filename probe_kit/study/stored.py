@@ -343,7 +343,7 @@ def probe_key(study: LoadedStudy, stored: StoredRun, run: "Run", partial: bool) 
         return stored_keys[-1]  # of several, which share the run through two blocks, the last of the file
     if partial or keys(stored.probed.in_wording()):  # they are fitted to other items
         return ""
-    other_keys = [key for key, bundle in read_probes(run.location).items() if settings_of(bundle).is_side]
+    other_keys = [key for key, bundle in read_probes(run.location).items() if settings_of(bundle).balanced]
     also = f" It has those of other settings: {', '.join(other_keys)}." if other_keys else ""
     names = ", ".join(f"[probes.{name}]" for name in tables)
     raise RunIncompleteError(

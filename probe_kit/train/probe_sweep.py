@@ -210,14 +210,14 @@ def train_probes(
     settings = sweep.settings
     stored = Controls() if sweep.stored is None else sweep.stored.controls
     prepared = prepare_controls(
-        run, sweep.samples, settings.is_side, controls, suite, stored, settings.categories
+        run, sweep.samples, settings.balanced, controls, suite, stored, settings.categories
     )  # fmt: skip
     untrained_sweep = None
     if untrained is not None:
-        check_same_source(run, untrained, sweep.samples, settings.is_side)
-        same: Target | str = settings.target if settings.is_side else sweep.target
+        check_same_source(run, untrained, sweep.samples, settings.balanced)
+        same: Target | str = settings.target if settings.balanced else sweep.target
         untrained_sweep = Sweep.of(untrained, same, settings.categories, **options)
-        check_untrained(run, untrained, sweep.samples, untrained_sweep.samples, settings.is_side, call)
+        check_untrained(run, untrained, sweep.samples, untrained_sweep.samples, settings.balanced, call)
         untrained_sweep.check()
     results = add_controls(sweep.results(**workers), sweep.problems, sweep.widths, prepared)
     if untrained_sweep is not None:
@@ -322,18 +322,18 @@ class Sweep:
         target = Target.of_run(run, target, seed=seed) if isinstance(target, str) else target.on(run)
         event = None if align_to is None else align_to.on(run)
         if categories is None:
-            categories = tuple(dict.fromkeys(run.episodes["category"])) if target.is_side else (EVERYWHERE,)
+            categories = tuple(dict.fromkeys(run.episodes["category"])) if target.balanced else (EVERYWHERE,)
         if folds != "groups" and (target.group_by or target.exchange_within):
             raise UsageError(
                 f"folds={folds!r} with columns of groups ({target.group_by or target.exchange_within}); expected "
                 "one of both. Leave --folds, or --group-by and --exchange-within, out"
             )
-        if target.is_side and (window is not None or event is not None):
+        if target.balanced and (window is not None or event is not None):
             option = f"window={window}" if window is not None else "align_to"
             raise UsageError(f"{option} with the side {target.name!r}; it needs labels of single inferences")
         samples = target_samples(run, target, categories, call, window, event, incomplete)
         grouping = ""
-        if not target.is_side:
+        if not target.balanced:
             ids = run.episodes["episode_id"].astype(str).tolist()
             columns = (names.tolist() for names in groups_of(run, target))
             grouping = sha256_json(sorted(zip(ids, *columns, strict=True)))
@@ -388,7 +388,7 @@ class Sweep:
     def widths(self) -> dict[str, int]:
         """The width of every stream; for a target other than a side, of the probed streams only."""
         streams = self.run.streams
-        names = streams if self.target.is_side else dict.fromkeys(site.stream for _, site in self.keys)
+        names = streams if self.target.balanced else dict.fromkeys(site.stream for _, site in self.keys)
         return {name: streams[name].width for name in names}
 
     def check(self) -> None:
@@ -416,7 +416,7 @@ class Sweep:
             (category, view, site): Direction(probe.weights, probe.intercepts, probe.spreads)
             for (view, site), of_site in probes.items()
             for category, probe in of_site.items()
-            if self.target.is_side
+            if self.target.balanced
         }
         run, left_out = self.run, self.samples.left_out
         return ProbeResults(self.settings, curves, directions, stamp=run.stamp, label=run.label, left_out=left_out)

@@ -32,7 +32,7 @@ from probe_kit.train.probe_sweep import (
 )
 from probe_kit.train.problem import Problem, make_problem, smallest_p_of_labels
 from probe_kit.train.results.probe_curve import ProbeCurve
-from probe_kit.train.results.probe_results import best_sites, score_cell
+from probe_kit.train.results.probe_results import best_sites, three_digits
 from probe_kit.train.samples import Samples, read_samples, sites_of
 from probe_kit.train.solver.arrays import RowSubset
 from probe_kit.train.target import Target
@@ -430,7 +430,7 @@ def _curve(
     of_view = {site: result for (name, site), result in transferred.items() if name == view}
     parts = tuple(str(run.streams[site.stream].part) for site in of_view)
     # Balanced between classes, of a side too: no fold of the other run says which share of sides was trained on.
-    balanced = replace(test, is_side=False)
+    balanced = replace(test, balanced=False)
     fitted, recentred = (
         balanced.curve({site: probes[at] for site, (probes, _) in of_view.items()}, parts) for at in (0, 1)
     )
@@ -453,11 +453,11 @@ def transfer_table(results: TransferResults, splits: bool = True) -> Table:
         (
             " · ".join([label_of(row["stream"]), *([row["view"]] if several else [])]),
             str(row["site"]),
-            score_cell(row["score"], False, (row["ci_low"], row["ci_high"])),
-            score_cell(row["chance"], False),
+            Cell(row["score"], three_digits, (row["ci_low"], row["ci_high"])),
+            Cell(row["chance"], three_digits),
             Cell(row["p_fwe"], p_text),
-            score_cell(row["recentred"], False),
-            score_cell(row["refitted"], False, (row["refitted_ci_low"], row["refitted_ci_high"])),
+            Cell(row["recentred"], three_digits),
+            Cell(row["refitted"], three_digits, (row["refitted_ci_low"], row["refitted_ci_high"])),
         )
         for row in _best(results)
     ]
@@ -492,7 +492,7 @@ def transfer_sentences(results: TransferResults) -> list[str]:
 
 def _best(results: TransferResults) -> "list[pd.Series]":
     """Return the row of `scores` of the best site of every view and stream: the largest excess over chance."""
-    return best_sites(results.scores.assign(category=EVERYWHERE), is_side=False)
+    return best_sites(results.scores.assign(category=EVERYWHERE))
 
 
 def _verdict(row: "pd.Series") -> str:

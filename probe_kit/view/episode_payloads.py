@@ -265,7 +265,7 @@ def episodes_payload(viewed: ViewedRun) -> dict[str, Any]:
 
 
 def _swap_responses(viewed: ViewedRun) -> list[int | None]:
-    responses = swap_responses_by_episode(viewed.run) if viewed.has_sides else {}
+    responses = swap_responses_by_episode(viewed.run) if viewed.run.source.is_scene else {}
     return [responses.get(str(name)) for name in viewed.run.episodes["episode_id"]]
 
 

@@ -159,8 +159,8 @@ def run_payload(viewed: ViewedRun, page_runs: Sequence[ViewedRun] = ()) -> dict[
         "committed": len(run.episodes),
         "failed": len(run.failed),
         "answers": viewed.answers,
-        "sides": viewed.has_sides,
-        "views": list(SCENE_VIEWS if viewed.has_sides else OTHER_VIEWS),
+        "sides": viewed.run.source.is_scene,
+        "views": list(SCENE_VIEWS if viewed.run.source.is_scene else OTHER_VIEWS),
         "targets": [
             {"target": results.settings.target, "category": category}
             for results, category in (viewed.target_curves if len(run.episodes) else ())
@@ -187,7 +187,7 @@ def run_payload(viewed: ViewedRun, page_runs: Sequence[ViewedRun] = ()) -> dict[
             "device": certificate.get("device"),
         },
         "table": _table(viewed, [other for other in page_runs if other.answers and other.run.suite == run.suite]),
-        "notes": list(viewed.table.notes) if len(run.episodes) and viewed.has_sides else [],
+        "notes": list(viewed.table.notes) if len(run.episodes) and viewed.run.source.is_scene else [],
         "settings": {name: str(value) for name, value in flat_settings(run.settings).items()},
         "stamp": run.stamp,
     }
@@ -202,7 +202,7 @@ def _site_entries(sites: Sequence[Site]) -> list[dict[str, Any]]:
 
 def best_sites(viewed: ViewedRun, category: str) -> dict[str, Any]:
     """Return by part the index of the best site among all, and whether it has signal; None without probes."""
-    row = viewed.probed_rows.get(category) if viewed.has_sides else None
+    row = viewed.probed_rows.get(category) if viewed.run.source.is_scene else None
     if row is None or viewed.curve(category) is None:
         return {"backbone": None, "action": None}
     names = [str(site) for site in viewed.sites]
@@ -221,7 +221,7 @@ def _scene(scene: Mapping[str, Any] | None) -> dict[str, Any] | None:
 
 def _table(viewed: ViewedRun, vlm_runs: Sequence[ViewedRun]) -> dict[str, Any]:
     """Return headings, a row per category and their mean, in the spelling of the retention table."""
-    rows = [*viewed.rows.values(), viewed.mean] if len(viewed.run.episodes) and viewed.has_sides else []
+    rows = [*viewed.rows.values(), viewed.mean] if len(viewed.run.episodes) and viewed.run.source.is_scene else []
     columns: tuple[Column, ...] = (ACCURACY if viewed.answers else SR,)
     if any(row.backbone.site or row.action.site for row in rows):
         columns += _PROBED

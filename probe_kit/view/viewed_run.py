@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.sites import Site, resolve_view
 from probe_kit.intervene.kinds.attention import PatchAttention, stored_patch_attention
-from probe_kit.intervene.settings import has_sides
 from probe_kit.retention import RetentionRow, RetentionTable, retention_table
 from probe_kit.runs import Run
 from probe_kit.runs.arrays import Rows, decode_bfloat16
@@ -205,11 +204,6 @@ class ViewedRun:
     lender: "ViewedRun | None" = None
     readings: dict[str, dict[int, Values]] = field(default_factory=dict)
 
-    @property
-    def has_sides(self) -> bool:
-        """Whether answers lie on a side, as in the scene; other runs have no retention table."""
-        return has_sides(self.run)
-
     @cached_property
     def table(self) -> RetentionTable:
         """The retention table of this run alone, without the columns that no page shows and that take longest."""
@@ -223,7 +217,7 @@ class ViewedRun:
     @property
     def own_results(self) -> ProbeResults | None:
         """The probes of the table; None without any."""
-        return self.table.results_of(self.run.location) if self.has_sides else None
+        return self.table.results_of(self.run.location) if self.run.source.is_scene else None
 
     @property
     def is_lent(self) -> bool:

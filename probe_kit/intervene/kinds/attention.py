@@ -28,7 +28,6 @@ from probe_kit.intervene.outcomes import (
 )
 from probe_kit.intervene.places import ALL, TILE_ROLES, TILES, roles_of
 from probe_kit.intervene.replay import CLEAN_RUN, Condition, ConditionContext, ConditionResult
-from probe_kit.intervene.settings import has_sides
 from probe_kit.intervene.stored import Measurement, StoredResult, stored_results
 from probe_kit.intervene.tokens import shown_cameras, token_boxes
 from probe_kit.runs.reader import RunReader
@@ -115,7 +114,7 @@ class AttentionReadout(Intervention):
         episodes, groups, categories = (
             rows[name].to_numpy(dtype=str) for name in ("episode_id", "group_id", "category")
         )
-        sides = rows["side_correct"].to_numpy(dtype=str) if has_sides(run) else np.full(len(rows), "")
+        sides = rows["side_correct"].to_numpy(dtype=str) if run.source.is_scene else np.full(len(rows), "")
         shares = AttentionShares(
             tuple(entries["roles"]), episodes, groups, categories, sides, calls, outcomes.mass
         )

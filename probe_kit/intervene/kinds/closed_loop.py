@@ -93,7 +93,7 @@ class ClosedLoop(AlongDirection):
     kind: ClassVar[str] = "closed-loop"
     summary: ClassVar[str] = "Interchange at every inference; whole episodes are played."
     position: ClassVar[int] = 7
-    needs_sides: ClassVar[bool] = True
+    needs_scene: ClassVar[bool] = True
     options: ClassVar[Mapping[str, str]] = {
         "sites": "default the last place, of each category, that the newest interchange localised",
         "roles": "with --sites; default all",

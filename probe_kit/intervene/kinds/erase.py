@@ -98,7 +98,7 @@ class ConceptErasure(Intervention):
     summary: ClassVar[str] = "Remove the decodable answer (weaker than interchange)."
     position: ClassVar[int] = 8
     fits_always: ClassVar[bool] = True
-    needs_sides: ClassVar[bool] = True
+    needs_scene: ClassVar[bool] = True
     options: ClassVar[Mapping[str, str]] = {
         "sites": "where tokens are erased, one site each; required",
         "roles": "of the erased tokens; default image",

@@ -24,7 +24,7 @@ from probe_kit.retention.displays.display import (
     significance_handles,
 )
 from probe_kit.retention.displays.report_figure import FigureSource, ReportFigure, in_report, probed_views
-from probe_kit.retention.rows.build import STEP
+from probe_kit.retention.estimators import STEP
 from probe_kit.train.crossval.task_scores import METRICS, score_interval
 from probe_kit.train.results.control_scores import ControlScore
 from probe_kit.train.results.probe_curve import ProbeCurve

@@ -197,9 +197,9 @@ class Ground:
         rows = [names.index(site) for site in stream.sites]
         every = np.broadcast_to(curve.null.ravel(), (len(rows), curve.null.size))
         # All sites of a side have chance one half, so that one band serves them; a label's chance differs by site.
-        null = every if curve.is_side else curve.null[rows]
+        null = every if curve.balanced else curve.null[rows]
         ends = np.percentile(null, [2.5, 97.5], axis=1) if curve.null.shape[1] >= FEWEST_PERMUTATIONS else None
-        controls = () if curve.is_side else results.controls.of_stream(category, view, stream.stream)
+        controls = () if curve.balanced else results.controls.of_stream(category, view, stream.stream)
         return cls(
             curve.chance[rows],
             None if ends is None else (ends[0], ends[1]),
@@ -282,11 +282,11 @@ class LayerCurveDisplay(Display):
         streams = tuple(
             StreamCurve.of_stream(rows, iterations) for _, rows in scores.groupby("stream", sort=False)
         )
-        metric, is_side = METRICS[settings.task], settings.is_side
+        metric = METRICS[settings.task]
         return cls(
             title=name_of_target(settings.target, category),
-            measure="held-out accuracy (%)" if is_side else f"held-out {metric}",
-            is_level=not is_side,  # panels of accuracies have a fixed range
+            measure="held-out accuracy (%)" if settings.balanced else f"held-out {metric}",
+            is_level=not settings.balanced,  # panels of accuracies have a fixed range
             figure_size=(2.75, 2.9),
             target=settings.target,
             metric=metric,
@@ -294,12 +294,12 @@ class LayerCurveDisplay(Display):
             view=view,
             streams=streams,
             grounds=tuple(Ground.of(results, category, view, stream) for stream in streams),
-            certificates=(ProvenanceLine.of_results(results, view, None if is_side else category),),
+            certificates=(ProvenanceLine.of_results(results, view, None if settings.balanced else category),),
         )
 
     @property
-    def is_side(self) -> bool:
-        """Whether the target is a side, whose accuracies are drawn in percent on one scale."""
+    def in_percent(self) -> bool:
+        """Whether scores are drawn in percent on one scale, as the accuracies of a side."""
         return self.target in SIDES
 
     @property
@@ -321,11 +321,11 @@ class LayerCurveDisplay(Display):
 
     def draw(self, axes: "Axes") -> None:
         """Draw the ground of the first stream, and all streams."""
-        scale = PERCENT if self.is_side else 1.0
+        scale = PERCENT if self.in_percent else 1.0
         self.grounds[0].draw(axes, self.streams[0].layers, scale)
         for number, curve in enumerate(self.streams):
             _draw_stream(axes, curve, _SIDESTEP * (number - (len(self.streams) - 1) / 2), scale)
-        if self.is_side:
+        if self.in_percent:
             accuracy_axis(axes)
         else:
             low, high = axes.get_ylim()

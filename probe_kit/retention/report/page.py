@@ -134,11 +134,11 @@ def report_html(
     source = FigureSource.of(runs, table)
     paths = tuple(path for run in runs for path in (run.location.address, str(run.location)))
     names = [without_folders(run.name, paths) for run in source.table_runs]
-    opening = opening_row(source) if table.is_of_sides else None
+    opening = None if table.labels else opening_row(source)
     pictures_of = arranged([*source.figures(), *_opening_curves(opening, table.iterations)], names, paths)
     sides: dict[str, Any] = {}
     tables = [table.summary_table]
-    if table.is_of_sides:
+    if not table.labels:
         grid = episode_grid([run.judged for run in source.table_runs], names, pictures)
         question = None if opening is None else _question(opening[0], names[opening[1].position], grid)
         sides = {"grid": grid, "question": question, **_sides(source, pictures_of)}
@@ -152,8 +152,8 @@ def report_html(
     return render(
         "page.html.jinja",
         paths,
-        is_of_sides=table.is_of_sides,
-        title=list_names(names if table.is_of_sides else table.targets),
+        of_labels=bool(table.labels),
+        title=list_names(table.targets if table.labels else names),
         suites=list(dict.fromkeys(run.suite for run in runs)),
         version=__version__,
         finding=table.summary,
@@ -561,7 +561,7 @@ def _stream(run: RunReader, name: str) -> str:
 
 
 def _of_target(probes: ProbeResults) -> str:
-    return "" if probes.settings.is_side else f" of {probes.settings.target}"
+    return "" if probes.settings.balanced else f" of {probes.settings.target}"
 
 
 # -- glossary ----------------------------------------------------------------------------------------------------
