@@ -15,9 +15,9 @@ MOST = 60
 def test_few_places_ask_whether_a_target_or_a_run_has_sides() -> None:
     files = [path for path in PACKAGE.rglob("*") if path.suffix in (".py", ".jinja")]
     mentions = {
-        str(path.relative_to(PACKAGE)): len(asked)
+        str(path.relative_to(PACKAGE)): len(questions)
         for path in files
-        if (asked := QUESTIONS.findall(path.read_text(encoding="utf-8")))
+        if (questions := QUESTIONS.findall(path.read_text(encoding="utf-8")))
     }
     assert sum(mentions.values()) < MOST, (
         f"{mentions}; ask `Target.chance` or `balanced`, `RetentionRow.label`, or `run.source.is_scene`"
@@ -30,6 +30,6 @@ def test_sides_and_labels_share_the_columns_of_backbone_and_action() -> None:
     fields = [column.key for group in TABLES["Retention"] for column in group.columns]
     assert len(fields) == len(set(fields)), "a field has one column, whatever the target"
     streams = {part: [key for key in fields if key.startswith(f"{part}.")] for part in ("backbone", "action")}
-    named = {part: [key.partition(".")[2] for key in keys] for part, keys in streams.items()}
-    assert set(named["backbone"]) - set(named["action"]) == {"exceeds"}
-    assert set(named["action"]) - set(named["backbone"]) == {"first_peak"}
+    field_names = {part: [key.partition(".")[2] for key in keys] for part, keys in streams.items()}
+    assert set(field_names["backbone"]) - set(field_names["action"]) == {"exceeds"}
+    assert set(field_names["action"]) - set(field_names["backbone"]) == {"first_peak"}

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from probe_kit.extract.extraction import Extraction
-    from probe_kit.intervene import ReplaySource
+    from probe_kit.intervene import ReplayFiles
     from probe_kit.intervene.pairs import PairRow
     from probe_kit.runs import Run
     from probe_kit.runs.plan import Row
@@ -228,14 +228,14 @@ def check_writable(html: Path) -> None:
         )
 
 
-def _replay_source(run: "Run", typed: Mapping[str, Any]) -> "ReplaySource":
+def _replay_source(run: "Run", typed: Mapping[str, Any]) -> "ReplayFiles":
     """Return where a stored run's model and source are now, by the options that were typed."""
     from probe_kit.hooks.contract.declared import read_pairs
-    from probe_kit.intervene import ReplaySource
+    from probe_kit.intervene import ReplayFiles
 
     options = read_pairs(typed.get("model_option", ()))
     device, seed = typed.get("device", AUTO), typed.get("weights_seed")
-    return ReplaySource(typed.get("suite"), typed.get("checkpoint"), options, seed, device, moved_of(run, typed))
+    return ReplayFiles(typed.get("suite"), typed.get("checkpoint"), options, seed, device, moved_of(run, typed))
 
 
 def _is_run(name: str, typed: Mapping[str, Any]) -> bool:
@@ -278,7 +278,7 @@ def _stored(name: str, typed: Mapping[str, Any], request: _Request) -> "Run":
     return run
 
 
-def _frames_of_run(run: "Run", source: "ReplaySource") -> Collection[tuple[str, int]]:
+def _frames_of_run(run: "Run", source: "ReplayFiles") -> Collection[tuple[str, int]]:
     """Return the frames that a table of pairs may name: those of the source, or first frames of the scene."""
     from probe_kit.intervene.frame_session import Frames
 

@@ -49,7 +49,7 @@ from probe_kit.train.choices import EVERYWHERE
 if TYPE_CHECKING:
     from probe_kit.hooks import ActivationCache, Model, Policy
     from probe_kit.hooks.contract.observation import Observation
-    from probe_kit.intervene.sessions import LoadPolicy, ReplaySession, ReplaySource
+    from probe_kit.intervene.sessions import LoadPolicy, ReplayFiles, ReplaySession
     from probe_kit.runs.run import Run
     from probe_kit.train import Target
 
@@ -159,7 +159,7 @@ def _relative_difference(group: SiteGroup, before: "ActivationCache", after: "Ac
 # -- the diagnosis of a run ----------------------------------------------------------------------------------
 
 FORMAT, FILE = "probe_kit diagnosis 5", "diagnosis.json"
-Progress = Callable[[str], None]
+Announce = Callable[[str], None]
 
 
 def diagnose_run(
@@ -174,9 +174,9 @@ def diagnose_run(
     pairs: Sequence[PairRow] = (),
     instructions: Sequence[str] = (),
     seed: int = 0,
-    source: "ReplaySource | None" = None,
+    source: "ReplayFiles | None" = None,
     load: "LoadPolicy | None" = None,
-    progress: Progress = lambda _: None,
+    progress: Announce = lambda _: None,
 ) -> Diagnosis:
     """Diagnose the inputs of a run's model on first frames of the run; a stored diagnosis is loaded.
 
@@ -205,9 +205,9 @@ def diagnose_run(
         InstructionError: For instructions that the policy cannot read in full.
     """
     from probe_kit.intervene.open_session import load_policy_of, open_session
-    from probe_kit.intervene.sessions import ReplaySource
+    from probe_kit.intervene.sessions import ReplayFiles
 
-    source = source or ReplaySource()
+    source = source or ReplayFiles()
     check_diagnosis(run, frames, inputs, pairs, instructions, source, None if load is not None else base)
     if target is not None:
         progress("probes")
@@ -267,7 +267,7 @@ def check_diagnosis(
     inputs: Sequence[str],
     pairs: Sequence[PairRow],
     instructions: Sequence[str],
-    source: "ReplaySource",
+    source: "ReplayFiles",
     base: str | None,
 ) -> None:
     """Check, before any weights are read, that a run can be diagnosed so; raises as `diagnose_run`.
@@ -330,7 +330,7 @@ def load_diagnosis(run: "Run", key: str) -> Diagnosis:
         raise bundle.damaged(FILE, "has other fields: another version of probe_kit made it") from error
 
 
-def check_base(run: "Run", source: "ReplaySource", base: str, cameras: Sequence[str]) -> None:
+def check_base(run: "Run", source: "ReplayFiles", base: str, cameras: Sequence[str]) -> None:
     """Check the base against the run's checkpoint by the files of both; raises as `check_base_files`."""
     origin = origin_of(run)
     checkpoint, options = source.checkpoint or origin.checkpoint, {**origin.options, **source.options}
@@ -427,7 +427,7 @@ def _inference(session: "ReplaySession", policy: "Policy | None" = None) -> Infe
 
 
 def _measure(
-    session: "ReplaySession", exchange: InputExchange, names: Sequence[str], inside: bool, progress: Progress
+    session: "ReplaySession", exchange: InputExchange, names: Sequence[str], inside: bool, progress: Announce
 ) -> tuple[InputDiagnosis, ...]:
     progress("inputs")
     policy = session.policy

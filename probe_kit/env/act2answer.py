@@ -11,11 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
 from probe_kit._system.counting import plural
+from probe_kit._system.types import Matrix
 from probe_kit.env.arm import DeltaController, check_action
-from probe_kit.env.rotations import Array
 from probe_kit.env.scene import SIDES, Scene
 from probe_kit.env.scoring import LED_TO, REST_SPEED, Ending, Outcome, Trajectory, distance, zone
-from probe_kit.env.simulation import Frame, Picture
+from probe_kit.env.simulation import Picture, RenderedFrame
 from probe_kit.env.spec import XY, SceneSpec
 from probe_kit.errors import EpisodeOverError, SceneError
 from probe_kit.suite.items import LAYOUTS, Episode, Item, Layout, Side, other_side
@@ -89,7 +89,7 @@ class Trial:
         self.scene = scene
         self.question = question
         self.controller = DeltaController(scene.arm, scene.spec.limits, scene.home_q, scene.spec.euler)
-        self.executed: Array | None = None
+        self.executed: Matrix | None = None
         self.steps = 0
         self.clipped = 0
         self.ik_error = 0.0
@@ -104,7 +104,7 @@ class Trial:
         """Whether the episode has ended."""
         return self.stopped_early or self.ending is not None
 
-    def advance(self, action: Array) -> None:
+    def advance(self, action: Matrix) -> None:
         """Execute one checked action (7,)."""
         move = self.controller.command(action)
         opening = 0.0 if self.steps < self.scene.spec.forced_closed else move.opening
@@ -209,7 +209,7 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
         self._question = Question.built_in()
         self._scene: Scene | None = None
         self._trial: Trial | None = None
-        self._frame: Frame | None = None
+        self._frame: RenderedFrame | None = None
         self._picture: Picture | None = None
         self._closed = False
 
@@ -393,7 +393,7 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
         self._frame = None
         return Trial(scene, self._question)
 
-    def _current_frame(self) -> Frame:
+    def _current_frame(self) -> RenderedFrame:
         if self._frame is None:
             self._frame, self._picture = self.scene.frame(), None
         return self._frame
@@ -462,7 +462,7 @@ class Recorder:
         return Trajectory.of_frames(np.asarray(self._frames, np.float32))
 
 
-def _state(scene: Scene) -> Array:
+def _state(scene: Scene) -> Matrix:
     """Return the state part of a frame; see `scoring.STATE`."""
     cube, tiles = scene.cube_state(), [scene.tile_state(side) for side in SIDES]
     return np.array(

@@ -399,11 +399,11 @@ def check_environment(
 
     Exits with 1 if a check failed.
     """
-    from probe_kit.extract import EnvSource
+    from probe_kit.extract import EnvironmentSettings
     from probe_kit.extract import check_environment as checks_of
     from probe_kit.extract.sources.environment_check import STEPS
 
-    source = EnvSource(environment, options=env_options or (), rotations=rotate or ())
+    source = EnvironmentSettings(environment, options=env_options or (), rotations=rotate or ())
     checks = []
     for check in checks_of(source, picture):
         checks.append(check)

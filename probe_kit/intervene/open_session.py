@@ -13,7 +13,7 @@ from probe_kit.hooks.family import SIZE
 from probe_kit.intervene.frame_session import Frames, FrameSession
 from probe_kit.intervene.pairs import Pair, PairRow
 from probe_kit.intervene.scene_session import SceneSession
-from probe_kit.intervene.sessions import LoadPolicy, ReplaySession, ReplaySource
+from probe_kit.intervene.sessions import LoadPolicy, ReplayFiles, ReplaySession
 from probe_kit.intervene.settings import Choice, items_of
 from probe_kit.runs.reader import origin_of
 from probe_kit.runs.run import Run
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from probe_kit.hooks import Policy
 
 
-def load_policy_of(run: Run, source: ReplaySource) -> "Policy":
+def load_policy_of(run: Run, source: ReplayFiles) -> "Policy":
     """Return the policy that a run names, loaded as its own process loaded it.
 
     A file whose weights call themselves random is loaded as a file: only requested random weights are drawn.
@@ -44,7 +44,7 @@ def load_policy_of(run: Run, source: ReplaySource) -> "Policy":
         )
 
 
-def checkpoint_of(run: Run, source: ReplaySource) -> tuple[str | None, dict[str, Any]]:
+def checkpoint_of(run: Run, source: ReplayFiles) -> tuple[str | None, dict[str, Any]]:
     """Return the checkpoint of a run's policy on this machine, None for its family's own, and the options."""
     origin = origin_of(run)
     checkpoint = source.checkpoint or None
@@ -57,7 +57,7 @@ def checkpoint_of(run: Run, source: ReplaySource) -> tuple[str | None, dict[str,
     return checkpoint, {**options, **source.options}
 
 
-def check_readable(run: Run, source: ReplaySource, instructions: Sequence[str]) -> None:
+def check_readable(run: Run, source: ReplayFiles, instructions: Sequence[str]) -> None:
     """Raise InstructionError for further instructions that the policy cannot read in full; no weights are read."""
     from probe_kit.hooks.registry import get_family
 
@@ -117,7 +117,7 @@ def check_pairs(table: Sequence[PairRow], frames: Collection[tuple[str, int]]) -
 
 def open_session(
     run: Run,
-    source: ReplaySource,
+    source: ReplayFiles,
     load: LoadPolicy | None = None,
     choice: Choice | None = None,
     table: Sequence[PairRow] = (),

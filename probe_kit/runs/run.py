@@ -24,7 +24,7 @@ from probe_kit.hooks.contract.card import streams_text
 from probe_kit.hooks.contract.sites import Site, Stream, resolve_view
 from probe_kit.runs.array_store import ArrayStore
 from probe_kit.runs.arrays import (
-    Rows,
+    EpisodeRows,
     StoredInputs,
     TokenBlock,
     decode_bfloat16,
@@ -552,7 +552,7 @@ class Run:
                 f"{self.location} keeps no trajectories; it was made before they were stored, or is a copy "
                 "without them. Extract it again to have them"
             )
-        rows = Rows(open_array(self.data, TRAJECTORY), self._numbers)
+        rows = EpisodeRows(open_array(self.data, TRAJECTORY), self._numbers)
         return Trajectories(rows, self.episodes["steps"].astype(int).tolist(), str(self.location))
 
     def trajectory(self, episode: str | int) -> "Trajectory":
@@ -722,7 +722,7 @@ class Run:
         """The sealed columns, None if there are none of exactly these episodes. Raises RunDamagedError."""
         return find_columns(self.root, self._commits)
 
-    def rows(self, stream: str, kind: ArrayKind = "pooled") -> Rows:
+    def rows(self, stream: str, kind: ArrayKind = "pooled") -> EpisodeRows:
         """Return the stored rows of the committed episodes: all that was captured in one episode at a time.
 
         Raises:
@@ -730,7 +730,7 @@ class Run:
         """
         if f"{stream}/{kind}" in self.root.left_out:
             self.root.refuse_left_out(f"there are no {kind} of {stream}")
-        return Rows(open_array(self.data, f"{stream}/{kind}"), self._numbers)
+        return EpisodeRows(open_array(self.data, f"{stream}/{kind}"), self._numbers)
 
     @property
     def data(self) -> ArrayStore:

@@ -4,16 +4,21 @@ A view is a run of the same class. It shares what was read; the index of its epi
 """
 
 from copy import copy
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from probe_kit.runs.array_run import ArrayRun
-    from probe_kit.runs.run import Run
+
+class Viewable(Protocol):
+    """A run, stored or in memory, that a view can be made of."""
+
+    @property
+    def viewed(self) -> Any:
+        """The run that this is a view of; None for a run itself."""
 
 
-def view_run[R: Run | ArrayRun](run: R, episodes: "pd.DataFrame", **reading: Any) -> R:
+def view_run[R: Viewable](run: R, episodes: "pd.DataFrame", **reading: Any) -> R:
     """Return a run with other episodes or outcomes; activations and trajectories stay those of the run.
 
     Args:

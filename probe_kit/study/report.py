@@ -14,7 +14,7 @@ from probe_kit.retention.displays import curves_side_by_side, dose_response, lay
 from probe_kit.retention.displays.display import BLUE, VERMILION, footer, panels, plain
 from probe_kit.retention.displays.report_figure import ONLY_FILLED, ReportFigure, figure_of
 from probe_kit.retention.displays.table_figures import SideTableDisplay
-from probe_kit.retention.report.page import Picture, citation, data_uri, provenance, render, words_of
+from probe_kit.retention.report.page import PageFigure, citation, data_uri, provenance, render, words_of
 from probe_kit.retention.table import RetentionTable, retention_table
 from probe_kit.study.cells import slugs
 from probe_kit.study.plan import plan_study
@@ -182,7 +182,7 @@ def study_report(study: LoadedStudy, partial: bool = False) -> StudyReport:
     ]
     state = Table.of("Runs", ("model", "run", "blocks", "episodes", "state"), rows, names=2)
     drawn = {
-        name: [Picture(each.title, "", each.reading, *data_uri(each, paths), extra=False) for each in of_name]
+        name: [PageFigure(each.title, "", each.reading, *data_uri(each, paths), extra=False) for each in of_name]
         for name, of_name in figures.items()
     }
     sentence, bibtex = citation([stored.run for stored in runs.runs])

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from probe_kit._system.types import Matrix
 from probe_kit.errors import SuiteNotFoundError, UsageError
 from probe_kit.hashing import derive_seed
 from probe_kit.runs.layout import DATASET
@@ -33,7 +34,7 @@ from probe_kit.train.results.control_scores import (
     ControlScore,
     UntrainedScore,
 )
-from probe_kit.train.results.probe_curve import Matrix, ProbeCurve
+from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_results import ProbeResults
 from probe_kit.train.samples import Samples
 from probe_kit.train.target_samples import TargetSamples

@@ -9,6 +9,7 @@ from typing import Any
 from probe_kit._execution.executor import GivenUp, TaskQueue, work_off
 from probe_kit._execution.process_pool import ProcessPool
 from probe_kit._execution.ray_pool import RayPool
+from probe_kit._system.types import Progress
 from probe_kit._terminal.notebook import notebook_progress
 from probe_kit.errors import NoProbesError, RunIncompleteError, UnknownCategoryError, UsageError, WorkerDiedError
 from probe_kit.hashing import sha256_json
@@ -112,8 +113,6 @@ TOKEN_PERMUTATIONS = 59
 
 The smallest p is then 1/60; a site with one permutation that does as well as the labels is still below 0.05.
 """
-Progress = Callable[[int, int, str], None]
-"""Function that is called with (sites done, sites in all, name of the site just done)."""
 
 
 def train_probes(
@@ -200,7 +199,7 @@ def train_probes(
     check_run(run, categories)
     if untrained is not None:
         check_run(untrained, categories)
-    sweep = Sweep.of(run, target, categories, **options)
+    sweep = ProbeSweep.of(run, target, categories, **options)
     if device is not None and sweep.target.task != "binary":
         raise UsageError(
             f"device {device!r} with {sweep.target.described}; ridge is solved by numpy, a device solves logistic "
@@ -216,7 +215,7 @@ def train_probes(
     if untrained is not None:
         check_same_source(run, untrained, sweep.samples, settings.balanced)
         same: Target | str = settings.target if settings.balanced else sweep.target
-        untrained_sweep = Sweep.of(untrained, same, settings.categories, **options)
+        untrained_sweep = ProbeSweep.of(untrained, same, settings.categories, **options)
         check_untrained(run, untrained, sweep.samples, untrained_sweep.samples, settings.balanced, call)
         untrained_sweep.check()
     results = add_controls(sweep.results(**workers), sweep.problems, sweep.widths, prepared)
@@ -278,11 +277,11 @@ def probe_settings(
     Raises:
         NoProbesError: For a run without activations.
     """
-    return Sweep.of(run, target, None, views=views, permutations=permutations, seed=seed).settings
+    return ProbeSweep.of(run, target, None, views=views, permutations=permutations, seed=seed).settings
 
 
 @dataclass(frozen=True)
-class Sweep:
+class ProbeSweep:
     """The probes of a target in one run that are to be fitted, or are stored.
 
     Attributes:
@@ -313,7 +312,7 @@ class Sweep:
         call: int = 0,
         window: int | None = None,
         align_to: Target | None = None,
-    ) -> "Sweep":
+    ) -> "ProbeSweep":
         """Read labels and samples; nothing is probed yet."""
         if not run.streams:
             raise NoProbesError(

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._system.types import Matrix
 from probe_kit.errors import TooFewGroupsError, UnbalancedEpisodesError
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.sites import Site
@@ -25,7 +26,7 @@ from probe_kit.statistics.label_permutations import (
 )
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.choices import EVERYWHERE, Task
-from probe_kit.train.crossval.nested_folds import Matrix, NestedFold, nested_folds
+from probe_kit.train.crossval.nested_folds import NestedFold, nested_folds
 from probe_kit.train.crossval.site_probe import SiteProbe, probe_site
 from probe_kit.train.crossval.task_scores import chance_level
 from probe_kit.train.results.probe_curve import ProbeCurve

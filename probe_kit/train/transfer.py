@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from probe_kit._system.counting import plural
 from probe_kit._system.table_cells import alike
+from probe_kit._system.types import Matrix, Progress
 from probe_kit._tables.numbers import p_text
 from probe_kit._tables.table import Cell, Table
 from probe_kit._terminal.notebook import notebook_progress
@@ -25,8 +26,7 @@ from probe_kit.train.crossval.site_probe import SiteProbe, predict_once, probe_s
 from probe_kit.train.crossval.task_scores import METRICS, balanced_scores, score_interval
 from probe_kit.train.probe_sweep import (
     TOKEN_PERMUTATIONS,
-    Progress,
-    Sweep,
+    ProbeSweep,
     check_options,
     check_run,
 )
@@ -40,9 +40,6 @@ from probe_kit.train.target_samples import TargetSamples
 
 if TYPE_CHECKING:
     import pandas as pd
-
-
-Matrix = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -207,10 +204,10 @@ def transfer_probes(
     of_other = target if other_target is None else other_target
     for reader in (run, other):
         check_run(reader, categories)
-    side = Sweep.of(run, target, pooled, window=window, permutations=0, **options)
+    side = ProbeSweep.of(run, target, pooled, window=window, permutations=0, **options)
     run_window = side.samples.window if side.target.per_step else None
     options |= {"permutations": permutations, "token_permutations": token_permutations, "window": run_window}
-    other_side = Sweep.of(other, of_other, pooled, **options)
+    other_side = ProbeSweep.of(other, of_other, pooled, **options)
     _check_alike(run, other, views, across_weights)
     train = make_problem(run, side.target, side.samples, EVERYWHERE, side.settings)
     if side.target.definition != other_side.target.definition:

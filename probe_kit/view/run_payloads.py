@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from probe_kit._system.escaping import terminal_safe, without_folders
 from probe_kit._tables.numbers import p_text, percent, with_limits
-from probe_kit._tables.table import Row, Table
+from probe_kit._tables.table import Table, TableRow
 from probe_kit.diagnose.diagnosis import load_diagnosis
 from probe_kit.diagnose.results import diagnosis_table
 from probe_kit.env.scoring import RULES
@@ -58,26 +58,26 @@ The least 16-bit integer, which no rounded log-odds takes: they are cut at 32767
 """
 
 
-class Packed(str):
+class PackedArray(str):
     """Base64 of a little-endian array, which is data and no text."""
 
     __slots__ = ()
 
 
-def pack_floats(values: ArrayLike) -> Packed:
+def pack_floats(values: ArrayLike) -> PackedArray:
     """Return the values as float32, row by row."""
     return _pack(values, "<f4")
 
 
-def pack_log_odds(values: ArrayLike) -> Packed:
+def pack_log_odds(values: ArrayLike) -> PackedArray:
     """Return log-odds as int16 in steps of 1/256, at most ±127.99; not a number becomes `MISSING`."""
     scaled = np.asarray(values, np.float64) * LOG_ODDS_SCALE
     steps = np.clip(np.round(scaled), MISSING + 1, -MISSING - 1)
     return _pack(np.where(np.isnan(scaled), MISSING, steps), "<i2")
 
 
-def _pack(values: ArrayLike, kind: str) -> Packed:
-    return Packed(b64encode(np.ascontiguousarray(values, dtype=kind).tobytes()).decode("ascii"))
+def _pack(values: ArrayLike, kind: str) -> PackedArray:
+    return PackedArray(b64encode(np.ascontiguousarray(values, dtype=kind).tobytes()).decode("ascii"))
 
 
 def code_words(words: Sequence[Any]) -> dict[str, Any]:
@@ -116,7 +116,7 @@ def _script(function: str, name: str, value: Any) -> bytes:
 
 
 def _encode(value: Any, paths: tuple[str, ...]) -> Any:
-    if isinstance(value, Packed):  # before text, which it is too: base64 has nothing to escape, and is long
+    if isinstance(value, PackedArray):  # before text, which it is too: base64 has nothing to escape, and is long
         return value
     if isinstance(value, str):
         return without_folders(terminal_safe(value), paths)
@@ -507,5 +507,5 @@ def _result_table(kind: str, key: str, table: Table, findings: Sequence[str]) ->
     }
 
 
-def _row(row: Row) -> list[dict[str, Any]]:
+def _row(row: TableRow) -> list[dict[str, Any]]:
     return [{"text": cell.text, "strong": cell.strong, "note": cell.note} for cell in row.cells]

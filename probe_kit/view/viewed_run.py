@@ -17,7 +17,7 @@ from probe_kit.hooks.contract.sites import Site, resolve_view
 from probe_kit.intervene.kinds.attention import PatchAttention, stored_patch_attention
 from probe_kit.retention import RetentionRow, RetentionTable, retention_table
 from probe_kit.runs import Run
-from probe_kit.runs.arrays import Rows, decode_bfloat16
+from probe_kit.runs.arrays import EpisodeRows, decode_bfloat16
 from probe_kit.runs.layout import MEAN_VIEW
 from probe_kit.runs.reader import reached_calls
 from probe_kit.train.results.probe_curve import ProbeCurve
@@ -143,7 +143,7 @@ class FrozenProbes:
         return np.asarray(reached_calls(self.run).sum(axis=1))
 
     @cached_property
-    def _rows(self) -> dict[str, Rows]:
+    def _rows(self) -> dict[str, EpisodeRows]:
         return {stream: self.run.rows(stream) for stream in self._streams}
 
     @cached_property

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 from probe_kit._system.escaping import as_argument
 from probe_kit._tables.numbers import Limits, points, whole_percent, with_sign
-from probe_kit._tables.table import Cell, Heading, Row, Table, absent
+from probe_kit._tables.table import Cell, Heading, Table, TableRow, absent
 from probe_kit.intervene.verdict import UseVerdict, describe_readouts, more_groups, size_of_groups
 from probe_kit.retention.behaviour import Regime
 from probe_kit.retention.columns.text import (
@@ -403,7 +403,7 @@ def summary_table(summaries: Sequence[RunSummary], differences: Sequence[Differe
     names = list(dict.fromkeys(category.name for category in every if category.row.category != MEAN))
     if any(len(run.categories) > 1 for run in summaries):
         names += [category.name for category in every if category.row.category == MEAN][:1]
-    lines: list[Row] = []
+    lines: list[TableRow] = []
     for name in names:
         for run in summaries:
             of_name = [category for category in run.rows if category.name == name]
@@ -411,7 +411,7 @@ def summary_table(summaries: Sequence[RunSummary], differences: Sequence[Differe
         for row in differences:
             if title_of(row.category) == name:
                 cells = (Cell(name), Cell(f"{row.group} − {row.minus}"), Cell(""), *_difference_cells(row))
-                lines.append(Row(cells, row.category == MEAN, is_difference=True))
+                lines.append(TableRow(cells, row.category == MEAN, is_difference=True))
     of_labels = any(category.row.label for category in every)
     headings = ("label" if of_labels else "category", "run", "view", *HEADINGS, *_TESTS)
     title = " · ".join(dict.fromkeys(run.title for run in summaries))
@@ -434,9 +434,9 @@ def summary_table(summaries: Sequence[RunSummary], differences: Sequence[Differe
     return replace(table, notes=(*legend, *filter(None, [readouts, size]), *_marks(summaries, table)))
 
 
-def _row(category: CategorySummary, run: str) -> Row:
+def _row(category: CategorySummary, run: str) -> TableRow:
     names = map(Cell, (category.name, run, category.row.view or ""))
-    return Row((*names, *category.cells, *[Cell("")] * len(_TESTS)), category.row.category == MEAN)
+    return TableRow((*names, *category.cells, *[Cell("")] * len(_TESTS)), category.row.category == MEAN)
 
 
 def _marks(summaries: Sequence[RunSummary], table: Table) -> list[str]:

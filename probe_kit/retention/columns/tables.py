@@ -8,7 +8,7 @@ from pathlib import Path
 
 from probe_kit._system.counting import plural
 from probe_kit._tables.numbers import NONE, number, percent, plain, points, span
-from probe_kit._tables.table import Cell, Cells, Heading, Legend, Row, Table, absent
+from probe_kit._tables.table import Cell, Cells, Heading, Legend, Table, TableRow, absent
 from probe_kit.retention.behaviour import rule_sentence
 from probe_kit.retention.choices import Section
 from probe_kit.retention.columns.columns import TABLES, Column, ColumnGroup, Labels, radius_columns
@@ -34,7 +34,7 @@ from probe_kit.retention.rows.row import MEAN, RetentionRow
 from probe_kit.runs.reader import full_name
 from probe_kit.statistics.significance import detectable
 
-TableRow = RetentionRow | Difference
+RowOrDifference = RetentionRow | Difference
 SUBJECTS = {
     "Accuracy of answers": "behaviour",
     "Success rate": "behaviour",
@@ -144,7 +144,7 @@ def _table(
             *(Heading(column.heading, column.help, group.title, group.detail) for column, group in columns),
         ),
         rows=tuple(
-            Row(
+            TableRow(
                 (*(Cell(text(line)) for _, text in names), *(_cell(column, line) for column, _ in columns)),
                 is_mean=line.category == MEAN,
                 is_difference=isinstance(line, Difference),
@@ -156,13 +156,13 @@ def _table(
     )
 
 
-def _ordered(rows: Sequence[RetentionRow], differences: Sequence[Difference]) -> list[TableRow]:
+def _ordered(rows: Sequence[RetentionRow], differences: Sequence[Difference]) -> list[RowOrDifference]:
     """Return the lines by category, means last; in each the runs of a view, followed by their differences."""
     categories = list(dict.fromkeys(row.category for row in rows))
     views = list(dict.fromkeys(row.view for row in rows))
     by_view = {view: at for at, view in enumerate(views)}
     several = len({row.key for row in rows}) > 1
-    lines: list[TableRow] = [*rows, *differences]
+    lines: list[RowOrDifference] = [*rows, *differences]
     if not several and len(views) < 2:
         return lines
     return sorted(
@@ -176,19 +176,19 @@ def _ordered(rows: Sequence[RetentionRow], differences: Sequence[Difference]) ->
 
 def _name_columns(
     title: str, rows: Sequence[RetentionRow], differences: Sequence[Difference]
-) -> list[tuple[Heading, Callable[[TableRow], str]]]:
+) -> list[tuple[Heading, Callable[[RowOrDifference], str]]]:
     """Return the columns that distinguish rows: the category, and run, view or call where there are several."""
 
-    def name(line: TableRow) -> str:
+    def name(line: RowOrDifference) -> str:
         return title_of(line.category) if isinstance(line, Difference) else name_of(line)
 
-    def run(line: TableRow) -> str:
+    def run(line: RowOrDifference) -> str:
         return difference_name(line) if isinstance(line, Difference) else model_name(line)
 
-    def call(line: TableRow) -> str:
+    def call(line: RowOrDifference) -> str:
         return plain(line.call if isinstance(line, Difference) else line.run.call)
 
-    names: list[tuple[Heading, Callable[[TableRow], str]]] = [
+    names: list[tuple[Heading, Callable[[RowOrDifference], str]]] = [
         (Heading("label", "What the probes decode, and in which category."), name)
         if any(row.label for row in rows)
         else (Heading("category", "Kind of question."), name)
@@ -215,7 +215,7 @@ def _title(title: str, rows: Sequence[RetentionRow]) -> str:
     return f"{title}{of_label}{view}: {model}{', '.join(dict.fromkeys(row.run.suite for row in rows))}"
 
 
-def _cell(column: Column, line: TableRow) -> Cell:
+def _cell(column: Column, line: RowOrDifference) -> Cell:
     """Return the cell of a column; an empty one where differences have no such number."""
     if isinstance(line, Difference):
         return absent("") if column.difference is None else column.difference(line)

@@ -15,7 +15,7 @@ from probe_kit.retention.displays.display import (
     GREEN,
     PARTS,
     Display,
-    Line,
+    LineLook,
     ProvenanceLine,
     best_row,
     in_panels,
@@ -257,7 +257,7 @@ def predicted_figures(source: FigureSource) -> Iterator[ReportFigure]:
 
 # -- scores by step ------------------------------------------------------------------------------------------
 
-_CONTROLS = (Line("black", "", ":"), Line(GREEN, "", (0, (5, 1))))  # type: ignore[arg-type]  # as `SERIES`
+_CONTROLS = (LineLook("black", "", ":"), LineLook(GREEN, "", (0, (5, 1))))  # type: ignore[arg-type]  # as `SERIES`
 
 
 @dataclass(kw_only=True)

@@ -15,7 +15,7 @@ from probe_kit.retention.columns.text import name_of_target
 from probe_kit.retention.displays.display import (
     PARTS,
     Display,
-    Line,
+    LineLook,
     ProvenanceLine,
     accuracy_axis,
     best_of,
@@ -411,7 +411,7 @@ def _draw_stream(axes: "Axes", curve: StreamCurve, sidestep: float = 0.0, scale:
     else:
         colours = _colours()
         for number, layers in enumerate(curve.lines):
-            shade = Line(colours(number / (len(curve.lines) - 1)), line.marker)  # type: ignore[arg-type]
+            shade = LineLook(colours(number / (len(curve.lines) - 1)), line.marker)  # type: ignore[arg-type]
             draw_line(axes, layers, shade, f"{_ITERATION}{layers.iteration}", sidestep, bars=False, scale=scale)
         axes.plot([], [], color=line.colour, marker=line.marker, ms=4, lw=1.3, label=f"{curve.name}, by iteration")
     mark_peaks(axes, curve, sidestep, scale)
@@ -425,7 +425,7 @@ def _has_bars(curve: StreamCurve) -> bool:
 def draw_line(
     axes: "Axes",
     line: LayerLine,
-    style: Line,
+    style: LineLook,
     name: str,
     sidestep: float = 0.0,
     bars: bool = True,

@@ -78,7 +78,7 @@ _TASKS: dict[Task, str] = {"binary": "binary", "classes": "categorical", "contin
 
 
 @dataclass(frozen=True)
-class Picture:
+class PageFigure:
     """A figure in the page.
 
     Attributes:
@@ -97,7 +97,7 @@ class Picture:
     extra: bool
 
 
-PicturesBySubject = Mapping[str, Sequence[Sequence[Picture]]]
+PicturesBySubject = Mapping[str, Sequence[Sequence[PageFigure]]]
 """By subject, the figures of each kind, those of several runs side by side."""
 
 
@@ -379,7 +379,7 @@ def arranged(
         names: The name of each run.
         paths: Paths that are shortened in texts, see `data_uri`.
     """
-    subjects: dict[str, dict[str, list[Picture]]] = {}
+    subjects: dict[str, dict[str, list[PageFigure]]] = {}
     together = {
         (figure.subject, _kind(figure)) for figure in figures if figure.run is None and not figure.is_table
     }
@@ -392,7 +392,7 @@ def arranged(
         before = [other for pictures in by_title.values() for other in pictures]
         extra = any(other.run == run and other.title.partition(",")[0] == kind for other in before)
         extra |= figure.run is not None and (figure.subject, f"{kind} side by side") in together
-        picture = Picture(figure.title, run, figure.reading, *data_uri(figure, paths), extra)
+        picture = PageFigure(figure.title, run, figure.reading, *data_uri(figure, paths), extra)
         by_title.setdefault(figure.title, []).append(picture)
     return {subject: list(by_title.values()) for subject, by_title in subjects.items()}
 

@@ -8,16 +8,15 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._system.types import Matrix
 from probe_kit.hooks.contract.sites import Site, part_of
-from probe_kit.statistics.crossfit import CHANCE, GroupSums, StreamScores, balanced_sums
+from probe_kit.statistics.crossfit import CHANCE, GroupSums, SiteScores, balanced_sums
 from probe_kit.statistics.folds import Fold, fold_of_groups, split_by_fold, sums_by_group
 from probe_kit.statistics.intervals import Accuracy
 from probe_kit.statistics.label_permutations import max_statistic_p, smallest_p
 from probe_kit.statistics.paired_tests import SHARED_PROBE
 from probe_kit.train.choices import Task
 from probe_kit.train.crossval.task_scores import class_weights, correctness, score_interval, squared_deviations
-
-Matrix = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -276,14 +275,14 @@ class ProbeCurve:
         last = max(other.layer for other in self.sites if other.stream == site.stream)
         return site.layer / max(1, last)  # a stream of one layer has depth 0
 
-    def fit_stream(self, rows: NDArray[np.intp]) -> StreamScores:
+    def fit_stream(self, rows: NDArray[np.intp]) -> SiteScores:
         """Return the sites at `rows`, which are one stream or a part of it, for cross-fitted scores.
 
         Of a side they are balanced accuracies, else scores above the chance of each site. Raises as `sums`, and as
-        `StreamScores.of`.
+        `SiteScores.of`.
         """
         sites = [self.sites[row] for row in rows]
-        return StreamScores.of(
+        return SiteScores.of(
             self.sums.only(rows) if self.balanced else self._above_chance(rows),
             self.inner[rows],
             fold_of_groups(self.fold_of, self.groups),

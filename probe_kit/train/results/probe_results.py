@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit._system.bounded_files import UNREADABLE, open_arrays
+from probe_kit._system.types import Matrix
 from probe_kit._tables.numbers import number, p_text, percent
 from probe_kit._tables.table import Cell, Legend, Table
 from probe_kit.errors import UnknownSiteError
@@ -26,7 +27,7 @@ from probe_kit.statistics.share_limits import wilson_limits
 from probe_kit.train.choices import EVERYWHERE, SIDES, Incomplete, Task
 from probe_kit.train.crossval.task_scores import METRICS, fold_auc, fold_spearman, log_loss
 from probe_kit.train.results.control_scores import Controls, has_signal
-from probe_kit.train.results.probe_curve import Matrix, ProbeCurve
+from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.samples import is_token_view
 
 if TYPE_CHECKING:
