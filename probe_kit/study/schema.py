@@ -154,7 +154,7 @@ TableKind = Literal[
     "drift",
 ]
 Control = Literal["untrained"] | FeatureControl
-FigureKind = Literal["curves", "sides", "dose", "overview"]
+FigureKind = Literal["curves", "dose", "overview"]
 
 
 class _Table(BaseModel):

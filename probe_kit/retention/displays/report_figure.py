@@ -120,7 +120,6 @@ class ReportFigure:
         reading: Explanation of the figure, in plain language.
         run: Its position among the runs, None if it shows all of them.
         draw: Makes the figure.
-        is_table: Whether its numbers are a table that is printed as such elsewhere.
         is_detail: Whether the main figures can be read without it.
     """
 
@@ -130,7 +129,6 @@ class ReportFigure:
     reading: str
     run: int | None
     draw: "Callable[[], Figure]"
-    is_table: bool = False
     is_detail: bool = False
 
     @contextmanager

@@ -380,12 +380,8 @@ def arranged(
         paths: Paths that are shortened in texts, see `data_uri`.
     """
     subjects: dict[str, dict[str, list[PageFigure]]] = {}
-    together = {
-        (figure.subject, _kind(figure)) for figure in figures if figure.run is None and not figure.is_table
-    }
+    together = {(figure.subject, _kind(figure)) for figure in figures if figure.run is None}
     for figure in figures:
-        if figure.is_table:
-            continue
         by_title = subjects.setdefault(figure.subject, {})
         run = "" if figure.run is None else names[figure.run]
         kind = _kind(figure)
