@@ -194,10 +194,10 @@ def test_a_policy_is_described_as_before_and_a_mixture_as_both(tmp_path: Path) -
     assert "share of its answers that are right" not in alone["report"]
     assert "the cube ends right in" in both["report"]
     assert "share of its answers that are right" in both["report"]
-    for name in FORMATS:
-        assert re.search(r"success rate|succeeds", alone[name], re.I), name
-        assert not re.search(r"accuracy of answers|says it", alone[name], re.I), name
-        assert re.search(r"accuracy of answers|says it", both[name], re.I), name
+    for name in set(FORMATS) - {"captions", "figures"}:  # of a run without probes none names the rate
+        assert re.search(r"success rate", alone[name], re.I), name
+        assert not re.search(r"accuracy of answers", alone[name], re.I), name
+        assert re.search(r"accuracy of answers", both[name], re.I), name
 
 
 def test_axes_and_titles_name_the_share_they_show(tmp_path: Path) -> None:
