@@ -68,7 +68,7 @@ def subjects_of(
     load_options = family.check(checkpoint, device, dtype, False, read_pairs(options), 0)
     common: dict[str, Any] = {"options": load_options, "instructions": instructions or INSTRUCTIONS}
     common |= {"device": device, "dtype": dtype}
-    kinds = [kind for kind in CONTRACTS if (family.acts if kind.acting else family.reads)]
+    kinds = [kind for kind in CONTRACTS if (family.abilities.acts if kind.acting else family.abilities.reads)]
     return [kind(model, checkpoint, **common) for kind in kinds]
 
 

@@ -453,7 +453,9 @@ def _say_cost(family: str, streams: "Sequence[Any]", inputs: Sequence[str], requ
     layers = {stream.name: stream.layers for stream in streams}
     declared = get_family(family)
     # Keys and values are of every block of the backbone, which has one residual site more.
-    handed_over = layers["backbone"] - 1 if declared is not None and declared.interventions.prompt_kv else 0
+    handed_over = (
+        layers["backbone"] - 1 if declared is not None and declared.abilities.interventions.prompt_kv else 0
+    )
     sites = sum(layers.values()) + handed_over if request.inside else 0
     frames, pairs, base = request.frames, len(request.pairs) or None, request.base is not None
     if request.pairs:

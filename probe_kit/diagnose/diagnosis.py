@@ -43,7 +43,7 @@ from probe_kit.intervene.tokens import PairTokens, roles_of_tokens
 from probe_kit.runs.layout import DIAGNOSES, UNITS
 from probe_kit.runs.reader import origin_of
 from probe_kit.runs.records import as_json
-from probe_kit.runs.results import is_complete, read_bundle, write_bundle
+from probe_kit.runs.results import Bundle, find_bundle, read_bundle, write_bundle
 from probe_kit.train.choices import EVERYWHERE
 
 if TYPE_CHECKING:
@@ -225,8 +225,8 @@ def diagnose_run(
         "seed": seed,
     }
     key = key_of(settings)
-    if is_complete(run.location, DIAGNOSES, key):
-        return replace(load_diagnosis(run, key), knowledge=knowledge)
+    if (stored := find_bundle(run.location, DIAGNOSES, key)) is not None:
+        return replace(_read(stored), knowledge=knowledge)
     with open_session(run, source, load, table=pairs, instructions=instructions) as session, session.ready():
         if base_policy is not None:
             base_policy = with_inputs_of(session.policy, base_policy)
@@ -322,10 +322,14 @@ def load_diagnosis(run: "Run", key: str) -> Diagnosis:
     Raises:
         RunDamagedError: If it was changed, or another version of probe_kit made it.
     """
-    bundle = read_bundle(run.location, DIAGNOSES, key)
+    return _read(read_bundle(run.location, DIAGNOSES, key))
+
+
+def _read(bundle: Bundle) -> Diagnosis:
     bundle.check_format(FORMAT)
+    values = bundle.read_json(FILE)
     try:
-        return Diagnosis.from_json(bundle.read_json(FILE))
+        return Diagnosis.from_json(values)
     except ValueError as error:
         raise bundle.damaged(FILE, "has other fields: another version of probe_kit made it") from error
 

@@ -388,7 +388,7 @@ def _selects_only(settings: Settings, location: Location | None) -> bool:
         return False
     if location is None:
         family = get_family(settings.model.family)
-        return family is not None and bool(family.declared)
+        return family is not None and bool(family.checkpoints.declared)
     with location.explained_errors():
         return not location.exists(RUN_FILE)
 

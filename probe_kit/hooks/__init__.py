@@ -6,6 +6,7 @@ from probe_kit._system.imports import lazy_names
 from probe_kit.hooks.capturing.edits import Edit
 from probe_kit.hooks.contract.card import ModelCard
 from probe_kit.hooks.contract.declared import Interventions, Option
+from probe_kit.hooks.contract.family_parts import Abilities, Checkpoints, Requirements
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.sites import Site, Stream
 from probe_kit.hooks.family import Family
@@ -28,10 +29,12 @@ if TYPE_CHECKING:
     from probe_kit.hooks.contract.roles import Roles, pool
 
 __all__ = [
+    "Abilities",
     "ActivationCache",
     "AnswerModel",
     "AttentionCut",
     "AttentionMass",
+    "Checkpoints",
     "Edit",
     "Family",
     "Interventions",
@@ -43,6 +46,7 @@ __all__ = [
     "Policy",
     "Prompt",
     "Reading",
+    "Requirements",
     "Roles",
     "Rows",
     "Site",

@@ -16,13 +16,13 @@ from probe_kit.study.schema import BlockTable, ConditionTable, Mistake, ModelTab
 def answers(model: ModelTable) -> bool:
     """Whether the model is a VLM."""
     family = get_family(model.family)
-    return family is not None and family.reads
+    return family is not None and family.abilities.reads
 
 
 def acts(model: ModelTable) -> bool:
     """Whether the model is a policy."""
     family = get_family(model.family)
-    return model.family in SCRIPTED or (family is not None and family.acts)
+    return model.family in SCRIPTED or (family is not None and family.abilities.acts)
 
 
 @dataclass(frozen=True)

@@ -35,6 +35,7 @@ from probe_kit.hooks.conformance.check import (
     try_check,
 )
 from probe_kit.hooks.conformance.subject import AnswerSubject, PolicySubject, Subject
+from probe_kit.hooks.contract.family_parts import Requirements
 from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.hooks.testing import ANSWER_CHECKS, POLICY_CHECKS
 from tests.support.contracts import GOLDEN
@@ -418,7 +419,13 @@ def load_sloppily(checkpoint: str, *_: object, **__: object) -> EncoderPolicy:
 
 
 def subject_of(loader: str, checkpoint: Path, monkeypatch: pytest.MonkeyPatch) -> Subject:
-    family = Family("encoder-vla", "", None, loader, needs_checkpoint=True)
+    family = Family(
+        "encoder-vla",
+        "",
+        None,
+        loader,
+        requirements=Requirements(needs_checkpoint=True),
+    )
     entry = SimpleNamespace(name="encoder-vla", load=lambda: family, value="x:y", dist=None)
     monkeypatch.setattr(registry, "family_entries", lambda: [entry])
     return PolicySubject("encoder-vla", checkpoint)

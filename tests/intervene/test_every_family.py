@@ -36,7 +36,7 @@ COMMON: dict[str, Any] = {"categories": ("color",), "items": ITEMS}
 
 
 def test_every_family_that_acts_is_here() -> None:
-    acting = {name for name, family in own_families().items() if family.acts}
+    acting = {name for name, family in own_families().items() if family.abilities.acts}
     assert acting - {"pi0-tiny-early", "pi0-tiny-state"} == FAMILIES.keys()
 
 
@@ -112,7 +112,7 @@ def asked_of(run: Run, kind: str) -> Intervention:
 )
 def test_every_kind_runs_or_is_refused_by_name(measured_run: tuple[Run, ReplayFiles], kind: str) -> None:
     run, source = measured_run
-    intervention, supported = asked_of(run, kind), find_family(run.model).interventions
+    intervention, supported = asked_of(run, kind), find_family(run.model).abilities.interventions
     if any(not supported.supports(needed) for needed in intervention.required_capabilities):
         with pytest.raises(UnsupportedInterventionError, match=f"{run.model} does not support"):
             run_intervention(run, intervention, source, load=not_loaded)
@@ -132,7 +132,7 @@ def not_loaded(run: Run, _: ReplayFiles) -> Policy:
 
 def _check_ledger(run: Run, effects: InterventionResult) -> None:
     """Every change fired; what writes back what is there, or is read by nothing, changes nothing."""
-    supported = find_family(run.model).interventions
+    supported = find_family(run.model).abilities.interventions
     last = f"backbone.{run.streams['backbone'].layers - 1:02d}|"
     for name, counts in effects.certificate["edits"].items():
         assert counts["fires"] > 0, name

@@ -14,7 +14,7 @@ from probe_kit.extract import ExtractSettings
 from probe_kit.extract.extraction import prepare
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.families.pi0.adapter import load_pi0_tiny
-from probe_kit.hooks.families.shared.lerobot.policy import MASK, TOKENS
+from probe_kit.hooks.families.shared.lerobot.packing import MASK, TOKENS
 from probe_kit.intervene.open_session import load_policy_of
 from probe_kit.intervene.sessions import LoadPolicy, ReplayFiles
 from probe_kit.models.building import initialise

@@ -150,7 +150,7 @@ class Act:
         """Raise UsageError for a model that answers, and in a scene the errors of `Family.check_acting`."""
         if family is None:
             return
-        if not family.acts:
+        if not family.abilities.acts:
             raise UsageError(f"{family.name} answers and does not act; use `probe-kit ask`, or a model that acts")
         if settings.source.is_scene and not settings.task.capture_only:
             family.check_acting(settings.model.checkpoint, settings.model.options)
@@ -304,6 +304,7 @@ class Ask:
     def declared_inputs(self, settings: AskSettings) -> "DeclaredInputs | None":
         """Return None: the cameras of a question are chosen by the prompt."""
         del settings
+        return None
 
     def planned(self, settings: AskSettings, sizes: PlannedSizes) -> AskSettings:
         """Return the settings: sizes decide nothing."""
@@ -312,10 +313,10 @@ class Ask:
 
     def check_family(self, settings: AskSettings, family: "Family | None") -> None:
         """Raise UsageError for a model that acts."""
-        if family is None or not family.reads:
+        if family is None or not family.abilities.reads:
             from probe_kit.hooks.registry import known_families
 
-            reads = [name for name, candidate in known_families().items() if candidate.reads]
+            reads = [name for name, candidate in known_families().items() if candidate.abilities.reads]
             raise UsageError(
                 f"{settings.model.family} acts and does not answer questions; those that do: {', '.join(reads)}"
             )

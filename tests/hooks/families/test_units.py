@@ -95,7 +95,7 @@ def test_statistics_of_an_adapters_folder_count_over_those_of_its_base(tmp_path:
 @pytest.mark.parametrize("family", list(DEFAULTS))
 def test_the_default_checkpoint_alone_has_default_units(family: str) -> None:
     entry = find_family(family)
-    assert entry.of_default == DEFAULTS[family]
+    assert entry.checkpoints.of_default == DEFAULTS[family]
     released = entry.check(random_weights=True, fetch=False, device="cpu")
     assert released.items() >= DEFAULTS[family].items()
     assert not entry.check("someone/fine-tune", random_weights=True, fetch=False).keys() & DEFAULTS[family].keys()

@@ -213,7 +213,7 @@ def test_every_format_shows_answers_sizes_and_gaps(runs: list[SaidRun], tmp_path
     assert [cells[:2] for cells in sizes.texts] == [("qwen3-vl", "p1"), ("qwen3-vl", "seen")]
 
 
-GROWN = {name: family for name, family in own_families().items() if family.source_weights is not None}
+GROWN = {name: family for name, family in own_families().items() if family.checkpoints.source_weights is not None}
 RIGHT = {"color": np.random.default_rng(0).random((12, 2)) < 0.7}
 
 
@@ -302,7 +302,7 @@ def test_the_early_policy_holds_the_weights_that_its_family_declares() -> None:
 @pytest.mark.parametrize("name", GROWN)
 def test_the_declared_source_is_a_released_size_of_its_family(name: str) -> None:
     family = GROWN[name]
-    source, declared = find_family(str(family.source)), family.source_weights
+    source, declared = find_family(str(family.checkpoints.source)), family.checkpoints.source_weights
     assert declared is not None
     if source.full_size is None:
         assert asdict(declared)["sha256"] == load_model(source.name).card.weights_sha256
