@@ -6,10 +6,10 @@ from probe_kit._system.imports import lazy_names
 from probe_kit.hooks.capturing.edits import Edit
 from probe_kit.hooks.contract.card import ModelCard
 from probe_kit.hooks.contract.declared import Interventions, Option
-from probe_kit.hooks.contract.family_parts import Abilities, Checkpoints, Requirements
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.sites import Site, Stream
 from probe_kit.hooks.family import Family
+from probe_kit.hooks.family_parts import Abilities, Checkpoints, Requirements
 from probe_kit.hooks.registry import known_families, load_model, load_policy
 
 if TYPE_CHECKING:

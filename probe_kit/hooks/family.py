@@ -41,7 +41,7 @@ from probe_kit.hooks.contract.declared import (
     ProtocolRow,
     check_options,
 )
-from probe_kit.hooks.contract.family_parts import Abilities, Checkpoints, Requirements
+from probe_kit.hooks.family_parts import Abilities, Checkpoints, Requirements
 from probe_kit.hooks.outline import Outline, bytes_to_fetch, configuration_folder, is_complete, outline_of
 from probe_kit.models.bounds import MOST_STEPS
 

@@ -27,7 +27,7 @@ from tests.support.pi05_checkpoints import write_pi05
 from tests.support.smolvla_checkpoints import write_smolvla
 
 DECLARING = [name for name, family in own_families().items() if family.checkpoints.declared]
-RELEASED = [(name, size) for name in DECLARING for size in own_families()[name].declared]
+RELEASED = [(name, size) for name in DECLARING for size in own_families()[name].checkpoints.declared]
 
 
 @pytest.fixture
@@ -65,7 +65,7 @@ def settings_of(name: str, suite: Suite, **options: Any) -> ExtractSettings | As
 def test_a_plan_needs_no_weights_no_network_and_no_gpu(name: str, size: str, small_suite: Suite) -> None:
     options = {"size": size} if size else {}
     planned = prepare(settings_of(name, small_suite, options=options), fetch=False)
-    declared = own_families()[name].declared[size]
+    declared = own_families()[name].checkpoints.declared[size]
     shapes = [
         (
             declaration.stream.name,
@@ -146,7 +146,7 @@ def test_a_checkpoint_whose_configuration_is_in_the_cache_is_planned_with_its_ow
     folder = write(tmp_path / "model")
     model = load_model(name, str(folder), **options)
     repo = cached(monkeypatch, tmp_path / "cache", "lab/tiny", folder)
-    model_options: dict[str, Any] = {"capture_only": True} if own_families()[name].acts else {}
+    model_options: dict[str, Any] = {"capture_only": True} if own_families()[name].abilities.acts else {}
     settings = settings_of(name, small_suite, checkpoint=repo, options=options, **model_options)
     planned = prepare(settings, fetch=False)
     assert sizes(planned.plan.streams) == sizes(model.streams.values())
@@ -285,7 +285,8 @@ def test_declared_streams_have_the_names_and_roles_of_the_loaded_model(name: str
     write, options = WRITERS[name]
     model = load_model(name, str(write(tmp_path / "model")), **options)
     declared = {
-        declaration.stream.name: declaration for declaration in next(iter(own_families()[name].declared.values()))
+        declaration.stream.name: declaration
+        for declaration in next(iter(own_families()[name].checkpoints.declared.values()))
     }
     assert declared.keys() == model.streams.keys()
     for stream in model.streams.values():

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from probe_kit.hooks import Observation, capture
 from probe_kit.hooks.capturing.capture_context import reason_of_change
-from probe_kit.hooks.contract.family_parts import Requirements
 from probe_kit.hooks.family import Family
+from probe_kit.hooks.family_parts import Requirements
 from probe_kit.hooks.testing import example_observations
 from tests.support.encoder_vla.policy import EncoderPolicy, load, write_checkpoint
 

@@ -35,8 +35,8 @@ from probe_kit.hooks.conformance.check import (
     try_check,
 )
 from probe_kit.hooks.conformance.subject import AnswerSubject, PolicySubject, Subject
-from probe_kit.hooks.contract.family_parts import Requirements
 from probe_kit.hooks.families.pi0.adapter import Pi0
+from probe_kit.hooks.family_parts import Requirements
 from probe_kit.hooks.testing import ANSWER_CHECKS, POLICY_CHECKS
 from tests.support.contracts import GOLDEN
 from tests.support.encoder_vla.policy import CHUNK, STEPS, WIDTH, EncoderPolicy, EncoderVLA, load, write_checkpoint

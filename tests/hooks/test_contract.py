@@ -48,7 +48,7 @@ FAMILIES = own_families()
 
 @pytest.mark.parametrize("name", [name for name, family in FAMILIES.items() if family.abilities.acts])
 def test_every_family_that_acts_names_its_streams_and_gives_a_reason_for_what_it_lacks(name: str) -> None:
-    supported = FAMILIES[name].interventions
+    supported = FAMILIES[name].abilities.interventions
     assert supported.edits, "say which quantities of which streams can be rewritten"
     assert {"backbone"} < supported.edits.keys()
     assert supported.prompt_kv or "kv" in supported.instead

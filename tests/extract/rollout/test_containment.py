@@ -35,9 +35,9 @@ from probe_kit.extract import ExtractSettings, extract_run, prepare
 from probe_kit.extract.sources.player import LONGEST_TRACEBACK, add_traceback, traceback_of
 from probe_kit.hooks import Observation
 from probe_kit.hooks.checkpoints.third_party import contain_policy, while_acting
-from probe_kit.hooks.contract.family_parts import Requirements
 from probe_kit.hooks.families.pi0.adapter import Pi0, load_pi0_tiny
 from probe_kit.hooks.family import Family
+from probe_kit.hooks.family_parts import Requirements
 from probe_kit.runs import Run, open_run
 from probe_kit.suite import Suite
 from tests.support.episode_tables import without_seconds

@@ -118,7 +118,7 @@ def test_the_plan_prints_whose_units_are_used(tmp_path: Path) -> None:
     assert "my_arm, from" in " ".join(result.output.split())
 
 
-ACTING = {name: writer for name, writer in WRITERS.items() if own_families()[name].acts}
+ACTING = {name: writer for name, writer in WRITERS.items() if own_families()[name].abilities.acts}
 MADE: dict[str, tuple[str, Callable[[Path], Path], dict[str, Any]]] = {
     **{name: (name, *arguments) for name, arguments in ACTING.items()},
     "groot of NVIDIA": ("groot", write_nvidias, {"embodiment": "libero_sim"}),

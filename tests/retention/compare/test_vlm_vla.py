@@ -304,11 +304,13 @@ def test_the_declared_source_is_a_released_size_of_its_family(name: str) -> None
     family = GROWN[name]
     source, declared = find_family(str(family.checkpoints.source)), family.checkpoints.source_weights
     assert declared is not None
-    if source.full_size is None:
+    if source.checkpoints.full_size is None:
         assert asdict(declared)["sha256"] == load_model(source.name).card.weights_sha256
         assert declared.parameters == load_model(source.name).card.parameters
         return
-    sizes = {checkpoint: size for size, checkpoint in source.sizes} or {source.default_checkpoint: None}
+    sizes = {checkpoint: size for size, checkpoint in source.checkpoints.sizes} or {
+        source.default_checkpoint: None
+    }
     size = sizes[declared.checkpoint]
     network = source.function("full_size")(*([] if size is None else [size]))
     assert sum(parameter.numel() for parameter in network.parameters()) == declared.parameters

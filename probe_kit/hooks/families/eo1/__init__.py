@@ -1,9 +1,9 @@
 """EO-1 through lerobot."""
 
 from probe_kit.hooks.contract.declared import Interventions, backbone, expert
-from probe_kit.hooks.contract.family_parts import Abilities, Checkpoints, Requirements
 from probe_kit.hooks.contract.sites import QUANTITIES
 from probe_kit.hooks.families.shared.kinds import MERGED, lerobot_family
+from probe_kit.hooks.family_parts import Abilities, Checkpoints, Requirements
 
 INTERVENTIONS = Interventions(
     edits={"backbone": QUANTITIES, "expert": QUANTITIES},

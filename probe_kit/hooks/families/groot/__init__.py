@@ -1,9 +1,9 @@
 """GR00T N1.7 through lerobot."""
 
 from probe_kit.hooks.contract.declared import TEXT, DeclaredStream, Interventions, Option, backbone, expert
-from probe_kit.hooks.contract.family_parts import Abilities, Checkpoints, Requirements
 from probe_kit.hooks.contract.sites import QUANTITIES, Stream
 from probe_kit.hooks.families.shared.kinds import MERGED, lerobot_family
+from probe_kit.hooks.family_parts import Abilities, Checkpoints, Requirements
 
 RESIZES = ("nvidia", "lerobot")
 """The code that brings pictures to their size, in two ways."""

@@ -16,11 +16,11 @@ from probe_kit.hooks.contract.declared import (
     backbone,
     expert,
 )
-from probe_kit.hooks.contract.family_parts import Abilities, Checkpoints
 from probe_kit.hooks.contract.sites import QUANTITIES, Stream
 from probe_kit.hooks.families.shared.action_statistics import ActionStatistics
 from probe_kit.hooks.families.shared.kinds import MERGED
 from probe_kit.hooks.family import Family
+from probe_kit.hooks.family_parts import Abilities, Checkpoints
 
 _UNCONDITIONAL = "action expert without condition"
 _HEAD = ("condition", "action")

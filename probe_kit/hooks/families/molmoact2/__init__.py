@@ -3,9 +3,9 @@
 from dataclasses import replace
 
 from probe_kit.hooks.contract.declared import backbone, expert
-from probe_kit.hooks.contract.family_parts import Abilities, Checkpoints
 from probe_kit.hooks.contract.sites import QUANTITIES
 from probe_kit.hooks.families.shared.kinds import FLOW, MERGED, lerobot_family
+from probe_kit.hooks.family_parts import Abilities, Checkpoints
 
 EXPERT = ("residual", "attention", "cross_attention", "mlp", "final_norm")
 LAYERWISE = replace(

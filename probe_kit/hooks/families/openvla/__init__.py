@@ -1,10 +1,10 @@
 """OpenVLA, native."""
 
 from probe_kit.hooks.contract.declared import ACT2ANSWER, OWN_SEEDS, Option, ProtocolRow, backbone, chosen_tokens
-from probe_kit.hooks.contract.family_parts import Abilities, Checkpoints, Requirements
 from probe_kit.hooks.families.prismatic import BITS, TOKENIZER
 from probe_kit.hooks.families.shared.kinds import TOKENS
 from probe_kit.hooks.family import Family
+from probe_kit.hooks.family_parts import Abilities, Checkpoints, Requirements
 
 BRIDGE = "bridge_orig"
 """The data set of the WidowX arm that Act2Answer imitates."""

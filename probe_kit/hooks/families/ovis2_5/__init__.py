@@ -1,8 +1,8 @@
 """Ovis2.5, native."""
 
 from probe_kit.hooks.contract.declared import answering
-from probe_kit.hooks.contract.family_parts import Checkpoints
 from probe_kit.hooks.families.shared.kinds import TOKENIZER_FOLDER, answering_family
+from probe_kit.hooks.family_parts import Checkpoints
 
 FAMILIES = (
     answering_family(

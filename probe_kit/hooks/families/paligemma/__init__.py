@@ -1,8 +1,8 @@
 """PaliGemma, on transformers' own network, and the embedded VLM of 0.61 million parameters."""
 
 from probe_kit.hooks.contract.declared import EMBEDDED, answering
-from probe_kit.hooks.contract.family_parts import Abilities, Checkpoints
 from probe_kit.hooks.families.shared.kinds import TOKENIZER_FOLDER, answering_family
+from probe_kit.hooks.family_parts import Abilities, Checkpoints
 
 FAMILIES = (
     answering_family(

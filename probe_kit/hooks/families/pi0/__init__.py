@@ -10,9 +10,9 @@ from probe_kit.hooks.contract.declared import (
     backbone,
     expert,
 )
-from probe_kit.hooks.contract.family_parts import Abilities, Checkpoints
 from probe_kit.hooks.families.shared.kinds import EVALUATION_OPTIONS, FLOW, lerobot_family
 from probe_kit.hooks.family import Family
+from probe_kit.hooks.family_parts import Abilities, Checkpoints
 
 _VLM_TINY = SourceWeights(
     sha256="77a4486bf2d356c1e11cfd2a7a0f835683dacf1a7864f714feef92cb19fa0650", parameters=658_944

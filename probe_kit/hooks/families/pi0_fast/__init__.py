@@ -4,8 +4,8 @@ from dataclasses import replace
 
 from probe_kit.hooks.contract.card import SourceWeights
 from probe_kit.hooks.contract.declared import Option, backbone, chosen_tokens
-from probe_kit.hooks.contract.family_parts import Abilities, Checkpoints
 from probe_kit.hooks.families.shared.kinds import TOKENS, lerobot_family
+from probe_kit.hooks.family_parts import Abilities, Checkpoints
 
 CAPTURED = 10
 """Action tokens whose positions are sites: "Action: ", and the lowest frequency of about seven dimensions."""

@@ -2,8 +2,8 @@
 
 from probe_kit.hooks.checkpoints.checkpoint import PATTERNS, RUN_WEIGHTS
 from probe_kit.hooks.contract.declared import Option, answering
-from probe_kit.hooks.contract.family_parts import Abilities, Checkpoints, Requirements
 from probe_kit.hooks.families.shared.kinds import answering_family
+from probe_kit.hooks.family_parts import Abilities, Checkpoints, Requirements
 
 TOKENIZER = Option(
     "tokenizer",

@@ -1,8 +1,8 @@
 """Qwen2.5-VL and Qwen3-VL, on transformers' own networks."""
 
 from probe_kit.hooks.contract.declared import answering
-from probe_kit.hooks.contract.family_parts import Checkpoints
 from probe_kit.hooks.families.shared.kinds import TOKENIZER_FOLDER, answering_family
+from probe_kit.hooks.family_parts import Checkpoints
 
 FAMILIES = (
     answering_family(

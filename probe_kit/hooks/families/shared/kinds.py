@@ -6,10 +6,10 @@ from types import MappingProxyType
 from typing import Any, Literal
 
 from probe_kit.hooks.contract.declared import Interventions, Option
-from probe_kit.hooks.contract.family_parts import Abilities, Checkpoints
 from probe_kit.hooks.contract.observation import OPENNESS
 from probe_kit.hooks.contract.sites import QUANTITIES
 from probe_kit.hooks.family import Family
+from probe_kit.hooks.family_parts import Abilities, Checkpoints
 
 FLOW = Interventions(
     edits={"backbone": QUANTITIES, "expert": QUANTITIES},

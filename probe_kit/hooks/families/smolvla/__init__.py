@@ -1,8 +1,8 @@
 """SmolVLA through lerobot."""
 
 from probe_kit.hooks.contract.declared import backbone, expert
-from probe_kit.hooks.contract.family_parts import Abilities, Checkpoints, Requirements
 from probe_kit.hooks.families.shared.kinds import FLOW, lerobot_family
+from probe_kit.hooks.family_parts import Abilities, Checkpoints, Requirements
 
 FAMILIES = (
     lerobot_family(

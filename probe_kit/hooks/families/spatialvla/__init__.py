@@ -1,10 +1,10 @@
 """SpatialVLA, native."""
 
 from probe_kit.hooks.contract.declared import ACT2ANSWER, Option, ProtocolRow, backbone, chosen_tokens
-from probe_kit.hooks.contract.family_parts import Abilities, Checkpoints
 from probe_kit.hooks.families.prismatic import TOKENIZER
 from probe_kit.hooks.families.shared.kinds import TOKENS
 from probe_kit.hooks.family import Family
+from probe_kit.hooks.family_parts import Abilities, Checkpoints
 
 FAMILIES = (
     Family(

@@ -2,11 +2,11 @@
 
 from probe_kit.hooks.contract.card import SourceWeights
 from probe_kit.hooks.contract.declared import ACT2ANSWER, Interventions, Option, ProtocolRow, backbone, expert
-from probe_kit.hooks.contract.family_parts import Abilities, Checkpoints
 from probe_kit.hooks.contract.observation import OPENNESS
 from probe_kit.hooks.contract.sites import QUANTITIES
 from probe_kit.hooks.families.shared.kinds import MERGED, TOKENIZER_FOLDER
 from probe_kit.hooks.family import Family
+from probe_kit.hooks.family_parts import Abilities, Checkpoints
 
 _EXPERT = ("residual", "attention", "middle", "mlp")
 INTERVENTIONS = Interventions(

@@ -1,9 +1,9 @@
 """X-VLA through lerobot."""
 
 from probe_kit.hooks.contract.declared import TEXT, DeclaredStream, Interventions, Option, expert
-from probe_kit.hooks.contract.family_parts import Abilities, Checkpoints
 from probe_kit.hooks.contract.sites import Stream
 from probe_kit.hooks.families.shared.kinds import MERGED, lerobot_family
+from probe_kit.hooks.family_parts import Abilities, Checkpoints
 
 PICTURES = ("padded", "squashed")
 """The ways in which pictures come to the network's resolution: of lerobot, and of the authors."""

@@ -61,7 +61,7 @@ class Checkpoints:
 
 @dataclass(frozen=True, kw_only=True)
 class Abilities:
-    """What the models of a family do.
+    """The abilities of a family's models.
 
     Attributes:
         acts: Whether it is a Policy.
@@ -88,7 +88,7 @@ class Abilities:
 
 @dataclass(frozen=True, kw_only=True)
 class Requirements:
-    """What has to be there before a model of a family can be loaded.
+    """The requirements for a model of a family to be loaded.
 
     Attributes:
         packages: Modules of an extra that it needs, with the name of that extra.
