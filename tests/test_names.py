@@ -209,7 +209,7 @@ HOMONYMS = frozenset(
     {"Attention", "Block", "Layer", "PictureSettings", "Projector", "VisionConfig", "Cell", "Choice"}
 )
 """Names of several classes: parts that networks call so, the cells of a table and of a patch, and two choices."""
-SHARED_TYPES = frozenset({"Matrix", "Progress"})
+SHARED_TYPES = frozenset({"Matrix", "PictureArray", "Progress"})
 
 
 def test_a_word_is_the_name_of_one_class() -> None:

@@ -11,11 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
 from probe_kit._system.counting import plural
-from probe_kit._system.types import Matrix
+from probe_kit._system.types import Matrix, PictureArray
 from probe_kit.env.arm import DeltaController, check_action
 from probe_kit.env.scene import SIDES, Scene
 from probe_kit.env.scoring import LED_TO, REST_SPEED, Ending, Outcome, Trajectory, distance, zone
-from probe_kit.env.simulation import Picture, RenderedFrame
+from probe_kit.env.simulation import RenderedFrame
 from probe_kit.env.spec import XY, SceneSpec
 from probe_kit.errors import EpisodeOverError, SceneError
 from probe_kit.suite.items import LAYOUTS, Episode, Item, Layout, Side, other_side
@@ -210,7 +210,7 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
         self._scene: Scene | None = None
         self._trial: Trial | None = None
         self._frame: RenderedFrame | None = None
-        self._picture: Picture | None = None
+        self._picture: PictureArray | None = None
         self._closed = False
 
     # -- gymnasium ---------------------------------------------------------------------------------------
@@ -238,7 +238,7 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
         reward, terminated, truncated, info = self.advance(action)
         return self.observe(), reward, terminated, truncated, info
 
-    def render(self) -> Picture:
+    def render(self) -> PictureArray:
         """Return the picture (H, W, 3) uint8 of the scene now, as rendered."""
         scene, frame = self.scene, self._current_frame()
         if self._picture is None:
@@ -246,7 +246,7 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
         # What a caller paints into it must not be what the next one sees.
         return self._picture.copy()
 
-    def render_small(self, height: int) -> Picture:
+    def render_small(self, height: int) -> PictureArray:
         """Return a picture (height, w, 3) uint8 of the scene now, for films and not for models.
 
         It is shrunk from that of `render` where that was drawn since the last action. Else it is drawn at this
@@ -301,7 +301,7 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
         agent_pos = np.concatenate([arm.tool_state(), [0.0, arm.opening()]]).astype(np.float32)
         return {"pixels": {"image": picture}, "agent_pos": agent_pos}
 
-    def observe_exchanged(self) -> tuple[Observation, Picture]:
+    def observe_exchanged(self) -> tuple[Observation, PictureArray]:
         """Return the observation with the two pictures in each other's place, and its picture as rendered.
 
         It shows the other layout of the item in this very state; the episode is unchanged.

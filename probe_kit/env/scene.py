@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from probe_kit._system.types import Matrix
+from probe_kit._system.types import Matrix, PictureArray
 from probe_kit.env.arm import ARMS, Arm
 from probe_kit.env.rotations import Pose, to_vector, yaw_quaternion
 from probe_kit.env.simulation import (
@@ -20,7 +20,6 @@ from probe_kit.env.simulation import (
     BulletClient,
     Camera,
     FilmCamera,
-    Picture,
     RenderedFrame,
     TextureCache,
     load_photo,
@@ -225,7 +224,7 @@ class Scene:
         self._drawn += 1
         return self._draw()
 
-    def small_picture(self, height: int) -> Picture:
+    def small_picture(self, height: int) -> PictureArray:
         """Return the finished picture (height, w, 3), drawn with fewer pixels, so that edges are less smooth."""
         if self.spec.tile_mass > 0:
             self._lay_pictures()
@@ -236,7 +235,7 @@ class Scene:
     def _draw(self) -> RenderedFrame:
         return self.camera.render(self.client, self.spec.light, self.spec.light_level)
 
-    def picture(self, frame: RenderedFrame) -> Picture:
+    def picture(self, frame: RenderedFrame) -> PictureArray:
         """Return the finished picture (H, W, 3) of a frame."""
         return self.backdrop.under(frame)
 
@@ -323,7 +322,7 @@ class Scene:
             )
         return q
 
-    def _surroundings(self, empty: RenderedFrame) -> Picture:
+    def _surroundings(self, empty: RenderedFrame) -> PictureArray:
         """Return the colours behind robot, cube and tiles; a photo is scaled with the light of the scene."""
         spec = self.spec
         if spec.rendering == "raw":

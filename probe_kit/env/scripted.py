@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from probe_kit._system.types import Matrix
+from probe_kit._system.types import Matrix, PictureArray
 from probe_kit.env.act2answer import Act2AnswerEnv
 from probe_kit.env.rotations import to_rpy
-from probe_kit.env.simulation import Picture
 from probe_kit.errors import EpisodeOverError
 from probe_kit.suite.items import other_side
 
@@ -213,7 +212,7 @@ def _pad(image: Image.Image, size: int) -> Any:
     return np.asarray(square)
 
 
-def save_gif(path: Path, pictures: Sequence[Picture], fps: float = 5.0) -> None:
+def save_gif(path: Path, pictures: Sequence[PictureArray], fps: float = 5.0) -> None:
     """Write pictures (H, W, 3) uint8 as an endless GIF; collect them with `env.render()` after each action.
 
     Raises:

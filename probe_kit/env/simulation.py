@@ -28,7 +28,7 @@ from PIL import Image
 
 from probe_kit._system.bounded_files import read_regular
 from probe_kit._system.imports import install_command
-from probe_kit._system.types import Matrix
+from probe_kit._system.types import Matrix, PictureArray
 from probe_kit.env.spec import CameraSpec, LightSpec
 from probe_kit.errors import SceneError
 from probe_kit.suite.pictures import decode_bytes
@@ -103,14 +103,12 @@ class BulletClient:
 
 # -- camera ---------------------------------------------------------------------------------------------------
 
-Picture = NDArray[np.uint8]
-
 
 @dataclass(frozen=True)
 class RenderedFrame:
     """A rendering: colours (H, W, 3), depth buffer (H, W) in [0, 1] and body ids (H, W), -1 for none."""
 
-    rgb: Picture
+    rgb: PictureArray
     depth: NDArray[np.float32]
     bodies: NDArray[np.int32]
 
@@ -205,7 +203,7 @@ class Camera:
 class Backdrop:
     """The scene without robot, cube and tiles: colours (H, W, 3) and depth buffer (H, W)."""
 
-    rgb: Picture
+    rgb: PictureArray
     depth: NDArray[np.float32]
 
     def at_size(self, spec: CameraSpec) -> "Backdrop":
@@ -215,7 +213,7 @@ class Backdrop:
         depth = Image.fromarray(self.depth).resize(size, Image.Resampling.NEAREST)
         return Backdrop(np.asarray(rgb), np.asarray(depth))
 
-    def under(self, frame: RenderedFrame) -> Picture:
+    def under(self, frame: RenderedFrame) -> PictureArray:
         """Return the picture (H, W, 3) of `frame` composed with the backdrop: the nearer surface is visible."""
         # The renderer lets the surface that is drawn later win a tie, and the table is drawn first.
         in_front = (frame.bodies >= 0) & (frame.depth <= self.depth)
@@ -284,7 +282,7 @@ SUPERSAMPLING = 2
 """Factor of the pixels in each direction that are drawn and then scaled down, so that seams are smooth."""
 
 
-def load_photo(path: Path, width: int, height: int) -> Picture:
+def load_photo(path: Path, width: int, height: int) -> PictureArray:
     """Read the photo at `path`, squeezed to (height, width, 3).
 
     Raises:
@@ -300,7 +298,7 @@ def load_photo(path: Path, width: int, height: int) -> Picture:
 
 
 @lru_cache(maxsize=8)
-def wooden_table(camera: Camera) -> Picture:
+def wooden_table(camera: Camera) -> PictureArray:
     """Draw a table of planks with a wall behind it, (H, W, 3), seen by `camera` in the right perspective."""
     fine = camera.magnified(SUPERSAMPLING)
     rays = fine.rays()
@@ -391,7 +389,7 @@ class FilmCamera:
         self._colors = {body: _colors(client, body) for body in (*self._resting, *self._moving)}
         self._drawn: _Resting | None = None
 
-    def picture(self, camera: Camera, light: LightSpec, level: float, pictures: tuple[int, ...]) -> Picture:
+    def picture(self, camera: Camera, light: LightSpec, level: float, pictures: tuple[int, ...]) -> PictureArray:
         """Return the finished picture (h, w, 3).
 
         Args:

@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
+from probe_kit._tables.numbers import Limits
 from probe_kit.env.scoring import DEFAULT_RULE, RULES, SENSITIVITY_RADII, rule_of, success_at
 from probe_kit.errors import UsageError
-from probe_kit.retention.estimators import Limits, limits
+from probe_kit.retention.estimators import limits
 from probe_kit.runs.array_run import ArrayRun
 from probe_kit.runs.layout import CAPTURE_ONLY
 from probe_kit.runs.reader import RunReader, check_several_wordings, full_name

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit._system.counting import list_names
-from probe_kit._tables.numbers import p_text
+from probe_kit._tables.numbers import Limits, p_text
 from probe_kit.errors import TooFewGroupsError, UnbalancedEpisodesError, UnknownSiteError, UsageError
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.retention.choices import Iterations
@@ -35,8 +35,6 @@ from probe_kit.train.results.probe_results import ProbeResults
 
 ACTION, BACKBONE = "action", "backbone"
 """Names of the two streams, in the order of the scores: retention is the first over the second."""
-Limits = tuple[float | None, float | None]
-"""A 95 % interval as rows, JSON and data frames hold it; (None, None) where the data set no limits."""
 
 
 def limits(interval: Interval) -> Limits:

@@ -11,6 +11,7 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from probe_kit._system.escaping import terminal_safe, without_folders
+from probe_kit._system.types import Matrix
 from probe_kit._tables.numbers import p_text, percent, with_limits
 from probe_kit._tables.table import Table, TableRow
 from probe_kit.diagnose.diagnosis import load_diagnosis
@@ -46,7 +47,7 @@ from probe_kit.suite.categories import category_of
 from probe_kit.train.results.probe_results import ProbeResults, best_sites_table
 from probe_kit.train.results.store import load_results, stored_targets
 from probe_kit.train.results.summary import best_sites_findings
-from probe_kit.view.viewed_run import Values, ViewedRun, decisions_toward_correct
+from probe_kit.view.viewed_run import ViewedRun, decisions_toward_correct
 
 # Log-odds travel as 16-bit integers: a page of a large run holds millions, and as text each is twice as long.
 LOG_ODDS_SCALE = 256
@@ -363,7 +364,7 @@ def _target_cells(row: Mapping[Hashable, Any]) -> list[str]:
     ]
 
 
-def _first_log_odds(viewed: ViewedRun, category: str) -> tuple[list[int], Values]:
+def _first_log_odds(viewed: ViewedRun, category: str) -> tuple[list[int], Matrix]:
     """Return rows of the E episodes that the probes of a category read, and their log-odds (S, E)."""
     probes = viewed.probes[category]
     if viewed.is_lent:

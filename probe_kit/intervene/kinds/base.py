@@ -11,8 +11,8 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from probe_kit._system.types import Matrix
 from probe_kit._tables.content import Cell as TableCell
 from probe_kit._tables.numbers import NONE as NO_NUMBER
 from probe_kit._tables.numbers import Write, number, percent, with_sign
@@ -46,7 +46,6 @@ if TYPE_CHECKING:
     from probe_kit.intervene.directions import Directions
     from probe_kit.intervene.sessions import ReplaySession
 
-Values = NDArray[np.float64]
 OPTIONS = (
     "sites", "roles", "direction", "controls", "coefficients", "target_side", "seed", "window", "readers", "heads",
     "closed_loop", "untrained",
@@ -387,7 +386,7 @@ class EffectRow(Effect):
         return " ".join(filter(None, (self.sites, self.role, self.direction)))
 
 
-def common_columns(outcomes: ConditionOutcomes, row: int, cell: EditedCell, gains: Values) -> dict[str, Any]:
+def common_columns(outcomes: ConditionOutcomes, row: int, cell: EditedCell, gains: Matrix) -> dict[str, Any]:
     """Return the columns of `EffectRow` for one condition.
 
     Args:
@@ -414,7 +413,7 @@ def common_columns(outcomes: ConditionOutcomes, row: int, cell: EditedCell, gain
     }
 
 
-def net_interval(gains: Values, outcomes: ConditionOutcomes) -> tuple[float, float]:
+def net_interval(gains: Matrix, outcomes: ConditionOutcomes) -> tuple[float, float]:
     """Return the 95 % interval by groups of the mean over episodes of (E,) gains."""
     drawn = units_seed(outcomes.groups, outcomes.seed_text)
     low, high = group_bootstrap(gains[:, None], outcomes.groups, drawn, bounds=GAINS)
@@ -435,14 +434,14 @@ class ControlTest(NamedTuple):
     """
 
     controls: list[int]
-    beyond: Values | None = None
+    beyond: Matrix | None = None
     t: float | None = None
     p: float | None = None
     p_fwe: float | None = None
 
 
 def compare_with_controls(
-    values: Values,
+    values: Matrix,
     cells: Sequence[EditedCell],
     outcomes: ConditionOutcomes,
     *,
@@ -477,7 +476,7 @@ def compare_with_controls(
     return tests
 
 
-def mean_of(values: Values) -> float | None:
+def mean_of(values: Matrix) -> float | None:
     """Return the mean of some numbers; None if there are none."""
     return float(values.mean()) if values.size else None
 

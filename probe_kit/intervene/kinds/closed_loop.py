@@ -57,7 +57,7 @@ MIN_IN_ZONE_RATIO = 0.5
 """Share of the clean in-zone share below which the task is called disrupted: most of the placing is gone."""
 CORRECT, WRONG = "correct", "wrong"
 """Outcomes of `env.scoring` with the cube in a zone; the third, `oob`, is outside both."""
-Finding = Literal["identity patch", "control", "task disrupted", "confirmed", "not confirmed"]
+LoopFinding = Literal["identity patch", "control", "task disrupted", "confirmed", "not confirmed"]
 
 
 def identity_patch(sites: Sequence[Site]) -> Condition:
@@ -267,7 +267,7 @@ class ClosedLoopEffect(EffectRow):
     disrupted: bool
 
     @property
-    def finding(self) -> Finding:
+    def finding(self) -> LoopFinding:
         """The finding: `confirmed` if, beyond controls and chance, enough episodes turn to the other picture."""
         if self.sites == CLEAN:
             return "identity patch"

@@ -62,7 +62,7 @@ if TYPE_CHECKING:
 LEACE = "leace"
 PROBE_ACCURACY = "probe_accuracy"
 """Entry of the certificate: accuracies of probes behind each condition, by category."""
-Finding = Literal[
+ErasureFinding = Literal[
     "identity patch", "control", "no baseline effect", "controls also disrupt", "effect", "no effect"
 ]
 UNTOUCHED, ZERO = "none", "0"
@@ -329,7 +329,7 @@ class ErasureEffect(EffectRow):
     probe_accuracy: float | None
 
     @property
-    def finding(self) -> Finding:
+    def finding(self) -> ErasureFinding:
         """The finding: `effect` if, beyond controls and chance, enough of the answer is gone from the action."""
         if self.direction == UNTOUCHED:
             return "identity patch"

@@ -78,7 +78,7 @@ _REACH = {
 # -- the exchange of an input, without sides -----------------------------------------------------------------
 
 
-Finding = Literal["decides", "moves", "no effect", "open"]
+SwapFinding = Literal["decides", "moves", "no effect", "open"]
 DECIDES = 0.5
 """Share of the exchange of all inputs from which an input decides; within ±`NOTHING` it has no effect."""
 
@@ -115,7 +115,7 @@ class InputEffect(Effect):
     share: float | None
     share_ci: tuple[float, float] | None
     p: float
-    finding: Finding
+    finding: SwapFinding
     every: float = 1.0
     seed: float | None = None
     key: str = ""
@@ -163,7 +163,7 @@ def input_effect(outcomes: ConditionOutcomes, swapped: str, vary: str) -> InputE
     )
 
 
-def _finding(share: SwapShare | None, p: float, ratio: float, by_seed: bool, is_trace: bool) -> Finding:
+def _finding(share: SwapShare | None, p: float, ratio: float, by_seed: bool, is_trace: bool) -> SwapFinding:
     """Return the verdict of an input.
 
     Where the seed decides, a share of the exchange of all inputs is a share of nothing; the rules are then those

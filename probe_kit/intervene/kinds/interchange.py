@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 
+from probe_kit._system.types import Matrix
 from probe_kit._tables.content import Cell as TableCell
 from probe_kit._tables.numbers import number, with_sign
 from probe_kit.errors import UsageError
@@ -28,7 +29,6 @@ from probe_kit.intervene.kinds.base import (
     AlongDirection,
     EffectColumn,
     EffectRow,
-    Values,
     centimetres,
     common_columns,
     compare_with_controls,
@@ -141,7 +141,7 @@ class PatchEffect(EffectRow):
         return " ".join(filter(None, (super().name, self.coefficient and f"coefficient {self.coefficient}")))
 
 
-def target_sign(outcomes: ConditionOutcomes, target_side: str) -> Values:
+def target_sign(outcomes: ConditionOutcomes, target_side: str) -> Matrix:
     """Return (E,) the target side of every episode, +1 for left."""
     correct = outcomes.correct_sign
     sides = {"left": np.ones_like(correct), "right": -np.ones_like(correct), "correct": correct}

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._tables.numbers import Limits
 from probe_kit.errors import UsageError
 from probe_kit.retention.behaviour import TableRun, shares_of, success_share, units_of
 from probe_kit.retention.compare.models import (
@@ -26,7 +27,7 @@ from probe_kit.retention.compare.models import (
     retention_of_model,
     success_of_model,
 )
-from probe_kit.retention.estimators import ACTION, BACKBONE, Limits, PooledScores, Rate, limits
+from probe_kit.retention.estimators import ACTION, BACKBONE, PooledScores, Rate, limits
 from probe_kit.retention.rows.build import RowSettings, RowWithEstimates, run_rows
 from probe_kit.retention.rows.row import MEAN, Mode
 from probe_kit.runs.layout import FIRST_FRAME

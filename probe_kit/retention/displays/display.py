@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from matplotlib.lines import Line2D
     from numpy.typing import ArrayLike
 
-    from probe_kit.retention.displays.shown_figure import Picture
+    from probe_kit.retention.displays.shown_figure import DrawnPicture
 
 
 # -- the look that all figures share --------------------------------------------------------------------------
@@ -397,7 +397,7 @@ class Display(ABC):
     def annotate(self) -> None:  # noqa: B027 - most displays have nothing to write
         """Write texts that need the marks' final places: after the layout of a figure of its own, else at once."""
 
-    def _repr_png_(self) -> "Picture | None":
+    def _repr_png_(self) -> "DrawnPicture | None":
         """Return the figure, whatever pyplot's backend is."""
         if self.ax_ is None:
             return None

@@ -6,6 +6,7 @@ from functools import partial
 from itertools import product
 from typing import TYPE_CHECKING, Literal, Self
 
+from probe_kit._tables.numbers import Limits
 from probe_kit.errors import UsageError
 from probe_kit.retention.columns.text import RATE, Modes, model_name, modes_of, title_of
 from probe_kit.retention.displays.display import (
@@ -102,9 +103,6 @@ def _covered(box: Box, boxes: Sequence[Box]) -> float:
     )
 
 
-Limits = tuple[float | None, float | None] | None
-
-
 @dataclass(frozen=True)
 class GapPoint:
     """One category of one run: probe accuracy and success rate, as shares, with 95 % intervals if known."""
@@ -112,9 +110,9 @@ class GapPoint:
     model: str
     category: str
     accuracy: float
-    accuracy_ci: Limits
+    accuracy_ci: Limits | None
     sr: float
-    sr_ci: Limits
+    sr_ci: Limits | None
     significant: bool
 
 
@@ -260,7 +258,7 @@ def _bars(point: GapPoint) -> "list[tuple[tuple[float, float], tuple[float, floa
     return level + upright
 
 
-def _arms(value: float, limits: Limits) -> list[list[float]] | None:
+def _arms(value: float, limits: Limits | None) -> list[list[float]] | None:
     if limits is None or limits[0] is None or limits[1] is None:
         return None
     return [[max(0.0, 100 * (value - limits[0]))], [max(0.0, 100 * (limits[1] - value))]]

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._system.types import Matrix
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.sites import label_of
 from probe_kit.retention.choices import Iterations
@@ -50,9 +51,6 @@ if TYPE_CHECKING:
     from matplotlib.lines import Line2D
 
 
-Shares = NDArray[np.float64]
-
-
 def of_iterations(scores: "pd.DataFrame", iterations: Iterations) -> "pd.DataFrame":
     """Return the rows of one stream that take part; all of a stream that runs once.
 
@@ -84,9 +82,9 @@ class LayerLine:
 
     iteration: int | None
     layers: NDArray[Any]
-    score: Shares
-    low: Shares
-    high: Shares
+    score: Matrix
+    low: Matrix
+    high: Matrix
     significant: NDArray[np.bool_]
 
     @classmethod
@@ -115,7 +113,7 @@ class StreamCurve(LayerLine):
     stream: str
     part: str
     sites: tuple[str, ...]
-    depth: Shares
+    depth: Matrix
     iterations: int
     lines: tuple[LayerLine, ...]
     peaks: tuple[tuple[int, int | None], ...]

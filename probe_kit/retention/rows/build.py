@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from probe_kit._tables.numbers import Limits
 from probe_kit.env.scoring import DEFAULT_RULE
 from probe_kit.errors import UnknownSiteError
 from probe_kit.hooks.contract.sites import Site
@@ -28,7 +29,6 @@ from probe_kit.retention.choices import Iterations
 from probe_kit.retention.estimators import (
     ACTION,
     BACKBONE,
-    Limits,
     Peak,
     Rate,
     StreamScores,

@@ -3,10 +3,10 @@
 from dataclasses import dataclass, field
 from typing import Literal, Self
 
+from probe_kit._tables.numbers import Limits
 from probe_kit.hooks.contract.sites import first_of, label_of
 from probe_kit.intervene.verdict import UseVerdict
 from probe_kit.retention.behaviour import OutcomeRuleScores, SuccessRate, TableRun
-from probe_kit.retention.estimators import Limits
 from probe_kit.runs.reader import full_name
 from probe_kit.statistics.sufficiency import Verdict
 from probe_kit.train.choices import CORRECT, SIDES, Task

@@ -145,8 +145,8 @@ def renamed_features(features: Iterable[str], renames: Mapping[str, str]) -> dic
     return by_name
 
 
-Picture = Literal["padded", "padded-top-left", "squashed"]
-PICTURES: tuple[Picture, ...] = ("padded", "padded-top-left", "squashed")
+PictureFit = Literal["padded", "padded-top-left", "squashed"]
+PICTURES: tuple[PictureFit, ...] = ("padded", "padded-top-left", "squashed")
 EVALUATION_OPTIONS = (
     Option(
         "statistics",
@@ -182,6 +182,6 @@ class Evaluation:
     """
 
     statistics: str | None = None
-    picture: Picture | None = None
+    picture: PictureFit | None = None
     openness: str = "measured"
     unread: str = ""
