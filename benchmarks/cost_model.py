@@ -83,7 +83,7 @@ def raw_bytes(family: str, tokens: bool) -> int:
 
 def streams_of(family: str) -> list[StoredStream]:
     """What a run of the released size stores."""
-    declared = known_families()[family].declared[""]
+    declared = known_families()[family].checkpoints.declared[""]
     return [
         StoredStream.of(declaration.stream, declaration.tokens, view_names(declaration.roles))
         for declaration in declared

@@ -13,14 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
+from probe_kit._system.types import Matrix
 from probe_kit.hashing import derive_seed
-from probe_kit.statistics.crossfit import CrossFit, StreamScores, balanced_sums, crossfit
+from probe_kit.statistics.crossfit import CrossFit, SiteScores, balanced_sums, crossfit
 from probe_kit.statistics.folds import fold_numbers, fold_of_groups, sums_by_group
 from probe_kit.train.crossval.nested_folds import nested_folds
 from probe_kit.train.crossval.site_probe import SiteProbe, probe_site
 from probe_kit.train.samples import Samples
 
-Matrix = NDArray[np.float64]
 WIDTH = 16
 OF_GROUP, SHARED, NEIGHBOURS = 0.4, 0.4, 0.9
 """Shares of variance of groups and of what both streams hold, and the correlation of neighbouring sites."""
@@ -100,7 +100,7 @@ def neighbours(values: Matrix) -> Matrix:
     return values
 
 
-def probe_streams(data: DataSet, seed: int) -> list[StreamScores]:
+def probe_streams(data: DataSet, seed: int) -> list[SiteScores]:
     """The streams of (expert, backbone) as `train_probes` and `retention` make them."""
     folds = nested_folds(data.labels, data.groups, derive_seed("folds", seed))
     fold_of = fold_numbers([fold.outer for fold in folds])
@@ -112,9 +112,7 @@ def probe_streams(data: DataSet, seed: int) -> list[StreamScores]:
         ]
         sums = balanced_sums(np.array([probe.decisions for probe in probes]), data.labels, fold_of, data.groups)
         inner = sums_by_group(np.array([probe.inner for probe in probes]), data.groups)
-        streams.append(
-            StreamScores.of(sums, inner, fold_of_groups(fold_of, data.groups), np.arange(len(features)))
-        )
+        streams.append(SiteScores.of(sums, inner, fold_of_groups(fold_of, data.groups), np.arange(len(features))))
     return streams
 
 

@@ -19,10 +19,10 @@ import torch
 from probe_kit.diagnose.diagnosis import diagnose_run
 from probe_kit.diagnose.inputs import frames_of
 from probe_kit.diagnose.results import count_groups
-from probe_kit.extract import EnvSource, ExtractSettings, extract_run
+from probe_kit.extract import EnvironmentSettings, ExtractSettings, extract_run
 from probe_kit.hooks.families.pi0.adapter import load_pi0_tiny
 from probe_kit.intervene.open_session import open_session
-from probe_kit.intervene.sessions import ReplaySource
+from probe_kit.intervene.sessions import ReplayFiles
 from probe_kit.runs import Run
 from probe_kit.suite import build_suite
 from tests.support.acting_checkpoints import GOLDEN, knowing
@@ -54,7 +54,7 @@ def run_of_two_cameras(folder: Path, draw: int, frames: int) -> Run:
     if not reference.exists():
         knowing(GOLDEN / "smolvla", build_suite(folder / "suite", ["color"], 24), reference)
     options = {"count": frames, "first": draw * frames}
-    source = EnvSource("tests.support.reach_env:TwoCameras", options, max_steps=1)
+    source = EnvironmentSettings("tests.support.reach_env:TwoCameras", options, max_steps=1)
     checkpoint = str(reference / "checkpoint")
     settings = ExtractSettings(
         "smolvla", checkpoint, source=source, execute=1, env_workers=0, accept_units=True, seed=draw
@@ -69,7 +69,7 @@ def edit_of(organism: Organism, folder: Path, frames: int) -> Edit:
     file = folder / "forgot.pt"
     if not file.exists():
         run, tuned = run_of(folder, "color", TUNING_SEED, frames), load_pi0_tiny()
-        with open_session(run, ReplaySource()) as session, session.ready():
+        with open_session(run, ReplayFiles()) as session, session.ready():
             forget_words(tuned, [frame.observation for frame in frames_of(session, 4 * frames)])
         torch.save(tuned.network.state_dict(), file)
     return lambda policy: policy.network.load_state_dict(torch.load(file))

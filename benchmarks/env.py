@@ -15,9 +15,9 @@ from pathlib import Path
 import gymnasium as gym
 from PIL import Image, ImageDraw
 
+from probe_kit._system.types import PictureArray
 from probe_kit.env import Act2AnswerEnv, SceneSpec, ScriptedExpert
 from probe_kit.env.scene import FLOOR_COLOR, INVISIBLE, TABLE_COLOR, Scene
-from probe_kit.env.simulation import Picture
 
 SPEC = SceneSpec(start_jitter=0.02, start_jitter_yaw=1.5, early_stop=True)
 OBSERVE_EVERY = 5
@@ -48,7 +48,7 @@ class ExpertEnv(Act2AnswerEnv):
         return time.process_time() - start
 
 
-def naive_picture(scene: Scene) -> Picture:
+def naive_picture(scene: Scene) -> PictureArray:
     """The whole scene drawn in one go."""
     for body, color in ((scene.table, TABLE_COLOR), (scene.floor, FLOOR_COLOR)):
         scene.client.changeVisualShape(body, -1, rgbaColor=color)

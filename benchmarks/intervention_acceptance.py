@@ -30,7 +30,7 @@ from probe_kit.intervene import (
     Interchange,
     InterventionResult,
     PatchEffect,
-    ReplaySource,
+    ReplayFiles,
     Steering,
     run_intervention,
 )
@@ -60,7 +60,7 @@ class Trial:
     """The trained organism's run, and what is true of it. used, unused: its categories."""
 
     run: Run
-    source: ReplaySource
+    source: ReplayFiles
     used: tuple[str, ...]
     unused: tuple[str, ...]
 
@@ -244,7 +244,7 @@ def main() -> int:
     ]
     run = dict(runs)[TRAINED]
     used, unused = (tuple(name for name, of in truth.items() if of == kind) for kind in ("used", "not used"))
-    trial = Trial(run, ReplaySource(suite.folder), used, unused)
+    trial = Trial(run, ReplayFiles(suite.folder), used, unused)
     weights = str(run.weights_sha256)[:12]
     print(f"{run.label}, weights {weights}, {run.suite}, suite seed {arguments.seed}, {arguments.items} items")
     holds = []

@@ -23,7 +23,7 @@ import numpy as np
 from probe_kit.env import SceneSpec
 from probe_kit.extract import ExtractSettings, extract_run
 from probe_kit.hooks import Policy, load_policy
-from probe_kit.intervene import ConditionOutcomes, ImageSwap, Interchange, ReplaySession, ReplaySource
+from probe_kit.intervene import ConditionOutcomes, ImageSwap, Interchange, ReplayFiles, ReplaySession
 from probe_kit.intervene.kinds.image_swap import image_swap_effects
 from probe_kit.intervene.kinds.interchange import patch_effects
 from probe_kit.intervene.open_session import open_session
@@ -169,7 +169,7 @@ def main() -> None:
     arguments = parser.parse_args()
     suite = build_suite(arguments.folder / "suite", arguments.categories.split(","), arguments.items)
     run = run_of(arguments.folder, suite, arguments.model)
-    with open_session(run, ReplaySource(suite.folder)) as bench, bench.ready():
+    with open_session(run, ReplayFiles(suite.folder)) as bench, bench.ready():
         items = dict.fromkeys(run.episodes["item_id"].astype(str))
         questions = [replace(pair, stored=None) for item in items for pair in bench.pairs(item)]
         frames = Frames(run, bench, questions)

@@ -18,6 +18,7 @@ from rich.console import Console
 from rich.table import Table
 from threadpoolctl import threadpool_limits
 
+from probe_kit._system.types import Matrix
 from probe_kit.hashing import derive_seed
 from probe_kit.statistics.bootstrap import explained_interval
 from probe_kit.statistics.folds import SHARED_TRAINING, stratified_folds
@@ -28,7 +29,6 @@ from probe_kit.train.crossval.site_probe import probe_site
 from probe_kit.train.crossval.task_scores import squared_deviations
 from probe_kit.train.samples import Samples
 
-Matrix = NDArray[np.float64]
 Kind = Literal["white", "group", "skewed", "ar"]
 WIDTH = 8
 

@@ -20,9 +20,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 from kept_draws import kept_draws
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from probe_kit._system.types import Matrix
 from probe_kit.hashing import derive_seed
 from probe_kit.statistics.label_permutations import p_value
 from probe_kit.statistics.significance import SIGNIFICANCE
@@ -34,7 +34,6 @@ from probe_kit.train.target_samples import TargetSamples
 
 GROUPS, EPISODES, FRAMES, WIDTH, SITES, PERMUTATIONS = 20, 2, 8, 12, 3, 99
 SHAPE = GROUPS, EPISODES, FRAMES
-Matrix = NDArray[np.float64]
 
 
 def autoregressive(draw: np.random.Generator, shape: tuple[int, ...], share: float = 0.9) -> Matrix:

@@ -20,6 +20,7 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.linear_model import LogisticRegression
 from threadpoolctl import threadpool_limits
 
+from probe_kit._system.types import Matrix
 from probe_kit.runs.arrays import TokenBlock
 from probe_kit.statistics.folds import INNER_FOLDS, OUTER_FOLDS
 from probe_kit.statistics.label_permutations import flip_items
@@ -30,7 +31,6 @@ from probe_kit.train.solver.design_matrix import Projection
 
 WIDTH = 2048
 SUBSET = 4  # label columns scikit-learn fits, at every C, in one inner fold
-Matrix = NDArray[np.float64]
 
 
 def features(n_episodes: int, width: int = WIDTH) -> NDArray[np.float32]:

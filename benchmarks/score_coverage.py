@@ -27,8 +27,9 @@ from rich.table import Table
 from scipy.special import ndtri
 from threadpoolctl import threadpool_limits
 
+from probe_kit._system.types import Matrix
 from probe_kit.hashing import derive_seed
-from probe_kit.statistics.crossfit import GroupSums, StreamScores, balanced_sums, crossfit
+from probe_kit.statistics.crossfit import GroupSums, SiteScores, balanced_sums, crossfit
 from probe_kit.statistics.folds import fold_numbers, sums_by_group
 from probe_kit.statistics.intervals import Accuracy, Share
 from probe_kit.statistics.paired_tests import better_than_best, better_than_reference
@@ -83,9 +84,6 @@ def rows(groups: tuple[int, ...], alike: tuple[float, ...], draws: int, seed: in
                 texts.append(f"{covered:.0%} {np.median([high - low for low, high in limits]):.2f}")
             cells.append(f"{truth:.2f}: {texts[0]} ({texts[1]})")
         yield f"{count} {kind}, {shared:g}", *cells
-
-
-Matrix = NDArray[np.float64]
 
 
 def trained(features: Matrix, labels: NDArray[np.bool_], folds: list[NestedFold]) -> SiteProbe:
@@ -238,9 +236,7 @@ def _limits_of_streams(right: Matrix, sizes: Matrix, sites: int) -> Matrix:
     for sums in right:
         scores = GroupSums(np.repeat(sums[None], sites, axis=0), sizes)
         inner = np.where(fold_of == np.arange(5)[:, None], 0.0, scores.sums[:, None, :])
-        interval = accuracy_interval(
-            crossfit([StreamScores.of(scores, inner, fold_of, np.arange(sites))], names), 0
-        )
+        interval = accuracy_interval(crossfit([SiteScores.of(scores, inner, fold_of, np.arange(sites))], names), 0)
         bounds.append((interval.low, interval.high))
     return np.array(bounds)
 

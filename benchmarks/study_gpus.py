@@ -14,7 +14,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from probe_kit.study import load_study, plan_study
-from probe_kit.study.cells import Failure
+from probe_kit.study.cells import StudyFailure
 from probe_kit.study.plan import StudyPlan
 from probe_kit.study.playing import ModelTask, RunFinished, RunTask, play_models
 
@@ -110,11 +110,11 @@ def main() -> None:
         ray.init(num_cpus=arguments.gpus, num_gpus=arguments.gpus, include_dashboard=False, log_to_driver=False)
         began = time.monotonic()
         with Waiting(arguments.gpus, len(tasks)) as waiting:
-            failures: list[Failure] = []
+            failures: list[StudyFailure] = []
 
             def note(event: object) -> None:
-                waiting.ended += isinstance(event, RunFinished | Failure)
-                failures.extend([event] if isinstance(event, Failure) else [])
+                waiting.ended += isinstance(event, RunFinished | StudyFailure)
+                failures.extend([event] if isinstance(event, StudyFailure) else [])
 
             play_models(tasks, note, ray="auto")
         seconds = time.monotonic() - began

@@ -24,7 +24,7 @@ from probe_kit.suite import Suite, build_suite
 from probe_kit.train import ArrayRun
 from probe_kit.train.control_features import LAYERS, ControlInputs
 from probe_kit.train.crossval.task_scores import correctness
-from probe_kit.train.probe_sweep import Sweep
+from probe_kit.train.probe_sweep import ProbeSweep
 from probe_kit.train.samples import Samples
 
 
@@ -58,7 +58,7 @@ def free_accuracy(suite: Suite, width: int) -> dict[str, tuple[float, float]]:
     """By category, the accuracy of the best random layer and the mean of all."""
     blank = np.zeros((len(_episodes(suite)), 1), np.float32)
     run = ArrayRun(suite.folder, "none", suite.identity, _episodes(suite), {(Site("backbone", 0), "mean"): blank})
-    sweep = Sweep.of(run, "side.correct", None, views=("mean",), permutations=0, seed=0)
+    sweep = ProbeSweep.of(run, "side.correct", None, views=("mean",), permutations=0, seed=0)
     inputs = ControlInputs(run, sweep.samples, True, suite)
     accuracy_by_category = {}
     for category in track(suite.categories, suite.identity, console=Console(stderr=True)):

@@ -27,7 +27,7 @@ from scipy.stats import binomtest
 from threadpoolctl import threadpool_limits
 
 from probe_kit.hashing import derive_seed
-from probe_kit.statistics.crossfit import GroupSums, StreamScores, balanced_sums, crossfit
+from probe_kit.statistics.crossfit import GroupSums, SiteScores, balanced_sums, crossfit
 from probe_kit.statistics.folds import fold_numbers, fold_of_groups, sums_by_group
 from probe_kit.statistics.intervals import Share, difference_interval, mean_interval
 from probe_kit.statistics.model_groups import exchange_p, is_exchangeable, welch_interval
@@ -283,7 +283,7 @@ def _probed(seed: int) -> NDArray[np.float64]:
         sums = balanced_sums(decisions, labels[present], fold_of, groups[present])
         by_group, fold_of_group = sums_by_group(inner, groups[present]), fold_of_groups(fold_of, groups[present])
         streams = [
-            StreamScores.of(sums.only(rows), by_group[rows], fold_of_group, [0, 1, 2])
+            SiteScores.of(sums.only(rows), by_group[rows], fold_of_group, [0, 1, 2])
             for rows in ([0, 1, 2], [3, 4, 5])
         ]
         fits.append(crossfit(streams, np.unique(groups[present]).astype(str).tolist()).above)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from probe_kit.diagnose import diagnose_run
     from probe_kit.env import Act2AnswerEnv, SceneSpec
     from probe_kit.errors import ProbeKitError
-    from probe_kit.extract import EnvSource, ExtractSettings, LeRobotSource, PictureFolder, extract_run
+    from probe_kit.extract import EnvironmentSettings, ExtractSettings, LeRobotSource, PictureFolder, extract_run
     from probe_kit.hooks import Site, capture, load_policy
     from probe_kit.intervene import (
         AttentionReadout,
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
         ImageSwap,
         Interchange,
         JointPlaces,
-        ReplaySource,
+        ReplayFiles,
         Steering,
         load_effects,
         patching,
@@ -53,7 +53,7 @@ __all__ = [
     "AttributionPatching",
     "ClosedLoop",
     "ConceptErasure",
-    "EnvSource",
+    "EnvironmentSettings",
     "ExtractSettings",
     "FinalPositionsDisplay",
     "ImageSwap",
@@ -66,7 +66,7 @@ __all__ = [
     "ModelDepthDisplay",
     "PictureFolder",
     "ProbeKitError",
-    "ReplaySource",
+    "ReplayFiles",
     "Run",
     "SceneSpec",
     "Site",
@@ -104,7 +104,7 @@ __getattr__, __dir__ = lazy_names(
         "AttentionReadout": "intervene",
         "ClosedLoop": "intervene",
         "Act2AnswerEnv": "env",
-        "EnvSource": "extract",
+        "EnvironmentSettings": "extract",
         "ExtractSettings": "extract",
         "FinalPositionsDisplay": "retention.displays",
         "ImageSwap": "intervene",
@@ -118,7 +118,7 @@ __getattr__, __dir__ = lazy_names(
         "Run": "runs",
         "SceneSpec": "env",
         "Site": "hooks",
-        "ReplaySource": "intervene",
+        "ReplayFiles": "intervene",
         "Suite": "suite",
         "Target": "train",
         "diagnose_run": "diagnose",

@@ -40,7 +40,7 @@ _PYTHONS = ((3, 12), (3, 14))  # from, and below
 
 
 @dataclass(frozen=True)
-class Finding:
+class CheckResult:
     """The result of one check.
 
     Attributes:
@@ -58,7 +58,7 @@ class Finding:
         return asdict(self)
 
 
-def examine() -> list[Finding]:
+def examine() -> list[CheckResult]:
     """Run every check, in the order a newcomer needs it.
 
     Takes ten seconds or more, as it loads torch and a simulator.
@@ -72,30 +72,30 @@ def examine() -> list[Finding]:
 # -- the machine -----------------------------------------------------------------------------------------------
 
 
-def _python() -> Finding:
+def _python() -> CheckResult:
     low, below = _PYTHONS
     described = f"{sys.version.split()[0]} on {sys.platform}"
     if low <= sys.version_info[:2] < below:
-        return Finding("python", "ok", described)
-    return Finding("python", "missing", described, "Use Python 3.12 or 3.13: `uv venv --python 3.12`")
+        return CheckResult("python", "ok", described)
+    return CheckResult("python", "missing", described, "Use Python 3.12 or 3.13: `uv venv --python 3.12`")
 
 
-def _processor() -> Finding:
+def _processor() -> CheckResult:
     count = cores_here()
     advice = "" if count > 1 else "Two cores halve the time of the demo: simulation and inference overlap"
-    return Finding("processor", "ok" if count > 1 else "note", f"{plural(count, 'core')} usable", advice)
+    return CheckResult("processor", "ok" if count > 1 else "note", f"{plural(count, 'core')} usable", advice)
 
 
-def _memory() -> Finding:
+def _memory() -> CheckResult:
     available = _available_memory()
     if available is None:
-        return Finding("memory", "note", "cannot be read on this system", "The demo needs about 2 GB")
+        return CheckResult("memory", "note", "cannot be read on this system", "The demo needs about 2 GB")
     described = f"{available / 1e9:.1f} GB available"
     if available < DEMO_MEMORY:
-        return Finding(
+        return CheckResult(
             "memory", "note", described, "The demo needs about 2 GB; close something, or it may be killed"
         )
-    return Finding("memory", "ok", described)
+    return CheckResult("memory", "ok", described)
 
 
 def _available_memory() -> float | None:
@@ -110,18 +110,18 @@ def _available_memory() -> float | None:
     return None
 
 
-def _disk() -> Finding:
+def _disk() -> CheckResult:
     free = shutil.disk_usage(Path.cwd()).free
     described = f"{free / 1e9:.1f} GB free here"
     if free < DEMO_DISK:
-        return Finding(
+        return CheckResult(
             "disk", "missing", described, f"The demo needs {DEMO_DISK / 1e6:.0f} MB: run it elsewhere (--out)"
         )
     if free < ROOMY_DISK:
-        return Finding(
+        return CheckResult(
             "disk", "note", described, "Enough for the demo; a full-size model and its runs want 20 GB and more"
         )
-    return Finding("disk", "ok", described)
+    return CheckResult("disk", "ok", described)
 
 
 # -- trials in processes of their own --------------------------------------------------------------------------
@@ -182,39 +182,39 @@ def let_policy_act() -> dict[str, Any]:
     }
 
 
-def _scene() -> list[Finding]:
+def _scene() -> list[CheckResult]:
     advice = "pybullet is compiled on installation: it needs a C++ compiler, and numpy at that time"
     trial = _trial("simulator", "draw_scene", advice)
-    if isinstance(trial, Finding):
+    if isinstance(trial, CheckResult):
         return [trial]
-    simulator = Finding("simulator", "ok", f"pybullet {trial['pybullet']} with numpy")
+    simulator = CheckResult("simulator", "ok", f"pybullet {trial['pybullet']} with numpy")
     if not trial["numpy"]:
         advice = f"Build it again beside numpy: `{install_command(rebuild='pybullet')}`"
         described = f"pybullet {trial['pybullet']} without numpy: pictures cost three times as much"
-        simulator = Finding("simulator", "note", described, advice)
+        simulator = CheckResult("simulator", "note", described, advice)
     drawn = (
         f"TinyRenderer (no GPU, no display needed; EGL is not used), {trial['size']} in {trial['seconds']:.2f} s"
     )
-    return [simulator, Finding("renderer", "ok", drawn)]
+    return [simulator, CheckResult("renderer", "ok", drawn)]
 
 
-def _policy() -> list[Finding]:
+def _policy() -> list[CheckResult]:
     trial = _trial("policy", "let_policy_act", f"Install again: `{install_command()}`")
-    if isinstance(trial, Finding):
+    if isinstance(trial, CheckResult):
         return [trial]
     acted = f"pi0-tiny acts (torch {trial['torch']}, lerobot {trial['lerobot']})"
-    return [Finding("policy", "ok", acted), _gpu(trial["gpus"])]
+    return [CheckResult("policy", "ok", acted), _gpu(trial["gpus"])]
 
 
-def _gpu(gpus: list[dict[str, Any]]) -> Finding:
+def _gpu(gpus: list[dict[str, Any]]) -> CheckResult:
     if not gpus:
         advice = "The demo needs none; pi0 wants a GPU of 16 GB or more, and drivers that torch finds"
-        return Finding("gpu", "note", "none that torch can use", advice)
+        return CheckResult("gpu", "note", "none that torch can use", advice)
     described = ", ".join(f"{gpu['name']} with {gpu['gigabytes']:.0f} GB" for gpu in gpus)
-    return Finding("gpu", "ok", described)
+    return CheckResult("gpu", "ok", described)
 
 
-def _trial(subject: str, function: str, advice: str) -> "dict[str, Any] | Finding":
+def _trial(subject: str, function: str, advice: str) -> "dict[str, Any] | CheckResult":
     """Return the result of a function of this module in a process of its own, or the finding that it failed.
 
     A trial without an answer in time is no failure: the machine is busy, and installing again would not help.
@@ -231,10 +231,10 @@ def _trial(subject: str, function: str, advice: str) -> "dict[str, Any] | Findin
             timeout=PATIENCE, check=False,
         )  # fmt: skip
     except subprocess.TimeoutExpired:
-        return Finding(subject, "note", f"not known: no answer within {PATIENCE} s{_load()}", TRY_AGAIN)
+        return CheckResult(subject, "note", f"not known: no answer within {PATIENCE} s{_load()}", TRY_AGAIN)
     if process.returncode != 0:
         words = process.stderr.strip().splitlines() or ["no message"]
-        return Finding(subject, "missing", f"ended with code {process.returncode}: {words[-1]}", advice)
+        return CheckResult(subject, "missing", f"ended with code {process.returncode}: {words[-1]}", advice)
     answer: dict[str, Any] = json.loads(process.stdout.strip().splitlines()[-1])
     return answer
 
@@ -247,12 +247,12 @@ def _load() -> str:
 # -- what can be downloaded or added ---------------------------------------------------------------------------
 
 
-def _hub() -> Finding:
+def _hub() -> CheckResult:
     from huggingface_hub import constants
 
     address = constants.ENDPOINT
     if constants.HF_HUB_OFFLINE:
-        return Finding("hub", "note", "offline mode (HF_HUB_OFFLINE)", "Unset it to download checkpoints")
+        return CheckResult("hub", "note", "offline mode (HF_HUB_OFFLINE)", "Unset it to download checkpoints")
     try:
         urlopen(Request(address, method="HEAD"), timeout=HUB_TIMEOUT).close()
     except HTTPError:
@@ -262,23 +262,23 @@ def _hub() -> Finding:
             "The demo needs no network; checkpoints must then be folders (--checkpoint DIR) or in the hub's cache"
         )
         reason = getattr(error, "reason", error)
-        return Finding("hub", "note", f"{address} does not answer ({reason})", advice)
-    return Finding("hub", "ok", f"{address} answers")
+        return CheckResult("hub", "note", f"{address} does not answer ({reason})", advice)
+    return CheckResult("hub", "ok", f"{address} answers")
 
 
-def _tokenizers() -> list[Finding]:
+def _tokenizers() -> list[CheckResult]:
     from huggingface_hub import try_to_load_from_cache
 
-    findings = [Finding("tokenizer", "ok", "pi0-tiny: embedded")]
+    findings = [CheckResult("tokenizer", "ok", "pi0-tiny: embedded")]
     for family, repository in TOKENIZERS.items():
         is_cached = isinstance(try_to_load_from_cache(repository, "tokenizer_config.json"), str)
         advice = "" if is_cached else f"Comes with the model, or `hf download {repository} --include 'tokenizer*'`"
         described = f"{family}: {repository} {'is in the cache' if is_cached else 'is not in the cache'}"
-        findings.append(Finding("tokenizer", "ok" if is_cached else "note", described, advice))
+        findings.append(CheckResult("tokenizer", "ok" if is_cached else "note", described, advice))
     return findings
 
 
-def _extras() -> list[Finding]:
+def _extras() -> list[CheckResult]:
     """Return the optional dependencies by extra; Ray is one of them."""
     needed: dict[str, list[str]] = {}
     for requirement in requires("probe-kit") or ():
@@ -288,12 +288,12 @@ def _extras() -> list[Finding]:
     return [_extra(name, packages) for name, packages in needed.items()]
 
 
-def _extra(name: str, packages: list[str]) -> Finding:
+def _extra(name: str, packages: list[str]) -> CheckResult:
     versions = {package: _installed_version(package) for package in packages}
     lacking = [package for package, version in versions.items() if version is None]
     if lacking:
-        return Finding(f"extra {name}", "note", f"without {', '.join(lacking)}", f"`{install_command(name)}`")
-    return Finding(
+        return CheckResult(f"extra {name}", "note", f"without {', '.join(lacking)}", f"`{install_command(name)}`")
+    return CheckResult(
         f"extra {name}", "ok", ", ".join(f"{package} {version}" for package, version in versions.items())
     )
 

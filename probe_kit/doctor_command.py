@@ -8,7 +8,7 @@ from probe_kit._terminal.console import err, markup, out, print_json, say
 from probe_kit._terminal.options import AsJson
 
 if TYPE_CHECKING:
-    from probe_kit.doctor import Finding
+    from probe_kit.doctor import CheckResult
 
 
 def doctor(
@@ -30,7 +30,7 @@ def doctor(
     raise typer.Exit(1 if missing else 0)
 
 
-def _print_findings(findings: "list[Finding]") -> None:
+def _print_findings(findings: "list[CheckResult]") -> None:
     from probe_kit._tables.table import Cell, Table
 
     rows = [

@@ -23,8 +23,8 @@ from probe_kit.demo.pipeline import (
     QUICK,
     TRAINED,
     Demo,
-    Finding,
     NamedProgress,
+    OrganismVerdict,
     Size,
     compare_organisms,
     run_demo,
@@ -65,9 +65,9 @@ def main() -> None:
     subprocess.run(sheet, check=True)
 
 
-def _of_trained(demo: Demo) -> list[Finding]:
+def _of_trained(demo: Demo) -> list[OrganismVerdict]:
     return [
-        Finding(TRAINED.name, row.category, TRAINED.expected(row.category), verdict(row), row)
+        OrganismVerdict(TRAINED.name, row.category, TRAINED.expected(row.category), verdict(row), row)
         for row in demo.table.rows
         if row.run.mode == "acts"
     ]
@@ -79,7 +79,7 @@ def _compared(folder: Path, stage: NamedProgress) -> dict[str, Any]:
     )
 
 
-def _measured(findings: Iterable[Finding], size: Size) -> dict[str, Any]:
+def _measured(findings: Iterable[OrganismVerdict], size: Size) -> dict[str, Any]:
     """The numbers of some policies on one suite, and what they were measured with: that of the trained one."""
     findings = list(findings)
     run = next(finding.row.run for finding in findings if finding.organism == TRAINED.name)
@@ -93,7 +93,7 @@ def _measured(findings: Iterable[Finding], size: Size) -> dict[str, Any]:
     }
 
 
-def _finding(finding: Finding) -> dict[str, object]:
+def _finding(finding: OrganismVerdict) -> dict[str, object]:
     row = finding.row
     return {
         "organism": finding.organism,

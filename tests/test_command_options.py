@@ -21,7 +21,7 @@ from probe_kit.env.arm import ARMS
 from probe_kit.env.scoring import RULES
 from probe_kit.env.spec import PRESETS
 from probe_kit.extract.commands import Sizes
-from probe_kit.extract.prompts import QUERIES, Picture, Query
+from probe_kit.extract.prompts import QUERIES, PictureShown, Query
 from probe_kit.extract.protocols import SCENES
 from probe_kit.hooks.contract.declared import ROTATIONS, ProtocolName, Readout
 from probe_kit.hooks.family import Dtype
@@ -65,7 +65,7 @@ CLOSED: dict[tuple[str, str], Collection[object]] = {
     ("ask", "--dtype"): get_args(Dtype),
     ("ask", "--tokens"): get_args(AskTokens),
     ("ask", "--frames"): get_args(FrameChoice),
-    ("ask", "--picture"): get_args(Picture),
+    ("ask", "--picture"): get_args(PictureShown),
     ("ask", "--query"): QUERIES,
     ("train", "--task"): TASKS,
     ("train", "--folds"): FOLD_UNITS,

@@ -146,7 +146,7 @@ def test_every_family_that_acts_has_a_row_on_the_page_of_families() -> None:
         for line in re.findall(r"^\| (`[^|]*) \|", page, re.MULTILINE)
         for name in re.findall(r"`([^`]+)`", line)
     }
-    acting = {name for name, family in own_families().items() if family.acts}
+    acting = {name for name, family in own_families().items() if family.abilities.acts}
     assert acting - {"pi0-tiny-early", "pi0-tiny-state"} - family_names == set()
 
 

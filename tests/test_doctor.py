@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from probe_kit import doctor
 from probe_kit._system.imports import install_command
 from probe_kit.cli import app
-from probe_kit.doctor import Finding, State
+from probe_kit.doctor import CheckResult, State
 
 Usage = namedtuple("Usage", "total used free")
 
@@ -36,7 +36,7 @@ def test_the_command_agrees_with_what_it_found() -> None:
 def test_only_what_stops_the_demo_makes_the_command_fail(
     state: State, code: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    findings = [Finding("python", "ok", "3.12"), Finding("disk", state, "1 GB [here]", "Clear it")]
+    findings = [CheckResult("python", "ok", "3.12"), CheckResult("disk", state, "1 GB [here]", "Clear it")]
     monkeypatch.setattr(doctor, "examine", lambda: findings)
     answer = CliRunner().invoke(app, ["doctor"])
     assert answer.exit_code == code
@@ -79,7 +79,7 @@ def test_a_trial_that_crashes_is_a_finding_with_its_last_words(monkeypatch: pyte
 
 @pytest.mark.parametrize("trial", [doctor._scene, doctor._policy])
 def test_a_trial_without_an_answer_in_time_says_that_the_machine_is_busy_and_not_to_install_again(
-    trial: Callable[[], list[Finding]], monkeypatch: pytest.MonkeyPatch
+    trial: Callable[[], list[CheckResult]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(doctor, "PATIENCE", 0.01)
     (finding,) = trial()
@@ -126,7 +126,9 @@ def test_a_machine_without_a_gpu_is_noted_and_one_with_is_described() -> None:
 def test_an_extra_lacks_what_is_not_installed() -> None:
     assert doctor._extra("demo", ["numpy"]).state == "ok"
     lacking = doctor._extra("demo", ["numpy", "no-such-distribution"])
-    assert lacking == Finding("extra demo", "note", "without no-such-distribution", f"`{install_command('demo')}`")
+    assert lacking == CheckResult(
+        "extra demo", "note", "without no-such-distribution", f"`{install_command('demo')}`"
+    )
 
 
 def test_available_memory_is_that_of_the_system() -> None:

@@ -188,7 +188,7 @@ def _stop_with(*arguments: Any, **_: Any) -> Any:
         if followed.model.family not in SCRIPTED:
             family = find_family(followed.model.family, tuple(SCRIPTED))
             check_options(family.name, family.options, followed.model.options)
-            assert family.acts != isinstance(settings, AskSettings)
+            assert family.abilities.acts != isinstance(settings, AskSettings)
     raise UsageError("accepted so far")
 
 

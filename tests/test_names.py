@@ -203,3 +203,34 @@ def test_a_parameter_is_found_in_prose(prose: str) -> None:
 def test_a_parameter_stands_under_args() -> None:
     function = 'def f(values):\n    """Return it.\n\n    Args:\n        values: (N,).\n    """'
     assert not list(parameters_in_prose(ast.parse(function)))
+
+
+HOMONYMS = frozenset(
+    {"Attention", "Block", "Layer", "PictureSettings", "Projector", "VisionConfig", "Cell", "Choice"}
+)
+"""Names of several classes: parts that networks call so, the cells of a table and of a patch, and two choices."""
+SHARED_TYPES = frozenset({"Matrix", "PictureArray", "Progress"})
+
+
+def test_a_word_is_the_name_of_one_class() -> None:
+    homes: dict[str, list[str]] = {}
+    for file, tree in package_trees().items():
+        for node in tree.body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                homes.setdefault(node.name, []).append(str(file.relative_to(PACKAGE)))
+    twice = {name: files for name, files in homes.items() if len(files) > 1}
+    assert twice.keys() <= HOMONYMS, twice
+    assert twice.keys() >= HOMONYMS, f"rename them here too: {sorted(HOMONYMS - twice.keys())}"
+    assert len(HOMONYMS) <= 10
+
+
+def test_types_that_many_files_share_are_declared_in_one() -> None:
+    homes = [
+        (name.id, str(file.relative_to(PACKAGE)))
+        for file, tree in package_trees().items()
+        for node in tree.body
+        if isinstance(node, ast.Assign)
+        for name in node.targets
+        if isinstance(name, ast.Name) and name.id in SHARED_TYPES
+    ]
+    assert sorted(homes) == [(name, "_system/types.py") for name in sorted(SHARED_TYPES)]

@@ -28,7 +28,7 @@ class Connection(Protocol):
 
 
 @dataclass(frozen=True)
-class Idle:
+class IdleMessage:
     """The message of a worker that waits for a task."""
 
 
@@ -55,7 +55,7 @@ def serve(connection: Connection) -> None:
     work, setup = connection.recv()
 
     def take() -> Any:
-        connection.send(Idle())
+        connection.send(IdleMessage())
         return connection.recv()
 
     try:
@@ -211,7 +211,7 @@ def work_off[T](pool: Pool, queue: TaskQueue[T]) -> Iterator[tuple[int, Any]]:
             for slot, message in pool.receive():
                 if isinstance(message, ProbeKitError):
                     raise message
-                if isinstance(message, Idle):
+                if isinstance(message, IdleMessage):
                     idle.add(slot)
                     begun.add(slot)
                     stillborn = 0

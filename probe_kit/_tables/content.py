@@ -97,7 +97,7 @@ class Heading:
 
 
 @dataclass(frozen=True)
-class Row:
+class TableRow:
     """The cells of a line. Pages keep means and differences below the others when they sort.
 
     Attributes:
@@ -142,7 +142,7 @@ class Content:
 
     title: str
     headings: tuple[Heading, ...]
-    rows: tuple[Row, ...]
+    rows: tuple[TableRow, ...]
     names: int = 1
     notes: tuple[str, ...] = ()
     numbers: tuple[Number, ...] = ()
@@ -173,7 +173,7 @@ class Content:
         """
         names = int(more.get("names", 1))
         cells = [tuple(cell if isinstance(cell, Cell) else Cell(cell) for cell in row) for row in rows]
-        lines = [Row(row, mean is not None and mean in [cell.text for cell in row[:names]]) for row in cells]
+        lines = [TableRow(row, mean is not None and mean in [cell.text for cell in row[:names]]) for row in cells]
         heads = tuple(heading if isinstance(heading, Heading) else Heading(heading) for heading in headings)
         return cls(title, heads, tuple(lines), notes=tuple(filter(None, notes)), **more)
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 from itertools import groupby, pairwise
 from typing import TYPE_CHECKING, Literal
 
-from probe_kit._tables.content import Cell, Content, Row
+from probe_kit._tables.content import Cell, Content, TableRow
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -219,7 +219,7 @@ def _text(cell: Cell) -> "Text":
     return Text(cell.text, style="bold red" if cell.alarm else "bold" if cell.strong else "")
 
 
-def _style(row: Row) -> str:
+def _style(row: TableRow) -> str:
     if row.is_difference:
         return "bold italic" if row.is_mean else "italic"
     return "bold" if row.is_mean else ""

@@ -14,7 +14,7 @@ from PIL import Image, ImageDraw
 from probe_kit._system.escaping import csv_of_rows
 from probe_kit.errors import UsageError
 from probe_kit.extract import AskSettings, ExtractSettings, ask_run, extract_run
-from probe_kit.hooks.conformance.check import Outcome, package_of, require, try_check
+from probe_kit.hooks.conformance.check import CheckOutcome, package_of, require, try_check
 from probe_kit.hooks.conformance.subject import INSTRUCTIONS, Subject
 from probe_kit.hooks.contract.declared import read_pairs
 from probe_kit.hooks.contract.model import Policy
@@ -68,15 +68,15 @@ def subjects_of(
     load_options = family.check(checkpoint, device, dtype, False, read_pairs(options), 0)
     common: dict[str, Any] = {"options": load_options, "instructions": instructions or INSTRUCTIONS}
     common |= {"device": device, "dtype": dtype}
-    kinds = [kind for kind in CONTRACTS if (family.acts if kind.acting else family.reads)]
+    kinds = [kind for kind in CONTRACTS if (family.abilities.acts if kind.acting else family.abilities.reads)]
     return [kind(model, checkpoint, **common) for kind in kinds]
 
 
-def outcomes(subjects: Sequence[Subject]) -> Iterator[Outcome]:
+def outcomes(subjects: Sequence[Subject]) -> Iterator[CheckOutcome]:
     """Check every subject and yield the outcome of each check; without a loaded model the rest is left out."""
     first, package = subjects[0], package_of(subjects[0].family.loader)
 
-    def checked(name: str, sentence: str, change: str, body: Callable[[], object]) -> Outcome:
+    def checked(name: str, sentence: str, change: str, body: Callable[[], object]) -> CheckOutcome:
         return try_check(name, sentence, change, body, package)
 
     if (module := entry_module(first.name)) is not None:

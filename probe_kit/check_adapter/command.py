@@ -12,7 +12,7 @@ from probe_kit.errors import UsageError
 from probe_kit.extract.parts import WeightsDtype
 
 if TYPE_CHECKING:
-    from probe_kit.hooks.conformance.check import Outcome
+    from probe_kit.hooks.conformance.check import CheckOutcome
 
 Instructions = Annotated[
     list[str] | None,
@@ -68,7 +68,7 @@ def check_adapter(
     raise typer.Exit(1 if failed else 0)
 
 
-def _print_outcome(outcome: "Outcome") -> None:
+def _print_outcome(outcome: "CheckOutcome") -> None:
     """Print one line; below a failed one the value seen, the value expected and the change to make."""
     colours = {"passed": "green", "failed": "bold red", "skipped": "yellow"}
     line = f"{outcome.sentence} ({outcome.reason})" if outcome.reason else outcome.sentence
@@ -78,7 +78,7 @@ def _print_outcome(outcome: "Outcome") -> None:
             out.print(markup("         [dim]{}[/] {}", f"{label:9}", getattr(outcome, name)), soft_wrap=True)
 
 
-def _print_end(model: str, checkpoint: str | None, outcomes: "list[Outcome]") -> None:
+def _print_end(model: str, checkpoint: str | None, outcomes: "list[CheckOutcome]") -> None:
     """Print how many checks passed, and what to do next."""
     counts = {
         state: sum(outcome.state == state for outcome in outcomes) for state in ("passed", "failed", "skipped")

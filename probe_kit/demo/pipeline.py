@@ -23,7 +23,7 @@ from probe_kit._tables.table import Cell, Table, group_headings
 from probe_kit._terminal.console import markup
 from probe_kit.extract import AskSettings, ExtractSettings, ask_run, extract_run
 from probe_kit.extract.prompts import TEMPLATES
-from probe_kit.intervene import ImageSwap, ReplaySource, run_intervention
+from probe_kit.intervene import ImageSwap, ReplayFiles, run_intervention
 from probe_kit.retention import RetentionRow, RetentionTable, retention_table
 from probe_kit.retention.columns.columns import FOLLOWS, MARGIN
 from probe_kit.retention.columns.text import exceeds_text, readable, retention_value, verdict
@@ -122,7 +122,7 @@ VLM = Organism(
 
 
 @dataclass(frozen=True)
-class Finding:
+class OrganismVerdict:
     """The verdict of the instrument on one organism and category, and the truth."""
 
     organism: str
@@ -151,9 +151,9 @@ def settings_of(organism: Organism, suite: Suite) -> ExtractSettings:
     )
 
 
-def source_of(organism: Organism, suite: Suite) -> ReplaySource:
+def source_of(organism: Organism, suite: Suite) -> ReplayFiles:
     """Return where interventions find the organism and its pictures, with the seed of its untrained weights."""
-    return ReplaySource(suite.folder, weights_seed=organism.weights_seed)
+    return ReplayFiles(suite.folder, weights_seed=organism.weights_seed)
 
 
 def probe_organism(
@@ -200,12 +200,12 @@ def ask_vlm(organism: Organism, suite: Suite, folder: Path, stage: NamedProgress
     return ask_run(settings, folder / organism.folder, progress=stage(f"questions, {organism.name}"))
 
 
-def findings(runs: Sequence[tuple[Organism, Run]]) -> list[Finding]:
+def findings(runs: Sequence[tuple[Organism, Run]]) -> list[OrganismVerdict]:
     """Return the verdict and the truth for every category of every organism's run."""
     rows = [(organism, row) for organism, run in runs for row in retention_table([run]).rows]
     trained_acts = any(verdict(row) == "used" for organism, row in rows if organism == TRAINED)
     return [
-        Finding(
+        OrganismVerdict(
             organism.name, row.category, organism.expected(row.category), measure_truth(row, trained_acts), row
         )
         for organism, row in rows
@@ -229,7 +229,7 @@ def measure_truth(row: RetentionRow, another_acts: bool) -> Truth:
     return f"{'against: ' * use.reversed}{use.behaviour}"
 
 
-def organism_table(findings: Sequence[Finding]) -> Table:
+def organism_table(findings: Sequence[OrganismVerdict]) -> Table:
     """Return one line per organism and category: the truth, the verdict, and the numbers behind it."""
     notes = [count_agreements([finding.agreement for finding in findings])]
     notes.append("accuracies in %, retention with its interval")
@@ -254,7 +254,7 @@ def count_agreements(agreements: Sequence[Agreement]) -> str:
     )
 
 
-def _cells(finding: Finding) -> tuple[Cell | str, ...]:
+def _cells(finding: OrganismVerdict) -> tuple[Cell | str, ...]:
     row = finding.row
     return (
         finding.organism, finding.category, finding.expected, finding.measured,
@@ -329,7 +329,7 @@ class Demo:
         return markup("[bold]Open[/]    probe-kit view {} {}", *runs)
 
 
-def compare_organisms(folder: Path, stage: NamedProgress) -> list[Finding]:
+def compare_organisms(folder: Path, stage: NamedProgress) -> list[OrganismVerdict]:
     """Judge the VLM and every organism on the questions of `FULL`.
 
     Args:

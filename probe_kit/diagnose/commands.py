@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from probe_kit.extract.extraction import Extraction
-    from probe_kit.intervene import ReplaySource
+    from probe_kit.intervene import ReplayFiles
     from probe_kit.intervene.pairs import PairRow
     from probe_kit.runs import Run
     from probe_kit.runs.plan import Row
@@ -205,7 +205,7 @@ class _Request(NamedTuple):
             check_words(self.instructions, episodes["instruction"].astype(str), bool(self.pairs))
         if self.target is None:
             return
-        if self.target.is_side and not in_scene:
+        if not (self.target.is_label or in_scene):
             raise UsageError(
                 f"--target {self.target.name} is a side, and {subject} has no correct picture on a side. Name a "
                 "column, built in or of --labels"
@@ -228,14 +228,14 @@ def check_writable(html: Path) -> None:
         )
 
 
-def _replay_source(run: "Run", typed: Mapping[str, Any]) -> "ReplaySource":
+def _replay_source(run: "Run", typed: Mapping[str, Any]) -> "ReplayFiles":
     """Return where a stored run's model and source are now, by the options that were typed."""
     from probe_kit.hooks.contract.declared import read_pairs
-    from probe_kit.intervene import ReplaySource
+    from probe_kit.intervene import ReplayFiles
 
     options = read_pairs(typed.get("model_option", ()))
     device, seed = typed.get("device", AUTO), typed.get("weights_seed")
-    return ReplaySource(typed.get("suite"), typed.get("checkpoint"), options, seed, device, moved_of(run, typed))
+    return ReplayFiles(typed.get("suite"), typed.get("checkpoint"), options, seed, device, moved_of(run, typed))
 
 
 def _is_run(name: str, typed: Mapping[str, Any]) -> bool:
@@ -261,30 +261,28 @@ def _stored(name: str, typed: Mapping[str, Any], request: _Request) -> "Run":
     from probe_kit.diagnose.diagnosis import check_base, check_network
     from probe_kit.diagnose.inputs import cameras_of
     from probe_kit.intervene.open_session import check_pairs, check_readable
-    from probe_kit.intervene.settings import has_sides
     from probe_kit.runs import open_run
 
     run = open_run(name)
     check_network(run)
     request.check_cameras(cameras_of(run))
-    request.check_episodes(run.episodes, str(run.location), has_sides(run))
+    request.check_episodes(run.episodes, str(run.location), run.source.is_scene)
     source = _replay_source(run, typed)
     if request.pairs:
         check_pairs(request.pairs, _frames_of_run(run, source))
     check_readable(run, source, request.instructions)
     if request.base is not None:
-        check_base(run, source, request.base)
+        check_base(run, source, request.base, cameras_of(run))
     for sentence in describe_spellings(run.episodes["instruction"].astype(str)):
         say_note(f"{sentence}.")
     return run
 
 
-def _frames_of_run(run: "Run", source: "ReplaySource") -> Collection[tuple[str, int]]:
+def _frames_of_run(run: "Run", source: "ReplayFiles") -> Collection[tuple[str, int]]:
     """Return the frames that a table of pairs may name: those of the source, or first frames of the scene."""
     from probe_kit.intervene.frame_session import Frames
-    from probe_kit.intervene.settings import has_sides
 
-    if has_sides(run):
+    if run.source.is_scene:
         return {(str(episode), 0) for episode in run.episodes["episode_id"]}
     frames = Frames(run, source)
     try:
@@ -435,10 +433,9 @@ def _planned_frames(rows: "Iterable[Row]", in_scene: bool) -> dict[tuple[str, in
 def _inputs_of(run: "Run", task_words: Sequence[str]) -> list[str]:
     """Return the inputs that can vary between the frames of a stored run."""
     from probe_kit.diagnose.inputs import cameras_of
-    from probe_kit.intervene.settings import has_sides
 
     texts = [*run.episodes["instruction"].astype(str), *task_words]
-    return _inputs(texts, len(cameras_of(run)), has_sides(run))
+    return _inputs(texts, len(cameras_of(run)), run.source.is_scene)
 
 
 def _inputs(instructions: Iterable[str], cameras: int, in_scene: bool) -> list[str]:
@@ -456,7 +453,9 @@ def _say_cost(family: str, streams: "Sequence[Any]", inputs: Sequence[str], requ
     layers = {stream.name: stream.layers for stream in streams}
     declared = get_family(family)
     # Keys and values are of every block of the backbone, which has one residual site more.
-    handed_over = layers["backbone"] - 1 if declared is not None and declared.interventions.prompt_kv else 0
+    handed_over = (
+        layers["backbone"] - 1 if declared is not None and declared.abilities.interventions.prompt_kv else 0
+    )
     sites = sum(layers.values()) + handed_over if request.inside else 0
     frames, pairs, base = request.frames, len(request.pairs) or None, request.base is not None
     if request.pairs:

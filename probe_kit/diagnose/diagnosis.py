@@ -23,7 +23,6 @@ from probe_kit.diagnose.results import (
     Diagnosis,
     InputDiagnosis,
     Knowledge,
-    Limits,
     SiteKnowledge,
     SitePassage,
     check_names,
@@ -39,20 +38,20 @@ from probe_kit.intervene.open_session import check_readable
 from probe_kit.intervene.pairs import Chunk, Given, Pair, PairRow
 from probe_kit.intervene.patching.patch import Cell, patched
 from probe_kit.intervene.places import ALL, SiteGroup, resolve_sites
-from probe_kit.intervene.settings import has_sides, key_of
+from probe_kit.intervene.settings import key_of
 from probe_kit.intervene.tokens import PairTokens, roles_of_tokens
 from probe_kit.runs.layout import DIAGNOSES, UNITS
 from probe_kit.runs.reader import origin_of
 from probe_kit.runs.records import as_json
-from probe_kit.runs.results import is_complete, read_bundle, write_bundle
+from probe_kit.runs.results import Bundle, find_bundle, read_bundle, write_bundle
 from probe_kit.train.choices import EVERYWHERE
 
 if TYPE_CHECKING:
     from probe_kit.hooks import ActivationCache, Model, Policy
     from probe_kit.hooks.contract.observation import Observation
-    from probe_kit.intervene.sessions import LoadPolicy, ReplaySession, ReplaySource
+    from probe_kit.intervene.sessions import LoadPolicy, ReplayFiles, ReplaySession
     from probe_kit.runs.run import Run
-    from probe_kit.train import ProbeResults, Target
+    from probe_kit.train import Target
 
 
 # -- the knowledge of a target -------------------------------------------------------------------------------
@@ -63,6 +62,7 @@ def measure_knowledge(run: "Run", target: "Target | str", seed: int = 0) -> Know
 
     Raises as `train_probes`, such as TooFewGroupsError.
     """
+    from probe_kit.retention.estimators import retention_of
     from probe_kit.train import train_probes
 
     results = train_probes(run, [EVERYWHERE], target=target, seed=seed)
@@ -76,24 +76,12 @@ def measure_knowledge(run: "Run", target: "Target | str", seed: int = 0) -> Know
             *(best[name] for name in ("stream", "layer", "part", "score", "chance", "signal")), strict=True
         )
     )
-    value, limits, note = _retention(run, results)
+    retained = retention_of(results, EVERYWHERE, results.settings.views[0])
+    low, high = (retained.interval.low, retained.interval.high) if retained.interval.bounded else (nan, nan)
     metric = str(frame["metric"].iloc[0])
-    return Knowledge(results.settings.target, results.key, metric, sites, value, limits, note)
-
-
-def _retention(run: "Run", results: "ProbeResults") -> tuple[float, Limits, str]:
-    from probe_kit.retention.behaviour import TableRun
-    from probe_kit.retention.rows.build import target_row
-
-    retained = target_row(
-        TableRun.of(run, with_behaviour=False), results, EVERYWHERE, results.settings.views[0]
-    ).retention
-    low, high = retained.ci or (None, None)
-    return _or_nan(retained.value), (_or_nan(low), _or_nan(high)), retained.note
-
-
-def _or_nan(value: float | None) -> float:
-    return nan if value is None else value
+    return Knowledge(
+        results.settings.target, results.key, metric, sites, retained.value, (low, high), retained.note
+    )
 
 
 # -- the passage of an input ---------------------------------------------------------------------------------
@@ -171,7 +159,7 @@ def _relative_difference(group: SiteGroup, before: "ActivationCache", after: "Ac
 # -- the diagnosis of a run ----------------------------------------------------------------------------------
 
 FORMAT, FILE = "probe_kit diagnosis 5", "diagnosis.json"
-Progress = Callable[[str], None]
+Announce = Callable[[str], None]
 
 
 def diagnose_run(
@@ -186,9 +174,9 @@ def diagnose_run(
     pairs: Sequence[PairRow] = (),
     instructions: Sequence[str] = (),
     seed: int = 0,
-    source: "ReplaySource | None" = None,
+    source: "ReplayFiles | None" = None,
     load: "LoadPolicy | None" = None,
-    progress: Progress = lambda _: None,
+    progress: Announce = lambda _: None,
 ) -> Diagnosis:
     """Diagnose the inputs of a run's model on first frames of the run; a stored diagnosis is loaded.
 
@@ -217,9 +205,9 @@ def diagnose_run(
         InstructionError: For instructions that the policy cannot read in full.
     """
     from probe_kit.intervene.open_session import load_policy_of, open_session
-    from probe_kit.intervene.sessions import ReplaySource
+    from probe_kit.intervene.sessions import ReplayFiles
 
-    source = source or ReplaySource()
+    source = source or ReplayFiles()
     check_diagnosis(run, frames, inputs, pairs, instructions, source, None if load is not None else base)
     if target is not None:
         progress("probes")
@@ -237,8 +225,8 @@ def diagnose_run(
         "seed": seed,
     }
     key = key_of(settings)
-    if is_complete(run.location, DIAGNOSES, key):
-        return replace(load_diagnosis(run, key), knowledge=knowledge)
+    if (stored := find_bundle(run.location, DIAGNOSES, key)) is not None:
+        return replace(_read(stored), knowledge=knowledge)
     with open_session(run, source, load, table=pairs, instructions=instructions) as session, session.ready():
         if base_policy is not None:
             base_policy = with_inputs_of(session.policy, base_policy)
@@ -248,7 +236,7 @@ def diagnose_run(
         else:
             drawn, rows = frames_of(session, frames, paraphrases), []
         exchange = InputExchange(_inference(session), drawn, seed, rows, instructions)
-        diagnosed = with_units(run, _measure(session, exchange, inputs, inside, progress))
+        diagnosed = _measure(session, exchange, inputs, inside, progress)
         if base_policy is not None:
             progress("inputs of the base")
             diagnosed = exchange.against(_inference(session, base_policy), diagnosed)
@@ -259,7 +247,7 @@ def diagnose_run(
         run.label,
         len(clean),
         groups,
-        diagnosed,
+        with_units(run, diagnosed),
         base or "",
         weights_sha256=str(run.weights_sha256),
         checkpoint=str(run.certificate["policy"]["checkpoint"]),
@@ -279,7 +267,7 @@ def check_diagnosis(
     inputs: Sequence[str],
     pairs: Sequence[PairRow],
     instructions: Sequence[str],
-    source: "ReplaySource",
+    source: "ReplayFiles",
     base: str | None,
 ) -> None:
     """Check, before any weights are read, that a run can be diagnosed so; raises as `diagnose_run`.
@@ -287,14 +275,15 @@ def check_diagnosis(
     The frames of a table of pairs are looked up when the source is open, see `open_session`.
     """
     check_network(run)
-    check_names(inputs, names_of(cameras_of(run)))
+    cameras = cameras_of(run)
+    check_names(inputs, names_of(cameras))
     if not pairs:
-        check_groups(run.episodes, frames, has_sides(run), lambda: f"{run.location} has")
+        check_groups(run.episodes, frames, run.source.is_scene, lambda: f"{run.location} has")
     if instructions:
         check_words(instructions, run.episodes["instruction"].astype(str), bool(pairs))
         check_readable(run, source, instructions)
     if base is not None:
-        check_base(run, source, base)
+        check_base(run, source, base, cameras)
 
 
 def check_words(instructions: Sequence[str], of_frames: Iterable[str], tabled: bool) -> None:
@@ -333,19 +322,23 @@ def load_diagnosis(run: "Run", key: str) -> Diagnosis:
     Raises:
         RunDamagedError: If it was changed, or another version of probe_kit made it.
     """
-    bundle = read_bundle(run.location, DIAGNOSES, key)
+    return _read(read_bundle(run.location, DIAGNOSES, key))
+
+
+def _read(bundle: Bundle) -> Diagnosis:
     bundle.check_format(FORMAT)
+    values = bundle.read_json(FILE)
     try:
-        return Diagnosis.from_json(bundle.read_json(FILE))
+        return Diagnosis.from_json(values)
     except ValueError as error:
         raise bundle.damaged(FILE, "has other fields: another version of probe_kit made it") from error
 
 
-def check_base(run: "Run", source: "ReplaySource", base: str) -> None:
+def check_base(run: "Run", source: "ReplayFiles", base: str, cameras: Sequence[str]) -> None:
     """Check the base against the run's checkpoint by the files of both; raises as `check_base_files`."""
     origin = origin_of(run)
     checkpoint, options = source.checkpoint or origin.checkpoint, {**origin.options, **source.options}
-    check_base_files(run.model, checkpoint, base, options, cameras_of(run))
+    check_base_files(run.model, checkpoint, base, options, cameras)
 
 
 def check_base_files(
@@ -438,7 +431,7 @@ def _inference(session: "ReplaySession", policy: "Policy | None" = None) -> Infe
 
 
 def _measure(
-    session: "ReplaySession", exchange: InputExchange, names: Sequence[str], inside: bool, progress: Progress
+    session: "ReplaySession", exchange: InputExchange, names: Sequence[str], inside: bool, progress: Announce
 ) -> tuple[InputDiagnosis, ...]:
     progress("inputs")
     policy = session.policy

@@ -11,11 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
 from probe_kit._system.counting import plural
+from probe_kit._system.types import Matrix, PictureArray
 from probe_kit.env.arm import DeltaController, check_action
-from probe_kit.env.rotations import Array
 from probe_kit.env.scene import SIDES, Scene
 from probe_kit.env.scoring import LED_TO, REST_SPEED, Ending, Outcome, Trajectory, distance, zone
-from probe_kit.env.simulation import Frame, Picture
+from probe_kit.env.simulation import RenderedFrame
 from probe_kit.env.spec import XY, SceneSpec
 from probe_kit.errors import EpisodeOverError, SceneError
 from probe_kit.suite.items import LAYOUTS, Episode, Item, Layout, Side, other_side
@@ -89,7 +89,7 @@ class Trial:
         self.scene = scene
         self.question = question
         self.controller = DeltaController(scene.arm, scene.spec.limits, scene.home_q, scene.spec.euler)
-        self.executed: Array | None = None
+        self.executed: Matrix | None = None
         self.steps = 0
         self.clipped = 0
         self.ik_error = 0.0
@@ -104,7 +104,7 @@ class Trial:
         """Whether the episode has ended."""
         return self.stopped_early or self.ending is not None
 
-    def advance(self, action: Array) -> None:
+    def advance(self, action: Matrix) -> None:
         """Execute one checked action (7,)."""
         move = self.controller.command(action)
         opening = 0.0 if self.steps < self.scene.spec.forced_closed else move.opening
@@ -209,8 +209,8 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
         self._question = Question.built_in()
         self._scene: Scene | None = None
         self._trial: Trial | None = None
-        self._frame: Frame | None = None
-        self._picture: Picture | None = None
+        self._frame: RenderedFrame | None = None
+        self._picture: PictureArray | None = None
         self._closed = False
 
     # -- gymnasium ---------------------------------------------------------------------------------------
@@ -238,7 +238,7 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
         reward, terminated, truncated, info = self.advance(action)
         return self.observe(), reward, terminated, truncated, info
 
-    def render(self) -> Picture:
+    def render(self) -> PictureArray:
         """Return the picture (H, W, 3) uint8 of the scene now, as rendered."""
         scene, frame = self.scene, self._current_frame()
         if self._picture is None:
@@ -246,7 +246,7 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
         # What a caller paints into it must not be what the next one sees.
         return self._picture.copy()
 
-    def render_small(self, height: int) -> Picture:
+    def render_small(self, height: int) -> PictureArray:
         """Return a picture (height, w, 3) uint8 of the scene now, for films and not for models.
 
         It is shrunk from that of `render` where that was drawn since the last action. Else it is drawn at this
@@ -301,7 +301,7 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
         agent_pos = np.concatenate([arm.tool_state(), [0.0, arm.opening()]]).astype(np.float32)
         return {"pixels": {"image": picture}, "agent_pos": agent_pos}
 
-    def observe_exchanged(self) -> tuple[Observation, Picture]:
+    def observe_exchanged(self) -> tuple[Observation, PictureArray]:
         """Return the observation with the two pictures in each other's place, and its picture as rendered.
 
         It shows the other layout of the item in this very state; the episode is unchanged.
@@ -393,7 +393,7 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
         self._frame = None
         return Trial(scene, self._question)
 
-    def _current_frame(self) -> Frame:
+    def _current_frame(self) -> RenderedFrame:
         if self._frame is None:
             self._frame, self._picture = self.scene.frame(), None
         return self._frame
@@ -462,7 +462,7 @@ class Recorder:
         return Trajectory.of_frames(np.asarray(self._frames, np.float32))
 
 
-def _state(scene: Scene) -> Array:
+def _state(scene: Scene) -> Matrix:
     """Return the state part of a frame; see `scoring.STATE`."""
     cube, tiles = scene.cube_state(), [scene.tile_state(side) for side in SIDES]
     return np.array(

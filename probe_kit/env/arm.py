@@ -19,7 +19,8 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import ArrayLike
 
-from probe_kit.env.rotations import Array, Pose, SerialChain, from_euler_xyz, from_rpy, to_rpy
+from probe_kit._system.types import Matrix
+from probe_kit.env.rotations import Pose, SerialChain, from_euler_xyz, from_rpy, to_rpy
 from probe_kit.env.simulation import BulletClient, import_pybullet
 from probe_kit.env.spec import XYZ, Euler, LimitSpec, PhysicsSpec
 from probe_kit.errors import ActionError, SceneError
@@ -252,7 +253,7 @@ class Arm:
         self._couple_fingers()
         self.chain = self._measure_chain()
 
-    def set_joints(self, q: Array, opening: float) -> None:
+    def set_joints(self, q: Matrix, opening: float) -> None:
         """Set the joints to these angles at rest, without moving through the space between."""
         for joint, angle in zip(self.model.joints, q, strict=True):
             self._client.resetJointState(self.body, joint, angle)
@@ -271,7 +272,7 @@ class Arm:
                 maxVelocity=self._physics.finger_speed,
             )
 
-    def command_joints(self, q: Array) -> None:
+    def command_joints(self, q: Matrix) -> None:
         """Pull the joints towards q during the next substep."""
         count = len(self.model.joints)
         self._client.setJointMotorControlArray(
@@ -284,11 +285,11 @@ class Arm:
             velocityGains=[VELOCITY_GAIN] * count,
         )
 
-    def joints(self) -> Array:
+    def joints(self) -> Matrix:
         """Return the measured joint angles (n,)."""
         return np.array([state[0] for state in self._client.getJointStates(self.body, self.model.joints)])
 
-    def tool_state(self) -> Array:
+    def tool_state(self) -> Matrix:
         """Return the measured x, y, z, roll, pitch, yaw (6,) of the tool.
 
         The angles are relative to pointing down.
@@ -355,7 +356,7 @@ class Arm:
             upper=np.array([i[9] for i in info]),
         )
 
-    def _matrix(self, quaternion: tuple[float, float, float, float]) -> Array:
+    def _matrix(self, quaternion: tuple[float, float, float, float]) -> Matrix:
         return np.array(self._client.getMatrixFromQuaternion(quaternion)).reshape(3, 3)
 
 
@@ -379,16 +380,16 @@ class Move:
         turn: (3,) radians by which the commanded pose really turned, in the convention of the action.
     """
 
-    q_from: Array
-    q_to: Array
+    q_from: Matrix
+    q_to: Matrix
     opening: float
     clipped: bool
     ik_error: float
-    shift: Array
-    turn: Array
+    shift: Matrix
+    turn: Matrix
 
 
-def check_action(action: ArrayLike) -> Array:
+def check_action(action: ArrayLike) -> Matrix:
     """Return the action as float64 (7,).
 
     Raises:
@@ -420,7 +421,7 @@ class DeltaController:
         euler: Convention of the rotation of an action, see `SceneSpec`.
     """
 
-    def __init__(self, arm: Arm, limits: LimitSpec, q: Array, euler: Euler = "zyx") -> None:
+    def __init__(self, arm: Arm, limits: LimitSpec, q: Matrix, euler: Euler = "zyx") -> None:
         self._arm = arm
         self._limits = limits
         floor = (-np.inf, -np.inf, arm.model.clearance)
@@ -429,7 +430,7 @@ class DeltaController:
         self.q = q
         self.target: Pose = arm.chain.pose(q)
 
-    def command(self, action: Array) -> Move:
+    def command(self, action: Matrix) -> Move:
         """Advance the commanded pose by a checked action (7,), or hold it if the new one is out of reach."""
         limits = self._limits
         shift, turn = _within(action[:3], limits.translation), _within(action[3:6], limits.rotation)
@@ -450,5 +451,5 @@ class DeltaController:
         return Move(q_from, self.q, opening, clipped, solution.error, shift, turn)
 
 
-def _within(values: Array, largest: float | None) -> Array:
+def _within(values: Matrix, largest: float | None) -> Matrix:
     return values if largest is None else np.clip(values, -largest, largest)

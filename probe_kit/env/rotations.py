@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from probe_kit._system.types import Matrix
 
 
-def from_rpy(rpy: ArrayLike) -> Array:
+def from_rpy(rpy: ArrayLike) -> Matrix:
     """Return the rotation matrix (3, 3) of roll, pitch, yaw (3,)."""
     (sr, sp, sy), (cr, cp, cy) = np.sin(rpy), np.cos(rpy)
     return np.array(
@@ -25,12 +25,12 @@ def from_rpy(rpy: ArrayLike) -> Array:
     )
 
 
-def from_euler_xyz(angles: ArrayLike) -> Array:
+def from_euler_xyz(angles: ArrayLike) -> Matrix:
     """Return the rotation matrix (3, 3) of Euler angles "XYZ" (3,): R = Rx(first) Ry(second) Rz(third)."""
     return from_rpy(np.negative(angles)).T
 
 
-def to_rpy(R: Array) -> Array:
+def to_rpy(R: Matrix) -> Matrix:
     """Return roll, pitch, yaw (3,) of a rotation matrix (3, 3); at pitch = ±π/2 the roll is set to zero."""
     level = np.hypot(R[0, 0], R[1, 0])
     pitch = np.arctan2(-R[2, 0], level)
@@ -39,7 +39,7 @@ def to_rpy(R: Array) -> Array:
     return np.array([np.arctan2(R[2, 1], R[2, 2]), pitch, np.arctan2(R[1, 0], R[0, 0])])
 
 
-def to_vector(R: Array) -> Array:
+def to_vector(R: Matrix) -> Matrix:
     """Return the rotation vector (3,), axis times angle with angle in [0, π], of a rotation matrix (3, 3)."""
     twist = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
     sine, cosine = np.linalg.norm(twist), 0.5 * (np.trace(R) - 1.0)
@@ -74,15 +74,15 @@ TOLERANCE = 1e-5
 class Pose:
     """A position (3,) in metres and a rotation matrix (3, 3), in the world frame."""
 
-    position: Array
-    rotation: Array
+    position: Matrix
+    rotation: Matrix
 
 
 @dataclass(frozen=True)
 class Solution:
     """Joint angles (n,) in radians, and the errors that remain to the target: metres and radians."""
 
-    q: Array
+    q: Matrix
     error: float
     turn_error: float
 
@@ -99,17 +99,17 @@ class SerialChain:
         upper: (n,) upper joint limits in radians.
     """
 
-    axes: Array
-    points: Array
+    axes: Matrix
+    points: Matrix
     tip: Pose
-    lower: Array
-    upper: Array
+    lower: Matrix
+    upper: Matrix
 
-    def pose(self, q: Array) -> Pose:
+    def pose(self, q: Matrix) -> Pose:
         """Return the pose of the tool at joint angles q (n,)."""
         return self.pose_and_jacobian(q)[0]
 
-    def solve(self, target: Pose, start: Array, posture: Array, iterations: int = 30) -> Solution:
+    def solve(self, target: Pose, start: Matrix, posture: Matrix, iterations: int = 30) -> Solution:
         """Return joint angles that bring the tool to `target`, within the limits, by damped least squares.
 
         An unreachable target raises nothing: look at the errors of the solution.
@@ -131,7 +131,7 @@ class SerialChain:
         remaining = _residual(target, self.pose(q))
         return Solution(q, float(np.linalg.norm(remaining[:3])), float(np.linalg.norm(remaining[3:])))
 
-    def _step(self, J: Array, residual: Array, size: float, to_posture: Array) -> Array:
+    def _step(self, J: Matrix, residual: Matrix, size: float, to_posture: Matrix) -> Matrix:
         damped = J @ J.T + min(DAMPING, size) ** 2 * np.eye(6)
         step = J.T @ np.linalg.solve(damped, residual)
         if J.shape[1] > 6:
@@ -139,7 +139,7 @@ class SerialChain:
             step += pull - J.T @ np.linalg.solve(damped, J @ pull)
         return np.asarray(step * min(1.0, MAX_JOINT_STEP / max(np.abs(step).max(), 1e-12)))
 
-    def pose_and_jacobian(self, q: Array) -> tuple[Pose, Array]:
+    def pose_and_jacobian(self, q: Matrix) -> tuple[Pose, Matrix]:
         """Return the tool's pose at joint angles q (n,), and its Jacobian (6, n), by the product of exponentials.
 
         The Jacobian is linear over angular velocity, both in the world frame.
@@ -156,11 +156,11 @@ class SerialChain:
         return pose, np.vstack([np.cross(axes, pose.position - points).T, axes.T])
 
     @cached_property
-    def _generators(self) -> tuple[Array, Array]:
+    def _generators(self) -> tuple[Matrix, Matrix]:
         """The cross-product matrices (n, 3, 3) of the axes, and their squares."""
         cross = np.cross(np.eye(3)[None], self.axes[:, None])
         return np.asarray(cross), np.asarray(cross @ cross)
 
 
-def _residual(target: Pose, pose: Pose) -> Array:
+def _residual(target: Pose, pose: Pose) -> Matrix:
     return np.concatenate([target.position - pose.position, to_vector(target.rotation @ pose.rotation.T)])

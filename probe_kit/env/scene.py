@@ -11,16 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from probe_kit._system.types import Matrix, PictureArray
 from probe_kit.env.arm import ARMS, Arm
-from probe_kit.env.rotations import Array, Pose, to_vector, yaw_quaternion
+from probe_kit.env.rotations import Pose, to_vector, yaw_quaternion
 from probe_kit.env.simulation import (
     INVISIBLE,
     Backdrop,
     BulletClient,
     Camera,
     FilmCamera,
-    Frame,
-    Picture,
+    RenderedFrame,
     TextureCache,
     load_photo,
     wooden_table,
@@ -50,7 +50,7 @@ GRASP_GAP = 0.003
 """Space between each finger and a cube that starts in the hand, before the fingers close, in metres."""
 QUAD_LIFT = 0.0005
 """Height of the picture above its box, in metres; enough for the depth buffer to separate them."""
-_EMPTY_TABLES: dict[tuple[CameraSpec, LightSpec, float], Frame] = {}
+_EMPTY_TABLES: dict[tuple[CameraSpec, LightSpec, float], RenderedFrame] = {}
 """Frames of the empty tables of this process's scenes; an equal scene need not draw it again."""
 _TILE_PIXELS: dict[tuple[CameraSpec, float, float, float, tuple[XY, ...]], dict[Side, int]] = {}
 """Pixels of the tiles' pictures in these scenes."""
@@ -68,8 +68,8 @@ class BodyState:
         speed: Linear speed in m/s.
     """
 
-    position: Array
-    quaternion: Array
+    position: Matrix
+    quaternion: Matrix
     speed: float
 
 
@@ -127,7 +127,7 @@ class Scene:
             self._shown = before
             self._show()
 
-    def advance(self, q_from: Array, q_to: Array, opening: float) -> bool:
+    def advance(self, q_from: Matrix, q_to: Matrix, opening: float) -> bool:
         """Drive the arm from one commanded posture to the next in one action; False if the state broke."""
         self.arm.command_gripper(opening)
         for share in np.linspace(0.0, 1.0, self.spec.physics.substeps + 1)[1:]:
@@ -203,7 +203,7 @@ class Scene:
         """Whether the cube touches a tile."""
         return any(self.touches_tile(side) for side in SIDES)
 
-    def frame(self, number: int | None = None) -> Frame:
+    def frame(self, number: int | None = None) -> RenderedFrame:
         """Draw robot, cube and tiles as the camera sees them, without the table.
 
         PyBullet normalises the normals of a mesh in place whenever it draws them. The last bit of some alternates,
@@ -224,7 +224,7 @@ class Scene:
         self._drawn += 1
         return self._draw()
 
-    def small_picture(self, height: int) -> Picture:
+    def small_picture(self, height: int) -> PictureArray:
         """Return the finished picture (height, w, 3), drawn with fewer pixels, so that edges are less smooth."""
         if self.spec.tile_mass > 0:
             self._lay_pictures()
@@ -232,18 +232,18 @@ class Scene:
         camera, spec = self.camera.at_height(height), self.spec
         return self._film.picture(camera, spec.light, spec.light_level, tuple(self._shown.values()))
 
-    def _draw(self) -> Frame:
+    def _draw(self) -> RenderedFrame:
         return self.camera.render(self.client, self.spec.light, self.spec.light_level)
 
-    def picture(self, frame: Frame) -> Picture:
+    def picture(self, frame: RenderedFrame) -> PictureArray:
         """Return the finished picture (H, W, 3) of a frame."""
         return self.backdrop.under(frame)
 
-    def tile_visibility(self, frame: Frame) -> dict[Side, float]:
+    def tile_visibility(self, frame: RenderedFrame) -> dict[Side, float]:
         """Return the share of each picture that is on screen and that neither robot nor cube hides in `frame`."""
         return {side: float((frame.bodies == self.quads[side]).sum() / self._tile_pixels[side]) for side in SIDES}
 
-    def tile_masks(self, frame: Frame) -> dict[Side, NDArray[np.bool_]]:
+    def tile_masks(self, frame: RenderedFrame) -> dict[Side, NDArray[np.bool_]]:
         """Return masks (H, W) of where each tile's picture is seen in the frame."""
         return {side: np.asarray(frame.bodies == self.quads[side]) for side in SIDES}
 
@@ -295,7 +295,7 @@ class Scene:
         self.client = BulletClient()
         self._build()
 
-    def _find_home(self) -> Array:
+    def _find_home(self) -> Matrix:
         spec, posture, limits = self.spec, np.array(self.arm.model.posture), self.spec.limits
         home = self.arm.tool_down(spec.home, spec.home_rpy)
         if spec.home_joints is not None:
@@ -305,7 +305,7 @@ class Scene:
             raise SceneError(f"the {spec.arm} cannot reach its home {spec.home} with the gripper down.")
         return solution.q
 
-    def _checked_home(self, q: Array, home: Pose) -> Array:
+    def _checked_home(self, q: Matrix, home: Pose) -> Matrix:
         spec, count = self.spec, len(self.arm.model.joints)
         if q.shape != (count,):
             raise SceneError(
@@ -322,7 +322,7 @@ class Scene:
             )
         return q
 
-    def _surroundings(self, empty: Frame) -> Picture:
+    def _surroundings(self, empty: RenderedFrame) -> PictureArray:
         """Return the colours behind robot, cube and tiles; a photo is scaled with the light of the scene."""
         spec = self.spec
         if spec.rendering == "raw":

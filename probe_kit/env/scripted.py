@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from probe_kit._system.types import Matrix, PictureArray
 from probe_kit.env.act2answer import Act2AnswerEnv
-from probe_kit.env.rotations import Array, to_rpy
-from probe_kit.env.simulation import Picture
+from probe_kit.env.rotations import to_rpy
 from probe_kit.errors import EpisodeOverError
 from probe_kit.suite.items import other_side
 
@@ -31,7 +31,7 @@ STAY_SHUT = np.array([0, 0, 0, 0, 0, 0, CLOSED])
 class Waypoint:
     """A tool position (3,) and turn about +z, the gripper command on the way, and actions to wait there."""
 
-    position: Array
+    position: Matrix
     yaw: float
     gripper: float
     wait: int = 0
@@ -57,7 +57,7 @@ class ScriptedExpert:
         self._mirrored = mirrored
         self._height = grasp_height
         self._tolerance = tolerance
-        self._actions: Iterator[Array] | None = None
+        self._actions: Iterator[Matrix] | None = None
 
     def reset(self) -> None:
         """Look at the table and plan.
@@ -106,7 +106,7 @@ class ScriptedExpert:
             Waypoint(above, yaw, OPEN),
         ]
 
-    def _follow(self, plan: list[Waypoint]) -> Iterator[Array]:
+    def _follow(self, plan: list[Waypoint]) -> Iterator[Matrix]:
         """Yield actions along the way-points, then no motion forever."""
         for waypoint in plan:
             while not self._arrived(waypoint):
@@ -118,7 +118,7 @@ class ScriptedExpert:
         while True:
             yield np.array([0, 0, 0, 0, 0, 0, OPEN])
 
-    def _towards(self, waypoint: Waypoint) -> Array:
+    def _towards(self, waypoint: Waypoint) -> Matrix:
         shift, turn = self._remaining(waypoint)
         shift *= min(1.0, MAX_SHIFT / max(float(np.linalg.norm(shift)), 1e-9))
         return np.array([*shift, 0.0, 0.0, np.clip(turn, -MAX_TURN, MAX_TURN), waypoint.gripper])
@@ -127,13 +127,13 @@ class ScriptedExpert:
         shift, turn = self._remaining(waypoint)
         return bool(np.linalg.norm(shift) < self._tolerance and abs(turn) < 1e-3)
 
-    def _remaining(self, waypoint: Waypoint) -> tuple[Array, float]:
+    def _remaining(self, waypoint: Waypoint) -> tuple[Matrix, float]:
         """Return the translation and turn about +z from the commanded pose to the way-point."""
         target = self._env.trial.controller.target
         yaw = to_rpy(target.rotation @ np.array(self._env.scene.arm.model.down).T)[2]
         return waypoint.position - target.position, float(waypoint.yaw - yaw)
 
-    def _cube(self) -> Array:
+    def _cube(self) -> Matrix:
         return self._env.scene.cube_state().position
 
     def _cube_yaw(self) -> float:
@@ -212,7 +212,7 @@ def _pad(image: Image.Image, size: int) -> Any:
     return np.asarray(square)
 
 
-def save_gif(path: Path, pictures: Sequence[Picture], fps: float = 5.0) -> None:
+def save_gif(path: Path, pictures: Sequence[PictureArray], fps: float = 5.0) -> None:
     """Write pictures (H, W, 3) uint8 as an endless GIF; collect them with `env.render()` after each action.
 
     Raises:

@@ -28,7 +28,7 @@ from PIL import Image
 
 from probe_kit._system.bounded_files import read_regular
 from probe_kit._system.imports import install_command
-from probe_kit.env.rotations import Array
+from probe_kit._system.types import Matrix, PictureArray
 from probe_kit.env.spec import CameraSpec, LightSpec
 from probe_kit.errors import SceneError
 from probe_kit.suite.pictures import decode_bytes
@@ -103,14 +103,12 @@ class BulletClient:
 
 # -- camera ---------------------------------------------------------------------------------------------------
 
-Picture = NDArray[np.uint8]
-
 
 @dataclass(frozen=True)
-class Frame:
+class RenderedFrame:
     """A rendering: colours (H, W, 3), depth buffer (H, W) in [0, 1] and body ids (H, W), -1 for none."""
 
-    rgb: Picture
+    rgb: PictureArray
     depth: NDArray[np.float32]
     bodies: NDArray[np.int32]
 
@@ -122,20 +120,20 @@ class Camera:
     spec: CameraSpec
 
     @property
-    def axes(self) -> Array:
+    def axes(self) -> Matrix:
         """The rows right, up, forward (3, 3): unit axes of the camera in the world."""
         forward = np.asarray(self.spec.forward) / np.linalg.norm(self.spec.forward)
         right = np.cross(forward, (0.0, 0.0, 1.0))
         right /= np.linalg.norm(right)
         return np.array([right, np.cross(right, forward), forward])
 
-    def project(self, points: ArrayLike) -> Array:
+    def project(self, points: ArrayLike) -> Matrix:
         """Return pixel places (..., 2) as x, y of world points (..., 3) in front of the camera."""
         x, y, z = np.moveaxis((np.asarray(points) - self.spec.eye) @ self.axes.T, -1, 0)
         centre = np.array([self.spec.width, self.spec.height]) / 2
         return np.asarray(centre + self.spec.focal_length * np.stack([x, -y], -1) / z[..., None])
 
-    def rays(self) -> Array:
+    def rays(self) -> Matrix:
         """Return the viewing direction (H, W, 3) in the world through the middle of every pixel, unnormalised."""
         v, u = np.mgrid[: self.spec.height, : self.spec.width] + 0.5
         across = (u - self.spec.width / 2) / self.spec.focal_length
@@ -177,7 +175,7 @@ class Camera:
         matrix[3, 2] = -1
         return [float(x) for x in matrix.T.ravel()]
 
-    def render(self, client: BulletClient, light: LightSpec, level: float) -> Frame:
+    def render(self, client: BulletClient, light: LightSpec, level: float) -> RenderedFrame:
         """Draw everything visible in the server behind `client`, with all light scaled by `level`."""
         width, height = self.spec.width, self.spec.height
         _, _, rgba, depth, bodies = client.getCameraImage(
@@ -194,7 +192,7 @@ class Camera:
             renderer=client.ER_TINY_RENDERER,
         )
         # np.asarray with reshape is right for both builds of pybullet, with numpy and without.
-        return Frame(
+        return RenderedFrame(
             np.asarray(rgba, np.uint8).reshape(height, width, 4)[..., :3],
             np.asarray(depth, np.float32).reshape(height, width),
             np.asarray(bodies, np.int32).reshape(height, width),
@@ -205,7 +203,7 @@ class Camera:
 class Backdrop:
     """The scene without robot, cube and tiles: colours (H, W, 3) and depth buffer (H, W)."""
 
-    rgb: Picture
+    rgb: PictureArray
     depth: NDArray[np.float32]
 
     def at_size(self, spec: CameraSpec) -> "Backdrop":
@@ -215,7 +213,7 @@ class Backdrop:
         depth = Image.fromarray(self.depth).resize(size, Image.Resampling.NEAREST)
         return Backdrop(np.asarray(rgb), np.asarray(depth))
 
-    def under(self, frame: Frame) -> Picture:
+    def under(self, frame: RenderedFrame) -> PictureArray:
         """Return the picture (H, W, 3) of `frame` composed with the backdrop: the nearer surface is visible."""
         # The renderer lets the surface that is drawn later win a tie, and the table is drawn first.
         in_front = (frame.bodies >= 0) & (frame.depth <= self.depth)
@@ -284,7 +282,7 @@ SUPERSAMPLING = 2
 """Factor of the pixels in each direction that are drawn and then scaled down, so that seams are smooth."""
 
 
-def load_photo(path: Path, width: int, height: int) -> Picture:
+def load_photo(path: Path, width: int, height: int) -> PictureArray:
     """Read the photo at `path`, squeezed to (height, width, 3).
 
     Raises:
@@ -300,7 +298,7 @@ def load_photo(path: Path, width: int, height: int) -> Picture:
 
 
 @lru_cache(maxsize=8)
-def wooden_table(camera: Camera) -> Picture:
+def wooden_table(camera: Camera) -> PictureArray:
     """Draw a table of planks with a wall behind it, (H, W, 3), seen by `camera` in the right perspective."""
     fine = camera.magnified(SUPERSAMPLING)
     rays = fine.rays()
@@ -317,7 +315,7 @@ def wooden_table(camera: Camera) -> Picture:
     return np.asarray(picture.resize((camera.spec.width, camera.spec.height), Image.Resampling.LANCZOS))
 
 
-def _wood(points: Array) -> Array:
+def _wood(points: Matrix) -> Matrix:
     """Return the table's colour at world points (..., 3): planks along y, each with its own grain and tone."""
     x, y = points[..., 0], points[..., 1]
     plank = np.floor(x / PLANK_WIDTH)
@@ -332,13 +330,13 @@ def _wood(points: Array) -> Array:
     return np.asarray((DARK_WOOD + lightness[..., None] * (LIGHT_WOOD - DARK_WOOD)) * shade[..., None])
 
 
-def _wall(points: Array) -> Array:
+def _wall(points: Matrix) -> Matrix:
     y, z = points[..., 1], points[..., 2]
     shade = 0.90 + 0.08 * np.tanh(4 * z) + 0.03 * (_noise(3 * y, 3 * z, 4) - 0.5)
     return np.asarray(WALL * shade[..., None])
 
 
-def _noise(u: Array, v: Array, seed: int) -> Array:
+def _noise(u: Matrix, v: Matrix, seed: int) -> Matrix:
     """Return smooth noise in [0, 1] on the plane: random values on a grid that repeats every 64 cells."""
     grid: NDArray[np.float64] = np.random.default_rng(seed).random((64, 64)).ravel()
     cell_u, cell_v = np.floor(u).astype(np.int32), np.floor(v).astype(np.int32)
@@ -350,7 +348,7 @@ def _noise(u: Array, v: Array, seed: int) -> Array:
     return np.asarray((1 - t) * near + t * far)
 
 
-def _ease(share: Array) -> Array:
+def _ease(share: Matrix) -> Matrix:
     return np.asarray(share * share * (3 - 2 * share))
 
 
@@ -372,7 +370,7 @@ class _Resting:
     """
 
     backdrop: Backdrop
-    places: Array
+    places: Matrix
     pictures: tuple[int, ...]
 
 
@@ -396,7 +394,7 @@ class FilmCamera:
         self._colors = {body: _colors(client, body) for body in (*self._resting, *self._moving)}
         self._drawn: _Resting | None = None
 
-    def picture(self, camera: Camera, light: LightSpec, level: float, pictures: tuple[int, ...]) -> Picture:
+    def picture(self, camera: Camera, light: LightSpec, level: float, pictures: tuple[int, ...]) -> PictureArray:
         """Return the finished picture (h, w, 3).
 
         Args:
@@ -449,7 +447,7 @@ def _colors(client: BulletClient, body: int) -> list[tuple[int, int, tuple[float
     return colors
 
 
-def _over(backdrop: Backdrop, frame: Frame) -> Backdrop:
+def _over(backdrop: Backdrop, frame: RenderedFrame) -> Backdrop:
     """Return the backdrop with the bodies of a frame in front of it."""
     nearer = np.where(frame.bodies >= 0, np.minimum(frame.depth, backdrop.depth), backdrop.depth)
     return Backdrop(backdrop.under(frame), nearer)

@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from probe_kit.extract.extraction import Extraction, ask_run, extract_run, prepare, prepare_asks
     from probe_kit.extract.prompts import TEMPLATES
     from probe_kit.extract.settings import AskSettings, ExtractSettings
-    from probe_kit.extract.sources.environment import EnvEpisode, EnvSource, OwnEnvironment, Step
+    from probe_kit.extract.sources.environment import EnvEpisode, EnvironmentSettings, OwnEnvironment, Step
     from probe_kit.extract.sources.environment_check import check_environment
     from probe_kit.extract.sources.pictures import PictureFolder
     from probe_kit.extract.sources.recording import LeRobotSource
@@ -17,7 +17,7 @@ __all__ = [
     "TEMPLATES",
     "AskSettings",
     "EnvEpisode",
-    "EnvSource",
+    "EnvironmentSettings",
     "ExtractSettings",
     "Extraction",
     "LeRobotSource",
@@ -39,7 +39,7 @@ __getattr__, __dir__ = lazy_names(
         "ExtractSettings": "settings",
         "Extraction": "extraction",
         "EnvEpisode": "sources.environment",
-        "EnvSource": "sources.environment",
+        "EnvironmentSettings": "sources.environment",
         "OwnEnvironment": "sources.environment",
         "Step": "sources.environment",
         "check_environment": "sources.environment_check",

@@ -113,26 +113,25 @@ def _typed_or_stored_source(run: "Run", typed: Mapping[str, Any]) -> dict[str, A
     if kinds_typed(typed).keys() - {kind}:
         return {}
     flags = {field: option.flag for field, option in kind.command_options().items()}
-    return {"source": source_of_run(run, kind.replaced_by(typed), flags)}
+    return {"source": _source_with_files(run, kind, kind.replaced_by(typed), flags)}
 
 
-def source_of_run(run: "Run", replaced: Collection[str], flags: Mapping[str, str]) -> dict[str, Any]:
+def _source_with_files(
+    run: "Run", kind: "type[SourceSettings]", replaced: Collection[str], flags: Mapping[str, str]
+) -> dict[str, Any]:
     """Return the settings of a run's source as values, with its files where the run had them.
 
     Args:
-        run: The run whose source is opened again.
+        run: The run whose source is opened again; it stores its settings.
+        kind: The class of these settings.
         replaced: The fields that are given anew.
         flags: The options of a command that give fields, by field.
 
     Raises:
-        UsageError: For a run without its settings, and for files that are gone.
+        UsageError: For files that are gone.
     """
-    config = run.settings.get(CONFIG)
-    if config is None:
-        raise UsageError(f"{run.location} does not say with which settings it was requested; extract it again")
-    kind = kind_of(config["source"])
     files = {field: path for field, path in origin_of(run).files.items() if field not in replaced}
-    source = kind.with_files(config["source"], files)
+    source = kind.with_files(run.settings[CONFIG]["source"], files)
     # A run that does not say where its files were leads to their names, which may lie here.
     for field, path in (kind(**source).files() | {field: Path(path) for field, path in files.items()}).items():
         if field not in replaced:
@@ -197,13 +196,16 @@ def moved_of(run: "Run", typed: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def source_again(run: "Run", moved: Mapping[str, Any]) -> "SourceSettings":
-    """Return the settings of a run's source, to show its observations again; errors are those of `source_of_run`.
+    """Return the settings of a run's source, to show its observations again.
 
     The parts of `moved`, by field, take the place of the stored ones.
+
+    Raises:
+        UsageError: For a run without its settings, and for files that are gone.
     """
-    kind = kind_of(run.settings[CONFIG]["source"]) if CONFIG in run.settings else None
-    flags = {} if kind is None else {field: option.flag for field, option in _options(kind).items()}
-    values = source_of_run(run, moved, flags)
-    kind = kind_of(values)
-    values = kind.with_moved(values, moved)
+    if CONFIG not in run.settings:
+        raise UsageError(f"{run.location} does not say with which settings it was requested; extract it again")
+    kind = kind_of(run.settings[CONFIG]["source"])
+    flags = {field: option.flag for field, option in _options(kind).items()}
+    values = kind.with_moved(_source_with_files(run, kind, moved, flags), moved)
     return kind(**values, **({"run": run.location.address} if kind.of_run else {}))

@@ -16,6 +16,7 @@ from probe_kit._execution.process_pool import ProcessPool, share_of_machine
 from probe_kit._execution.ray_pool import RayPool
 from probe_kit._system.counting import plural
 from probe_kit._system.imports import install_command
+from probe_kit._system.types import Progress
 from probe_kit._terminal.notebook import notebook_progress
 from probe_kit.errors import DiskSpaceError, EpisodesFailedError, MissingExtraError, UsageError
 from probe_kit.extract.parts import SCRIPTED
@@ -48,7 +49,6 @@ CheckCameras = Callable[[Sequence[str]], object]
 """A function that gets the names of the model's cameras that get a picture, and raises UsageError."""
 ChooseRows = Callable[[Sequence[Row]], Sequence[Row]]
 """A function that returns some of the rows that a source has, or raises UsageError."""
-Progress = Callable[[int, int, str], None]
 # If this many episodes were given up and none succeeded, something is wrong with all of them.
 HOPELESS = 3
 _OF_THE_CHECKPOINT = ("dtype", "execute", "random_weights", "captured_calls")
@@ -388,7 +388,7 @@ def _selects_only(settings: Settings, location: Location | None) -> bool:
         return False
     if location is None:
         family = get_family(settings.model.family)
-        return family is not None and bool(family.declared)
+        return family is not None and bool(family.checkpoints.declared)
     with location.explained_errors():
         return not location.exists(RUN_FILE)
 

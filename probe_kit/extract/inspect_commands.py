@@ -86,7 +86,7 @@ def _print_words(name: str | None, run: str | None, as_json: bool) -> None:
 
     check_no_others({"--run": run is not None}, "--words")
     families = list(own_families().values()) if name is None else [find_family(name, tuple(SCRIPTED))]
-    if not any(family.vocabulary for family in families):
+    if not any(family.abilities.vocabulary for family in families):
         raise UsageError(f"{name} reads any text; --words lists those of embedded models. Leave --words out")
     listed = sorted({word for family in families for word in family.known_words()})
     if as_json:
@@ -132,14 +132,17 @@ def _model_rows(name: str | None) -> list[dict[str, Any]]:
         {
             "model": family.name,
             "description": family.description,
-            "checkpoint": family.default_checkpoint or ("your own" if family.needs_checkpoint else EMBEDDED),
+            "checkpoint": family.default_checkpoint
+            or ("your own" if family.requirements.needs_checkpoint else EMBEDDED),
             "streams": family.streams_text(),
             "embodiment": family.embodiment,
             "scene": str(family.home),
             "ready": _ready(family),
             "weights": weights_needed(family.name, None, {}, None),
             "notes": family.notes,
-            "does": " and ".join(verb for verb, can in (("acts", family.acts), ("answers", family.reads)) if can),
+            "does": " and ".join(
+                verb for verb, can in (("acts", family.abilities.acts), ("answers", family.abilities.reads)) if can
+            ),
             "protocols": {
                 " ".join(filter(None, (protocol, row.variant))): row.settings()
                 for protocol, first in family.protocols.items()
@@ -399,11 +402,11 @@ def check_environment(
 
     Exits with 1 if a check failed.
     """
-    from probe_kit.extract import EnvSource
+    from probe_kit.extract import EnvironmentSettings
     from probe_kit.extract import check_environment as checks_of
     from probe_kit.extract.sources.environment_check import STEPS
 
-    source = EnvSource(environment, options=env_options or (), rotations=rotate or ())
+    source = EnvironmentSettings(environment, options=env_options or (), rotations=rotate or ())
     checks = []
     for check in checks_of(source, picture):
         checks.append(check)

@@ -20,7 +20,7 @@ from probe_kit._terminal.console import whole_number
 from probe_kit._terminal.field_options import Part
 from probe_kit._terminal.options import further_option, speed_option
 from probe_kit.errors import UsageError
-from probe_kit.extract.prompts import P1, Picture, Query, Template, find_template
+from probe_kit.extract.prompts import P1, PictureShown, Query, Template, find_template
 from probe_kit.hooks import family as hook_family
 from probe_kit.hooks.capturing.edits import Edit, Vectors
 from probe_kit.hooks.contract.card import EMBEDDED
@@ -288,7 +288,7 @@ class AskTask(Part):
     ] = None
     prompt: PromptTemplate = P1
     picture: Annotated[
-        Picture,
+        PictureShown,
         control_option(
             "--picture",
             help="frame: show the first frame. side-by-side: show both pictures on grey. none: show no picture; "

@@ -27,7 +27,7 @@ from probe_kit.suite import Episode, Item, Side, Suite, load_picture
 from probe_kit.suite.items import other_side
 
 Query = Literal["target", "distractor", "absent"]
-Picture = Literal["frame", "side-by-side", "none"]
+PictureShown = Literal["frame", "side-by-side", "none"]
 """The picture of a question: the first frame, the two pictures on grey, or nothing."""
 QUERIES: Mapping[Query, str] = {
     "target": "the object of the instruction",

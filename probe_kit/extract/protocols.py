@@ -140,7 +140,7 @@ def _defaults(model: str, row: ProtocolRow) -> dict[str, str]:
 
     family = find_family(model)
     defaults = {f"-M {option.name}": option.default for option in family.options}
-    defaults |= {f"-M {name}": as_text(value) for name, value in family.of_default.items()}
+    defaults |= {f"-M {name}": as_text(value) for name, value in family.checkpoints.of_default.items()}
     defaults |= {
         "checkpoint": family.default_checkpoint or EMBEDDED,
         "execute": "the checkpoint's",

@@ -157,7 +157,7 @@ def weights_bytes_needed(model: str) -> dict[str, Any]:
     family = get_family(model)
     if family is None or family.weights_bytes({}) is None:
         return {}
-    names = DTYPES[:1] if family.always_float32 else DTYPES
+    names = DTYPES[:1] if family.requirements.always_float32 else DTYPES
     count = _parameters(family, None, {}, None)
     fetched = 0 if family.is_here(None, {}) else family.bytes_to_fetch(None, {})
     download = {} if fetched is None else {"download_bytes": fetched}
@@ -195,7 +195,7 @@ def weights_needed(
     memory_by_dtype = {name: in_units(family.memory_bytes(options, name, count) or 0) for name in DTYPES}
     every = (
         memory_by_dtype["float32"]
-        if family.always_float32
+        if family.requirements.always_float32
         else " or ".join(f"{size} in {name}" for name, size in memory_by_dtype.items())
     )
     memory = next((size for name, size in memory_by_dtype.items() if name == dtype), every)

@@ -9,6 +9,7 @@ from probe_kit.hooks.contract.declared import Interventions, Option
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.sites import Site, Stream
 from probe_kit.hooks.family import Family
+from probe_kit.hooks.family_parts import Abilities, Checkpoints, Requirements
 from probe_kit.hooks.registry import known_families, load_model, load_policy
 
 if TYPE_CHECKING:
@@ -28,10 +29,12 @@ if TYPE_CHECKING:
     from probe_kit.hooks.contract.roles import Roles, pool
 
 __all__ = [
+    "Abilities",
     "ActivationCache",
     "AnswerModel",
     "AttentionCut",
     "AttentionMass",
+    "Checkpoints",
     "Edit",
     "Family",
     "Interventions",
@@ -43,6 +46,7 @@ __all__ = [
     "Policy",
     "Prompt",
     "Reading",
+    "Requirements",
     "Roles",
     "Rows",
     "Site",

@@ -3,7 +3,7 @@
 import inspect
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from importlib import import_module
 from importlib.util import find_spec
 from operator import attrgetter
@@ -22,7 +22,6 @@ from probe_kit.errors import (
 )
 from probe_kit.hooks.checkpoints.checkpoint import (
     CONFIG_FILE,
-    PATTERNS,
     hub_name,
     is_on_hub,
     missing_weights,
@@ -32,18 +31,17 @@ from probe_kit.hooks.checkpoints.checkpoint import (
 )
 from probe_kit.hooks.checkpoints.folders import check_files, checkpoint_folder, with_adapters_named
 from probe_kit.hooks.checkpoints.third_party import while_loading
-from probe_kit.hooks.contract.card import ModelCard, SourceWeights
+from probe_kit.hooks.contract.card import ModelCard
 from probe_kit.hooks.contract.declared import (
-    ALL_EDITS,
     RELEASED,
     DeclaredStream,
     DefaultScene,
     InterventionKind,
-    Interventions,
     Option,
     ProtocolRow,
     check_options,
 )
+from probe_kit.hooks.family_parts import Abilities, Checkpoints, Requirements
 from probe_kit.hooks.outline import Outline, bytes_to_fetch, configuration_folder, is_complete, outline_of
 from probe_kit.models.bounds import MOST_STEPS
 
@@ -67,46 +65,12 @@ class Family:
         loader: `loader(checkpoint, device, dtype, random_weights)` gives a Model, and takes `weights_seed` if its
             untrained networks can differ.
         streams: Layers and iterations in words, of a family that declares none.
-        outputs: `outputs(loader, folder, recorded arrays)` gives the `Outputs` that a golden reference is compared
-            with; None for a family that compares nothing.
-        full_size: `full_size()` gives the network of the released size on the meta device; it takes the name of
-            one where there are `sizes`.
-        stored_names: `module:constant`, how names of tensors in released files become those of the network, see
-            `probe_kit.models.checkpoint_files`.
         options: Further keyword arguments that the loader takes.
-        acts: Whether it is a Policy.
-        reads: Whether it is an AnswerModel.
-        unstored: Tensors of a checkpoint that the network does not have, by name or prefix ending in a dot;
-            `verify --keys` prints them.
-        hub: The repositories that the default checkpoint is loaded from, hub ids with a file each whose presence
-            tells; default its config.json.
-        packages: Modules of an extra that it needs, with the name of that extra.
-        config_types: The values that `type` or `model_type` in the config.json of its checkpoints may have. It is
-            empty if they have none, and then only the loader recognises one.
-        instead: For other such types that people may take for one of them, what to do.
-        needs_checkpoint: Whether nothing is there by default, so that a checkpoint has to be named.
         protocols: Published protocols that use the family, by name, with what they use it with.
-        source: Name of the VLM whose network this policy grew from, if it is one of ours.
-        source_weights: The weights from which the default checkpoint, and those of protocols, grew.
-        sizes: Hub ids of the released sizes by name, the default one first; `size` is then an option, instead of a
-            checkpoint.
-        interventions: The interventions that its policy supports.
-        declared: Streams of the released sizes, by name of the size, which is empty where there is one. A plan is
-            made of them where no weights are read.
-        words: `module:function(checkpoint, instructions, **options)` that raises InstructionError for what cannot
-            be read, from the checkpoint's small files alone; see `check_instructions`.
-        units: `module:function(checkpoint, **options)` that says whose units the actions get, and where they
-            stand, from the small files. It raises UsageError where that has to be chosen.
-        of_default: Options that belong to the default checkpoint, and to no other; they count where they are not
-            given.
-        files: Patterns of the files of a hub repository that are needed.
-        parameters: Count of the released sizes, by name.
-        always_float32: Whether weights stay in float32 whatever dtype is chosen.
-        not_acting: Released checkpoints whose actions no arm here can execute, for plans without their
-            configuration.
         home: The scene it acts in, or is asked about, when none is named.
-        vocabulary: Module with `known_words` and `words_in`, of a family whose default checkpoint knows few words;
-            empty for one that reads any text.
+        checkpoints: Its checkpoints and what is released.
+        abilities: What its models do, and the functions that say so of a checkpoint.
+        requirements: What has to be there before it can be loaded.
 
     Raises:
         UsageError: If an option is not declared as an `Option`.
@@ -119,33 +83,12 @@ class Family:
     streams: str = ""
     embodiment: str = "7-DoF end-effector delta"
     notes: str = ""
-    outputs: str | None = None
-    full_size: str | None = None
-    stored_names: str | None = None
     options: tuple[Option, ...] = ()
-    acts: bool = True
-    reads: bool = False
-    unstored: tuple[str, ...] = ()
-    hub: tuple[tuple[str, str], ...] = ()
-    packages: tuple[tuple[str, str], ...] = ()
-    config_types: tuple[str, ...] = ()
-    instead: tuple[tuple[str, str], ...] = ()
-    needs_checkpoint: bool = False
     protocols: Mapping[str, ProtocolRow] = MappingProxyType({})
-    source: str | None = None
-    source_weights: SourceWeights | None = None
-    sizes: tuple[tuple[str, str], ...] = ()
-    interventions: Interventions = ALL_EDITS
-    declared: Mapping[str, tuple[DeclaredStream, ...]] = MappingProxyType({})
-    words: str | None = None
-    units: str | None = None
-    of_default: Mapping[str, Any] = MappingProxyType({})
-    files: tuple[str, ...] = PATTERNS
-    parameters: Mapping[str, int] = MappingProxyType({})
-    always_float32: bool = False
-    not_acting: tuple[str, ...] = ()
     home: DefaultScene = RELEASED
-    vocabulary: str = ""
+    checkpoints: Checkpoints = field(default_factory=Checkpoints)
+    abilities: Abilities = field(default_factory=Abilities)
+    requirements: Requirements = field(default_factory=Requirements)
 
     def __post_init__(self) -> None:
         for option in self.options:
@@ -154,17 +97,17 @@ class Family:
                     f"the family {self.name} declares its option as {option!r}; an option has a type and "
                     f"help: Option({str(option)!r}, str, 'what it does') from probe_kit.hooks"
                 )
-        if self.sizes:
-            names = tuple(name for name, _ in self.sizes)
+        if self.checkpoints.sizes:
+            names = tuple(name for name, _ in self.checkpoints.sizes)
             help_text = f"A released size ({', '.join(names)}) instead of --checkpoint."
             size = Option(SIZE, str, help_text, names[0], names)
             object.__setattr__(self, "options", (*self.options, size))
 
     def check_words(self, texts: Iterable[str], checkpoint: str | None = None) -> None:
         """Raise InstructionError for a text with a word that the default checkpoint does not know."""
-        if not self.vocabulary or checkpoint is not None:
+        if not self.abilities.vocabulary or checkpoint is not None:
             return
-        vocabulary = import_module(self.vocabulary)
+        vocabulary = import_module(self.abilities.vocabulary)
         readable = set(vocabulary.known_words())
         unknown = {text: [word for word in vocabulary.words_in(text) if word not in readable] for text in texts}
         bad = {text: words for text, words in unknown.items() if words}
@@ -178,7 +121,7 @@ class Family:
 
     def known_words(self) -> list[str]:
         """Return the words that an instruction may hold, sorted; empty for a family that reads any text."""
-        words = import_module(self.vocabulary).known_words() if self.vocabulary else ()
+        words = import_module(self.abilities.vocabulary).known_words() if self.abilities.vocabulary else ()
         return sorted(word for word in words if word.strip())
 
     def load(
@@ -244,7 +187,10 @@ class Family:
             self.default_checkpoint,
             *(row.checkpoint for first in self.protocols.values() for row in first.rows),
         )
-        return {"source": self.source, "source_weights": self.source_weights if is_own_checkpoint else None}
+        return {
+            "source": self.checkpoints.source,
+            "source_weights": self.checkpoints.source_weights if is_own_checkpoint else None,
+        }
 
     def check(
         self,
@@ -290,35 +236,45 @@ class Family:
                 f"{self.name} needs {module}, which is not installed; `{install_command(extra)}`"
             )
         location = self.location(checkpoint, loader_options.get(SIZE))
-        if location is None and self.needs_checkpoint:
+        if location is None and self.requirements.needs_checkpoint:
             raise UsageError(f"{self.name} has no default checkpoint; pass a folder or hub id as --checkpoint")
-        if self.declared and location is not None and not is_on_hub(location) and not Path(location).exists():
+        if (
+            self.checkpoints.declared
+            and location is not None
+            and not is_on_hub(location)
+            and not Path(location).exists()
+        ):
             checkpoint_folder(location)  # says that it is not there, or finds the user's home
-        if location is not None and self.config_types and (fetch or not is_on_hub(location)):
+        if location is not None and self.checkpoints.config_types and (fetch or not is_on_hub(location)):
             with while_loading(self.name, location):
                 weights = fetch and not random_weights
-                check_files(checkpoint_folder(location, self.files), self.config_types, weights, self.instead)
+                check_files(
+                    checkpoint_folder(location, self.checkpoints.files),
+                    self.checkpoints.config_types,
+                    weights,
+                    self.checkpoints.instead,
+                )
         return self._with_defaults(loader_options, location)
 
     def _with_defaults(self, loader_options: Mapping[str, Any], location: str | None) -> dict[str, Any]:
         """The options with those that belong to the default checkpoint, where it is the one."""
         is_default = location is not None and without_revision(location) == self.default_checkpoint
-        return {**(self.of_default if is_default else {}), **loader_options}
+        return {**(self.checkpoints.of_default if is_default else {}), **loader_options}
 
     def declared_streams(self, options: Mapping[str, Any]) -> tuple[DeclaredStream, ...] | None:
         """Return the streams of the size that `options` choose; None for a family that declares none."""
         size = check_options(self.name, self.options, options).get(SIZE)
-        return self.declared.get(size or next(iter(self.declared), ""))
+        return self.checkpoints.declared.get(size or next(iter(self.checkpoints.declared), ""))
 
     def streams_text(self) -> str:
         """The streams of the default size in words, with its name where there are several."""
-        size, declared = next(iter(self.declared.items()), ("", ()))
+        size, declared = next(iter(self.checkpoints.declared.items()), ("", ()))
         text = ", ".join(map(str, declared)) or self.streams
         return f"{text} ({size})" if size else text
 
     def streams_json(self) -> dict[str, dict[str, int]]:
         """Return the shapes of the streams of the default size by name; empty for a family that declares none."""
-        declared = next(iter(self.declared.values()), ())
+        declared = next(iter(self.checkpoints.declared.values()), ())
         return {part.stream.name: {**part.stream.shape_json(), "tokens": part.tokens} for part in declared}
 
     def weights_bytes(
@@ -335,12 +291,12 @@ class Family:
             None where the count is not declared.
         """
         size = check_options(self.name, self.options, options).get(SIZE)
-        count = parameters or self.parameters.get(size or next(iter(self.parameters), ""))
+        count = parameters or self.checkpoints.parameters.get(size or next(iter(self.checkpoints.parameters), ""))
         return None if count is None else count * {"float32": 4, "bfloat16": 2}[dtype]
 
     def memory_bytes(self, options: Mapping[str, Any], dtype: Dtype, parameters: int | None = None) -> int | None:
         """Return the bytes that `weights_bytes` gives for the weights in memory when `dtype` is chosen."""
-        return self.weights_bytes(options, "float32" if self.always_float32 else dtype, parameters)
+        return self.weights_bytes(options, "float32" if self.requirements.always_float32 else dtype, parameters)
 
     def outline(
         self, checkpoint: str | None, options: Mapping[str, Any] = MappingProxyType({}), dtype: str | None = None
@@ -350,7 +306,7 @@ class Family:
         None also for a family that declares no streams, whose models are loaded. Asks no network. Raises what
         loading raises for a checkpoint in a folder.
         """
-        if not self.declared:
+        if not self.checkpoints.declared:
             return None
         location, loader_options = self._located(checkpoint, options)
         if (folder := configuration_folder(location)) is None:
@@ -384,7 +340,9 @@ class Family:
             return
         outline = self.outline(checkpoint, options)
         reason = None if outline is None else outline.misfit()
-        if (outline is None or outline.model is None) and (bare := without_revision(location)) in self.not_acting:
+        if (outline is None or outline.model is None) and (
+            bare := without_revision(location)
+        ) in self.checkpoints.not_acting:
             reason = f"{bare} puts out numbers that no arm here can execute"
         if reason is not None:
             raise UsageError(f"{reason}. Plan and capture it with --no-act, or pass a fine-tune as --checkpoint")
@@ -401,9 +359,9 @@ class Family:
             fetch: Download small files that are not here; without it, nothing is checked then.
         """
         location, loader_options = self._located(checkpoint, options)
-        if self.words is None or (not fetch and location is not None and is_on_hub(location)):
+        if self.abilities.words is None or (not fetch and location is not None and is_on_hub(location)):
             return
-        check = self._imported(self.words)
+        check = self._imported(self.abilities.words)
         with while_loading(self.name, str(location or "what it brings")):
             check(location, instructions, **loader_options)
 
@@ -422,9 +380,9 @@ class Family:
             UsageError: Where several are there and none was chosen.
         """
         location, loader_options = self._located(checkpoint, options)
-        if self.units is None or location is None or (not fetch and is_on_hub(location)):
+        if self.abilities.units is None or location is None or (not fetch and is_on_hub(location)):
             return ""
-        describe_units = self._imported(self.units)
+        describe_units = self._imported(self.abilities.units)
         with while_loading(self.name, location):
             return with_adapters_named(
                 str(describe_units(location, **self._with_defaults(loader_options, location)))
@@ -437,20 +395,20 @@ class Family:
             UnsupportedInterventionError: For a kind that the family does not support, and for a family that does
                 not act.
         """
-        if not self.acts:
+        if not self.abilities.acts:
             raise UnsupportedInterventionError(
                 f"{self.name} does not support interventions ({kind}): it answers and does not act, and "
                 "interventions compare actions. Take a family that acts (`probe-kit models` lists which do)"
             )
-        self.interventions.check(kind, self.name)
+        self.abilities.interventions.check(kind, self.name)
 
     def interventions_json(self) -> dict[str, Any] | None:
         """The supported interventions as plain values; None for a family that does not act.
 
         The key `asked_as` has the same in the words of `probe-kit intervene`, values by option.
         """
-        interventions = self.interventions
-        return {**interventions.to_json(), "asked_as": interventions.asked_as()} if self.acts else None
+        interventions = self.abilities.interventions
+        return {**interventions.to_json(), "asked_as": interventions.asked_as()} if self.abilities.acts else None
 
     def location(self, checkpoint: str | None, size: str | None = None) -> str | None:
         """Return the checkpoint to load: `checkpoint`, that of a `size`, or the default.
@@ -465,7 +423,7 @@ class Family:
                 f"a checkpoint ({checkpoint}) and -M size={size} were given; a size stands for a checkpoint, so "
                 "leave one of them out"
             )
-        return dict(self.sizes)[size]
+        return dict(self.checkpoints.sizes)[size]
 
     def folder_here(self, checkpoint: str | None, options: Mapping[str, Any]) -> Path:
         """The folder that a local checkpoint has, or an embedded one; of a hub id it need not exist."""
@@ -478,7 +436,7 @@ class Family:
 
     def check_purpose(self, purpose: Literal["outputs", "full_size"]) -> None:
         """Raise UsageError if the family has no function for `purpose`; nothing is imported."""
-        if getattr(self, purpose) is None:
+        if self._function(purpose) is None:
             raise UsageError(f"{self.name} has no {purpose.replace('_', '-')}; it cannot be verified this way")
 
     def function(self, purpose: Literal["outputs", "full_size"]) -> Callable[..., Any]:
@@ -488,7 +446,10 @@ class Family:
             UsageError: If it has none.
         """
         self.check_purpose(purpose)
-        return self._imported(getattr(self, purpose))
+        return self._imported(str(self._function(purpose)))
+
+    def _function(self, purpose: Literal["outputs", "full_size"]) -> str | None:
+        return self.abilities.outputs if purpose == "outputs" else self.checkpoints.full_size
 
     def _imported(self, path: str) -> Callable[..., Any]:
         with while_loading(self.name, path), one_scan_of_packages():
@@ -502,14 +463,14 @@ class Family:
 
     def renames(self) -> tuple[tuple[str, str], ...]:
         """Return pairs that turn names of tensors in released files into the network's; empty if they agree."""
-        return () if self.stored_names is None else tuple(import_object(self.stored_names))
+        return () if self.checkpoints.stored_names is None else tuple(import_object(self.checkpoints.stored_names))
 
     def missing(self) -> str:
         """Return requirements that this machine lacks, the default checkpoint included; empty if it is ready."""
         lacking = [f"extra {extra}" for extra in dict.fromkeys(extra for _, extra in self._missing_packages())]
-        if self.needs_checkpoint:
+        if self.requirements.needs_checkpoint:
             lacking.append("a checkpoint of yours (--checkpoint)")
-        default, files = self.default_checkpoint, self.hub
+        default, files = self.default_checkpoint, self.checkpoints.hub
         if default is not None and default not in dict(files):
             files = ((default, CONFIG_FILE), *files)
         absent = [name for name, file in files if self._is_absent(name, file)]
@@ -523,11 +484,11 @@ class Family:
 
         name, inside, _ = hub_name(repository) or (repository, "", "")
         cached = try_to_load_from_cache(name, f"{inside}/{file}" if inside else file)
-        needs_weights = repository == self.default_checkpoint and bool(self.config_types)
+        needs_weights = repository == self.default_checkpoint and bool(self.checkpoints.config_types)
         return not isinstance(cached, str) or (needs_weights and bool(missing_weights(Path(cached).parent)))
 
     def _missing_packages(self) -> list[tuple[str, str]]:
-        return [(module, extra) for module, extra in self.packages if find_spec(module) is None]
+        return [(module, extra) for module, extra in self.requirements.packages if find_spec(module) is None]
 
 
 def _note_on_states(model: "Model") -> tuple[str, ...]:

@@ -196,7 +196,7 @@ def load_policy(
     """
     from probe_kit.hooks.contract.model import Policy
 
-    if not find_family(name).acts:
+    if not find_family(name).abilities.acts:
         raise UsageError(f"{name} answers and does not act; load it with load_model")
     model = load_model(name, checkpoint, device, dtype, random_weights, weights_seed, **options)
     if not isinstance(model, Policy):

@@ -159,12 +159,16 @@ def verify_keys(family: str, file: Path) -> Verification:
     theirs = {
         rename_tensor(name, renames): (tuple(entry["shape"]), entry["dtype"]) for name, entry in recorded.items()
     }
-    sizes: list[str | None] = [name for name, _ in declared.sizes] or [None]
+    sizes: list[str | None] = [name for name, _ in declared.checkpoints.sizes] or [None]
     differences = {
-        size: _differences(build(size) if size else build(), theirs, declared.unstored) for size in sizes
+        size: _differences(build(size) if size else build(), theirs, declared.checkpoints.unstored)
+        for size in sizes
     }
     size = min(differences, key=lambda name: len(differences[name]))
-    wrong, unstored = differences[size], sorted(name for name in theirs if _is_declared(name, declared.unstored))
+    wrong, unstored = (
+        differences[size],
+        sorted(name for name in theirs if _is_declared(name, declared.checkpoints.unstored)),
+    )
     comparison = Comparison(
         f"{len(theirs) - len(unstored)} keys{f' of {size}' if size else ''}",
         "over" if wrong else "ok", float(len(wrong)), 0.0, "; ".join(wrong[:8]),

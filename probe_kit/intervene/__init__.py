@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from probe_kit.intervene.patching.attribution import AttributionEffect
     from probe_kit.intervene.results import InterventionResult, load_effects
     from probe_kit.intervene.runner import run_intervention
-    from probe_kit.intervene.sessions import ReplaySession, ReplaySource
+    from probe_kit.intervene.sessions import ReplayFiles, ReplaySession
     from probe_kit.intervene.stored import stored_interventions
     from probe_kit.intervene.verdict import Behaviour, Places, UseVerdict, classify_all, classify_use
     from probe_kit.intervene.vocabulary import ValueWords, WordMatch, value_words
@@ -63,8 +63,8 @@ __all__ = [
     "KnockoutEffect",
     "PatchEffect",
     "Places",
+    "ReplayFiles",
     "ReplaySession",
-    "ReplaySource",
     "Steering",
     "UseVerdict",
     "ValueWords",
@@ -111,7 +111,7 @@ __getattr__, __dir__ = lazy_names(
         "ImageSwap": "kinds.image_swap",
         "ImageSwapEffect": "kinds.image_swap",
         "UseVerdict": "verdict",
-        "ReplaySource": "sessions",
+        "ReplayFiles": "sessions",
         "Behaviour": "verdict",
         "JointEffect": "kinds.joint",
         "JointPlaces": "kinds.joint",

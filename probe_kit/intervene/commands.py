@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from probe_kit.hooks.contract.sites import Stream
     from probe_kit.intervene.kinds.base import Intervention
     from probe_kit.intervene.results import InterventionResult
-    from probe_kit.intervene.sessions import ReplaySource
+    from probe_kit.intervene.sessions import ReplayFiles
     from probe_kit.runs import Run
 
 
@@ -263,7 +263,7 @@ def intervene(
     probe-kit intervene runs/mine
     probe-kit intervene runs/mine --kind interchange --sites "backbone.*"
     """  # noqa: D301 - click reads the \b
-    from probe_kit.intervene import ReplaySource
+    from probe_kit.intervene import ReplayFiles
     from probe_kit.intervene.further_instructions import read_instructions
     from probe_kit.intervene.pairs import read_pairs
     from probe_kit.runs import open_run
@@ -284,16 +284,16 @@ def intervene(
     kind_options = {name: value for name, value in inside.items() if value is not None}
     check_options(kind, kind_options)
     intervention = kind_of(kind).from_options(opened, **of_every_kind, **kind_options)
-    source = ReplaySource(
+    source = ReplayFiles(
         suite, checkpoint, read_options(model_options or []), weights_seed, device, moved_of(opened, typed)
     )
     result = _run(opened, intervention, source)
     print_result(result, style, details)
     if style == "table":
-        has_sides = result.outcomes.has_sides
+        is_scene = result.outcomes.is_scene
         location = as_argument(run)
-        following = f"retention {location}" if has_sides else f"run show {location}"
-        what = "use beside probes and success" if has_sides else "what the run stores"
+        following = f"retention {location}" if is_scene else f"run show {location}"
+        what = "use beside probes and success" if is_scene else "what the run stores"
         say(markup("next: [bold]probe-kit {}[/]  {}", following, what))
     say(markup("stored as {}", result.key))
 
@@ -317,7 +317,7 @@ def check_options(name: str, options: Mapping[str, Any]) -> None:
             )
 
 
-def _run(run: "Run", intervention: "Intervention", source: "ReplaySource") -> "InterventionResult":
+def _run(run: "Run", intervention: "Intervention", source: "ReplayFiles") -> "InterventionResult":
     """Run an intervention with progress; print a line if its result was stored before."""
     from probe_kit.intervene import run_intervention
     from probe_kit.intervene.runner import check_intervention, too_few_groups

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit._system.table_cells import is_count
+from probe_kit._system.types import Matrix
 from probe_kit.errors import NoDirectionError, UsageError
 
-Array = NDArray[np.float64]
 Way = Literal["leace", "mean-difference", "inlp"]
 WAYS: tuple[Way, ...] = get_args(Way)
 RANK = 5
@@ -76,7 +76,7 @@ class PaddedTokens:
         present: (N, T) whether an episode has the position.
     """
 
-    values: Array
+    values: Matrix
     present: NDArray[np.bool_]
 
     def only(self, rows: NDArray[np.int64]) -> "PaddedTokens":
@@ -88,7 +88,7 @@ class PaddedTokens:
         counts = [self.present[is_left == side].sum(axis=0) for side in (True, False)]
         return np.asarray(np.minimum(*counts) >= FEWEST)
 
-    def centred(self) -> "tuple[Array, Array]":
+    def centred(self) -> "tuple[Matrix, Matrix]":
         """Return the tokens (N, T, D) minus their means (T, D) over the samples with the position, and the means.
 
         Both are zero at positions that no sample has.
@@ -113,12 +113,12 @@ class Eraser:
         fitted: (T,) positions with enough episodes to fit on and a direction; the others are left as they are.
     """
 
-    means: Array
-    removed: Array
-    read: Array
+    means: Matrix
+    removed: Matrix
+    read: Matrix
     fitted: NDArray[np.bool_]
 
-    def __call__(self, values: Array) -> Array:
+    def __call__(self, values: Matrix) -> Matrix:
         """Return tokens (…, T, D) erased; T may be less than the number of positions that were fitted."""
         count = values.shape[-2]
         apart = np.where(self.fitted[:count, None], values - self.means[:count], 0.0)
@@ -126,7 +126,7 @@ class Eraser:
             np.broadcast_to(directions, (self.fitted.size, *directions.shape[1:]))[:count]
             for directions in (self.removed, self.read)
         )
-        change: Array = np.einsum("...tk,tkd->...td", np.einsum("...td,tkd->...tk", apart, read), removed)
+        change: Matrix = np.einsum("...tk,tkd->...td", np.einsum("...td,tkd->...tk", apart, read), removed)
         return np.asarray(values - change)
 
 
@@ -212,7 +212,7 @@ def fit_control(
     return Eraser(means, controls, controls, usable)
 
 
-def ledoit_wolf(centred: Array) -> float:
+def ledoit_wolf(centred: Matrix) -> float:
     """Return in [0, 1] how far Ledoit and Wolf (2004) shrink the covariance of data (N, D) toward a sphere.
 
     It is computed from the (N, N) products of episodes: dimensions are many and episodes few.
@@ -226,7 +226,7 @@ def ledoit_wolf(centred: Array) -> float:
     return 0.0 if spread <= 0 else float(np.clip(noise / spread, 0.0, 1.0))
 
 
-def leace_direction(centred: Array, label: Array, shrinkage: float | None = None) -> tuple[Array, Array]:
+def leace_direction(centred: Matrix, label: Matrix, shrinkage: float | None = None) -> tuple[Matrix, Matrix]:
     """Return the direction that LEACE removes for one label, and the one that reads it, both (D,).
 
     The eraser is P = removed · readᵀ, with P = Σ_xz (Σ_xzᵀ Σ⁻¹ Σ_xz)⁻¹ Σ_xzᵀ Σ⁻¹ of the covariances. Whatever the
@@ -273,7 +273,7 @@ def _check_more(method: Method, available: int) -> None:
         )
 
 
-def _answer(tokens: PaddedTokens, is_left: NDArray[np.bool_]) -> Array:
+def _answer(tokens: PaddedTokens, is_left: NDArray[np.bool_]) -> Matrix:
     """Return the answer (N, T) as ±½, centred at every position over the episodes that are present there."""
     values = np.where(tokens.present, is_left[:, None] - 0.5, 0.0)
     means = values.sum(axis=0) / np.maximum(tokens.present.sum(axis=0), 1)
@@ -286,8 +286,8 @@ def _rows(present: NDArray[np.bool_], usable: NDArray[np.bool_]) -> Iterator[tup
 
 
 def _leace(
-    centred: Array, present: NDArray[np.bool_], label: Array, usable: NDArray[np.bool_]
-) -> tuple[Array, Array]:
+    centred: Matrix, present: NDArray[np.bool_], label: Matrix, usable: NDArray[np.bool_]
+) -> tuple[Matrix, Matrix]:
     """Return the directions of `leace_direction` at every position, (T, 1, D) each, for labels (N, T)."""
     removed, read = (np.zeros((usable.size, 1, centred.shape[2])) for _ in range(2))
     for position, rows in _rows(present, usable):
@@ -296,8 +296,8 @@ def _leace(
 
 
 def _inlp(
-    centred: Array, present: NDArray[np.bool_], is_left: NDArray[np.bool_], usable: NDArray[np.bool_], rank: int
-) -> Array:
+    centred: Matrix, present: NDArray[np.bool_], is_left: NDArray[np.bool_], usable: NDArray[np.bool_], rank: int
+) -> Matrix:
     """Return directions (T, K, D): at every position, a probe's, then that of a probe without it, and so on."""
     from sklearn.linear_model import LogisticRegression
 
@@ -316,7 +316,7 @@ def _inlp(
     return directions
 
 
-def _differences(centred: Array, present: NDArray[np.bool_], is_left: NDArray[np.bool_]) -> Array:
+def _differences(centred: Matrix, present: NDArray[np.bool_], is_left: NDArray[np.bool_]) -> Matrix:
     """Return the differences (T, D) between the means of either answer."""
     sums = [
         centred[is_left == side].sum(axis=0) / np.maximum(present[is_left == side].sum(axis=0), 1)[:, None]
@@ -325,7 +325,7 @@ def _differences(centred: Array, present: NDArray[np.bool_], is_left: NDArray[np
     return np.asarray(sums[0] - sums[1])
 
 
-def half_differences(tokens: PaddedTokens, is_left: NDArray[np.bool_], eraser: Eraser) -> Array:
+def half_differences(tokens: PaddedTokens, is_left: NDArray[np.bool_], eraser: Eraser) -> Matrix:
     """Return (T, K) half the differences of class means along an eraser's shared directions, toward `left`.
 
     They are zero at the positions at which nothing was fitted.
@@ -335,7 +335,7 @@ def half_differences(tokens: PaddedTokens, is_left: NDArray[np.bool_], eraser: E
     return np.where(eraser.fitted[:, None], halves, 0.0)
 
 
-def _shared_directions(differences: Array, rank: int, size: float) -> Array:
+def _shared_directions(differences: Matrix, rank: int, size: float) -> Matrix:
     """Return the directions (1, K, D) along which positions' differences (T, D) lie most, the same for all.
 
     Args:
@@ -348,10 +348,10 @@ def _shared_directions(differences: Array, rank: int, size: float) -> Array:
     return np.asarray(directions[None])
 
 
-def _basis(directions: Array, past: Array) -> Array:
+def _basis(directions: Matrix, past: Matrix) -> Matrix:
     """Return directions (K, D) without the span of `past` (J, D), orthonormal; zero where nothing is left."""
     past_units = [direction / np.linalg.norm(direction) for direction in past if np.linalg.norm(direction) > 0]
-    units: list[Array] = []
+    units: list[Matrix] = []
     for direction in directions:
         length = float(np.linalg.norm(direction))
         for _ in range(2):  # once more for rounding

@@ -281,7 +281,7 @@ def which_layer(
         categories: Categories to describe.
     """
     family = get_family(evidence.run.model)
-    has_kv = family is not None and family.interventions.supports("kv")
+    has_kv = family is not None and family.abilities.interventions.supports("kv")
     lines = {}
     for name in categories:
         rows, category_places = evidence.maps.get(name, []), evidence.places.get(name) or Places()
@@ -317,7 +317,7 @@ def _best_site(
     best = site_scores.loc[site_scores["accuracy"].idxmax()]
     site, family = f"{BACKBONE}.{int(best['layer']):02d}", get_family(run.model)
     tie, role = "", role_of_view(view)
-    if family is not None and unread_places([site], run.streams, family.interventions):
+    if family is not None and unread_places([site], run.streams, family.abilities.interventions):
         tie = "is unread: nothing that acts reads the end of the backbone"
     else:
         at_site = _tie(rows, along, site, role or "")

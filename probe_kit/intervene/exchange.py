@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._system.types import Matrix
 from probe_kit._tables.numbers import whole_percent
 from probe_kit.statistics.bootstrap import draw_groups, units_seed
 from probe_kit.statistics.paired_tests import max_t, paired_greater_p
 from probe_kit.statistics.significance import SIGNIFICANCE
 
-Values = NDArray[np.float64]
 CARRIES, NOTHING = 0.5, 0.1
 """Shares of the swap from which a set carries it, and within which, on both sides of 0, it carries nothing.
 
@@ -28,7 +28,7 @@ TRACE = 0.01
 """Share of the variance below which an effect does not matter: a tenth of the actions' spread, squared."""
 
 
-def share_of_variance(size: Values) -> Values:
+def share_of_variance(size: Matrix) -> Matrix:
     """Return the share of the actions' variance of changes (E,) in root mean squares of spreads.
 
     It is half the mean squared change, by Jansen's estimator (Computer Physics Communications 117, 1999): two
@@ -172,16 +172,16 @@ class Exchange:
         flips_seed: Seed of sign flips.
     """
 
-    clean: Values
-    source: Values
-    toward: Values
+    clean: Matrix
+    source: Matrix
+    toward: Matrix
     groups: NDArray[np.str_]
     items: NDArray[np.str_]
     seed_text: str
     flips_seed: int
 
     @property
-    def full(self) -> Values:
+    def full(self) -> Matrix:
         """The difference (E,) of the source's output from the clean one."""
         return self.source - self.clean
 
@@ -205,11 +205,11 @@ class Exchange:
         return -1.0 if self.p_values[1] < SIGNIFICANCE else 1.0
 
     @property
-    def leads(self) -> Values:
+    def leads(self) -> Matrix:
         """The direction (E,), ±1, in which the source moves the output."""
         return self.sign * self.toward
 
-    def share(self, moved: Values) -> SwapShare | None:
+    def share(self, moved: Matrix) -> SwapShare | None:
         """Return `moved` (E,) as a share of the source's effect; groups are drawn for both sums together.
 
         None if the source moves the output by no more than chance: a share would be a ratio of noise.
@@ -218,14 +218,14 @@ class Exchange:
             return None
         return share_of_whole(moved, self.full, self.groups, self.seed_text)
 
-    def test(self, moved: Values) -> tuple[Values, Values, Values]:
+    def test(self, moved: Matrix) -> tuple[Matrix, Matrix, Matrix]:
         """Return t, p and p_fwe (K,) that each of `moved` (K, E) is where the source leads.
 
         The tests are one-sided, by sign flips of whole groups; p_fwe is against the largest t of all K.
         """
         return max_t(self.leads * moved, self.items, self.groups, self.flips_seed)
 
-    def readings(self, every: Values, alone: Values, lost: Values) -> Iterator[CellReading]:
+    def readings(self, every: Matrix, alone: Matrix, lost: Matrix) -> Iterator[CellReading]:
         """Yield the readings of C cells.
 
         Args:

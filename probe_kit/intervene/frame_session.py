@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
     from probe_kit.hooks import Policy
 
-from probe_kit.intervene.sessions import ReplaySession, ReplaySource
+from probe_kit.intervene.sessions import ReplayFiles, ReplaySession
 
 CACHED = 256
 """Number of observations that are kept: those of the nearest frames are compared again and again."""
@@ -56,7 +56,7 @@ class Frames:
     inferences.
     """
 
-    def __init__(self, run: Run, source: ReplaySource) -> None:
+    def __init__(self, run: Run, source: ReplayFiles) -> None:
         """Open the source of the run again and list its frames.
 
         Raises:

@@ -13,8 +13,8 @@ from probe_kit.hooks.family import SIZE
 from probe_kit.intervene.frame_session import Frames, FrameSession
 from probe_kit.intervene.pairs import Pair, PairRow
 from probe_kit.intervene.scene_session import SceneSession
-from probe_kit.intervene.sessions import LoadPolicy, ReplaySession, ReplaySource
-from probe_kit.intervene.settings import Choice, has_sides, items_of
+from probe_kit.intervene.sessions import LoadPolicy, ReplayFiles, ReplaySession
+from probe_kit.intervene.settings import Choice, items_of
 from probe_kit.runs.reader import origin_of
 from probe_kit.runs.run import Run
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from probe_kit.hooks import Policy
 
 
-def load_policy_of(run: Run, source: ReplaySource) -> "Policy":
+def load_policy_of(run: Run, source: ReplayFiles) -> "Policy":
     """Return the policy that a run names, loaded as its own process loaded it.
 
     A file whose weights call themselves random is loaded as a file: only requested random weights are drawn.
@@ -44,7 +44,7 @@ def load_policy_of(run: Run, source: ReplaySource) -> "Policy":
         )
 
 
-def checkpoint_of(run: Run, source: ReplaySource) -> tuple[str | None, dict[str, Any]]:
+def checkpoint_of(run: Run, source: ReplayFiles) -> tuple[str | None, dict[str, Any]]:
     """Return the checkpoint of a run's policy on this machine, None for its family's own, and the options."""
     origin = origin_of(run)
     checkpoint = source.checkpoint or None
@@ -57,12 +57,14 @@ def checkpoint_of(run: Run, source: ReplaySource) -> tuple[str | None, dict[str,
     return checkpoint, {**options, **source.options}
 
 
-def check_readable(run: Run, source: ReplaySource, instructions: Sequence[str]) -> None:
+def check_readable(run: Run, source: ReplayFiles, instructions: Sequence[str]) -> None:
     """Raise InstructionError for further instructions that the policy cannot read in full; no weights are read."""
     from probe_kit.hooks.registry import get_family
 
-    if instructions and (family := get_family(run.model)) is not None:
-        checkpoint, options = checkpoint_of(run, source)
+    if not instructions:
+        return
+    checkpoint, options = checkpoint_of(run, source)
+    if (family := get_family(run.model)) is not None:
         family.check_words(instructions, checkpoint)
         family.check_instructions(checkpoint, instructions, options, fetch=False)
 
@@ -115,7 +117,7 @@ def check_pairs(table: Sequence[PairRow], frames: Collection[tuple[str, int]]) -
 
 def open_session(
     run: Run,
-    source: ReplaySource,
+    source: ReplayFiles,
     load: LoadPolicy | None = None,
     choice: Choice | None = None,
     table: Sequence[PairRow] = (),
@@ -148,7 +150,7 @@ def open_session(
     check_readable(run, source, instructions or (() if choice is None else choice.instructions))
     with ExitStack() as on_failure:
         session: ReplaySession
-        if has_sides(run):
+        if run.source.is_scene:
             check_pairs(table, {(str(episode), 0) for episode in run.episodes["episode_id"]})
             session = SceneSession.of(run, source, policy)
             on_failure.callback(session.close)

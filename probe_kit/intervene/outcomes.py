@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit._system.bounded_files import open_arrays
+from probe_kit._system.types import Matrix
 from probe_kit.hashing import derive_seed
 from probe_kit.intervene.edited_cells import COLUMNS, NO_CELL, EditedCell, read_former_name
 from probe_kit.intervene.exchange import Exchange
@@ -45,12 +46,11 @@ def arrays_from_bytes(content: bytes) -> dict[str, Any]:
         return dict(arrays)
 
 
-Array = NDArray[np.float64]
 _FLAT = 1e-6
 """Share of a number's size below which its spread is rounding."""
 
 
-def spread_of(clean: NDArray[np.float32]) -> Array:
+def spread_of(clean: NDArray[np.float32]) -> Matrix:
     """Return (N,) 1 / variance of every number of the clean actions (E, N); 0 for numbers without spread."""
     values = np.ascontiguousarray(clean, np.float64)
     variance = values.var(axis=0)
@@ -58,7 +58,7 @@ def spread_of(clean: NDArray[np.float32]) -> Array:
     return np.where(varies, 1 / np.where(varies, variance, 1.0), 0.0)
 
 
-def directions_of(clean: Array, source: Array, weights: Array) -> tuple[Array, Array]:
+def directions_of(clean: Matrix, source: Matrix, weights: Matrix) -> tuple[Matrix, Matrix]:
     """Return the directions (E, N) along which displacements are measured, and the sources' own (E,).
 
     A displacement of x is (x − clean) · direction: its component toward the source, in root mean squares of
@@ -77,7 +77,7 @@ def directions_of(clean: Array, source: Array, weights: Array) -> tuple[Array, A
     return apart * weights / count * scale[:, None], lengths
 
 
-def displacements_toward(chunks: NDArray[np.float32], source: int) -> Array:
+def displacements_toward(chunks: NDArray[np.float32], source: int) -> Matrix:
     """Return the displacements (K, E) toward the source's action of K conditions.
 
     Args:
@@ -89,7 +89,7 @@ def displacements_toward(chunks: NDArray[np.float32], source: int) -> Array:
     return np.asarray(((values - values[0]) * directions).sum(axis=2))
 
 
-def sizes(chunks: NDArray[np.float32]) -> Array:
+def sizes(chunks: NDArray[np.float32]) -> Matrix:
     """Return (K, E) the distance of K conditions' actions from clean ones, in root mean squares of spreads."""
     values = np.ascontiguousarray(chunks, np.float64)  # sums are rounded by how an array lies
     weights = spread_of(chunks[0])
@@ -187,9 +187,14 @@ class ConditionOutcomes:
         return tuple(EditedCell(*cell) for cell in zip(*(getattr(self, name) for name in COLUMNS), strict=True))
 
     @property
-    def has_sides(self) -> bool:
+    def is_scene(self) -> bool:
         """Whether the correct picture lies on a side; else displacements are toward the source's action."""
         return bool(self.sides.size) and bool(self.sides[0])
+
+    @property
+    def has_sides(self) -> bool:
+        """The same as `is_scene`."""
+        return self.is_scene
 
     def of(self, condition: str) -> NDArray[np.float64]:
         """Return the displacement (E,) of one condition."""
@@ -236,7 +241,7 @@ class ConditionOutcomes:
         references = [name for name in (DONOR, IMAGE_SWAP) if name in self.conditions]
         toward = displacements_toward(self.chunks, self.conditions.index(references[0])) if references else None
         displacement = self.displacement
-        if toward is not None and not self.has_sides:
+        if toward is not None and not self.is_scene:
             # Where no inference gave another action, a displacement is none, or was estimated.
             displacement = np.where(self.max_action_change > 0, toward, displacement)
         return replace(self, displacement=displacement, toward=toward, size=sizes(self.chunks))

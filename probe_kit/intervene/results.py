@@ -72,7 +72,7 @@ class InterventionResult(Measurement):
     def table(self) -> "pd.DataFrame":
         """The effects as one line per row, with their columns; for a kind with verdicts also its `UseVerdict`."""
         frame = frame_of(self.effects)
-        if self._kind.has_verdict and self.outcomes.has_sides:
+        if self._kind.has_verdict and self.outcomes.is_scene:
             verdicts = [self.verdicts.get(str(category), None) for category in frame["category"]]
             for name in _VERDICT_COLUMNS:
                 frame[name] = [None if verdict is None else getattr(verdict, name) for verdict in verdicts]
@@ -116,13 +116,13 @@ class InterventionResult(Measurement):
         outcomes = self.outcomes
         # Swaps of an input play all of the donor's inputs as well, and have their own floor.
         is_part = IMAGE_SWAP in outcomes.conditions and DONOR not in outcomes.conditions
-        if outcomes.has_sides or outcomes.size is None or not is_part:
+        if outcomes.is_scene or outcomes.size is None or not is_part:
             return []
         share = float(share_of_variance(outcomes.size[outcomes.conditions.index(IMAGE_SWAP)]).mean())
         return [f"{describe_trace(self.exchange, share)}."] if share < TRACE else []
 
     def _one_step(self) -> list[str]:
-        if not self.outcomes.has_sides:
+        if not self.outcomes.is_scene:
             return []
         if self.readout == PER_STEP:
             return [
@@ -202,7 +202,7 @@ class InterventionResult(Measurement):
         Raises:
             RunDamagedError: If a stored intervention was changed.
         """
-        if self.lacks_sides:
+        if not self.is_scene:
             return {}
         evidence = StoredEvidence(self.run, self.effects if self._kind.has_verdict else ())
         return evidence.verdicts(_newest_probes(self.run))
@@ -210,7 +210,7 @@ class InterventionResult(Measurement):
     @cached_property
     def layers(self) -> dict[str, list[str]]:
         """The knowledge of the layer by category, of a kind that edits places; see `which_layer`."""
-        if self.lacks_sides or not self._kind.asks_where:
+        if not self.is_scene or not self._kind.asks_where:
             return {}
         return which_layer(StoredEvidence(self.run), _newest_probes(self.run), self.settings["categories"])
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from probe_kit._system.types import Progress
 from probe_kit._terminal.notebook import notebook_progress
 from probe_kit.errors import CaptureChangedActionError, UsageError
 from probe_kit.hooks.capturing.edits import LOG_FIELDS
@@ -17,8 +18,8 @@ from probe_kit.intervene.outcomes import ConditionOutcomes, arrays_of
 from probe_kit.intervene.places import ALL, resolve_all, roles_of, unread_note, unread_places
 from probe_kit.intervene.replay import Condition
 from probe_kit.intervene.results import InterventionResult, load_effects, save
-from probe_kit.intervene.sessions import LoadPolicy, Progress, ReplaySession, ReplaySource
-from probe_kit.intervene.settings import check_run_fits, has_sides, key_of, settings_of
+from probe_kit.intervene.sessions import LoadPolicy, ReplayFiles, ReplaySession
+from probe_kit.intervene.settings import check_run_fits, key_of, settings_of
 from probe_kit.intervene.stored import is_stored
 from probe_kit.runs.layout import INTERVENTIONS
 from probe_kit.runs.provenance import provenance_here
@@ -36,7 +37,7 @@ REDO = "the same `probe-kit intervene` then plays it again"
 def run_intervention(
     run: Run,
     intervention: Intervention | None = None,
-    source: ReplaySource | None = None,
+    source: ReplayFiles | None = None,
     *,
     load: LoadPolicy | None = None,
     progress: Progress | None = None,
@@ -71,7 +72,7 @@ def run_intervention(
         return load_effects(run, key)
     pieces = Pieces.of(run.location, INTERVENTIONS, key, run.stamp, REDO)
     requested = intervention.items_in(run)
-    with open_session(run, source or ReplaySource(), load, intervention) as session, session.ready():
+    with open_session(run, source or ReplayFiles(), load, intervention) as session, session.ready():
         policy = session.policy
         session.on_fit_progress = on_fit_progress or notebook_progress("items learnt from")
         check_roles(intervention, policy)
@@ -146,7 +147,7 @@ def too_few_groups(run: Run, intervention: Intervention) -> dict[str, int]:
 
     Empty for other kinds; see `groups_for_not_used`.
     """
-    if not isinstance(intervention, ImageSwap) or not has_sides(run):
+    if not isinstance(intervention, ImageSwap) or not run.source.is_scene:
         return {}
     episodes = run.episodes[run.episodes["item_id"].isin(intervention.items_in(run))]
     counts = episodes.groupby("category", sort=False)["group_id"].nunique()

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from probe_kit.hooks import Policy
 
-from probe_kit.intervene.sessions import ReplaySession, ReplaySource
+from probe_kit.intervene.sessions import ReplayFiles, ReplaySession
 
 _OTHER: Mapping[Layout, Layout] = {"original": "swapped", "swapped": "original"}
 
@@ -58,7 +58,7 @@ class SceneSession(ReplaySession):
         )
 
     @classmethod
-    def of(cls, run: Run, source: ReplaySource, load: "Callable[[], Policy]") -> "SceneSession":
+    def of(cls, run: Run, source: ReplayFiles, load: "Callable[[], Policy]") -> "SceneSession":
         """Return the session of a run.
 
         Raises:

@@ -10,11 +10,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from math import nan
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
 from probe_kit._system.machine import AUTO
+from probe_kit._system.types import Progress
 from probe_kit.errors import (
     CaptureChangedActionError,
 )
@@ -38,15 +39,8 @@ Batches of another size, threads and GPUs round differently. A larger difference
 """
 
 
-class Progress(Protocol):
-    """A function that is called after every item."""
-
-    def __call__(self, count: int, total: int, what: str, /) -> None:
-        """Report the number of items so far, their total, and the name of the last one."""
-
-
 @dataclass(frozen=True)
-class ReplaySource:
+class ReplayFiles:
     """The places of a run's policy, pictures and files; their hashes must be the run's.
 
     Attributes:
@@ -69,7 +63,7 @@ class ReplaySource:
     moved: Mapping[str, Any] = field(default_factory=dict)
 
 
-LoadPolicy = Callable[[Run, ReplaySource], "Policy"]
+LoadPolicy = Callable[[Run, ReplayFiles], "Policy"]
 
 
 class ReplaySession(ABC):

@@ -8,7 +8,6 @@ from probe_kit.errors import UnknownCategoryError, UsageError
 from probe_kit.hashing import sha256_json
 from probe_kit.hooks.contract.declared import Readout
 from probe_kit.intervene.pairs import PairRow
-from probe_kit.runs.reader import SIDE
 from probe_kit.runs.run import Run
 
 FORMAT = 2  # raise when stored numbers would be others; with the settings it is hashed into the key
@@ -101,7 +100,7 @@ def items_of(run: Run, categories: Sequence[str] | None, items: int | None) -> l
 def settings_of(intervention: Choice, run: Run) -> dict[str, Any]:
     """Return everything that decides the numbers, as plain JSON; its hash is the key."""
     pairs: dict[str, Any] = {}
-    if not has_sides(run):
+    if not run.source.is_scene:
         pairs = {"vary": intervention.varied, "frames": intervention.frames}
         pairs["pairs"] = [list(row) for row in intervention.pairs]
         pairs |= {} if intervention.pairs else {"donors": DONORS}
@@ -122,8 +121,8 @@ def settings_of(intervention: Choice, run: Run) -> dict[str, Any]:
 
 
 def has_sides(run: Run) -> bool:
-    """Whether a run's questions have a correct picture on a side."""
-    return SIDE in run.episodes
+    """Whether a run's questions have a correct picture on a side, as those of the scene have."""
+    return run.source.is_scene
 
 
 def key_of(settings: Mapping[str, Any]) -> str:
@@ -143,7 +142,7 @@ def check_run_fits(run: Run) -> None:
         why = f"{run.model} was asked and did not act; intervene on a run of `probe-kit extract`"
     elif run.weights_sha256 is None or not run.streams:
         why = f"{run.model} is scripted: it has no network in which anything could be changed"
-    elif not has_sides(run) and run.inputs is None:
+    elif not run.source.is_scene and run.inputs is None:
         why = "it stores no inputs, with which a repeated observation could be compared"
     elif run.capture_only and not run.recorded:
         why = (

@@ -163,14 +163,19 @@ class Measurement:
         return label if self.run.label.endswith(f" on {name}") else f"{label} on {self.run.suite}"
 
     @property
+    def is_scene(self) -> bool:
+        """Whether the run is of the scene, where the correct picture lies on a side."""
+        return self.outcomes.is_scene
+
+    @property
     def lacks_sides(self) -> bool:
-        """Whether the run has no correct picture on a side."""
-        return not self.outcomes.has_sides
+        """Whether the run is not of the scene."""
+        return not self.is_scene
 
     @property
     def exchange(self) -> str:
         """The change of inputs of which effects are shares, in words."""
-        return f"exchange of the {self.settings.get('vary') or ''}" if self.lacks_sides else "image swap"
+        return "image swap" if self.is_scene else f"exchange of the {self.settings.get('vary') or ''}"
 
     @property
     def verdicts(self) -> Mapping[str, Any]:

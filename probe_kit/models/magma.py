@@ -147,7 +147,7 @@ class Grid:
 
 
 @dataclass(frozen=True)
-class Picture:
+class MagmaPicture:
     """A prepared picture: crops (rows · columns, 3, S, S) float32 in raster order."""
 
     crops: Tensor
@@ -235,7 +235,7 @@ def shrink_picture(picture: NDArray[np.uint8], side: int) -> NDArray[np.uint8]:
     return np.asarray(Image.fromarray(picture).resize((side, side), Image.Resampling.BICUBIC))
 
 
-def prepare_picture(picture: NDArray[np.uint8], settings: PictureSettings) -> Picture:
+def prepare_picture(picture: NDArray[np.uint8], settings: PictureSettings) -> MagmaPicture:
     """Return the crops of a (H, W, 3) uint8 picture."""
     height, width = picture.shape[:2]
     grid, side = choose_grid(width, height, settings), settings.base
@@ -248,7 +248,7 @@ def prepare_picture(picture: NDArray[np.uint8], settings: PictureSettings) -> Pi
         align_corners=False,
     )
     crops = stretched.reshape(3, grid.rows, side, grid.columns, side).permute(1, 3, 0, 2, 4)
-    return Picture(crops.reshape(-1, 3, side, side).contiguous(), grid)
+    return MagmaPicture(crops.reshape(-1, 3, side, side).contiguous(), grid)
 
 
 # -- the vision tower -----------------------------------------------------------------------------------------
@@ -328,7 +328,7 @@ def stitch_crops(crops: Tensor, grid: Grid) -> Tensor:
     return places.reshape(grid.rows * high, grid.columns * wide, channels)
 
 
-def whole_picture(picture: Picture) -> Tensor:
+def whole_picture(picture: MagmaPicture) -> Tensor:
     """Return the picture that the crops were cut from, (1, 3, rows · S, columns · S)."""
     return stitch_crops(picture.crops.permute(0, 2, 3, 1), picture.grid).permute(2, 0, 1)[None]
 
@@ -406,11 +406,11 @@ class MagmaNetwork(TokenNetwork):
         rows, columns = map_size(grid, side, self.vision_tower.reduction, self.config.vision.strategy)
         return PictureSpan(placeholder(ids, self.config.image_token), rows, columns)
 
-    def trunk_input(self, picture: Picture) -> Tensor:
+    def trunk_input(self, picture: MagmaPicture) -> Tensor:
         """Return the trunk's input of a picture: its crops (N, 3, S, S), or all of it (1, 3, H, W)."""
         return whole_picture(picture) if self.config.vision.strategy == "global" else picture.crops
 
-    def look(self, pictures: Sequence[Picture]) -> list[Tensor]:
+    def look(self, pictures: Sequence[MagmaPicture]) -> list[Tensor]:
         """Return the tokens (h · (w + 1), D) of every picture, a separator at the end of every row of its map."""
         reference = self.multi_modal_projector.row_seperator
         if self.config.vision.strategy == "global":
@@ -428,7 +428,9 @@ class MagmaNetwork(TokenNetwork):
 
     # -- text --------------------------------------------------------------------------------------------
 
-    def embed(self, prompts: Sequence[Sequence[int]], pictures: Sequence[Picture] | None) -> tuple[Tensor, Tensor]:
+    def embed(
+        self, prompts: Sequence[Sequence[int]], pictures: Sequence[MagmaPicture] | None
+    ) -> tuple[Tensor, Tensor]:
         """Return embeddings (B, S, D) and mask (B, S) of prompts, with one placeholder where there is a picture.
 
         Raises:
@@ -445,14 +447,14 @@ class MagmaNetwork(TokenNetwork):
             rows.append(torch.cat([embedding(before.long()), tokens, embedding(behind.long())]))
         return pack_rows(rows)
 
-    def forward(self, prompts: Sequence[Sequence[int]], pictures: Sequence[Picture] | None) -> Any:
+    def forward(self, prompts: Sequence[Sequence[int]], pictures: Sequence[MagmaPicture] | None) -> Any:
         """Return the output of transformers for one pass, with logits (B, S, V) and all hidden states."""
         return self.whole_pass(*self.embed(prompts, pictures))
 
     def decode(
         self,
         prompts: Sequence[Sequence[int]],
-        pictures: Sequence[Picture] | None,
+        pictures: Sequence[MagmaPicture] | None,
         steps: int,
         choose: Choose = greedy,
     ) -> Decoded:

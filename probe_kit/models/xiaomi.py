@@ -240,7 +240,7 @@ _THOUSANDTHS = 1000
 
 
 @dataclass(frozen=True)
-class Prompt:
+class FlowPrompt:
     """The parts of the prompt that the flow transformer keeps.
 
     Attributes:
@@ -270,7 +270,7 @@ class XiaomiNetwork(nn.Module):
         self.sink = nn.Embedding(1, flow.width)
         self.prompt_kv = PromptKV(int(config.vlm.text_config.num_hidden_layers))
 
-    def read(self, inputs: QwenInputs) -> Prompt:
+    def read(self, inputs: QwenInputs) -> FlowPrompt:
         """Read the prompt in one pass of the vision-language model, whose output head is not called.
 
         Nothing reads the head's output.
@@ -279,9 +279,9 @@ class XiaomiNetwork(nn.Module):
         cache = self.vlm.model(**keywords, use_cache=True).past_key_values
         self.prompt_kv(cache.layers)
         caches = [(layer.keys, layer.values) for layer in cache.layers[-len(self.dit.layers) :]]
-        return Prompt(caches, inputs.mask.bool(), keywords["position_ids"].amax(dim=-1, keepdim=True))
+        return FlowPrompt(caches, inputs.mask.bool(), keywords["position_ids"].amax(dim=-1, keepdim=True))
 
-    def velocity(self, prompt: Prompt, state: Tensor, actions: Tensor, moment: Tensor) -> Tensor:
+    def velocity(self, prompt: FlowPrompt, state: Tensor, actions: Tensor, moment: Tensor) -> Tensor:
         """Return the velocity of the actions, (B, A, action numbers).
 
         Args:
@@ -357,7 +357,7 @@ _POINTING_DOWN = Rotation.from_matrix([[0, 0, 1], [0, 1, 0], [-1, 0, 0]])
 
 
 @dataclass(frozen=True)
-class ActionUnits:
+class RobotUnits:
     """The units of one robot: per step of a chunk and number of an action its mean and deviation.
 
     Attributes:
@@ -385,7 +385,7 @@ class ActionUnits:
         return np.asarray(actions * self.deviation + self.mean, np.float64)
 
 
-def read_units(folder: Path, robot: str | None, numbers: int) -> ActionUnits:
+def read_units(folder: Path, robot: str | None, numbers: int) -> RobotUnits:
     """Return the statistics of one robot in a checkpoint's processor; without a name, of the only one.
 
     They are `action_config` of `preprocessor_config.json`, or of `processor_config.json` and its part
@@ -411,7 +411,7 @@ def read_units(folder: Path, robot: str | None, numbers: int) -> ActionUnits:
     if not np.isfinite([mean, deviation]).all():
         raise CheckpointError(f"{file}: the statistics of {name} are not finite")
     check_deviations(mean, deviation, f"{file}, {name}")
-    return ActionUnits(name, mean, deviation)
+    return RobotUnits(name, mean, deviation)
 
 
 def _action_config(folder: Path) -> tuple[Mapping[str, Any], str]:

@@ -28,10 +28,7 @@ if TYPE_CHECKING:
         ModelDepthDisplay,
         OutcomeRulesDisplay,
         PairedLayoutsDisplay,
-        RetentionTableDisplay,
         RoleCurvesDisplay,
-        SideTableDisplay,
-        SuccessTableDisplay,
         layer_curve,
     )
     from probe_kit.retention.displays.call_curves import event_calls
@@ -56,11 +53,8 @@ __all__ = [
     "Retention",
     "RetentionRow",
     "RetentionTable",
-    "RetentionTableDisplay",
     "RoleCurvesDisplay",
-    "SideTableDisplay",
     "SuccessRate",
-    "SuccessTableDisplay",
     "best_site",
     "chance_margin",
     "event_calls",
@@ -84,7 +78,7 @@ _HOMES = {
     "displays": (
         "CallCurveDisplay", "FinalPositionsDisplay", "IterationMapDisplay", "KnowledgeActionDisplay",
         "LayerCurveDisplay", "ModelDepthDisplay", "OutcomeRulesDisplay", "PairedLayoutsDisplay",
-        "RetentionTableDisplay", "RoleCurvesDisplay", "SideTableDisplay", "SuccessTableDisplay", "layer_curve",
+        "RoleCurvesDisplay", "layer_curve",
     ),
     "displays.call_curves": ("event_calls",),
     "estimators": ("Peak", "Retention", "best_site", "measure_retention"),

@@ -7,16 +7,19 @@ from enum import StrEnum
 from functools import cached_property
 from pathlib import Path
 from statistics import fmean
-from typing import TYPE_CHECKING, Any, Self, cast
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
+from probe_kit._tables.numbers import Limits
 from probe_kit.env.scoring import DEFAULT_RULE, RULES, SENSITIVITY_RADII, rule_of, success_at
 from probe_kit.errors import UsageError
-from probe_kit.retention.estimators import Limits, limits
+from probe_kit.retention.estimators import limits
+from probe_kit.runs.array_run import ArrayRun
 from probe_kit.runs.layout import CAPTURE_ONLY
 from probe_kit.runs.reader import RunReader, check_several_wordings, full_name
 from probe_kit.runs.run_inputs import notes_of_content
+from probe_kit.runs.run_view import view_run
 from probe_kit.statistics.intervals import Share
 from probe_kit.statistics.paired_tests import heads_p
 from probe_kit.statistics.significance import chance_margin
@@ -55,41 +58,16 @@ def read_by_clause(episodes: "pd.DataFrame", text: "pd.Series[str]") -> tuple[fl
     return share, float(((text == "correct") & ~in_clause).mean()) if share > MANY_BY_CLAUSE else None
 
 
-class ScoredAnswers:
-    """A VLM run, read by one of its scores; everything else is the run's own.
-
-    Args:
-        run: The run of a VLM.
-        score: A key of `SCORES`.
-        with_side_words: Keep items in whose name a side stands, such as "no left turn sign": answers and names of
-            these are not distinguishable.
-    """
-
-    def __init__(self, run: RunReader, score: str = "text", with_side_words: bool = False) -> None:
-        self._run, self.score, self._with_side_words = run, score, with_side_words
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._run, name)
-
-    @cached_property
-    def episodes(self) -> "pd.DataFrame":
-        """The episodes of the run with `outcome` and `side_placed` by the score; `outcome_text` stays."""
-        episodes = self._run.episodes
-        if not self._with_side_words and "side_word" in episodes:
-            episodes = episodes[~episodes["side_word"].astype(bool)]
-        outcome, side = SCORES[self.score]
-        return episodes.assign(
-            outcome_text=episodes["outcome"], outcome=episodes[outcome], side_placed=episodes[side]
-        )
-
-
 def scored(run: RunReader, score: str, with_side_words: bool = False) -> RunReader:
-    """Return a VLM run by a score, in place of any that it was read by; a policy run stays as it is.
+    """Return a view of a VLM run by a score, in place of any that it was read by; a policy run stays as it is.
+
+    Its episodes have `outcome` and `side_placed` by the score; the column `outcome_text` has the outcomes by text.
 
     Args:
         run: The run of a VLM or of a policy.
         score: A key of `SCORES`.
-        with_side_words: Keep items in whose name a side stands, see `ScoredAnswers`.
+        with_side_words: Keep items in whose name a side stands, such as "no left turn sign": answers and names of
+            these are not distinguishable.
 
     Raises:
         UsageError: For an unknown score.
@@ -98,8 +76,15 @@ def scored(run: RunReader, score: str, with_side_words: bool = False) -> RunRead
         raise UsageError(f"score is {score!r}; expected one of {', '.join(SCORES)}")
     if run.ask is None:
         return run
-    unscored = run._run if isinstance(run, ScoredAnswers) else run
-    return cast("RunReader", ScoredAnswers(unscored, score, with_side_words))
+    unscored = run if run.viewed is None else run.viewed
+    episodes = unscored.episodes
+    if not with_side_words and "side_word" in episodes:
+        episodes = episodes[~episodes["side_word"].astype(bool)]
+    outcome, side = SCORES[score]
+    by_score = episodes.assign(
+        outcome_text=episodes["outcome"], outcome=episodes[outcome], side_placed=episodes[side]
+    )
+    return view_run(unscored, by_score, score=score)
 
 
 def left_out(runs: Sequence[RunReader]) -> list[str]:
@@ -108,7 +93,7 @@ def left_out(runs: Sequence[RunReader]) -> list[str]:
         f"{run.location}: {missing} episodes are left out because a side stands in the name that was asked for, "
         "such as 'no left turn sign' (--with-side-words counts them)."
         for run in runs
-        if isinstance(run, ScoredAnswers) and (missing := len(run._run.episodes) - len(run.episodes))
+        if run.viewed is not None and (missing := len(run.viewed.episodes) - len(run.episodes))
     ]
 
 
@@ -621,12 +606,17 @@ class TableRun:
         scene = run.settings.get("scene")
         words = "" if scene is None else rule_of(rule, scene).words
         is_stored = (rule, last_steps) == (DEFAULT_RULE, 1)
-        if scene is None or run.episodes.empty or (is_stored and not with_behaviour) or not run.has_trajectories:
+        if (
+            isinstance(run, ArrayRun)
+            or scene is None
+            or run.episodes.empty
+            or (is_stored and not with_behaviour)
+            or not run.has_trajectories
+        ):
             return cls(run, run, label, group, rule, words, last_steps)
-        judgeable: Any = run  # a run of `probe_kit.runs`, which keeps trajectories
-        verdicts = {name: judgeable.judged(name) for name in RULES}
-        judged = judgeable.under(rule, last_steps)
-        return cls(run, judged, label, group, rule, words, last_steps, verdicts, judgeable.behaviour)
+        verdicts = {name: run.judged(name) for name in RULES}
+        judged = run.under(rule, last_steps)
+        return cls(run, judged, label, group, rule, words, last_steps, verdicts, run.behaviour)
 
     @property
     def location(self) -> str:

@@ -5,12 +5,14 @@ The action is made in the action expert or, in a policy without one, at the posi
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from math import nan, sqrt
+from math import isnan, nan, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.errors import TooFewGroupsError, UnbalancedEpisodesError, UsageError
+from probe_kit._system.counting import list_names
+from probe_kit._tables.numbers import Limits, p_text
+from probe_kit.errors import TooFewGroupsError, UnbalancedEpisodesError, UnknownSiteError, UsageError
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.retention.choices import Iterations
 from probe_kit.statistics.crossfit import CHANCE, CrossFit, crossfit
@@ -24,14 +26,15 @@ from probe_kit.statistics.intervals import (
     mean_interval,
 )
 from probe_kit.statistics.retention import Ratio, Scores, accuracy_interval, retention, t_quantile
+from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.statistics.sufficiency import ABSENT_BELOW, at_most, findable, is_absent, permuted_threshold
-from probe_kit.train.results.control_scores import Controls, Exceeds, has_signal
+from probe_kit.train.crossval.task_scores import METRICS
+from probe_kit.train.results.control_scores import Controls, Exceeds, has_signal, missed_controls
 from probe_kit.train.results.probe_curve import ProbeCurve
+from probe_kit.train.results.probe_results import ProbeResults
 
 ACTION, BACKBONE = "action", "backbone"
 """Names of the two streams, in the order of the scores: retention is the first over the second."""
-Limits = tuple[float | None, float | None]
-"""A 95 % interval as rows, JSON and data frames hold it; (None, None) where the data set no limits."""
 
 
 def limits(interval: Interval) -> Limits:
@@ -106,7 +109,7 @@ def score_streams(curve: ProbeCurve, rows: Mapping[str, NDArray[np.intp]], seed_
     if not rows:
         return None
     streams = {name: curve.fit_stream(of_stream) for name, of_stream in rows.items()}
-    if not curve.is_side:  # chance differs between sites and is subtracted from each
+    if not curve.balanced:  # chance differs between sites and is subtracted from each
         return StreamScores(
             tuple(rows), crossfit(list(streams.values()), curve.group_names, seed_text, chance=0.0)
         )
@@ -253,6 +256,12 @@ def _only(run: StreamScores, names: Sequence[str]) -> CrossFit:
 
 NO_SCORES = "n/a (too few groups of items, or a fold with one side only)"
 """The text in place of retention where no score is defined."""
+ONE_STREAM = "n/a (one stream only)"
+LEAST_EXCESS = 0.05
+"""Least R² above chance of a backbone; a ratio with less in the denominator is the ratio of two errors."""
+STEP = "step"
+"""The control that labels of several inferences need: the number of the inference alone may say as much."""
+NO_STEP = "n/a (control step was not run)"
 
 
 @dataclass(frozen=True)
@@ -284,7 +293,8 @@ class RetentionEstimate:
         published: The ratio of the peaks, as in the paper.
         defined: Whether the backbone's best site is above chance (family-wise) and better than every control that
             was run.
-        note: The missing condition where it is not defined.
+        note: The missing condition where it is not defined, in few words.
+        reason: Of a target that is no side, the same with the finding, the expectation and the remedy.
     """
 
     value: float
@@ -292,6 +302,7 @@ class RetentionEstimate:
     published: float
     defined: bool
     note: str
+    reason: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -325,7 +336,7 @@ def best_site(curve: ProbeCurve, stream: str, iterations: Iterations = "all") ->
     rows = stream_rows(curve, stream, iterations)
     if rows.size == 0:
         return None
-    if curve.is_side:
+    if curve.balanced:
         right = curve.correct[rows].sum(axis=1)
         best, ties = rows[np.argmax(right)], int((right == right.max()).sum()) - 1
     else:
@@ -412,6 +423,137 @@ def estimate_retention(
         defined=has_signal(exceeds),
         note=_missing_signal(exceeds, streams, absent_below) if streams.at_most else "",
     )
+
+
+def retention_of(
+    results: ProbeResults,
+    category: str,
+    view: str,
+    iterations: Iterations = "all",
+    absent_below: float = ABSENT_BELOW,
+    seed_text: str | None = None,
+) -> RetentionEstimate:
+    """Return the retention of a target in one category and view, without a row of a table.
+
+    Args:
+        results: Probes of the target.
+        category: A probed category.
+        view: A probed view.
+        iterations: Iterations of the action's stream that take part.
+        absent_below: Accuracy below which a backbone without signal counts as absent, see `verdict`.
+        seed_text: Seed text of the run; None for that of the probes.
+
+    Raises:
+        UnknownSiteError: If category or view was not probed.
+        UsageError: If the action's stream has no such iteration.
+    """
+    curve = probed_curve(results, category, view)
+    seed_text = results.settings.seed_text if seed_text is None else seed_text
+    peaks, streams = stream_peaks(curve, iterations), curve_scores(curve, iterations, seed_text)
+    return estimate_of_peaks(results, category, view, peaks, streams, absent_below)
+
+
+def probed_curve(results: ProbeResults, category: str, view: str) -> ProbeCurve:
+    """Return the curve of a category and view.
+
+    Raises:
+        UnknownSiteError: If category or view was not probed.
+    """
+    settings = results.settings
+    if (category, view) not in results.curves:
+        raise UnknownSiteError(
+            f"category {category!r} was not probed in view {view!r}; probed: categories "
+            f"{', '.join(settings.categories)} in views {', '.join(settings.views)}"
+        )
+    return results.curves[category, view]
+
+
+def estimate_of_peaks(
+    results: ProbeResults,
+    category: str,
+    view: str,
+    peaks: Mapping[str, Peak],
+    streams: StreamScores | None,
+    absent_below: float = ABSENT_BELOW,
+) -> RetentionEstimate:
+    """Return the retention of best sites and scores that are known already; see `retention_of`."""
+    exceeds: Exceeds = {}
+    estimate = RetentionEstimate(value=nan, interval=NO_LIMITS, published=nan, defined=False, note=ONE_STREAM)
+    if len(peaks) == 2:
+        backbone = peaks[BACKBONE]
+        exceeds = results.controls.exceeds(category, view, str(backbone.site), backbone.p_fwe)
+        estimate = estimate_retention(peaks, streams, exceeds, absent_below)
+    if results.settings.balanced:
+        return estimate
+    above = None if streams is None or BACKBONE not in streams.names else streams.above(BACKBONE)
+    note, reason = missing_condition(results, category, view, peaks, above, exceeds)
+    # The paper's ratio is of accuracies above one half, which the metric of a label is not.
+    return replace(estimate, published=nan, defined=not note, note=note, reason=reason)
+
+
+def missing_condition(
+    results: ProbeResults,
+    category: str,
+    view: str,
+    peaks: Mapping[str, Peak],
+    above: float | None,
+    exceeds: Exceeds,
+    tests: int = 1,
+) -> tuple[str, str]:
+    """Return why a label leaves nothing to retain, in few words and in full; two empty texts otherwise.
+
+    Args:
+        results: Probes of the label.
+        category: Category of the probes.
+        view: View of the probes.
+        peaks: Best sites by name, with p corrected for `tests`.
+        above: Cross-fitted score of the backbone above chance; None where no score is defined.
+        exceeds: By name, whether the backbone's best site exceeds chance and each control.
+        tests: Number of tests that p is corrected for.
+    """
+    settings = results.settings
+    if len(peaks) < 2:
+        part = BACKBONE if BACKBONE not in peaks else ACTION
+        probed = ", ".join(results.curves[category, view].streams)
+        return ONE_STREAM, (
+            f"no site of the {part} was probed, so there is no retention; probed: {probed}. Extract a policy "
+            "whose backbone and action stream are captured"
+        )
+    backbone = peaks[BACKBONE]
+    best = f"the backbone's best site {backbone.site} has {METRICS[settings.task]} {backbone.score:.2f}"
+    if isnan(backbone.p_fwe) or isnan(backbone.chance):
+        return "n/a (no permutations)", (
+            f"{best}, and no permuted labels say what chance is. Train with --permutations 200, on groups that "
+            "can exchange labels"
+        )
+    if settings.window > 1 and STEP not in results.controls.names:
+        return NO_STEP, (
+            f"{best}, and labels change within episodes, so their step may say as much. Train with the control "
+            f"step: `--controls {','.join([STEP, *results.controls.names])}`"
+        )
+    if missed := missed_controls(exceeds):
+        scores = {
+            control.name: control.score
+            for control in results.controls.scores
+            if control.category == category and control.stream in ("", backbone.site.stream)
+        }
+        facts = [f"chance {backbone.chance:.2f}, p {p_text(backbone.p_fwe)}"]
+        facts += [f"{name} {scores[name]:.2f}" for name in missed if name in scores]
+        advice = "Label more groups, or choose a label that these controls do not decode"
+        if remedy := results.remedy(category, view, tests):
+            advice = f"No p can be below it: {remedy}"
+        return f"n/a (backbone not shown to exceed {list_names(missed)})", (
+            f"{best} ({'; '.join(facts)}). Expected p < {SIGNIFICANCE} and more than every control that was run. "
+            f"{advice}"
+        )
+    if above is None:
+        return NO_SCORES, f"{best}, and too few groups to choose a site on others. Label more groups"
+    if settings.task == "continuous" and above < LEAST_EXCESS:
+        return f"n/a (backbone {above:.2f} above chance)", (
+            f"{best}, {above:.2f} above chance where a site is chosen on other groups; expected "
+            f"{LEAST_EXCESS} or more to divide by. Label more groups"
+        )
+    return "", ""
 
 
 def _published(action: float, backbone: float) -> float:

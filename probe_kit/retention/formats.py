@@ -158,7 +158,7 @@ def _in_words(row: RetentionRow) -> dict[str, Any]:
     """Return the verdict and its conclusion, as tables and sentences have them; None of a mean."""
     if row.category == MEAN:
         return {"verdict": None, "finding": None, "conclusion": None}
-    words = {"verdict": verdict(row)} if row.is_side else {"metric": row.metric, "verdict": None}
+    words = {"metric": row.metric, "verdict": None} if row.label else {"verdict": verdict(row)}
     return words | {"finding": finding(row), "conclusion": conclusion(row)}
 
 

@@ -113,9 +113,9 @@ class RetentionTable:
         return tuple(dict.fromkeys(row.target for row in self.rows))
 
     @property
-    def is_of_sides(self) -> bool:
-        """Whether the rows are of sides of a picture, which have success rates and a mean."""
-        return all(row.is_side for row in self.rows)
+    def labels(self) -> tuple[str, ...]:
+        """The labels of the rows, in order; empty where all are of the answer's side: success rates and a mean."""
+        return tuple(dict.fromkeys(row.label for row in self.rows if row.label))
 
     def results_of(self, location: Location | str) -> ProbeResults | None:
         """Return the probes of a run, of its first target; None without any."""

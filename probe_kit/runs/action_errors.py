@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._system.types import Matrix
 from probe_kit._tables.numbers import number
 from probe_kit._tables.table import Cell, Table
 from probe_kit.errors import UsageError
@@ -14,8 +15,6 @@ from probe_kit.runs.reader import RunReader
 
 if TYPE_CHECKING:
     import pandas as pd
-
-Matrix = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

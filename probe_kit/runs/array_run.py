@@ -75,6 +75,7 @@ class ArrayRun:
     wordings: ClassVar[Sequence[str]] = ()
     rule: ClassVar[str] = "disc"  # the rule by which outcomes are stored; its module needs a scene
     score: ClassVar[str] = "text"
+    viewed: ClassVar["ArrayRun | None"] = None
 
     def __post_init__(self) -> None:
         arrays = {f"features of {site}, view {view!r},": array for (site, view), array in self.features.items()}

@@ -235,7 +235,7 @@ _DAMAGE = (ChunkNotFoundError, ValueError, RuntimeError)
 
 
 @dataclass(frozen=True)
-class Rows:
+class EpisodeRows:
     """An array with one row per planned episode, seen through the committed ones.
 
     Attributes:
@@ -315,7 +315,9 @@ def role_mask(spans: Sequence[Spans], tokens: int, role: str | None) -> NDArray[
     return mask
 
 
-def token_blocks(rows: Rows, at: tuple[int, ...], mask: NDArray[np.bool_], block: int) -> Iterator[TokenBlock]:
+def token_blocks(
+    rows: EpisodeRows, at: tuple[int, ...], mask: NDArray[np.bool_], block: int
+) -> Iterator[TokenBlock]:
     """Yield blocks of `block` tokens at `at` (call, [iteration,] layer); a block that `mask` lacks is left out.
 
     Reads only the inner chunks it needs, one block of all episodes at a time.
@@ -394,14 +396,14 @@ class StoredInputs:
         """Return all inputs (E, C, …) of one kind. Raises KeyError for one that is not stored, RunDamagedError."""
         if kind not in self.kinds:
             raise KeyError(kind)
-        rows = Rows(open_array(self._store, f"{INPUTS}/{kind}"), self._numbers)
+        rows = EpisodeRows(open_array(self._store, f"{INPUTS}/{kind}"), self._numbers)
         return np.stack(list(rows))
 
     def row(self, kind: str, position: int) -> NDArray[Any]:
         """Return the inputs (C, …) of one kind, of the row at a position. Raises KeyError, RunDamagedError."""
         if kind not in self.kinds:
             raise KeyError(kind)
-        return Rows(open_array(self._store, f"{INPUTS}/{kind}"), self._numbers)[position]
+        return EpisodeRows(open_array(self._store, f"{INPUTS}/{kind}"), self._numbers)[position]
 
     def column(self, name: str) -> NDArray[np.float64]:
         """Return one column (E, C) of the data set. Raises KeyError for one that is not stored."""

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from probe_kit._system.drafts import draft_of, full_disk_in_words, write_whole
 from probe_kit.errors import UsageError
-from probe_kit.runs.arrays import Rows
+from probe_kit.runs.arrays import EpisodeRows
 from probe_kit.runs.direction_files import about_direction, check_direction_file, write_directions
 from probe_kit.runs.export_vectors import StreamChoice, choose, is_tokens, write_parquet, write_sae
 from probe_kit.runs.layout import MEAN_VIEW, ArrayKind, ExportFormat, SaeDtype
@@ -161,7 +161,7 @@ def _digest(path: Path) -> str:
 # -- all that was stored -----------------------------------------------------------------------------------------
 
 
-def _arrays(run: Run) -> Iterator[tuple[str, str, Rows]]:
+def _arrays(run: Run) -> Iterator[tuple[str, str, EpisodeRows]]:
     """Yield stream, kind and rows of every array of the run."""
     tokens: tuple[ArrayKind, ...] = ("tokens",) if run.settings["tokens"] == "all" else ()
     for stream in run.streams:

@@ -17,7 +17,7 @@ from probe_kit._system.imports import require
 from probe_kit.errors import UnknownSiteError, UsageError
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.sites import PADDING, Site, plays, resolve_view
-from probe_kit.runs.arrays import Rows, Spans, decode_bfloat16, encode_bfloat16
+from probe_kit.runs.arrays import EpisodeRows, Spans, decode_bfloat16, encode_bfloat16
 from probe_kit.runs.layout import ArrayKind, SaeDtype, StoredStream
 from probe_kit.runs.run import Run
 
@@ -43,7 +43,7 @@ class StreamChoice:
 
 
 @dataclass(frozen=True)
-class Block:
+class VectorBlock:
     """The n vectors of every site of a choice, at one captured inference of one episode.
 
     Attributes:
@@ -102,9 +102,9 @@ def choose(run: Run, sites: Sequence[str] | None, view: str | None) -> tuple[Str
     return tuple(choices)
 
 
-def blocks(run: Run, choices: Sequence[StreamChoice]) -> Iterator[Block]:
+def blocks(run: Run, choices: Sequence[StreamChoice]) -> Iterator[VectorBlock]:
     """Yield all vectors, episode by episode and inference by inference. Raises RunDamagedError."""
-    rows: dict[str, dict[ArrayKind, Rows]] = {}
+    rows: dict[str, dict[ArrayKind, EpisodeRows]] = {}
     for choice in choices:
         kinds: tuple[ArrayKind, ...] = (TOKENS,) if is_tokens(choice.views[0]) else run.root.vector_kinds
         rows[choice.name] = {kind: run.rows(choice.name, kind) for kind in kinds}
@@ -182,8 +182,8 @@ def _tokens(run: Run) -> str:
 
 
 def _pooled_blocks(
-    run: Run, rows: Mapping[ArrayKind, Rows], choice: StreamChoice, position: int, inferences: int
-) -> Iterator[Block]:
+    run: Run, rows: Mapping[ArrayKind, EpisodeRows], choice: StreamChoice, position: int, inferences: int
+) -> Iterator[VectorBlock]:
     full = rows["pooled"][position]
     later = rows["later"][position] if "later" in rows and inferences > 1 else None
     for inference in range(inferences):
@@ -199,10 +199,12 @@ def _pooled_blocks(
                 vectors = [full[(inference, *choice.stored.at(site), index)] for site in choice.sites]
             role = view.removeprefix(_MEAN_OF) if view.startswith(_MEAN_OF) else ""
             none = np.array([POOLED], np.int32)
-            yield Block(choice, position, inference, view, none, (role,), np.stack(vectors)[:, None])
+            yield VectorBlock(choice, position, inference, view, none, (role,), np.stack(vectors)[:, None])
 
 
-def _token_blocks(rows: Rows, choice: StreamChoice, position: int, spans: Sequence[Any]) -> Iterator[Block]:
+def _token_blocks(
+    rows: EpisodeRows, choice: StreamChoice, position: int, spans: Sequence[Any]
+) -> Iterator[VectorBlock]:
     (view,) = choice.views
     for inference, stream_spans in enumerate(spans):
         tokens, roles = chosen_tokens(stream_spans[choice.name], view)
@@ -213,7 +215,7 @@ def _token_blocks(rows: Rows, choice: StreamChoice, position: int, spans: Sequen
         for index, site in enumerate(choice.sites):
             bits = rows.read(position, (inference, *choice.stored.at(site), until))
             values[index] = decode_bfloat16(bits)[tokens]
-        yield Block(choice, position, inference, view, tokens, roles, values)
+        yield VectorBlock(choice, position, inference, view, tokens, roles, values)
 
 
 # -- Parquet -----------------------------------------------------------------------------------------------------
@@ -288,7 +290,7 @@ def write_parquet(run: Run, choices: Sequence[StreamChoice], out: Path, about: s
             writer.write_table(_table(block, origins, schema))
 
 
-def _table(block: Block, origins: Origins, schema: Any) -> Any:
+def _table(block: VectorBlock, origins: Origins, schema: Any) -> Any:
     """Return the vectors of a block as rows, site by site."""
     pa = origins.pa
     sites, count, width = block.values.shape
@@ -365,7 +367,7 @@ def _write_matrices(
         order: (N,) row of every vector.
 
     Returns:
-        Rows (4, N) of position, inference, token and role, as in `Block`; the names of the roles; the files by
+        Rows (4, N) of position, inference, token and role, as in `VectorBlock`; the roles; the files by
         site.
     """
     count = count_vectors(run, choice)

@@ -179,7 +179,7 @@ def write_bundle(
     """
     with location.take_turns(f"{home}/{key}"):
         folder, run = f"{home}/{key}", _identity(location)
-        before = read_bundle(location, home, key) if is_complete(location, home, key) else None
+        before = find_bundle(location, home, key)
         former = dict(before.files) if before else {}
         files_now = dict(former)
         for name, content in files.items():
@@ -232,6 +232,11 @@ def _rename_key(name: str, content_sum: Checksum) -> str:
 def read_bundle(location: Location, home: str, key: str) -> Bundle:
     """Return the bundle `key`. Raises RunDamagedError if head or times are missing, changed, or of another run."""
     return _read_bundle(location, home, key, _identity(location))
+
+
+def find_bundle(location: Location, home: str, key: str) -> Bundle | None:
+    """Return the bundle `key` if it is stored with all its files, else None. Raises as `read_bundle`."""
+    return read_bundle(location, home, key) if is_complete(location, home, key) else None
 
 
 def _read_bundle(location: Location, home: str, key: str, run: str | None) -> Bundle:

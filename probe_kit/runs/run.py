@@ -2,7 +2,6 @@
 
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from copy import copy
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
@@ -25,7 +24,7 @@ from probe_kit.hooks.contract.card import streams_text
 from probe_kit.hooks.contract.sites import Site, Stream, resolve_view
 from probe_kit.runs.array_store import ArrayStore
 from probe_kit.runs.arrays import (
-    Rows,
+    EpisodeRows,
     StoredInputs,
     TokenBlock,
     decode_bfloat16,
@@ -66,6 +65,7 @@ from probe_kit.runs.provenance import (
 from probe_kit.runs.records import RESTORE, Checksum
 from probe_kit.runs.root import read_label, read_root
 from probe_kit.runs.run_source import SERVED, Origin, RunSource, select_items
+from probe_kit.runs.run_view import view_run
 from probe_kit.runs.store import Location, locate
 from probe_kit.runs.trajectories import Trajectories, judge_again, watch, with_outcomes
 
@@ -134,12 +134,14 @@ class Run:
         score: The score by which a run of questions is read: `text`, as stored.
         control_features: Features of a control by its name that the run brings along; none for a stored run, see
             `ArrayRun`.
+        viewed: The run that this is a view of, see `view_run`; None for a run as it is stored.
     """
 
     rule: str = DEFAULT_RULE
     last_steps: int = 1
     score: str = "text"  # of a run of questions; see `retention/behaviour.py` for others
     control_features: Mapping[str, NDArray[np.floating]] = MappingProxyType({})
+    viewed: "Run | None" = None
 
     def __init__(
         self, path: Path | str | Location, wording: str | None = None, item_ids: frozenset[str] | None = None
@@ -550,7 +552,7 @@ class Run:
                 f"{self.location} keeps no trajectories; it was made before they were stored, or is a copy "
                 "without them. Extract it again to have them"
             )
-        rows = Rows(open_array(self.data, TRAJECTORY), self._numbers)
+        rows = EpisodeRows(open_array(self.data, TRAJECTORY), self._numbers)
         return Trajectories(rows, self.episodes["steps"].astype(int).tolist(), str(self.location))
 
     def trajectory(self, episode: str | int) -> "Trajectory":
@@ -588,10 +590,8 @@ class Run:
         """Return the same run with its outcomes by another rule, for tables and figures; see `judge_again`."""
         if (check_rule(rule), last_steps) == (self.rule, self.last_steps):
             return self
-        judged = copy(self)  # shares what was read; of the cache only `episodes` depends on the rule
-        judged.rule, judged.last_steps = rule, last_steps
-        judged.__dict__["episodes"] = with_outcomes(self.episodes, self.judged(rule, last_steps))
-        return judged
+        episodes = with_outcomes(self.episodes, self.judged(rule, last_steps))
+        return view_run(self, episodes, rule=rule, last_steps=last_steps)
 
     @cached_property
     def behaviour(self) -> pd.DataFrame:
@@ -722,7 +722,7 @@ class Run:
         """The sealed columns, None if there are none of exactly these episodes. Raises RunDamagedError."""
         return find_columns(self.root, self._commits)
 
-    def rows(self, stream: str, kind: ArrayKind = "pooled") -> Rows:
+    def rows(self, stream: str, kind: ArrayKind = "pooled") -> EpisodeRows:
         """Return the stored rows of the committed episodes: all that was captured in one episode at a time.
 
         Raises:
@@ -730,7 +730,7 @@ class Run:
         """
         if f"{stream}/{kind}" in self.root.left_out:
             self.root.refuse_left_out(f"there are no {kind} of {stream}")
-        return Rows(open_array(self.data, f"{stream}/{kind}"), self._numbers)
+        return EpisodeRows(open_array(self.data, f"{stream}/{kind}"), self._numbers)
 
     @property
     def data(self) -> ArrayStore:

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 ORIGIN = "origin"
 """The entry of a certificate that holds the origin of its process."""
 SUITE = "suite"
+SCENE = "scene"
 SERVED = "served"
 """The kind of a run whose observations clients sent to a policy server."""
 OF_SCENE = "scene."
@@ -82,9 +83,14 @@ class RunSource:
     words: str
 
     @property
+    def is_scene(self) -> bool:
+        """Whether these are scenes, whose questions have a correct picture on a side."""
+        return self.kind == SCENE
+
+    @property
     def subject(self) -> str:
         """The things that its model was shown, in a word; for a source of your own its kind."""
-        words = {"scene": "scenes", "lerobot": "recordings", "env": "environments", SERVED: "served observations"}
+        words = {SCENE: "scenes", "lerobot": "recordings", "env": "environments", SERVED: "served observations"}
         return words.get(self.kind, self.kind)
 
     @classmethod
@@ -101,7 +107,7 @@ class RunSource:
             name = f"{settings['played']['name']}@{settings[ENVIRONMENT]['revision']}"
             return cls("env", name, f"it plays an environment of your own ({name})")
         name = str(settings["suite"]["identity"])
-        return cls("scene", name, f"it plays {name}")
+        return cls(SCENE, name, f"it plays {name}")
 
 
 def select_items(

@@ -49,7 +49,7 @@ class FrameSheet:
 
 
 @dataclass(frozen=True)
-class EpisodeFrames:
+class ThumbnailFrames:
     """The frames of an episode as a reader is shown them.
 
     Attributes:
@@ -70,7 +70,7 @@ class EpisodeFrames:
         return decode_frames(self.content, self.count)
 
 
-def episode_frames(run: RunReader, position: int) -> EpisodeFrames | None:
+def episode_frames(run: RunReader, position: int) -> ThumbnailFrames | None:
     """Return the stored picture of the episode in a row, else one of what its inferences saw; None without either.
 
     Raises:
@@ -79,15 +79,15 @@ def episode_frames(run: RunReader, position: int) -> EpisodeFrames | None:
     row, inputs = run.episodes.iloc[position], run.inputs
     sheet = read_sheet(run.location, int(row.get("episode", position)))
     if sheet is not None and sheet.count is not None:
-        return EpisodeFrames(sheet.content, sheet.count, "all")
+        return ThumbnailFrames(sheet.content, sheet.count, "all")
     cameras = len(source_settings_of(run.settings).get("cameras", ())) or 1
     if sheet is not None:
-        return EpisodeFrames(sheet.content, count_ends(row), "ends", cameras)
+        return ThumbnailFrames(sheet.content, count_ends(row), "ends", cameras)
     if inputs is None or "pixels" not in inputs.kinds:
         return None
     inferences = int((run.control_steps[position] >= 0).sum())
     frames = tuple(np.hstack(list(pictures)) for pictures in inputs.row("pixels", position)[:inferences])
-    return EpisodeFrames(as_thumbnail(frames, "all"), len(frames), "inferences", cameras) if frames else None
+    return ThumbnailFrames(as_thumbnail(frames, "all"), len(frames), "inferences", cameras) if frames else None
 
 
 def count_ends(episode: "Mapping[Any, Any] | pd.Series[Any]") -> int:

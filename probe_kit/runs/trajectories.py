@@ -19,7 +19,7 @@ from zarr.abc.store import Store
 from probe_kit.env.scoring import CHANNELS, RULES, Trajectory, behaviour_of, judge, rule_of
 from probe_kit.env.spec import SceneSpec
 from probe_kit.errors import RunDamagedError
-from probe_kit.runs.arrays import Rows, create_array
+from probe_kit.runs.arrays import EpisodeRows, create_array
 from probe_kit.runs.layout import ROOM, TRAJECTORY
 from probe_kit.suite.items import Side, other_side
 
@@ -46,7 +46,7 @@ class Trajectories:
         RunDamagedError: If other channels are stored than those that are read today.
     """
 
-    def __init__(self, rows: Rows, steps: Sequence[int], where: str) -> None:
+    def __init__(self, rows: EpisodeRows, steps: Sequence[int], where: str) -> None:
         self._rows, self._steps, self._where = rows, steps, where
         channels = cast("list[str]", self._rows.array.attrs["channels"])
         if channels != list(CHANNELS):

@@ -22,7 +22,7 @@ from probe_kit.errors import MissingExtraError, ProbeKitError, RunDamagedError
 from probe_kit.hooks.contract.sites import PADDING
 from probe_kit.hooks.family import import_object
 from probe_kit.runs.array_store import ArrayStore
-from probe_kit.runs.arrays import Rows, create_array, open_array
+from probe_kit.runs.arrays import EpisodeRows, create_array, open_array
 from probe_kit.runs.columns import Columns, columns_folder, find_columns, seal_key, write_seal
 from probe_kit.runs.commits import Commit, numbered_objects, read_commit, read_failures, read_seconds
 from probe_kit.runs.contents import StoredObject, sizes_of, stored_objects, stray_keys
@@ -126,7 +126,7 @@ def _write_vectors(run: "Run", name: str, kind: VectorKind, group: zarr.Group) -
         array[index] = column
 
 
-def _lead(stored: StoredStream, rows: Rows, kind: VectorKind) -> tuple[int, ...]:
+def _lead(stored: StoredStream, rows: EpisodeRows, kind: VectorKind) -> tuple[int, ...]:
     """Return the axes of the columns before episode and feature."""
     views = (len(stored.views),) if kind == "pooled" else ()
     return (rows.array.shape[1], *views, *stored.lead)
@@ -361,7 +361,7 @@ def _reading_problems(run: Run) -> Iterator[str]:
 
 
 def _read_first(run: Run, name: str) -> None:
-    Rows(open_array(run.data, name), [min(commit.episode for commit in run.commits())])[0]
+    EpisodeRows(open_array(run.data, name), [min(commit.episode for commit in run.commits())])[0]
 
 
 def _complaints(reader: Callable[[], object]) -> Iterator[str]:

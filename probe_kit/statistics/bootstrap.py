@@ -6,10 +6,9 @@ from math import exp, inf, sqrt
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from probe_kit._system.types import Matrix
 from probe_kit.hashing import derive_seed
 from probe_kit.statistics.significance import SIGNIFICANCE
-
-Matrix = NDArray[np.float64]
 
 Bounds = tuple[float, float]
 """The least and the largest value that a score can have."""

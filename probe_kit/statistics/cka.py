@@ -7,11 +7,9 @@ Nguyen, Raghu and Kornblith, “Do wide and deep networks learn the same things?
 from math import sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 
+from probe_kit._system.types import Matrix
 from probe_kit.errors import UsageError
-
-Matrix = NDArray[np.float64]
 
 FEWEST = 4
 """Number of episodes that the unbiased estimator needs."""

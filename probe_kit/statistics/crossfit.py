@@ -12,11 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from probe_kit._system.types import Matrix
 from probe_kit.errors import TooFewGroupsError, UnbalancedEpisodesError, UsageError
 from probe_kit.statistics.bootstrap import draw_groups
 from probe_kit.statistics.folds import OUTER_FOLDS
-
-Matrix = NDArray[np.float64]
 
 CHANCE = 0.5
 """Balanced accuracy of any answer that does not depend on the question."""
@@ -138,7 +137,7 @@ _EQUAL = 1e-9
 
 
 @dataclass(frozen=True)
-class StreamScores:
+class SiteScores:
     """The sites of one stream, on G groups in F outer folds.
 
     Attributes:
@@ -160,7 +159,7 @@ class StreamScores:
         fold_of: ArrayLike,
         layers: ArrayLike,
         iterations: ArrayLike | None = None,
-    ) -> "StreamScores":
+    ) -> "SiteScores":
         """Make the scores of a stream from those of its sites, in any order.
 
         A stream that runs once is chosen by its qualities. With several iterations, the guide is half a site's
@@ -261,7 +260,7 @@ class CrossFit:
 
 
 def crossfit(
-    streams: Sequence[StreamScores], groups: Sequence[str], suite: str = "", chance: float = CHANCE
+    streams: Sequence[SiteScores], groups: Sequence[str], suite: str = "", chance: float = CHANCE
 ) -> CrossFit:
     """Score each stream by the sites that its inner folds choose, on the outer folds.
 
@@ -290,7 +289,7 @@ def crossfit(
     )
 
 
-def _score_stream(stream: StreamScores) -> tuple[float, Matrix, Matrix]:
+def _score_stream(stream: SiteScores) -> tuple[float, Matrix, Matrix]:
     """Return the score of a stream, (G,) the influence of every group on it, and (R, G) the sums of choices."""
     sums, sizes = stream.scores.sums, stream.scores.sizes
     # One seed for all streams and runs: on equal groups their choices are made in the same resamples.
@@ -350,7 +349,7 @@ def smoothing(layers: ArrayLike, iterations: ArrayLike) -> Matrix:
     return weights
 
 
-def _check(streams: Sequence[StreamScores], groups: Sequence[str]) -> None:
+def _check(streams: Sequence[SiteScores], groups: Sequence[str]) -> None:
     counts = sorted({stream.scores.n_groups for stream in streams})
     if counts != [len(groups)]:
         raise UsageError(

@@ -15,6 +15,7 @@ from statistics import fmean
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from probe_kit._system.types import Matrix
 from probe_kit.errors import UsageError
 from probe_kit.statistics.share_limits import (
     NEGLIGIBLE_VARIANCE,
@@ -139,8 +140,6 @@ def _combine_limits(first: float, second: float, correlation: float) -> float:
 
 
 # -- shares --------------------------------------------------------------------------------------------------
-
-Matrix = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -10,11 +10,10 @@ from math import comb, pi, sqrt
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from probe_kit._system.types import Matrix
 from probe_kit.statistics.crossfit import CHANCE
 from probe_kit.statistics.label_permutations import p_value
 from probe_kit.statistics.significance import SIGNIFICANCE
-
-Matrix = NDArray[np.float64]
 
 # -- controls and other models -------------------------------------------------------------------------------
 

@@ -7,8 +7,9 @@ from math import nan, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._system.types import Matrix
 from probe_kit.errors import UsageError
-from probe_kit.statistics.crossfit import CrossFit, Matrix
+from probe_kit.statistics.crossfit import CrossFit
 from probe_kit.statistics.intervals import (
     NO_LIMITS,
     Interval,

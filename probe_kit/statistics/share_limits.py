@@ -18,9 +18,8 @@ from statistics import NormalDist
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from probe_kit._system.types import Matrix
 from probe_kit.statistics.significance import SIGNIFICANCE
-
-Matrix = NDArray[np.float64]
 
 TAIL = SIGNIFICANCE / 2
 """Chance of either side of a two-sided 95 % interval."""

@@ -11,9 +11,10 @@ import numpy as np
 
 from probe_kit._system.counting import plural
 from probe_kit._system.escaping import as_argument
+from probe_kit._system.types import Matrix
 from probe_kit.errors import TooFewGroupsError
 from probe_kit.statistics.bootstrap import GAINS, group_bootstrap
-from probe_kit.statistics.crossfit import CHANCE, FEWEST_GROUPS, GroupSums, Matrix
+from probe_kit.statistics.crossfit import CHANCE, FEWEST_GROUPS, GroupSums
 from probe_kit.statistics.folds import OUTER_FOLDS
 from probe_kit.statistics.label_permutations import possible_flips, smallest_p
 from probe_kit.statistics.paired_tests import smallest_flip_p

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from probe_kit._system.imports import lazy_names
 
 if TYPE_CHECKING:
-    from probe_kit.study.cells import Failure
+    from probe_kit.study.cells import StudyFailure
     from probe_kit.study.drift import CategoryDrift, measure_drift
     from probe_kit.study.pack import pack_study, publish_data_set, write_data_set
     from probe_kit.study.plan import StudyPlan, plan_study
@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 __all__ = [
     "CategoryDrift",
     "EpisodeStored",
-    "Failure",
     "LoadedStudy",
     "Mistake",
     "RunFinished",
+    "StudyFailure",
     "StudyFileError",
     "StudyPlan",
     "conduct_study",
@@ -53,7 +53,7 @@ __getattr__, __dir__ = lazy_names(
         "write_study_report": "report",
         "StudyPlan": "plan",
         "plan_study": "plan",
-        "Failure": "cells",
+        "StudyFailure": "cells",
         "RunFinished": "playing",
         "EpisodeStored": "playing",
         "conduct_study": "playing",

@@ -28,7 +28,7 @@ from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, ValidationErr
 
 from probe_kit._system.bounded_files import check_no_pointer, parse_json, read_regular
 from probe_kit._system.complaints import in_words
-from probe_kit._tables.content import Cell, Heading, Row, absent
+from probe_kit._tables.content import Cell, Heading, TableRow, absent
 from probe_kit._tables.table import Table
 from probe_kit.errors import DiskSpaceError, RunDamagedError, UsageError
 
@@ -347,9 +347,9 @@ def table_of_record(record: dict[str, Any]) -> Table:
     # An older archive has texts alone, without a flag per column.
     are_numeric = record.get("are_numeric", [False] * len(headings))
 
-    def row(cells: list[Any], is_mean: bool) -> Row:
+    def row(cells: list[Any], is_mean: bool) -> TableRow:
         texts = zip(map(str, cells), are_numeric, strict=True)
-        return Row(tuple(absent(text) if is_numeric else Cell(text) for text, is_numeric in texts), is_mean)
+        return TableRow(tuple(absent(text) if is_numeric else Cell(text) for text, is_numeric in texts), is_mean)
 
     return Table(
         title=str(record["title"]),

@@ -98,7 +98,7 @@ CHECKPOINT = "checkpoint"
 
 
 @dataclass(frozen=True)
-class Selection:
+class ItemSelection:
     """Categories, and the number of items of each.
 
     Attributes:
@@ -114,16 +114,16 @@ class Selection:
         return {name: count if self.items is None else min(count, self.items) for name, count in every.items()}
 
 
-def join_selections(selections: Iterable[Selection]) -> Selection:
+def join_selections(selections: Iterable[ItemSelection]) -> ItemSelection:
     """Return the smallest selection that holds all of these."""
     every = list(selections)
     categories = tuple(dict.fromkeys(name for selection in every for name in selection.categories))
     counts = [selection.items for selection in every]
-    return Selection(categories, None if None in counts else max(count or 0 for count in counts))
+    return ItemSelection(categories, None if None in counts else max(count or 0 for count in counts))
 
 
 @dataclass(frozen=True)
-class Cell:
+class PlannedRun:
     """A run of the study.
 
     Attributes:
@@ -141,11 +141,11 @@ class Cell:
     way: str
     seed: int
     settings: Settings
-    selections: Mapping[str, Selection]
+    selections: Mapping[str, ItemSelection]
     suite: PlannedSuite
     unavailable: str = ""
     packed_key: str = ""
-    find_key: "Callable[[Cell], str] | None" = field(default=None, compare=False, repr=False)
+    find_key: "Callable[[PlannedRun], str] | None" = field(default=None, compare=False, repr=False)
 
     @property
     def name(self) -> str:
@@ -163,11 +163,11 @@ class Cell:
         return self.settings.task.capture_only
 
     @cached_property
-    def selection(self) -> Selection:
+    def selection(self) -> ItemSelection:
         """The selection that all blocks together need."""
         return join_selections(self.selections.values())
 
-    def selected(self, blocks: Collection[str]) -> Selection | None:
+    def selected(self, blocks: Collection[str]) -> ItemSelection | None:
         """Return the selection that these blocks need together, None if none of them uses the run."""
         selections = [selection for name, selection in self.selections.items() if name in blocks]
         return join_selections(selections) if selections else None
@@ -266,7 +266,7 @@ NOT_TRIED_AGAIN: tuple[Stage, ...] = ("playing", "episodes")
 """The failures that take long, and so are tried again only on request."""
 
 
-class Failure(Record):
+class StudyFailure(Record):
     """The reason why runs of a model, or probes of a run, were not made.
 
     Attributes:
@@ -287,7 +287,7 @@ class Failure(Record):
     when: str = ""
 
     @classmethod
-    def of(cls, stage: Stage, model: str, run: str, error: BaseException) -> "Failure":
+    def of(cls, stage: Stage, model: str, run: str, error: BaseException) -> "StudyFailure":
         """Return the failure of an error, with its traceback and the time."""
         reason = str(error) or type(error).__name__
         return cls(
@@ -300,7 +300,7 @@ class Failure(Record):
             return f"probes of {self.run}: {self.reason}"
         return f"{self.model} failed at {self.run}: {self.reason}"
 
-    def same(self, other: "Failure | None") -> bool:
+    def same(self, other: "StudyFailure | None") -> bool:
         """Whether both have the same stage, run, error and reason, at whatever time."""
         key = (self.stage, self.run, self.error, self.reason)
         return other is not None and key == (other.stage, other.run, other.error, other.reason)
@@ -322,7 +322,7 @@ class Failures:
         with self._location.explained_errors(), self._location.take_turns(FOLDER):
             pass
 
-    def of(self, cell: Cell, probes: str = "") -> Failure | None:
+    def of(self, cell: PlannedRun, probes: str = "") -> StudyFailure | None:
         """Return the failure of a run, or of its probes; None without one.
 
         Args:
@@ -335,20 +335,20 @@ class Failures:
         key = _key(cell, probes)
         if not self._location.exists(key):
             return None
-        return Failure.read(self._location, key, _ADVICE, run=cell.name)
+        return StudyFailure.read(self._location, key, _ADVICE, run=cell.name)
 
-    def note(self, cell: Cell, failure: Failure, probes: str = "") -> None:
+    def note(self, cell: PlannedRun, failure: StudyFailure, probes: str = "") -> None:
         """Write a failure, unless the same one is there."""
         if not failure.same(self.of(cell, probes)):
             with self._location.explained_errors():
                 self._location.write(_key(cell, probes), failure.to_bytes())
 
-    def clear(self, cell: Cell, probes: str = "") -> None:
+    def clear(self, cell: PlannedRun, probes: str = "") -> None:
         """Remove the failure of a run or of probes that are made now."""
         self._location.delete(_key(cell, probes))
 
 
-def _key(cell: Cell, probes: str) -> str:
+def _key(cell: PlannedRun, probes: str) -> str:
     # The folder holds the key of the settings: a failure of other settings is none of this cell.
     name = "+".join([*cell.folder.split("/"), *([probes] if probes else [])])
     return f"{FOLDER}/{name}.json"

@@ -24,7 +24,7 @@ from probe_kit.train.command_options import Jobs
 
 if TYPE_CHECKING:
     from probe_kit._tables.table import Table
-    from probe_kit.study import Failure, LoadedStudy, StudyPlan
+    from probe_kit.study import LoadedStudy, StudyFailure, StudyPlan
     from probe_kit.study.playing import Event
 
 HELP = """Run a whole study from one file: models × conditions × categories.
@@ -178,9 +178,9 @@ def _look(plan: "StudyPlan", verify: bool, orphans: bool, as_json: bool) -> bool
     return bool(problems)
 
 
-def _play(plan: "StudyPlan", **options: Any) -> "list[Failure]":
+def _play(plan: "StudyPlan", **options: Any) -> "list[StudyFailure]":
     """Play what is missing, with a bar for the study and one per run in play."""
-    from probe_kit.study import EpisodeStored, Failure, conduct_study
+    from probe_kit.study import EpisodeStored, StudyFailure, conduct_study
 
     with progress() as bar:
         totals, count = plan.totals(), _counters(bar, "")
@@ -188,7 +188,7 @@ def _play(plan: "StudyPlan", **options: Any) -> "list[Failure]":
 
         def report(event: "Event") -> None:
             nonlocal stored
-            if isinstance(event, Failure):
+            if isinstance(event, StudyFailure):
                 say(markup("[red]{}[/]", event))
             elif isinstance(event, EpisodeStored):
                 count(event.run, event.stored, event.planned)

@@ -12,6 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._system.types import Matrix
 from probe_kit._tables.content import Number, group_headings
 from probe_kit._tables.numbers import number, p_text, percent, points
 from probe_kit._tables.table import Cell, Cells, Table
@@ -35,8 +36,6 @@ from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_results import Direction, ProbeResults
 from probe_kit.train.results.store import load_results
 
-Features = NDArray[np.float64]
-
 PERMUTATIONS = 999
 """Number of permutations of the labels of whole groups, for the p of a transfer.
 
@@ -50,7 +49,7 @@ Side = tuple[RunReader, ProbeResults]
 """A run of one wording, with its probes."""
 
 
-def _features(side: Side, site: Site, view: str, episodes: NDArray[np.str_]) -> Features:
+def _features(side: Side, site: Site, view: str, episodes: NDArray[np.str_]) -> Matrix:
     """Return the features (E, D) of these episodes, in this order."""
     at = {name: row for row, name in enumerate(side[0].episodes["episode_id"].astype(str))}
     return np.asarray(side[0].column(site, view)[[at[name] for name in episodes]], np.float64)
@@ -58,7 +57,7 @@ def _features(side: Side, site: Site, view: str, episodes: NDArray[np.str_]) -> 
 
 def _transfer(
     probed: Side, other: Side, category: str, view: str, sites: Sequence[Site], common: NDArray[np.str_]
-) -> tuple[Features, float]:
+) -> tuple[Matrix, float]:
     """Return accuracies of the probes of one run on the activations of another, as shares, and p: (3, S).
 
     The first accuracies are of decisions as they are. For the second ones features are centred and scaled as in
@@ -95,11 +94,11 @@ def _transfer(
 
 def _decisions(
     direction: Direction,
-    features: Features,
-    like: Features | None,
+    features: Matrix,
+    like: Matrix | None,
     fold_of: NDArray[np.int64],
     folds: NDArray[np.int64],
-) -> Features:
+) -> Matrix:
     """Return decisions (E,) on features (E, D), moved and scaled from their own training folds to `like`'s."""
     decisions = np.empty(len(features))
     for position, fold in enumerate(folds):
@@ -111,18 +110,18 @@ def _decisions(
     return decisions
 
 
-def _move_features(features: Features, origin: Features, like: Features) -> Features:
+def _move_features(features: Matrix, origin: Matrix, like: Matrix) -> Matrix:
     """Return features with means and deviations of `like` instead of those of `origin`.
 
     Constant features become means.
     """
     spread = origin.std(axis=0)
     scale = np.divide(like.std(axis=0), spread, out=np.zeros_like(spread), where=spread > _CONSTANT * spread.max())
-    moved: Features = (features - origin.mean(axis=0)) * scale + like.mean(axis=0)
+    moved: Matrix = (features - origin.mean(axis=0)) * scale + like.mean(axis=0)
     return moved
 
 
-def _cosines(first: Direction, second: Direction, features: Features) -> tuple[float, float, float]:
+def _cosines(first: Direction, second: Direction, features: Matrix) -> tuple[float, float, float]:
     """Return three cosines of the directions of two runs.
 
     The first is of their unit vectors. The second is weighted by the covariance of the features, which is the

@@ -9,20 +9,20 @@ from probe_kit.errors import ProbeKitError
 from probe_kit.extract.parts import SCRIPTED, ModelSettings
 from probe_kit.extract.settings import AskSettings, ExtractSettings, Settings
 from probe_kit.hooks.registry import get_family
-from probe_kit.study.cells import Cell, PlannedSuite, Selection, slugs
+from probe_kit.study.cells import ItemSelection, PlannedRun, PlannedSuite, slugs
 from probe_kit.study.schema import BlockTable, ConditionTable, Mistake, ModelTable, Place, Study
 
 
 def answers(model: ModelTable) -> bool:
     """Whether the model is a VLM."""
     family = get_family(model.family)
-    return family is not None and family.reads
+    return family is not None and family.abilities.reads
 
 
 def acts(model: ModelTable) -> bool:
     """Whether the model is a policy."""
     family = get_family(model.family)
-    return model.family in SCRIPTED or (family is not None and family.acts)
+    return model.family in SCRIPTED or (family is not None and family.abilities.acts)
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ def members(study: Study) -> Iterator[Member]:
                     yield from (Member(block, position, model, way, seed) for seed in block.seeds)
 
 
-def runs_of_side[Run: (Member, Cell)](runs: Sequence[Run], side: str) -> list[Run]:
+def runs_of_side[Run: (Member, PlannedRun)](runs: Sequence[Run], side: str) -> list[Run]:
     """Return the runs of one side of a drift pair: of a model's first condition, or of that after the slash."""
     model, _, way = side.partition("/")
     of_model = [run for run in runs if run.model == model and (run.way == way if way else not run.asks)]
@@ -83,12 +83,12 @@ def categories_of(study: Study, block: BlockTable, suite: PlannedSuite) -> tuple
     return slugs(block.categories or study.suite.categories or list(suite.items))
 
 
-def expand(study: Study, suite: PlannedSuite) -> tuple[list[Cell], list[Mistake]]:
+def expand(study: Study, suite: PlannedSuite) -> tuple[list[PlannedRun], list[Mistake]]:
     """Return the cells of a study without wrong names, and mistakes that only their settings show.
 
     Blocks that ask for the same run share its cell.
     """
-    cells: dict[tuple[str, str, int], Cell] = {}
+    cells: dict[tuple[str, str, int], PlannedRun] = {}
     mistakes: list[Mistake] = []
     for member in members(study):
         if not (answers if member.block.asks else acts)(study.models[member.model]):
@@ -104,11 +104,13 @@ def expand(study: Study, suite: PlannedSuite) -> tuple[list[Cell], list[Mistake]
             mistakes.append(Mistake(("conditions", member.way, "background"), str(error)))
             continue
         block = member.block
-        selections = {block.name: Selection(categories_of(study, block, suite), block.items or study.suite.items)}
+        selections = {
+            block.name: ItemSelection(categories_of(study, block, suite), block.items or study.suite.items)
+        }
         cell = cells.get(member.run)
         if cell is None:
             unavailable = study.models[member.model].unavailable or ""
-            cells[member.run] = Cell(*member.run, settings, selections, suite, unavailable)
+            cells[member.run] = PlannedRun(*member.run, settings, selections, suite, unavailable)
         elif cell.settings != settings:
             text = f"{cell.name} is already planned by block {next(iter(cell.selections))!r} with other settings"
             mistakes.append(Mistake(member.path, f"{text}; give both blocks the same tokens"))
@@ -161,7 +163,7 @@ def _settings_of(study: Study, name: str, condition: ConditionTable, tokens: str
     ).followed()
 
 
-def _same_settings(cells: list[Cell]) -> list[Mistake]:
+def _same_settings(cells: list[PlannedRun]) -> list[Mistake]:
     """Return a mistake for conditions or asks that are the same for a model under two names."""
     mistakes = []
     for at, cell in enumerate(cells):
@@ -175,7 +177,7 @@ def _same_settings(cells: list[Cell]) -> list[Mistake]:
     return mistakes
 
 
-def control_of(study: Study, cells: Sequence[Cell], cell: Cell) -> Cell | None:
+def control_of(study: Study, cells: Sequence[PlannedRun], cell: PlannedRun) -> PlannedRun | None:
     """Return the run of a policy's untrained network that its probes are compared with; None without a network.
 
     It is in the same condition, or else of the same scene and seed. Whether a network then acts changes nothing in
@@ -191,7 +193,7 @@ def control_of(study: Study, cells: Sequence[Cell], cell: Cell) -> Cell | None:
     return next(same, None) or next(alike, None)
 
 
-def _without_control(study: Study, cells: list[Cell]) -> Iterator[Mistake]:
+def _without_control(study: Study, cells: list[PlannedRun]) -> Iterator[Mistake]:
     """Yield a mistake for probes whose untrained network is played in other scenes alone."""
     for name, table in study.probes.items():
         for cell in cells if "untrained" in table.controls else ():

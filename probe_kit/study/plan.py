@@ -19,7 +19,7 @@ from probe_kit.runs.layout import RUN_FILE, StoredStream
 from probe_kit.runs.root import read_root
 from probe_kit.runs.run_folders import in_units
 from probe_kit.runs.store import locate
-from probe_kit.study.cells import NOT_TRIED_AGAIN, Cell, Failure, Failures, Selection
+from probe_kit.study.cells import NOT_TRIED_AGAIN, Failures, ItemSelection, PlannedRun, StudyFailure
 from probe_kit.study.expansion import control_of
 from probe_kit.study.reading import LoadedStudy
 from probe_kit.study.schema import ProbesTable, complaint_of_unknown
@@ -36,7 +36,7 @@ _FITTED = ("views", "permutations", "seed")
 """The fields of a table that decide its probes; the plan names those that changed as the reason to fit again."""
 
 
-def probes_of(study: LoadedStudy, cell: Cell) -> Iterator[tuple[str, ProbesTable, Selection]]:
+def probes_of(study: LoadedStudy, cell: PlannedRun) -> Iterator[tuple[str, ProbesTable, ItemSelection]]:
     """Yield the tables of probes that a cell belongs to, by name, each with the part of the run that is probed."""
     for name, table in study.study.probes.items():
         selection = cell.selected(table.runs)
@@ -44,7 +44,7 @@ def probes_of(study: LoadedStudy, cell: Cell) -> Iterator[tuple[str, ProbesTable
             yield name, table, selection
 
 
-def planned_probes(study: LoadedStudy, cell: Cell, run: "Run") -> dict[str, str]:
+def planned_probes(study: LoadedStudy, cell: PlannedRun, run: "Run") -> dict[str, str]:
     """Return by table why the probes of a whole run are to be fitted; empty for those that are stored."""
     failures, reasons = Failures(study.study.folder), dict[str, str]()
     for name, table, selection in probes_of(study, cell):
@@ -54,7 +54,9 @@ def planned_probes(study: LoadedStudy, cell: Cell, run: "Run") -> dict[str, str]
     return reasons
 
 
-def _why_missing(study: LoadedStudy, table: ProbesTable, cell: Cell, run: "Run", selection: Selection) -> str:
+def _why_missing(
+    study: LoadedStudy, table: ProbesTable, cell: PlannedRun, run: "Run", selection: ItemSelection
+) -> str:
     """Return why the probes of a table are to be fitted, empty if they and all of their controls are stored."""
     if not run.streams:
         return "the run has no activations"
@@ -82,7 +84,7 @@ def _why_missing(study: LoadedStudy, table: ProbesTable, cell: Cell, run: "Run",
 
 
 def _why_other_network(
-    study: LoadedStudy, table: ProbesTable, network: Cell, selection: Selection, controls: Controls
+    study: LoadedStudy, table: ProbesTable, network: PlannedRun, selection: ItemSelection, controls: Controls
 ) -> str:
     """Return why probes are to be compared with their untrained network again, empty if they are."""
     if not controls.untrained_probes:
@@ -99,7 +101,7 @@ def _text(value: object) -> str:
     return ", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
 
 
-def untrained_cell(study: LoadedStudy, table: ProbesTable, cell: Cell) -> Cell | None:
+def untrained_cell(study: LoadedStudy, table: ProbesTable, cell: PlannedRun) -> PlannedRun | None:
     """Return the run of the untrained network that probes are compared with, None without such a control."""
     return control_of(study.study, study.cells, cell) if "untrained" in table.controls else None
 
@@ -127,13 +129,13 @@ class PlannedCell:
         streams: Streams of the stored run.
     """
 
-    cell: Cell
+    cell: PlannedRun
     location: str
     state: State
     stored: int
     why: str
-    failure: Failure | None = None
-    waits_for: Failure | None = None
+    failure: StudyFailure | None = None
+    waits_for: StudyFailure | None = None
     probes: Mapping[str, str] = field(default_factory=dict)
     sealed: bool = True
     seconds: float | None = None
@@ -320,7 +322,7 @@ def plan_study(study: LoadedStudy, only: str | None = None) -> StudyPlan:
     return StudyPlan(study, tuple(_waiting(planned)))
 
 
-def _plan_cell(study: LoadedStudy, cell: Cell) -> PlannedCell:
+def _plan_cell(study: LoadedStudy, cell: PlannedRun) -> PlannedCell:
     location = str(locate(cell.location(study.study.folder)))
     if cell.unavailable:
         return PlannedCell(cell, location, "skipped", 0, f"skipped: {cell.unavailable}")
@@ -349,7 +351,7 @@ def _plan_cell(study: LoadedStudy, cell: Cell) -> PlannedCell:
     )
 
 
-def _why_new(study: LoadedStudy, cell: Cell) -> str:
+def _why_new(study: LoadedStudy, cell: PlannedRun) -> str:
     """Return the changes since the newest run of the same model, condition and seed on this machine, if any."""
     out = study.study.folder
     if study.home is not None and (hint := study.home.hint(cell)):
@@ -403,7 +405,7 @@ def _waiting(cells: list[PlannedCell]) -> Iterator[PlannedCell]:
             yield replace(planned, state="waiting", waits_for=failure, why=why)
 
 
-def _stored_episodes(cell: Cell, run: "Run") -> int:
+def _stored_episodes(cell: PlannedRun, run: "Run") -> int:
     """Count the episodes of the cell's selection that a run holds, which may hold others as well."""
     selected: set[str] = set()
     for category, count in cell.selection.counts(cell.suite).items():
@@ -435,7 +437,7 @@ def _known_sums(sums: Mapping[str, float | None]) -> tuple[dict[str, float], lis
     ]
 
 
-def bytes_per_episode(cell: Cell, stored: Sequence[StoredStream] | None) -> int | None:
+def bytes_per_episode(cell: PlannedRun, stored: Sequence[StoredStream] | None) -> int | None:
     """Return the bytes of an episode with the most inferences, if every one is captured.
 
     Args:

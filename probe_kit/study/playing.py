@@ -31,7 +31,7 @@ from probe_kit.extract.rollout.tasks import task_of
 from probe_kit.extract.settings import Settings
 from probe_kit.runs import seal
 from probe_kit.runs.store import locate
-from probe_kit.study.cells import NOT_TRIED_AGAIN, Cell, Failure, Failures, Selection
+from probe_kit.study.cells import NOT_TRIED_AGAIN, Failures, ItemSelection, PlannedRun, StudyFailure
 from probe_kit.study.plan import PlannedCell, StudyPlan, probes_of, untrained_cell
 from probe_kit.study.reading import LoadedStudy
 from probe_kit.study.schema import ProbesTable
@@ -101,7 +101,7 @@ class RunFinished:
     run: str
 
 
-Event = EpisodeStored | RunFinished | Failure
+Event = EpisodeStored | RunFinished | StudyFailure
 Report = Callable[[Event], None]
 ProbeProgress = Callable[[str, int, int, str], None]
 
@@ -114,7 +114,7 @@ def conduct_study(
     ray: str | None = None,
     env_workers: int | None = None,
     retry_failed: bool = False,
-) -> list[Failure]:
+) -> list[StudyFailure]:
     """Play and ask everything that a plan finds missing; return the failures, those of before included.
 
     Every run is checked, and every scene built, before the first one is played. A model that fails stops itself
@@ -139,7 +139,7 @@ def conduct_study(
         require("ray", "ray")
     cells = {planned.cell.name: planned.cell for planned in plan.cells}
     missing = [planned for planned in plan.played if planned.state != "whole"]
-    stored, failures = Failures(plan.study.study.folder), list[Failure]()
+    stored, failures = Failures(plan.study.study.folder), list[StudyFailure]()
     if not retry_failed:
         before = (planned.failure for planned in missing)
         failures += [failure for failure in before if failure and failure.stage in NOT_TRIED_AGAIN]
@@ -148,15 +148,15 @@ def conduct_study(
     home, recorded = plan.study.home, set[str]()
 
     def note(event: Event) -> None:
-        if home is not None and not isinstance(event, Failure) and event.run not in recorded:
+        if home is not None and not isinstance(event, StudyFailure) and event.run not in recorded:
             recorded.add(event.run)  # with the first episode: a killed run resumes with the same model
             try:
                 home.note_played(cells[event.run])
             except SettingsMismatchError as error:
-                note(Failure.of("checking", event.model, event.run, error))
+                note(StudyFailure.of("checking", event.model, event.run, error))
         if isinstance(event, RunFinished):
             stored.clear(cells[event.run])
-        elif isinstance(event, Failure):
+        elif isinstance(event, StudyFailure):
             failures.append(event)
             stored.note(cells[event.run], event)
         if report is not None:
@@ -202,7 +202,7 @@ def _checked_tasks(
         yield ModelTask(model, runs, plan.study.study.models[model].gpus, size)
 
 
-def _problem(planned: PlannedCell, rehearsed: list[SceneSpec], ray: str | None) -> Failure | None:
+def _problem(planned: PlannedCell, rehearsed: list[SceneSpec], ray: str | None) -> StudyFailure | None:
     """Return the fault of a run that shows without the model.
 
     Args:
@@ -222,7 +222,7 @@ def _problem(planned: PlannedCell, rehearsed: list[SceneSpec], ray: str | None) 
     except STOPS_ALL:
         raise
     except ProbeKitError as error:
-        return Failure.of("checking", cell.model, cell.name, error)
+        return StudyFailure.of("checking", cell.model, cell.name, error)
     return None
 
 
@@ -262,11 +262,11 @@ def play_model(task: ModelTask, report: Report) -> None:
             raise
         except EpisodesFailedError as error:
             some = bool(run.stored or moved)  # without a single episode it is the model that fails
-            report(Failure.of("episodes" if some else "playing", task.model, run.run, error))
+            report(StudyFailure.of("episodes" if some else "playing", task.model, run.run, error))
             if not some:
                 return
         except Exception as error:  # noqa: BLE001 - whatever a model raises must not end the others
-            report(Failure.of("playing", task.model, run.run, error))
+            report(StudyFailure.of("playing", task.model, run.run, error))
             return
 
 
@@ -333,7 +333,7 @@ def _note(queue: TaskQueue[ModelTask], slot: int, event: Any, report: Report) ->
     if isinstance(event, GivenUp):
         model, run = event.task.model, event.task.runs[0].run
         reason = f"{event.reason}, {MOST_LOSSES} times without an episode in between. Its last words are above"
-        report(Failure.of("playing", model, run, WorkerDiedError(reason)))
+        report(StudyFailure.of("playing", model, run, WorkerDiedError(reason)))
         return
     if isinstance(event, EpisodeStored):
         queue.advanced(event.model)  # its losses are counted anew: it does not die of one episode
@@ -347,7 +347,9 @@ def _note(queue: TaskQueue[ModelTask], slot: int, event: Any, report: Report) ->
 # -- probes ------------------------------------------------------------------------------------------------------
 
 
-def fit_probes(plan: StudyPlan, progress: ProbeProgress | None = None, jobs: int | None = None) -> list[Failure]:
+def fit_probes(
+    plan: StudyPlan, progress: ProbeProgress | None = None, jobs: int | None = None
+) -> list[StudyFailure]:
     """Fit the probes of a study file that a plan does not find stored; return the failures.
 
     A failure of stage `waiting` marks a run that is not whole yet; others are stored with the study.
@@ -357,7 +359,7 @@ def fit_probes(plan: StudyPlan, progress: ProbeProgress | None = None, jobs: int
         progress: Called with the run's name, sites done, sites in all and the last one.
         jobs: Processes, as in `train_probes`.
     """
-    stored, failures = Failures(plan.study.study.folder), list[Failure]()
+    stored, failures = Failures(plan.study.study.folder), list[StudyFailure]()
     fitted = {
         (planned.cell.name, name) for planned in plan.cells for name, why in planned.probes.items() if not why
     }
@@ -368,9 +370,9 @@ def fit_probes(plan: StudyPlan, progress: ProbeProgress | None = None, jobs: int
             try:
                 _fit(plan.study, table, cell, selection, progress, jobs)
             except (RunNotFoundError, RunIncompleteError) as error:
-                failures.append(Failure.of("waiting", cell.model, cell.name, error))
+                failures.append(StudyFailure.of("waiting", cell.model, cell.name, error))
             except ProbeKitError as error:
-                failures.append(Failure.of("probes", cell.model, cell.name, error))
+                failures.append(StudyFailure.of("probes", cell.model, cell.name, error))
                 stored.note(cell, failures[-1], name)
             else:
                 stored.clear(cell, name)
@@ -380,8 +382,8 @@ def fit_probes(plan: StudyPlan, progress: ProbeProgress | None = None, jobs: int
 def _fit(
     study: LoadedStudy,
     table: ProbesTable,
-    cell: Cell,
-    selection: Selection,
+    cell: PlannedRun,
+    selection: ItemSelection,
     progress: ProbeProgress | None,
     jobs: int | None,
 ) -> None:

@@ -17,7 +17,7 @@ from probe_kit._system.escaping import as_argument
 from probe_kit.errors import UsageError
 from probe_kit.study import schema
 from probe_kit.study.archive import RUNS, STUDY_FILE, Pack, open_archive
-from probe_kit.study.cells import Cell, PlannedSuite, planned_suite
+from probe_kit.study.cells import PlannedRun, PlannedSuite, planned_suite
 from probe_kit.study.checks import misfits, unknown_names
 from probe_kit.study.expansion import expand
 from probe_kit.study.schema import Mistake, Place, StudyFileError, part_in_file
@@ -45,7 +45,7 @@ class LoadedStudy:
     file: Path
     study: schema.Study
     suite: PlannedSuite
-    cells: tuple[Cell, ...]
+    cells: tuple[PlannedRun, ...]
     pack: Pack | None = None
     home: StudyFolder | None = None
 
@@ -110,7 +110,7 @@ def load_study(name: str | Path) -> LoadedStudy:
         suite = PlannedSuite(pack.suite.identity, dict(pack.suite.items), None, "the archive")
         mistakes = []
     mistakes += unknown_names(study, suite)
-    cells: list[Cell] = []
+    cells: list[PlannedRun] = []
     if not mistakes:  # all else is about names that exist
         cells, of_settings = expand(study, suite)
         mistakes = [*misfits(study, suite), *of_settings]

@@ -12,9 +12,8 @@ from probe_kit.errors import UsageError
 from probe_kit.intervene.kinds.interchange import stored_steering
 from probe_kit.retention.displays import curves_side_by_side, dose_response, layer_curve
 from probe_kit.retention.displays.display import BLUE, VERMILION, footer, panels, plain
-from probe_kit.retention.displays.report_figure import ONLY_FILLED, ReportFigure, figure_of
-from probe_kit.retention.displays.table_figures import SideTableDisplay
-from probe_kit.retention.report.page import Picture, citation, data_uri, provenance, render, words_of
+from probe_kit.retention.displays.report_figure import ONLY_FILLED, ReportFigure
+from probe_kit.retention.report.page import PageFigure, citation, data_uri, provenance, render, words_of
 from probe_kit.retention.table import RetentionTable, retention_table
 from probe_kit.study.cells import slugs
 from probe_kit.study.plan import plan_study
@@ -55,10 +54,6 @@ def make_figures(study: LoadedStudy, name: str, partial_runs: bool = False) -> l
         return _doses(name, runs)
     opened = [stored.run for stored in runs.runs]
     table = retention_table(opened, labels=runs.labels, pairs=(), keys=[""] * len(opened))
-    if figure.kind == "sides":
-        display = SideTableDisplay.from_table(table)
-        draw = partial(figure_of, SideTableDisplay.from_table, table)
-        return [ReportFigure(name, display.heading, "behaviour", display.note, None, draw)]
     reading = "Normalised score of the mean over the categories of a domain: 0 for guessing, 100 for perfection."
     return [ReportFigure(name, "Score by domain", "behaviour", reading, None, partial(draw_overview, table))]
 
@@ -182,7 +177,7 @@ def study_report(study: LoadedStudy, partial: bool = False) -> StudyReport:
     ]
     state = Table.of("Runs", ("model", "run", "blocks", "episodes", "state"), rows, names=2)
     drawn = {
-        name: [Picture(each.title, "", each.reading, *data_uri(each, paths), extra=False) for each in of_name]
+        name: [PageFigure(each.title, "", each.reading, *data_uri(each, paths), extra=False) for each in of_name]
         for name, of_name in figures.items()
     }
     sentence, bibtex = citation([stored.run for stored in runs.runs])

@@ -17,7 +17,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 from probe_kit._system.complaints import shorten_text
 from probe_kit.errors import UsageError
 from probe_kit.extract.parts import ModelSettings
-from probe_kit.extract.prompts import Picture, Query
+from probe_kit.extract.prompts import PictureShown, Query
 from probe_kit.extract.sources.scene import SceneOptions
 from probe_kit.hooks.contract.declared import ProtocolName
 from probe_kit.runs.layout import AskTokens, LaterViews
@@ -154,7 +154,7 @@ TableKind = Literal[
     "drift",
 ]
 Control = Literal["untrained"] | FeatureControl
-FigureKind = Literal["curves", "sides", "dose", "overview"]
+FigureKind = Literal["curves", "dose", "overview"]
 
 
 class _Table(BaseModel):
@@ -233,7 +233,7 @@ class AskTable(_Table):
 
     prompt: Text
     picture_size: Size = "224x224"
-    picture: Picture = "frame"
+    picture: PictureShown = "frame"
     query: Query = "target"
 
 

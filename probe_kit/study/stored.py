@@ -16,7 +16,7 @@ from probe_kit.extract.parts import is_here
 from probe_kit.hooks.checkpoints.checkpoint import COMMIT_DIGITS, is_on_hub, without_revision
 from probe_kit.runs import open_run
 from probe_kit.runs.store import locate
-from probe_kit.study.cells import Cell, Failures, Selection
+from probe_kit.study.cells import Failures, ItemSelection, PlannedRun
 from probe_kit.study.file_contents import content_of
 from probe_kit.study.reading import LoadedStudy, load_study, shipped_studies
 from probe_kit.study.schema import ProbesTable
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 _MOST_PRINTED = 3
 
 
-def differences(run: "Run", cell: Cell, played: PlayedModel | None = None) -> Iterator[str]:
+def differences(run: "Run", cell: PlannedRun, played: PlayedModel | None = None) -> Iterator[str]:
     """Yield the settings in which a run is not one of `cell`, in words, stored value first.
 
     Args:
@@ -57,7 +57,7 @@ def differences(run: "Run", cell: Cell, played: PlayedModel | None = None) -> It
         yield f"item {changed[0]!r} {state} since it was played ({len(changed)} of {len(hashes)} items)"
 
 
-def _weights(run: "Run", cell: Cell, played: PlayedModel | None) -> Iterator[Change]:
+def _weights(run: "Run", cell: PlannedRun, played: PlayedModel | None) -> Iterator[Change]:
     """Yield what the process that loaded the model recorded of it, and what the cell's model is.
 
     A card has the commit of a hub id. A file may name a branch or nothing: then repository and folder count. Of a
@@ -102,7 +102,7 @@ def check_same_items(runs: Sequence["Run"]) -> None:
             )
 
 
-def check_same_weights(runs: Sequence[tuple[Cell, "Run"]]) -> None:
+def check_same_weights(runs: Sequence[tuple[PlannedRun, "Run"]]) -> None:
     """Raise SettingsMismatchError for two runs of one model that were played with different weights.
 
     A model that acts and answers may load other parts of its checkpoint for either.
@@ -127,7 +127,7 @@ class StoredRun:
         probed: The run with the items that the file's probes are fitted to.
     """
 
-    cell: Cell
+    cell: PlannedRun
     run: "Run"
     probed: "Run"
 
@@ -156,7 +156,7 @@ class StoredRuns:
 
 def stored_runs(
     study: LoadedStudy,
-    select: Callable[[Cell], Selection | None],
+    select: Callable[[PlannedRun], ItemSelection | None],
     subject: str,
     partial: bool = False,
     categories: Sequence[str] | None = None,
@@ -208,7 +208,7 @@ def stored_runs(
     return StoredRuns(tuple(runs), tuple(missing), tuple(unfinished), labels)
 
 
-def _why_missing(study: LoadedStudy, cell: Cell, error: ProbeKitError) -> str:
+def _why_missing(study: LoadedStudy, cell: PlannedRun, error: ProbeKitError) -> str:
     failure = None if study.archive is not None else Failures(study.study.folder).of(cell)
     if failure is not None:
         return failure.reason
@@ -220,7 +220,7 @@ def _first_sentence(error: ProbeKitError) -> str:
     return str(error).partition(". ")[0].removesuffix(".")
 
 
-def open_matching(study: LoadedStudy, cell: Cell, partial: bool) -> "Run":
+def open_matching(study: LoadedStudy, cell: PlannedRun, partial: bool) -> "Run":
     """Open the run of a cell, checked to be of its settings, weights and suite; raises as `open_run` too.
 
     Args:
@@ -232,7 +232,7 @@ def open_matching(study: LoadedStudy, cell: Cell, partial: bool) -> "Run":
         SettingsMismatchError: For the run of another cell, which it names.
     """
 
-    def played(any_cell: Cell) -> PlayedModel | None:
+    def played(any_cell: PlannedRun) -> PlayedModel | None:
         return None if study.home is None else study.home.played_model(any_cell)
 
     if study.home is not None:
@@ -263,7 +263,7 @@ def open_matching(study: LoadedStudy, cell: Cell, partial: bool) -> "Run":
     )
 
 
-def open_stored(study: LoadedStudy, cell: Cell, partial: bool = False) -> "Run":
+def open_stored(study: LoadedStudy, cell: PlannedRun, partial: bool = False) -> "Run":
     """Open the run of a cell as `open_matching` does, checked to hold all items of its blocks.
 
     Raises as `open_matching` too.
@@ -288,8 +288,8 @@ def open_stored(study: LoadedStudy, cell: Cell, partial: bool = False) -> "Run":
 
 def open_cell(
     study: LoadedStudy,
-    cell: Cell,
-    selection: Selection,
+    cell: PlannedRun,
+    selection: ItemSelection,
     partial: bool = False,
     categories: Sequence[str] | None = None,
 ) -> StoredRun:
@@ -301,7 +301,9 @@ def open_cell(
     return StoredRun(cell, part, part if fitted is None else part_of(run, cell, fitted))
 
 
-def part_of(run: "Run", cell: Cell, selection: Selection, categories: Sequence[str] | None = None) -> "Run":
+def part_of(
+    run: "Run", cell: PlannedRun, selection: ItemSelection, categories: Sequence[str] | None = None
+) -> "Run":
     """Return the selected part of a run, which may hold more: of other blocks or a former state of the file."""
     counts = selection.counts(cell.suite)
     counts = {name: count for name, count in counts.items() if categories is None or name in categories}
@@ -343,7 +345,7 @@ def probe_key(study: LoadedStudy, stored: StoredRun, run: "Run", partial: bool) 
         return stored_keys[-1]  # of several, which share the run through two blocks, the last of the file
     if partial or keys(stored.probed.in_wording()):  # they are fitted to other items
         return ""
-    other_keys = [key for key, bundle in read_probes(run.location).items() if settings_of(bundle).is_side]
+    other_keys = [key for key, bundle in read_probes(run.location).items() if settings_of(bundle).balanced]
     also = f" It has those of other settings: {', '.join(other_keys)}." if other_keys else ""
     names = ", ".join(f"[probes.{name}]" for name in tables)
     raise RunIncompleteError(
@@ -368,7 +370,7 @@ def probe_key_of(table: ProbesTable, run: "Run") -> str:
 # -- names -------------------------------------------------------------------------------------------------------
 
 
-def _label(study: LoadedStudy, cell: Cell, several: bool) -> str:
+def _label(study: LoadedStudy, cell: PlannedRun, several: bool) -> str:
     label = study.study.models[cell.model].label or cell.model
     seed = f", seed {cell.seed}" if cell.seed else ""
     return f"{label} · {cell.way}{seed}" if several or seed else label

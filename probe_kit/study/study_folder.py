@@ -27,7 +27,7 @@ from probe_kit.runs.records import Record
 from probe_kit.runs.root import read_root
 from probe_kit.runs.store import Location, locate
 from probe_kit.runs.writer import flat_settings
-from probe_kit.study.cells import CHECKPOINT, KEY_DIGITS, Cell
+from probe_kit.study.cells import CHECKPOINT, KEY_DIGITS, PlannedRun
 from probe_kit.study.file_contents import content_of, former_stamp
 
 RECORDS = "_checkpoints"
@@ -46,7 +46,7 @@ class PlayedModel(Record):
         run: The folder of the run below that of the study.
         model: Name of the model in the file.
         asks: Whether it was asked: a model that acts and answers may load other parts for either.
-        paths: Texts of settings that may name files, as `Cell.paths`.
+        paths: Texts of settings that may name files, as `PlannedRun.paths`.
         contents: Hash of the content of those that were files here, by the same names.
         weights_sha256: Hash of the loaded weights.
         policy: Everything else that its numbers depend on, as in the run's settings.
@@ -93,8 +93,8 @@ class StudyFolder:
 
     # -- content -------------------------------------------------------------------------------------------------
 
-    def contents(self, cell: Cell) -> dict[str, str]:
-        """Return the content of the files that settings name, by the names of `Cell.paths`.
+    def contents(self, cell: PlannedRun) -> dict[str, str]:
+        """Return the content of the files that settings name, by the names of `PlannedRun.paths`.
 
         Of files that are not here it is what the last run of the model had under the same path, if that is known.
         """
@@ -112,7 +112,7 @@ class StudyFolder:
         """Return whether a model was loaded from the file of this text."""
         return lambda model: model.model == model_name and model.paths.get(name) == text and name in model.contents
 
-    def _contents_here(self, cell: Cell, again: bool = False) -> dict[str, str]:
+    def _contents_here(self, cell: PlannedRun, again: bool = False) -> dict[str, str]:
         options = {f"option {name}" for name in cell.settings.model.files()}
         contents = {}
         for name, text in cell.paths.items():
@@ -127,7 +127,7 @@ class StudyFolder:
 
     # -- keys ----------------------------------------------------------------------------------------------------
 
-    def key(self, cell: Cell) -> str:
+    def key(self, cell: PlannedRun) -> str:
         """Return the key of the stored run of a cell, or that of a new run."""
         contents = self.contents(cell)
         key = cell.key_with(contents)
@@ -138,10 +138,10 @@ class StudyFolder:
             return self._former_key(cell, contents) or key
         return key
 
-    def _has_run(self, cell: Cell, key: str) -> bool:
+    def _has_run(self, cell: PlannedRun, key: str) -> bool:
         return self._location.exists(f"{cell.folder_of(key)}/{RUN_FILE}")
 
-    def _former_key(self, cell: Cell, contents: Mapping[str, str]) -> str | None:
+    def _former_key(self, cell: PlannedRun, contents: Mapping[str, str]) -> str | None:
         """Return the key of a run that an earlier version named; None without one."""
         checkpoint = cell.settings.model.checkpoint
         stamp = former_stamp(checkpoint) if checkpoint is not None and is_here(checkpoint) else None
@@ -171,12 +171,12 @@ class StudyFolder:
             return None
         return max((run for of_weights in runs.values() for run in of_weights), default=(0, None))[1]
 
-    def _keys_of_content(self, cell: Cell, contents: Mapping[str, str]) -> list[str]:
+    def _keys_of_content(self, cell: PlannedRun, contents: Mapping[str, str]) -> list[str]:
         """Return the keys of the cell's name under which runs of these files are recorded."""
         return _keys_in((model.run for model in self._models.values() if self._is_of(model, cell, contents)), cell)
 
     @staticmethod
-    def _is_of(model: PlayedModel, cell: Cell, contents: Mapping[str, str]) -> bool:
+    def _is_of(model: PlayedModel, cell: PlannedRun, contents: Mapping[str, str]) -> bool:
         """Whether a model was loaded from files of these contents, with the cell's other options."""
         options = [
             {name: text for name, text in paths.items() if name not in contents}
@@ -185,7 +185,7 @@ class StudyFolder:
         of_cell = (model.model, model.asks, model.contents) == (cell.model, cell.asks, contents)
         return of_cell and options[0] == options[1]
 
-    def keys_of_name(self, cell: Cell) -> list[str]:
+    def keys_of_name(self, cell: PlannedRun) -> list[str]:
         """Return the keys of all stored runs of the cell's name, whatever they hold."""
         if "://" in self._out:
             runs = [key.removesuffix(f"/{RUN_FILE}") for key in self._location.keys(cell.model)]
@@ -194,13 +194,13 @@ class StudyFolder:
             runs = [file.parent.relative_to(self._out).as_posix() for file in files]
         return _keys_in(runs, cell)
 
-    def check_unambiguous(self, cell: Cell) -> None:
+    def check_unambiguous(self, cell: PlannedRun) -> None:
         """Raise SettingsMismatchError if several stored runs may be that of a cell."""
         _ = cell.key
         if problem := self._problems.get(cell.name):
             raise SettingsMismatchError(problem)
 
-    def hint(self, cell: Cell) -> str:
+    def hint(self, cell: PlannedRun) -> str:
         """Return why no run is known to be that of a cell whose checkpoint is not here; empty if it is here."""
         checkpoint = cell.settings.model.checkpoint
         if checkpoint is None or is_on_hub(checkpoint) or CHECKPOINT in self.contents(cell):
@@ -212,13 +212,13 @@ class StudyFolder:
 
     # -- records -------------------------------------------------------------------------------------------------
 
-    def played_model(self, cell: Cell) -> PlayedModel | None:
+    def played_model(self, cell: PlannedRun) -> PlayedModel | None:
         """Return the model as the run of a cell, or another run of the same files, was played; None if unknown."""
         contents = self.contents(cell)
         model = self._newest(lambda model: model.run == cell.folder)
         return model or (self._newest(lambda model: self._is_of(model, cell, contents)) if contents else None)
 
-    def note_played(self, cell: Cell) -> None:
+    def note_played(self, cell: PlannedRun) -> None:
         """Write the record of a run that this process, or a worker of it, has just played.
 
         Raises:
@@ -234,7 +234,7 @@ class StudyFolder:
         if settings.get("weights_sha256") is not None:
             self._note(cell, settings["weights_sha256"], settings.get("policy") or {})
 
-    def note_stored(self, cell: Cell) -> None:
+    def note_stored(self, cell: PlannedRun) -> None:
         """Complete the records of a whole run.
 
         They then tell which of several contents of a path was there last. A run of an earlier version has none: it
@@ -252,7 +252,7 @@ class StudyFolder:
         if is_here(checkpoint) and content_of(checkpoint) == contents.get(CHECKPOINT):
             self._note(cell, str(run.weights_sha256), run.root.own_settings.get("policy") or {})
 
-    def _note(self, cell: Cell, weights_sha256: str, policy: Mapping[str, Any]) -> None:
+    def _note(self, cell: PlannedRun, weights_sha256: str, policy: Mapping[str, Any]) -> None:
         when, contents = datetime.now(UTC).isoformat(timespec="microseconds"), self._contents_here(cell)
         model = PlayedModel(
             run=cell.folder, model=cell.model, asks=cell.asks, paths=cell.paths, contents=contents,
@@ -267,7 +267,7 @@ class StudyFolder:
         self._models[name] = model
 
 
-def _keys_in(runs: Iterable[str], cell: Cell) -> list[str]:
+def _keys_in(runs: Iterable[str], cell: PlannedRun) -> list[str]:
     """Return the keys in the names of folders that are named as those of the cell, each once."""
     pattern = re.compile(rf"{re.escape(cell.folder_of(''))}([0-9a-f]{{{KEY_DIGITS}}})")
     return sorted({match[1] for run in runs if (match := pattern.fullmatch(run))})
@@ -276,7 +276,7 @@ def _keys_in(runs: Iterable[str], cell: Cell) -> list[str]:
 # -- settings ----------------------------------------------------------------------------------------------------
 
 
-def changed_settings(own_settings: Mapping[str, Any], cell: Cell) -> Iterator[Change]:
+def changed_settings(own_settings: Mapping[str, Any], cell: PlannedRun) -> Iterator[Change]:
     """Yield the settings of a stored run that differ from those of `cell`."""
     stored, expected = flat_settings(own_settings), flat_settings(_expected_settings(cell))
     for name in sorted(stored | expected):
@@ -285,7 +285,7 @@ def changed_settings(own_settings: Mapping[str, Any], cell: Cell) -> Iterator[Ch
             yield name, stored.get(name), expected.get(name)
 
 
-def _expected_settings(cell: Cell) -> dict[str, Any]:
+def _expected_settings(cell: PlannedRun) -> dict[str, Any]:
     """Return the settings that a run of the cell has whatever model is loaded, as plain values.
 
     Settings that the file leaves to the model are absent.

@@ -30,8 +30,7 @@ from probe_kit.retention.rows.row import MEAN
 from probe_kit.retention.table import RetentionTable
 from probe_kit.runs.provenance import differences
 from probe_kit.study.archive import TABLES, Pack, table_of_record
-from probe_kit.study.cells import Cell as PlannedRun
-from probe_kit.study.cells import Selection, slugs
+from probe_kit.study.cells import ItemSelection, PlannedRun, slugs
 from probe_kit.study.drift import CategoryDrift, drift_table, measure_drift
 from probe_kit.study.expansion import runs_of_side
 from probe_kit.study.rates import caption, probing_table, score_table, sides_table, success_table, vlm_table
@@ -398,7 +397,7 @@ def _table_of_kind(study: LoadedStudy, table: TableTable, stored: StoredRuns, na
     )
 
 
-def _selection(study: LoadedStudy, table: TableTable) -> Callable[[PlannedRun], Selection | None]:
+def _selection(study: LoadedStudy, table: TableTable) -> Callable[[PlannedRun], ItemSelection | None]:
     if table.kind == "drift":
         pairs = study.study.drift[table.drift or ""].pairs
         names = {cell.name for pair in pairs for side in pair for cell in runs_of_side(study.cells, side)}
@@ -409,7 +408,7 @@ def _selection(study: LoadedStudy, table: TableTable) -> Callable[[PlannedRun], 
     models, ways = _compared_models(study, comparison)
     asks = comparison.pairs is not None  # a chain and groups are of policies
 
-    def select(cell: PlannedRun) -> Selection | None:
+    def select(cell: PlannedRun) -> ItemSelection | None:
         blocks = table.runs is None or cell.selected(table.runs) is not None
         is_compared = cell.model in models and cell.way in ways and (asks or not cell.asks) and blocks
         return cell.selection if is_compared else None

@@ -102,7 +102,7 @@ def _item(
     )
 
 
-Progress = Callable[[int, int], None]
+CountItems = Callable[[int, int], None]
 
 
 # -- the suite ---------------------------------------------------------------------------------------------------
@@ -117,7 +117,7 @@ def build_suite(
     categories: Sequence[str] | None = None,
     items_per_category: int | Mapping[str, int] = ITEMS,
     seed: int = 0,
-    progress: Progress | None = None,
+    progress: CountItems | None = None,
 ) -> Suite:
     """Draw the embedded suite and write it to `folder`.
 
@@ -155,7 +155,7 @@ def default_suite(
     categories: Sequence[str] | None = None,
     items_per_category: int = ITEMS,
     seed: int = 0,
-    progress: Progress | None = None,
+    progress: CountItems | None = None,
 ) -> Suite:
     """Return the embedded suite, built on first use and kept in `$PROBE_KIT_CACHE` or `~/.cache/probe_kit`.
 

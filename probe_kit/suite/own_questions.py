@@ -57,7 +57,7 @@ class PicturePair:
 
 
 @dataclass(frozen=True)
-class Row:
+class QuestionLine:
     """One line of the table.
 
     Attributes:
@@ -271,7 +271,7 @@ def suite_from_csv(
     return questions.save({"rows": len(rows)}, groups, lines)
 
 
-def _ask_rows(questions: _Questions, drawn: Sequence[tuple[Row, Picture, Picture]]) -> None:
+def _ask_rows(questions: _Questions, drawn: Sequence[tuple[QuestionLine, Picture, Picture]]) -> None:
     pixels = [(row.category, correct.pixels_sha256, wrong.pixels_sha256) for row, correct, wrong in drawn]
     together = Counter((category, frozenset(both)) for category, *both in pixels)
     phrases = {key: row.object for (row, *_), key in zip(drawn, pixels, strict=True)}
@@ -296,7 +296,7 @@ def _ask_rows(questions: _Questions, drawn: Sequence[tuple[Row, Picture, Picture
         )  # fmt: skip
 
 
-def _picture(questions: _Questions, table: Path, row: Row, column: str) -> Picture:
+def _picture(questions: _Questions, table: Path, row: QuestionLine, column: str) -> Picture:
     """Return the picture in one column of a row.
 
     Raises:
@@ -315,7 +315,7 @@ def _picture(questions: _Questions, table: Path, row: Row, column: str) -> Pictu
         raise SuiteError(f"{where}: {str(error).replace(RESTORE, 'Give another file.')}") from error
 
 
-def read_rows(table: Path, category: str = DEFAULT_CATEGORY) -> list[Row]:
+def read_rows(table: Path, category: str = DEFAULT_CATEGORY) -> list[QuestionLine]:
     """Read the rows of the table, one per question.
 
     Raises:
@@ -344,7 +344,7 @@ def read_rows(table: Path, category: str = DEFAULT_CATEGORY) -> list[Row]:
     return [replace(row, group=by_line.get(row.line, "")) for row in rows]
 
 
-def _check_contradictions(rows: Sequence[Row], table: Path) -> None:
+def _check_contradictions(rows: Sequence[QuestionLine], table: Path) -> None:
     """Refuse a question that is asked twice, or with another answer.
 
     Raises:
@@ -363,7 +363,7 @@ def _check_contradictions(rows: Sequence[Row], table: Path) -> None:
             )
 
 
-def _row(record: Mapping[str, str | None], line: int, opened: TextTable, category: str) -> Row:
+def _row(record: Mapping[str, str | None], line: int, opened: TextTable, category: str) -> QuestionLine:
     where, table = opened.where(line), opened.path
     cells = {column: cell or "" for column, cell in record.items()}
     empty = [column for column in COLUMNS if not cells[column]]
@@ -387,7 +387,7 @@ def _row(record: Mapping[str, str | None], line: int, opened: TextTable, categor
         if not cells.get("category"):
             raise
         raise UsageError(f"{where}, column category: {error}") from error
-    return Row(line, cells["instruction"], correct, wrong, cells.get("group", ""), slug, phrase, other)
+    return QuestionLine(line, cells["instruction"], correct, wrong, cells.get("group", ""), slug, phrase, other)
 
 
 def _object_of(instruction: str) -> str | None:

@@ -22,6 +22,7 @@ from PIL import Image
 
 from probe_kit._system.counting import plural
 from probe_kit._system.drafts import write_whole
+from probe_kit._system.types import Matrix
 from probe_kit.hashing import derive_seed
 from probe_kit.statistics.folds import OUTER_FOLDS, assign_folds
 from probe_kit.statistics.intervals import Accuracy
@@ -216,7 +217,6 @@ _TREES = 60
 _WORD_BUCKETS = 256
 _INK_SUM_STEP = 60
 
-Array = npt.NDArray[np.float64]
 Labels = npt.NDArray[np.bool_]  # True where the correct picture lies left
 Rows = npt.NDArray[np.intp]
 
@@ -331,25 +331,25 @@ def _groups(episodes: Sequence[Episode]) -> tuple[npt.NDArray[np.str_], str]:
 # -- features ----------------------------------------------------------------------------------------
 
 
-def _both_sides(episodes: Sequence[Episode], describe: Callable[[Image.Image], Array]) -> Array:
+def _both_sides(episodes: Sequence[Episode], describe: Callable[[Image.Image], Matrix]) -> Matrix:
     """Return the values of `describe` for the left and then the right picture of every episode."""
     paths = {episode.picture(side) for episode in episodes for side in SIDES}
     described = {path: describe(load_picture(path)) for path in paths}
     return np.array([np.concatenate([described[episode.picture(side)] for side in SIDES]) for episode in episodes])
 
 
-def _pixels(episodes: Sequence[Episode]) -> Array:
-    def describe(image: Image.Image) -> Array:
+def _pixels(episodes: Sequence[Episode]) -> Matrix:
+    def describe(image: Image.Image) -> Matrix:
         small = image.resize((_THUMBNAIL, _THUMBNAIL), Image.Resampling.BOX)
         return np.asarray(small, np.float64).ravel() / 255
 
     return _both_sides(episodes, describe)
 
 
-def _statistics(episodes: Sequence[Episode]) -> Array:
+def _statistics(episodes: Sequence[Episode]) -> Matrix:
     """Return the features that need no recognition: colour, spread, background, ink, edges, extent."""
 
-    def describe(image: Image.Image) -> Array:
+    def describe(image: Image.Image) -> Matrix:
         pixels = np.asarray(image.resize((64, 64), Image.Resampling.BOX), np.float64)
         background = np.median(np.concatenate([pixels[0], pixels[-1]]), axis=0)
         ink = np.abs(pixels - background).sum(axis=2) > _INK_SUM_STEP
@@ -362,7 +362,7 @@ def _statistics(episodes: Sequence[Episode]) -> Array:
     return _both_sides(episodes, describe)
 
 
-def _words(episodes: Sequence[Episode]) -> Array:
+def _words(episodes: Sequence[Episode]) -> Matrix:
     """Return the hashed bag of the instruction's words."""
     counts = np.zeros((len(episodes), _WORD_BUCKETS))
     for row, episode in enumerate(episodes):
@@ -374,7 +374,7 @@ def _words(episodes: Sequence[Episode]) -> Array:
 # -- learners ----------------------------------------------------------------------------------------
 
 
-def _linear(features: Array, correct: Labels, train: Rows, test: Rows) -> Labels:
+def _linear(features: Matrix, correct: Labels, train: Rows, test: Rows) -> Labels:
     from sklearn.linear_model import RidgeClassifier
     from sklearn.pipeline import make_pipeline
     from sklearn.preprocessing import StandardScaler
@@ -383,7 +383,7 @@ def _linear(features: Array, correct: Labels, train: Rows, test: Rows) -> Labels
     return np.asarray(model.fit(features[train], correct[train]).predict(features[test]), bool)
 
 
-def _forest(features: Array, correct: Labels, train: Rows, test: Rows, seed: int) -> Labels:
+def _forest(features: Matrix, correct: Labels, train: Rows, test: Rows, seed: int) -> Labels:
     from sklearn.ensemble import RandomForestClassifier
 
     model = RandomForestClassifier(_TREES, random_state=seed)

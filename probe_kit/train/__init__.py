@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING
 from probe_kit._system.imports import lazy_names
 
 if TYPE_CHECKING:
+    from probe_kit._system.types import Progress
     from probe_kit.runs.array_run import ArrayRun
     from probe_kit.runs.reader import RunReader
     from probe_kit.statistics.folds import FOLD_UNITS, FoldUnit
     from probe_kit.train.array_probe import ArrayProbes, probe
     from probe_kit.train.choices import CONTROLS, INCOMPLETE, SIDES, Control, Incomplete, Side
-    from probe_kit.train.probe_sweep import Progress, train_probes
+    from probe_kit.train.probe_sweep import train_probes
     from probe_kit.train.results.control_scores import ControlComparison, Controls, ControlScore, UntrainedScore
     from probe_kit.train.results.probe_curve import ProbeCurve
     from probe_kit.train.results.probe_results import Direction, ProbeResults, ProbeSettings
@@ -75,7 +76,7 @@ __getattr__, __dir__ = lazy_names(
         "Target": "target",
         "ProbeResults": "results.probe_results",
         "ProbeSettings": "results.probe_results",
-        "Progress": "probe_sweep",
+        "Progress": "probe_kit._system.types",
         "RunReader": "probe_kit.runs.reader",
         "UntrainedScore": "results.control_scores",
         "load_results_by_call": "results.store",

@@ -6,6 +6,7 @@ Side = Literal["side.correct", "side.chosen", "side.shuffled"]
 Incomplete = Literal["keep", "drop"]
 Control = Literal["position", "step", "state", "action", "instruction", "random-features", "pixels"]
 Task = Literal["binary", "classes", "continuous"]
+Chance = Literal["half", "permuted"]
 
 CORRECT: Side = "side.correct"
 """The target of probes unless another is named."""

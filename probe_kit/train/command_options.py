@@ -236,13 +236,13 @@ class TargetOptions:
         """Raise UsageError for a target that has no source, and for a side with options that no side has."""
         from probe_kit.train.builtin_columns import builtin_names, is_builtin
 
-        is_side, sides = self.name in SIDES, ", ".join(map(repr, SIDES))
-        if self.file is not None and is_side:
+        sides = ", ".join(map(repr, SIDES))
+        if self.file is not None and not self.is_label:
             raise UsageError(
                 f"--target {self.name} is a side, and --labels {self.file} is given. Name a column of the table "
                 "with --target; rename the column if it is called so"
             )
-        if self.file is None and not is_side and not is_builtin(self.name):
+        if self.file is None and self.is_label and not is_builtin(self.name):
             raise UsageError(
                 f"--target {self.name!r} is not one of {sides}, nor a built-in column "
                 f"({', '.join(builtin_names())}). `probe-kit targets RUN` lists those of a run, such as "
@@ -253,16 +253,16 @@ class TargetOptions:
             "--window": window, "--align-to": self.align_to,
         }  # fmt: skip
         present = [option for option, value in options.items() if value is not None]
-        if is_side and present:
+        if present and not self.is_label:
             raise UsageError(
                 f"{present[0]} is for labels of your own and built-in columns; give --target COLUMN too, and "
                 "--labels FILE for one of a table"
             )
 
     @property
-    def is_side(self) -> bool:
-        """Whether the target is a side of a picture."""
-        return self.name in SIDES
+    def is_label(self) -> bool:
+        """Whether the target is a built-in column or one of a table, and no side of a picture."""
+        return self.name not in SIDES
 
     def read(self, run: "RunReader", file: Path | None = None, seed: int = 0) -> "Target":
         """Return the target for a run: from the table, from another `file`, or built in."""

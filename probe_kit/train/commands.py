@@ -107,14 +107,14 @@ def train(
     }
     if directions is not None:
         check_direction_file(directions)
-        if not target_options.is_side:
+        if target_options.is_label:
             raise UsageError(f"--directions with --target {target}: only probes of a side have directions")
         _only_call(call, opened, "--directions")
     fitted = _train(opened, target_options, categories, call, options, details)
     if directions is not None:
         count = write_direction_file(fitted[0].directions, directions, opened.weights_sha256)
         say(markup("{} directions: {}", count, directions))
-    of_target = "" if target_options.is_side else f" --target {shlex.quote(target)}"
+    of_target = f" --target {shlex.quote(target)}" if target_options.is_label else ""
     say(markup("next: [bold]probe-kit retention {}{}[/]", as_argument(run), of_target))
 
 
@@ -132,7 +132,7 @@ def _train(
     from probe_kit.train.results.summary import best_sites_findings
 
     read = target_options.read(run, seed=options["seed"])
-    if not target_options.is_side:
+    if target_options.is_label:
         out.print(read.contents, markup=False, highlight=False)
     left_out: dict[int, Exception] = {}
     fitted: list[ProbeResults] = []

@@ -45,8 +45,8 @@ class ControlInputs:
     They need a suite only where a control reads its pictures; it is None elsewhere.
     """
 
-    def __init__(self, run: RunReader, samples: TargetSamples, is_side: bool, suite: "Suite | None") -> None:
-        self.run, self.samples, self.is_side, self.suite = run, samples, is_side, suite
+    def __init__(self, run: RunReader, samples: TargetSamples, balanced: bool, suite: "Suite | None") -> None:
+        self.run, self.samples, self.balanced, self.suite = run, samples, balanced, suite
 
     def features(self, name: str) -> Features:
         """Return the features (n, D) of a control other than `random-features`."""
@@ -74,7 +74,7 @@ class ControlInputs:
         They are read once for all layers.
         """
         parts = [self._pixels(SIDE), word_counts(self.run)[self.samples.rows]]
-        if not self.is_side and why_no_state(self.run) is None:
+        if not self.balanced and why_no_state(self.run) is None:
             parts.append(self._state())
         return parts
 
@@ -90,7 +90,7 @@ class ControlInputs:
         one side.
         """
         counts = word_counts(self.run)[self.samples.rows]
-        return np.hstack([counts, counts * self._layout()]) if self.is_side else counts
+        return np.hstack([counts, counts * self._layout()]) if self.balanced else counts
 
     def _state(self) -> Features:
         if self.recorded is not None:

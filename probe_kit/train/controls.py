@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from probe_kit._system.types import Matrix
 from probe_kit.errors import SuiteNotFoundError, UsageError
 from probe_kit.hashing import derive_seed
 from probe_kit.runs.layout import DATASET
@@ -33,7 +34,7 @@ from probe_kit.train.results.control_scores import (
     ControlScore,
     UntrainedScore,
 )
-from probe_kit.train.results.probe_curve import Matrix, ProbeCurve
+from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_results import ProbeResults
 from probe_kit.train.samples import Samples
 from probe_kit.train.target_samples import TargetSamples
@@ -78,7 +79,7 @@ class PreparedControls:
 def prepare_controls(
     run: RunReader,
     samples: TargetSamples,
-    is_side: bool,
+    balanced: bool,
     names: Sequence[str] | None,
     folder: Path | None,
     stored: Controls,
@@ -91,7 +92,7 @@ def prepare_controls(
     Args:
         run: Run that is probed.
         samples: Its samples of the target.
-        is_side: Whether the target is a side, which has other default controls.
+        balanced: Whether the target is a side, which has other default controls.
         names: None for the default ones. Those that are not possible are then left out, with a warning where
             pictures are missing.
         folder: Folder of the run's suite, see `suite_of`.
@@ -105,7 +106,7 @@ def prepare_controls(
     available = (*array_features, *(name for name in CONTROLS if name not in array_features))
     if unknown := [name for name in names or () if name not in available]:
         raise UsageError(f"unknown control {unknown[0]!r}; expected some of {', '.join(available)}")
-    default = SIDE_DEFAULT if is_side else tuple(name for name in available if name not in NOT_BY_DEFAULT)
+    default = SIDE_DEFAULT if balanced else tuple(name for name in available if name not in NOT_BY_DEFAULT)
     ordered = [name for name in available if name in (default if names is None else names)]
     reasons = {name: why for name, why in why_impossible(run, samples).items() if name not in array_features}
     if names is not None and (wrong := [name for name in ordered if name in reasons]):
@@ -122,7 +123,7 @@ def prepare_controls(
             lost = [name for name in missing if name in PICTURED]
             subject = f"control {lost[0]} is" if len(lost) == 1 else f"controls {' and '.join(lost)} are"
             judged = (
-                ", so that a signal is judged against chance only" if is_side and RANDOM_FEATURES in lost else ""
+                ", so that a signal is judged against chance only" if balanced and RANDOM_FEATURES in lost else ""
             )
             warnings.warn(
                 f"the {subject} on by default and NOT run{judged}: {error}; or say that you want none (--controls "
@@ -131,7 +132,7 @@ def prepare_controls(
             )
             left_out |= dict.fromkeys(lost, "the pictures of the suite were not found")
             missing = [name for name in missing if name not in PICTURED]
-    return PreparedControls(tuple(missing), ControlInputs(run, samples, is_side, suite), left_out)
+    return PreparedControls(tuple(missing), ControlInputs(run, samples, balanced, suite), left_out)
 
 
 def add_controls(
@@ -163,14 +164,14 @@ def add_controls(
                 }
                 # Of a side one score, as wide as the backbone: the table of leaks has no streams.
                 scored = references
-                if problem.is_side:
+                if problem.balanced:
                     scored = {"": references.get("backbone", next(iter(references.values())))}
             else:
                 reference = problem.control_curve([problem.probe(features)])
                 references, scored = dict.fromkeys(widths, reference), {"": reference}
             scores = [control_score(name, category, curve, stream) for stream, curve in scored.items()]
             compared: list[ControlComparison] = []
-            is_compared = name == RANDOM_FEATURES or not problem.is_side
+            is_compared = name == RANDOM_FEATURES or not problem.balanced
             if not is_compared and references:
                 reference = next(iter(references.values()))  # the same for all streams
                 is_compared = is_informative(reference.inner[0], reference.labels, reference.groups)
@@ -209,7 +210,7 @@ def is_informative(inner: NDArray[np.floating], labels: NDArray[np.bool_], group
 def _layer_probes(inputs: ControlInputs, problem: Problem, width: int, seed: int) -> list[SiteProbe]:
     """Return the probes of the random layers, without label permutations."""
     # Words of seeds, which numbers depend on: another word would draw other layers.
-    kind = "binding" if problem.is_side else "label random features"
+    kind = "binding" if problem.balanced else "label random features"
     layers = (inputs.layer(problem.positions, width, derive_seed(kind, seed, number)) for number in range(LAYERS))
     return [problem.fit(Samples.pooled(layer)) for layer in layers]
 
@@ -220,7 +221,7 @@ def control_score(name: str, category: str, curve: ProbeCurve, stream: str = "",
     p = float(p_value(curve.metric.mean(keepdims=True), curve.null.mean(axis=0)[None, :])[0])
     chance = float(curve.chance.mean())
     by_step = (
-        np.mean([curve.by_step(scores) for scores in curve.scores], axis=0) if not curve.is_side else np.empty(0)
+        np.mean([curve.by_step(scores) for scores in curve.scores], axis=0) if not curve.balanced else np.empty(0)
     )
     return ControlScore(
         name=name,
@@ -250,7 +251,7 @@ def _compared(
     """
     curve, settings = results.curves[key], results.settings
     rows = curve.stream(stream)
-    if settings.is_side:
+    if settings.balanced:
         seed = derive_seed(_SIDE_SEEDS.get(name, name), settings.seed, *key, stream)
     else:
         scope = key[1:] if settings.categories == (EVERYWHERE,) else key
@@ -273,7 +274,7 @@ _SHOWN = (DATASET, "suite", "scene", "seed")
 """Settings that decide which frames a network is shown."""
 
 
-def check_same_source(run: RunReader, untrained: RunReader, samples: TargetSamples, is_side: bool) -> None:
+def check_same_source(run: RunReader, untrained: RunReader, samples: TargetSamples, balanced: bool) -> None:
     """Raise UsageError if `untrained` is the run itself.
 
     For a target other than a side, also raise it for other frames and for missing episodes.
@@ -282,13 +283,13 @@ def check_same_source(run: RunReader, untrained: RunReader, samples: TargetSampl
         run: Run that is probed.
         untrained: Run to compare with.
         samples: Samples of `run`.
-        is_side: Whether the target is a side.
+        balanced: Whether the target is a side.
     """
     if run.location.address == untrained.location.address:
         raise UsageError(
             f"{run.location} cannot be its own untrained control; give another run of the same episodes"
         )
-    if is_side:
+    if balanced:
         return
     if differing := [name for name in _SHOWN if _identity(run, name) != _identity(untrained, name)]:
         raise UsageError(
@@ -309,7 +310,7 @@ def check_untrained(
     untrained: RunReader,
     samples: TargetSamples,
     untrained_samples: TargetSamples,
-    is_side: bool,
+    balanced: bool,
     call: int,
 ) -> None:
     """Raise UsageError unless `untrained` is another run of the same episodes, instructions, frames and labels.
@@ -322,7 +323,7 @@ def check_untrained(
         untrained: Run to compare with.
         samples: Samples of `run`.
         untrained_samples: Samples of `untrained`.
-        is_side: Whether the target is a side.
+        balanced: Whether the target is a side.
         call: Captured inference that is probed, counted from 0; it appears in the advice of the error.
     """
     identities, untrained_identities = (
@@ -346,7 +347,7 @@ def check_untrained(
             f"{untrained.location} is a copy of {run.location}, which cannot be its own untrained control; "
             "give a run of other weights"
         )
-    if run.recorded and not is_side:
+    if run.recorded and not balanced:
         frames, other_frames = (
             reader.control_steps[reader_samples.rows, reader_samples.inferences]
             for reader, reader_samples in ((run, samples), (untrained, untrained_samples))
@@ -356,7 +357,7 @@ def check_untrained(
                 f"the untrained control {untrained.location} shows other frames than {run.location}. Extract both "
                 "with the same --select"
             )
-    elif not is_side and samples.inferences.any():
+    elif not balanced and samples.inferences.any():
         raise UsageError(
             f"an untrained control of labels after the first inference: the network of {untrained.location} acted "
             "otherwise, so it saw other frames. Expected labels of whole episodes at --call 0, --window 1, or "
@@ -395,7 +396,7 @@ def add_untrained(results: ProbeResults, untrained: ProbeResults) -> ProbeResult
                 f"episodes, this run {curve.labels.size}, and they are not the same. Extract both from the same "
                 "suite."
             )
-        if curve.is_side:
+        if curve.balanced:
             gains += _gains(key, curve, other, untrained)
         for stream in curve.streams:
             if not (other_rows := other.stream(stream)).size:
@@ -403,7 +404,7 @@ def add_untrained(results: ProbeResults, untrained: ProbeResults) -> ProbeResult
                     f"the untrained control {untrained.label!r} has no {key[1]!r} of the stream {stream}; "
                     "expected all streams of the run. Extract both by the same command"
                 )
-            if not curve.is_side:
+            if not curve.balanced:
                 best = other.only(other.best(stream))
                 scores.append(replace(control_score(UNTRAINED, key[0], best, stream, key[1]), chance=None, p=None))
             compared += _compared(results, UNTRAINED, key, stream, other.scores[other_rows])

@@ -9,6 +9,7 @@ from typing import Any
 from probe_kit._execution.executor import GivenUp, TaskQueue, work_off
 from probe_kit._execution.process_pool import ProcessPool
 from probe_kit._execution.ray_pool import RayPool
+from probe_kit._system.types import Progress
 from probe_kit._terminal.notebook import notebook_progress
 from probe_kit.errors import NoProbesError, RunIncompleteError, UnknownCategoryError, UsageError, WorkerDiedError
 from probe_kit.hashing import sha256_json
@@ -112,8 +113,6 @@ TOKEN_PERMUTATIONS = 59
 
 The smallest p is then 1/60; a site with one permutation that does as well as the labels is still below 0.05.
 """
-Progress = Callable[[int, int, str], None]
-"""Function that is called with (sites done, sites in all, name of the site just done)."""
 
 
 def train_probes(
@@ -200,7 +199,7 @@ def train_probes(
     check_run(run, categories)
     if untrained is not None:
         check_run(untrained, categories)
-    sweep = Sweep.of(run, target, categories, **options)
+    sweep = ProbeSweep.of(run, target, categories, **options)
     if device is not None and sweep.target.task != "binary":
         raise UsageError(
             f"device {device!r} with {sweep.target.described}; ridge is solved by numpy, a device solves logistic "
@@ -210,14 +209,14 @@ def train_probes(
     settings = sweep.settings
     stored = Controls() if sweep.stored is None else sweep.stored.controls
     prepared = prepare_controls(
-        run, sweep.samples, settings.is_side, controls, suite, stored, settings.categories
+        run, sweep.samples, settings.balanced, controls, suite, stored, settings.categories
     )  # fmt: skip
     untrained_sweep = None
     if untrained is not None:
-        check_same_source(run, untrained, sweep.samples, settings.is_side)
-        same: Target | str = settings.target if settings.is_side else sweep.target
-        untrained_sweep = Sweep.of(untrained, same, settings.categories, **options)
-        check_untrained(run, untrained, sweep.samples, untrained_sweep.samples, settings.is_side, call)
+        check_same_source(run, untrained, sweep.samples, settings.balanced)
+        same: Target | str = settings.target if settings.balanced else sweep.target
+        untrained_sweep = ProbeSweep.of(untrained, same, settings.categories, **options)
+        check_untrained(run, untrained, sweep.samples, untrained_sweep.samples, settings.balanced, call)
         untrained_sweep.check()
     results = add_controls(sweep.results(**workers), sweep.problems, sweep.widths, prepared)
     if untrained_sweep is not None:
@@ -278,11 +277,11 @@ def probe_settings(
     Raises:
         NoProbesError: For a run without activations.
     """
-    return Sweep.of(run, target, None, views=views, permutations=permutations, seed=seed).settings
+    return ProbeSweep.of(run, target, None, views=views, permutations=permutations, seed=seed).settings
 
 
 @dataclass(frozen=True)
-class Sweep:
+class ProbeSweep:
     """The probes of a target in one run that are to be fitted, or are stored.
 
     Attributes:
@@ -313,7 +312,7 @@ class Sweep:
         call: int = 0,
         window: int | None = None,
         align_to: Target | None = None,
-    ) -> "Sweep":
+    ) -> "ProbeSweep":
         """Read labels and samples; nothing is probed yet."""
         if not run.streams:
             raise NoProbesError(
@@ -322,18 +321,18 @@ class Sweep:
         target = Target.of_run(run, target, seed=seed) if isinstance(target, str) else target.on(run)
         event = None if align_to is None else align_to.on(run)
         if categories is None:
-            categories = tuple(dict.fromkeys(run.episodes["category"])) if target.is_side else (EVERYWHERE,)
+            categories = tuple(dict.fromkeys(run.episodes["category"])) if target.balanced else (EVERYWHERE,)
         if folds != "groups" and (target.group_by or target.exchange_within):
             raise UsageError(
                 f"folds={folds!r} with columns of groups ({target.group_by or target.exchange_within}); expected "
                 "one of both. Leave --folds, or --group-by and --exchange-within, out"
             )
-        if target.is_side and (window is not None or event is not None):
+        if target.balanced and (window is not None or event is not None):
             option = f"window={window}" if window is not None else "align_to"
             raise UsageError(f"{option} with the side {target.name!r}; it needs labels of single inferences")
         samples = target_samples(run, target, categories, call, window, event, incomplete)
         grouping = ""
-        if not target.is_side:
+        if not target.balanced:
             ids = run.episodes["episode_id"].astype(str).tolist()
             columns = (names.tolist() for names in groups_of(run, target))
             grouping = sha256_json(sorted(zip(ids, *columns, strict=True)))
@@ -388,7 +387,7 @@ class Sweep:
     def widths(self) -> dict[str, int]:
         """The width of every stream; for a target other than a side, of the probed streams only."""
         streams = self.run.streams
-        names = streams if self.target.is_side else dict.fromkeys(site.stream for _, site in self.keys)
+        names = streams if self.target.balanced else dict.fromkeys(site.stream for _, site in self.keys)
         return {name: streams[name].width for name in names}
 
     def check(self) -> None:
@@ -416,7 +415,7 @@ class Sweep:
             (category, view, site): Direction(probe.weights, probe.intercepts, probe.spreads)
             for (view, site), of_site in probes.items()
             for category, probe in of_site.items()
-            if self.target.is_side
+            if self.target.balanced
         }
         run, left_out = self.run, self.samples.left_out
         return ProbeResults(self.settings, curves, directions, stamp=run.stamp, label=run.label, left_out=left_out)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._system.types import Matrix
 from probe_kit.errors import TooFewGroupsError, UnbalancedEpisodesError
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.sites import Site
@@ -25,7 +26,7 @@ from probe_kit.statistics.label_permutations import (
 )
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.choices import EVERYWHERE, Task
-from probe_kit.train.crossval.nested_folds import Matrix, NestedFold, nested_folds
+from probe_kit.train.crossval.nested_folds import NestedFold, nested_folds
 from probe_kit.train.crossval.site_probe import SiteProbe, probe_site
 from probe_kit.train.crossval.task_scores import chance_level
 from probe_kit.train.results.probe_curve import ProbeCurve
@@ -48,6 +49,7 @@ class Problem:
     E counts the samples: episodes, or inferences where each has a label.
 
     Attributes:
+        balanced: Whether accuracies are balanced between two sides, see `Target`.
         classes: Names of the classes, empty for a quantity.
         positions: (E,) places of the category's samples among those of the target.
         samples: The samples of the category.
@@ -60,7 +62,7 @@ class Problem:
     """
 
     task: Task
-    is_side: bool
+    balanced: bool
     classes: tuple[str, ...]
     positions: NDArray[np.intp]
     samples: TargetSamples
@@ -92,7 +94,7 @@ class Problem:
     def fit(self, samples: Samples, permuted_labels: NDArray[Any] | None = None) -> SiteProbe:
         """Probe the samples of this category, and again for every column of (E, P) permuted labels."""
         permuted = self.permuted_labels[:, :0] if permuted_labels is None else permuted_labels
-        return probe_site(samples, self.labels, permuted, self.folds, None if self.is_side else self.task)
+        return probe_site(samples, self.labels, permuted, self.folds, None if self.balanced else self.task)
 
     def curve(self, probes: Mapping[Site, SiteProbe], parts: tuple[str, ...] = ()) -> ProbeCurve:
         """Return the curve of the probes of some sites, in order."""
@@ -110,14 +112,14 @@ class Problem:
             inner=np.stack([sums_by_group(probe.inner, self.groups) for probe in fitted]).astype(np.float32),
             parts=parts,
             task=self.task,
-            is_side=self.is_side,
+            balanced=self.balanced,
             classes=self.classes,
-            sample_scores=None if self.is_side else np.stack([probe.scores for probe in fitted]),
+            sample_scores=None if self.balanced else np.stack([probe.scores for probe in fitted]),
             inferences=self.samples.inferences.astype(np.int64),
             aligned=None if self.samples.aligned is None else self.samples.aligned.astype(np.int64),
             # As many permutations as were fitted: fewer where every token is a sample.
             smallest_p=None
-            if self.is_side
+            if self.balanced
             else smallest_p_of_labels(self.labels, self.permuted_labels[:, : fitted[0].null.size]),
         )
 
@@ -145,14 +147,14 @@ def make_problem(
     if settings.folds != "groups":
         subset = replace(subset, groups=fold_units(table, settings.folds))
     # Of all categories together a class without samples is an error, of one category it is another's.
-    pooled = target.is_side or category == EVERYWHERE
+    pooled = target.balanced or category == EVERYWHERE
     coded = replace(target.coded, values=subset.values) if pooled else target.coded.of_values(subset.values)
-    labels: NDArray[Any] = coded.values == 1 if target.is_side else coded.values
-    draw = _side_folds_and_permutations if target.is_side else _block_folds_and_permutations
+    labels: NDArray[Any] = coded.values == 1 if target.balanced else coded.values
+    draw = _side_folds_and_permutations if target.balanced else _block_folds_and_permutations
     folds, permuted = draw(run, replace(target, coded=coded), subset, labels, category, settings)
     return Problem(
         task=target.task,
-        is_side=target.is_side,
+        balanced=target.balanced,
         classes=coded.classes,
         positions=positions,
         samples=subset,

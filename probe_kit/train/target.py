@@ -23,7 +23,7 @@ from probe_kit.runs.layout import RECORDED_EPISODES
 from probe_kit.runs.reader import RunReader, check_sides
 from probe_kit.statistics.label_permutations import flip_items
 from probe_kit.train.builtin_columns import BuiltinColumn, BuiltinColumns
-from probe_kit.train.choices import SIDES, Task
+from probe_kit.train.choices import SIDES, Chance, Task
 from probe_kit.train.label_columns import (
     EPISODE,
     FRAME,
@@ -266,9 +266,14 @@ class Target:
         return self.coded.task
 
     @property
-    def is_side(self) -> bool:
-        """Whether this is the side of a picture, whose chance is one half."""
+    def balanced(self) -> bool:
+        """Whether accuracies are balanced between two sides of a picture, so that `chance` is one half."""
         return self.null != "exchange_blocks"
+
+    @property
+    def chance(self) -> Chance:
+        """The level that scores are compared with: one half, or the mean score of permuted labels at each site."""
+        return "half" if self.balanced else "permuted"
 
     @property
     def per_step(self) -> bool:

@@ -174,12 +174,12 @@ def _trials_of_a_column(name: str, column: "BuiltinColumn") -> Trials:
 
 def _refusal(run: "RunReader", target: "Target", categories: Sequence[str] | None) -> str:
     """Return why `train` refuses a target, by its own checks before any probe is fitted; empty if it does not."""
-    from probe_kit.train.probe_sweep import Sweep
+    from probe_kit.train.probe_sweep import ProbeSweep
 
     try:
         with catch_warnings():
             simplefilter("ignore")  # train says them where they matter
-            _ = Sweep.of(run, target, categories, views=("mean",), permutations=0, seed=0).problems
+            _ = ProbeSweep.of(run, target, categories, views=("mean",), permutations=0, seed=0).problems
     except ProbeKitError as error:
         # Lines of targets that are refused for one reason are printed as one.
         return str(error).removeprefix(f"label {target.name!r}: ")

@@ -121,7 +121,7 @@ def target_samples(
     labelled = reaching[:, None] & np.isfinite(values)
     rows, steps = np.nonzero(labelled)
     groups, strata = groups_of(run, target)
-    if not target.is_side:
+    if not target.balanced:
         _check_groups(run, target, groups, strata, np.unique(rows))
     short = f"before inference {call + window - 1}" if align_to is None else f"within {window} inferences of it"
     outside = int(np.isfinite(grid[reaching]).sum() - labelled[reaching].sum()) if target.per_step else 0

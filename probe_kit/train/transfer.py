@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from probe_kit._system.counting import plural
 from probe_kit._system.table_cells import alike
+from probe_kit._system.types import Matrix, Progress
 from probe_kit._tables.numbers import p_text
 from probe_kit._tables.table import Cell, Table
 from probe_kit._terminal.notebook import notebook_progress
@@ -25,14 +26,13 @@ from probe_kit.train.crossval.site_probe import SiteProbe, predict_once, probe_s
 from probe_kit.train.crossval.task_scores import METRICS, balanced_scores, score_interval
 from probe_kit.train.probe_sweep import (
     TOKEN_PERMUTATIONS,
-    Progress,
-    Sweep,
+    ProbeSweep,
     check_options,
     check_run,
 )
 from probe_kit.train.problem import Problem, make_problem, smallest_p_of_labels
 from probe_kit.train.results.probe_curve import ProbeCurve
-from probe_kit.train.results.probe_results import best_sites, score_cell
+from probe_kit.train.results.probe_results import best_sites, three_digits
 from probe_kit.train.samples import Samples, read_samples, sites_of
 from probe_kit.train.solver.arrays import RowSubset
 from probe_kit.train.target import Target
@@ -40,9 +40,6 @@ from probe_kit.train.target_samples import TargetSamples
 
 if TYPE_CHECKING:
     import pandas as pd
-
-
-Matrix = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -207,10 +204,10 @@ def transfer_probes(
     of_other = target if other_target is None else other_target
     for reader in (run, other):
         check_run(reader, categories)
-    side = Sweep.of(run, target, pooled, window=window, permutations=0, **options)
+    side = ProbeSweep.of(run, target, pooled, window=window, permutations=0, **options)
     run_window = side.samples.window if side.target.per_step else None
     options |= {"permutations": permutations, "token_permutations": token_permutations, "window": run_window}
-    other_side = Sweep.of(other, of_other, pooled, **options)
+    other_side = ProbeSweep.of(other, of_other, pooled, **options)
     _check_alike(run, other, views, across_weights)
     train = make_problem(run, side.target, side.samples, EVERYWHERE, side.settings)
     if side.target.definition != other_side.target.definition:
@@ -430,7 +427,7 @@ def _curve(
     of_view = {site: result for (name, site), result in transferred.items() if name == view}
     parts = tuple(str(run.streams[site.stream].part) for site in of_view)
     # Balanced between classes, of a side too: no fold of the other run says which share of sides was trained on.
-    balanced = replace(test, is_side=False)
+    balanced = replace(test, balanced=False)
     fitted, recentred = (
         balanced.curve({site: probes[at] for site, (probes, _) in of_view.items()}, parts) for at in (0, 1)
     )
@@ -453,11 +450,11 @@ def transfer_table(results: TransferResults, splits: bool = True) -> Table:
         (
             " · ".join([label_of(row["stream"]), *([row["view"]] if several else [])]),
             str(row["site"]),
-            score_cell(row["score"], False, (row["ci_low"], row["ci_high"])),
-            score_cell(row["chance"], False),
+            Cell(row["score"], three_digits, (row["ci_low"], row["ci_high"])),
+            Cell(row["chance"], three_digits),
             Cell(row["p_fwe"], p_text),
-            score_cell(row["recentred"], False),
-            score_cell(row["refitted"], False, (row["refitted_ci_low"], row["refitted_ci_high"])),
+            Cell(row["recentred"], three_digits),
+            Cell(row["refitted"], three_digits, (row["refitted_ci_low"], row["refitted_ci_high"])),
         )
         for row in _best(results)
     ]
@@ -492,7 +489,7 @@ def transfer_sentences(results: TransferResults) -> list[str]:
 
 def _best(results: TransferResults) -> "list[pd.Series]":
     """Return the row of `scores` of the best site of every view and stream: the largest excess over chance."""
-    return best_sites(results.scores.assign(category=EVERYWHERE), is_side=False)
+    return best_sites(results.scores.assign(category=EVERYWHERE))
 
 
 def _verdict(row: "pd.Series") -> str:

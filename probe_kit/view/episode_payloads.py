@@ -12,9 +12,16 @@ from probe_kit.hashing import sha256_json
 from probe_kit.intervene.kinds.image_swap import swap_responses_by_episode
 from probe_kit.retention.behaviour import SCORES
 from probe_kit.runs.layout import FIRST_FRAME, FRAME_COLUMNS
-from probe_kit.runs.thumbnails import EpisodeFrames, episode_frames
+from probe_kit.runs.thumbnails import ThumbnailFrames, episode_frames
 from probe_kit.suite.pictures import picture_size
-from probe_kit.view.run_payloads import Packed, best_sites, code_words, pack_floats, pack_log_odds, round_number
+from probe_kit.view.run_payloads import (
+    PackedArray,
+    best_sites,
+    code_words,
+    pack_floats,
+    pack_log_odds,
+    round_number,
+)
 from probe_kit.view.viewed_run import ViewedRun, toward
 
 _STILL = 1e-4
@@ -101,7 +108,7 @@ def _refitted_log_odds(viewed: ViewedRun, row: dict[str, Any], calls: int) -> An
     return pack_log_odds(log_odds)
 
 
-def _frames(viewed: ViewedRun, number: int, frames: EpisodeFrames) -> dict[str, Any]:
+def _frames(viewed: ViewedRun, number: int, frames: ThumbnailFrames) -> dict[str, Any]:
     """Return the division of the episode's picture: `count` frames of one size in `columns`.
 
     The `steps` are those of the frames, where there is one for each inference.
@@ -265,7 +272,7 @@ def episodes_payload(viewed: ViewedRun) -> dict[str, Any]:
 
 
 def _swap_responses(viewed: ViewedRun) -> list[int | None]:
-    responses = swap_responses_by_episode(viewed.run) if viewed.has_sides else {}
+    responses = swap_responses_by_episode(viewed.run) if viewed.run.source.is_scene else {}
     return [responses.get(str(name)) for name in viewed.run.episodes["episode_id"]]
 
 
@@ -273,7 +280,7 @@ def _word(value: Any) -> str | None:
     return None if value is None or value != value else str(value)
 
 
-def _best_log_odds(viewed: ViewedRun, part: str) -> Packed | None:
+def _best_log_odds(viewed: ViewedRun, part: str) -> PackedArray | None:
     """Return the packed log-odds (E,) of the best sites; None without probes of that part."""
     best_of_category = {name: best_sites(viewed, name)[part] for name in viewed.probed_categories}
     if all(best is None for best in best_of_category.values()):

@@ -11,8 +11,9 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from probe_kit._system.escaping import terminal_safe, without_folders
+from probe_kit._system.types import Matrix
 from probe_kit._tables.numbers import p_text, percent, with_limits
-from probe_kit._tables.table import Row, Table
+from probe_kit._tables.table import Table, TableRow
 from probe_kit.diagnose.diagnosis import load_diagnosis
 from probe_kit.diagnose.results import diagnosis_table
 from probe_kit.env.scoring import RULES
@@ -46,7 +47,7 @@ from probe_kit.suite.categories import category_of
 from probe_kit.train.results.probe_results import ProbeResults, best_sites_table
 from probe_kit.train.results.store import load_results, stored_targets
 from probe_kit.train.results.summary import best_sites_findings
-from probe_kit.view.viewed_run import Values, ViewedRun, decisions_toward_correct
+from probe_kit.view.viewed_run import ViewedRun, decisions_toward_correct
 
 # Log-odds travel as 16-bit integers: a page of a large run holds millions, and as text each is twice as long.
 LOG_ODDS_SCALE = 256
@@ -58,26 +59,26 @@ The least 16-bit integer, which no rounded log-odds takes: they are cut at 32767
 """
 
 
-class Packed(str):
+class PackedArray(str):
     """Base64 of a little-endian array, which is data and no text."""
 
     __slots__ = ()
 
 
-def pack_floats(values: ArrayLike) -> Packed:
+def pack_floats(values: ArrayLike) -> PackedArray:
     """Return the values as float32, row by row."""
     return _pack(values, "<f4")
 
 
-def pack_log_odds(values: ArrayLike) -> Packed:
+def pack_log_odds(values: ArrayLike) -> PackedArray:
     """Return log-odds as int16 in steps of 1/256, at most ±127.99; not a number becomes `MISSING`."""
     scaled = np.asarray(values, np.float64) * LOG_ODDS_SCALE
     steps = np.clip(np.round(scaled), MISSING + 1, -MISSING - 1)
     return _pack(np.where(np.isnan(scaled), MISSING, steps), "<i2")
 
 
-def _pack(values: ArrayLike, kind: str) -> Packed:
-    return Packed(b64encode(np.ascontiguousarray(values, dtype=kind).tobytes()).decode("ascii"))
+def _pack(values: ArrayLike, kind: str) -> PackedArray:
+    return PackedArray(b64encode(np.ascontiguousarray(values, dtype=kind).tobytes()).decode("ascii"))
 
 
 def code_words(words: Sequence[Any]) -> dict[str, Any]:
@@ -116,7 +117,7 @@ def _script(function: str, name: str, value: Any) -> bytes:
 
 
 def _encode(value: Any, paths: tuple[str, ...]) -> Any:
-    if isinstance(value, Packed):  # before text, which it is too: base64 has nothing to escape, and is long
+    if isinstance(value, PackedArray):  # before text, which it is too: base64 has nothing to escape, and is long
         return value
     if isinstance(value, str):
         return without_folders(terminal_safe(value), paths)
@@ -159,8 +160,8 @@ def run_payload(viewed: ViewedRun, page_runs: Sequence[ViewedRun] = ()) -> dict[
         "committed": len(run.episodes),
         "failed": len(run.failed),
         "answers": viewed.answers,
-        "sides": viewed.has_sides,
-        "views": list(SCENE_VIEWS if viewed.has_sides else OTHER_VIEWS),
+        "sides": viewed.run.source.is_scene,
+        "views": list(SCENE_VIEWS if viewed.run.source.is_scene else OTHER_VIEWS),
         "targets": [
             {"target": results.settings.target, "category": category}
             for results, category in (viewed.target_curves if len(run.episodes) else ())
@@ -187,7 +188,7 @@ def run_payload(viewed: ViewedRun, page_runs: Sequence[ViewedRun] = ()) -> dict[
             "device": certificate.get("device"),
         },
         "table": _table(viewed, [other for other in page_runs if other.answers and other.run.suite == run.suite]),
-        "notes": list(viewed.table.notes) if len(run.episodes) and viewed.has_sides else [],
+        "notes": list(viewed.table.notes) if len(run.episodes) and viewed.run.source.is_scene else [],
         "settings": {name: str(value) for name, value in flat_settings(run.settings).items()},
         "stamp": run.stamp,
     }
@@ -202,7 +203,7 @@ def _site_entries(sites: Sequence[Site]) -> list[dict[str, Any]]:
 
 def best_sites(viewed: ViewedRun, category: str) -> dict[str, Any]:
     """Return by part the index of the best site among all, and whether it has signal; None without probes."""
-    row = viewed.probed_rows.get(category) if viewed.has_sides else None
+    row = viewed.probed_rows.get(category) if viewed.run.source.is_scene else None
     if row is None or viewed.curve(category) is None:
         return {"backbone": None, "action": None}
     names = [str(site) for site in viewed.sites]
@@ -221,7 +222,7 @@ def _scene(scene: Mapping[str, Any] | None) -> dict[str, Any] | None:
 
 def _table(viewed: ViewedRun, vlm_runs: Sequence[ViewedRun]) -> dict[str, Any]:
     """Return headings, a row per category and their mean, in the spelling of the retention table."""
-    rows = [*viewed.rows.values(), viewed.mean] if len(viewed.run.episodes) and viewed.has_sides else []
+    rows = [*viewed.rows.values(), viewed.mean] if len(viewed.run.episodes) and viewed.run.source.is_scene else []
     columns: tuple[Column, ...] = (ACCURACY if viewed.answers else SR,)
     if any(row.backbone.site or row.action.site for row in rows):
         columns += _PROBED
@@ -363,7 +364,7 @@ def _target_cells(row: Mapping[Hashable, Any]) -> list[str]:
     ]
 
 
-def _first_log_odds(viewed: ViewedRun, category: str) -> tuple[list[int], Values]:
+def _first_log_odds(viewed: ViewedRun, category: str) -> tuple[list[int], Matrix]:
     """Return rows of the E episodes that the probes of a category read, and their log-odds (S, E)."""
     probes = viewed.probes[category]
     if viewed.is_lent:
@@ -507,5 +508,5 @@ def _result_table(kind: str, key: str, table: Table, findings: Sequence[str]) ->
     }
 
 
-def _row(row: Row) -> list[dict[str, Any]]:
+def _row(row: TableRow) -> list[dict[str, Any]]:
     return [{"text": cell.text, "strong": cell.strong, "note": cell.note} for cell in row.cells]

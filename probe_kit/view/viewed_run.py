@@ -12,21 +12,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._system.types import Matrix
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.sites import Site, resolve_view
 from probe_kit.intervene.kinds.attention import PatchAttention, stored_patch_attention
-from probe_kit.intervene.settings import has_sides
 from probe_kit.retention import RetentionRow, RetentionTable, retention_table
 from probe_kit.runs import Run
-from probe_kit.runs.arrays import Rows, decode_bfloat16
+from probe_kit.runs.arrays import EpisodeRows, decode_bfloat16
 from probe_kit.runs.layout import MEAN_VIEW
 from probe_kit.runs.reader import reached_calls
 from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_results import ProbeResults, read_directions
 from probe_kit.train.results.store import how_to_probe, load_results, load_results_by_call, stored_targets
 from probe_kit.train.samples import is_token_view
-
-Values = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -42,8 +40,8 @@ class _StreamProbes:
     positions: list[int]
     at: tuple[list[int], ...]
     view: int
-    weights: Values
-    intercepts: Values
+    weights: Matrix
+    intercepts: Matrix
 
 
 class FrozenProbes:
@@ -62,7 +60,7 @@ class FrozenProbes:
     """
 
     def __init__(
-        self, run: Run, results: ProbeResults, category: str, view: str, readings: dict[int, Values] | None = None
+        self, run: Run, results: ProbeResults, category: str, view: str, readings: dict[int, Matrix] | None = None
     ) -> None:
         self.run, self.curve = run, results.curves[category, view]
         self._readings = readings
@@ -75,7 +73,7 @@ class FrozenProbes:
         """The S sites, in the order of the curve."""
         return self.curve.sites
 
-    def first(self, position: int) -> Values:
+    def first(self, position: int) -> Matrix:
         """Return the log-odds (S,) of the episode in row `position` at the inference of the probes.
 
         They are those of `log_odds`. Of the run's own probes they are the stored out-of-fold ones; NaN for an
@@ -90,13 +88,13 @@ class FrozenProbes:
             self._readings[number] = values[0] if len(values) else np.full(len(self.sites), np.nan)
         return self._readings[number]
 
-    def _stored(self, episode: str, side_correct: str) -> Values:
+    def _stored(self, episode: str, side_correct: str) -> Matrix:
         column = self._place_of.get(episode)
         if column is None:
             return np.full(len(self.sites), np.nan)
         return np.asarray(self.curve.decisions[:, column] * toward(side_correct))
 
-    def log_odds(self, position: int) -> tuple[Values, bool]:
+    def log_odds(self, position: int) -> tuple[Matrix, bool]:
         """Return the log-odds (K, S) of the episode in row `position`, by captured inference and site.
 
         Only the inferences that the episode reached are in it. Log-odds are toward the correct side. They are NaN
@@ -122,10 +120,10 @@ class FrozenProbes:
             log_odds[:, probes.positions] = values * toward(side)
         return log_odds, fold is not None
 
-    def _features(self, stream: str, probes: _StreamProbes, position: int, calls: int) -> Values:
+    def _features(self, stream: str, probes: _StreamProbes, position: int, calls: int) -> Matrix:
         """Return the view (K, S, D) at every captured inference; NaN where it is not stored."""
         sites: tuple[Any, ...] = (slice(None), *probes.at)
-        first: Values = self._rows[stream][position][:calls][(*sites, probes.view)].astype(np.float64)
+        first: Matrix = self._rows[stream][position][:calls][(*sites, probes.view)].astype(np.float64)
         if len(first) == calls:
             return first
         later = np.full((calls - 1, *first.shape[1:]), np.nan)
@@ -144,7 +142,7 @@ class FrozenProbes:
         return np.asarray(reached_calls(self.run).sum(axis=1))
 
     @cached_property
-    def _rows(self) -> dict[str, Rows]:
+    def _rows(self) -> dict[str, EpisodeRows]:
         return {stream: self.run.rows(stream) for stream in self._streams}
 
     @cached_property
@@ -172,7 +170,7 @@ def toward(side_correct: str) -> float:
     return 1.0 if side_correct == "left" else -1.0
 
 
-def decisions_toward_correct(curve: ProbeCurve, positions: Sequence[int], sides: Sequence[str]) -> Values:
+def decisions_toward_correct(curve: ProbeCurve, positions: Sequence[int], sides: Sequence[str]) -> Matrix:
     """Return the held-out log-odds (S, E) of some episodes of the curve, the correct side up.
 
     Args:
@@ -203,12 +201,7 @@ class ViewedRun:
     key: str
     run: Run
     lender: "ViewedRun | None" = None
-    readings: dict[str, dict[int, Values]] = field(default_factory=dict)
-
-    @property
-    def has_sides(self) -> bool:
-        """Whether answers lie on a side, as in the scene; other runs have no retention table."""
-        return has_sides(self.run)
+    readings: dict[str, dict[int, Matrix]] = field(default_factory=dict)
 
     @cached_property
     def table(self) -> RetentionTable:
@@ -223,7 +216,7 @@ class ViewedRun:
     @property
     def own_results(self) -> ProbeResults | None:
         """The probes of the table; None without any."""
-        return self.table.results_of(self.run.location) if self.has_sides else None
+        return self.table.results_of(self.run.location) if self.run.source.is_scene else None
 
     @property
     def is_lent(self) -> bool:

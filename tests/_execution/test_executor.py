@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from probe_kit._execution.executor import GivenUp, Idle, Lost, TaskQueue, Work, WorkerLostWarning, work_off
+from probe_kit._execution.executor import GivenUp, IdleMessage, Lost, TaskQueue, Work, WorkerLostWarning, work_off
 from probe_kit._execution.process_pool import ProcessPool, share_of_machine
 from probe_kit._system.machine import CORES, cores_here
 from probe_kit.errors import UsageError, WorkerDiedError
@@ -70,7 +70,7 @@ class Workers:
                 yield slot, Lost(f"worker {slot}", "ended with code 9")
             elif slot in self._asking:
                 self._asking.discard(slot)
-                yield slot, Idle()
+                yield slot, IdleMessage()
             elif self._held[slot] and (lost := self._dies(slot, self._held[slot][0])):
                 yield slot, lost
             elif self._held[slot]:
@@ -244,7 +244,9 @@ def is_running(pid: int) -> bool:
 def test_each_worker_gets_the_setup_its_own_environment_and_task_after_task(shared: ProcessPool) -> None:
     for slot in (0, 1):
         shared.send(slot, f"to {slot}")
-    assert answers(shared, {0: 2, 1: 2}) == {slot: [(SETUP, str(slot), f"to {slot}"), Idle()] for slot in (0, 1)}
+    assert answers(shared, {0: 2, 1: 2}) == {
+        slot: [(SETUP, str(slot), f"to {slot}"), IdleMessage()] for slot in (0, 1)
+    }
 
 
 @pytest.mark.parametrize(
@@ -258,7 +260,7 @@ def test_a_worker_that_ends_is_named_with_its_code_and_can_be_started_again(
     shared.send(0, task)
     assert answers(shared, {0: 1}) == {0: [lost]}
     shared.start(0)
-    assert answers(shared, {0: 1}) == {0: [Idle()]}
+    assert answers(shared, {0: 1}) == {0: [IdleMessage()]}
     assert shared.pid(0) != before
 
 
@@ -314,7 +316,7 @@ with ProcessPool(echo, None, 1) as pool:
     )  # fmt: skip
     assert driver.stdout is not None
     pid = int(driver.stdout.readline())
-    assert "Idle" in driver.stdout.readline()
+    assert "IdleMessage" in driver.stdout.readline()
     assert os.getpgid(pid) != os.getpgid(driver.pid)
     os.killpg(driver.pid, signal.SIGINT)
     _, errors = driver.communicate(timeout=60)

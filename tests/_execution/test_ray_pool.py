@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from probe_kit._execution import ray_pool
-from probe_kit._execution.executor import GivenUp, Idle, TaskQueue, WorkerLostWarning, work_off
+from probe_kit._execution.executor import GivenUp, IdleMessage, TaskQueue, WorkerLostWarning, work_off
 from probe_kit._execution.ray_pool import ClusterFullWarning, RayPool
 from probe_kit.errors import UnknownModelError, WorkerDiedError
 
@@ -31,7 +31,7 @@ class Actor:
     gpus: int
     running: bool = False
     dead: bool = False
-    reports: list[Any] = field(default_factory=lambda: [Idle()])
+    reports: list[Any] = field(default_factory=lambda: [IdleMessage()])
     tasks: list[Any] = field(default_factory=list)
 
     def __getattr__(self, name: str) -> Any:
@@ -43,7 +43,7 @@ class Actor:
 
     def _give(self, task: Any) -> None:
         self.tasks.append(task)
-        self.reports += [task, Idle()]
+        self.reports += [task, IdleMessage()]
 
     def _collect(self) -> "Call":
         return Call(self)
@@ -58,7 +58,7 @@ class Call:
 class Cluster:
     """room: actors that can run at a time. dies: of each actor with something to report, whether it dies first.
 
-    first_report: instead of `Idle`. alive: names of its nodes.
+    first_report: instead of `IdleMessage`. alive: names of its nodes.
     """
 
     room: int

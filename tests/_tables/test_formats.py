@@ -20,7 +20,7 @@ from probe_kit._tables.formats import names, render
 from probe_kit._tables.formats.latex import _SPECIAL, MOST_COLUMNS
 from probe_kit._tables.html import sort_key
 from probe_kit._tables.numbers import number
-from probe_kit._tables.table import Cell, Heading, Legend, Row, Table, absent, group_headings
+from probe_kit._tables.table import Cell, Heading, Legend, Table, TableRow, absent, group_headings
 
 HOSTILE = [
     "<img src=x onerror=alert(1)>", "</script><b>", "[text](https://evil.example)", "**bold**", "a | b",
@@ -40,7 +40,7 @@ def tables(draw: st.DrawFn) -> Table:
     width, names = draw(st.integers(2, 5)), draw(st.integers(1, 2))
     headings = [Heading(draw(CELLS), group=draw(st.sampled_from(["", "first", "a|b"]))) for _ in range(width)]
     rows = [
-        Row(
+        TableRow(
             tuple(
                 Cell(draw(CELLS), heat=draw(st.sampled_from([None, 0.1, 0.9])), alarm=draw(st.booleans()))
                 for _ in range(width)

@@ -40,7 +40,7 @@ def kinds(cell: NotebookNode) -> list[str]:
 FIGURES = {
     "layer_curve": "pk.layer_curve(results)",
     "display": "pk.LayerCurveDisplay.from_results(results, 'color').plot()",
-    "heat table": "SuccessTableDisplay.from_table(table).plot()",
+    "knowledge and action": "pk.KnowledgeActionDisplay.from_table(table).plot()",
     "model depths": "model_depths([results])",
     "final positions": "pk.FinalPositionsDisplay.from_run(run).plot()",
     "layer_curve, after pyplot came in": "pk.layer_curve(results)",
@@ -58,7 +58,6 @@ def executed_cells(
     loading = (
         f"import probe_kit as pk\nrun = pk.open_run({str(run.path)!r})\n"
         f"results = pk.load_results(run, {results.key!r})\ntable = pk.retention_table([run], keys=[results.key])\n"
-        "from probe_kit.retention import SuccessTableDisplay\n"
         "from probe_kit.retention.displays import model_depths"
     )
     cells = {"loading": loading, **FIGURES}

@@ -167,7 +167,7 @@ def test_the_same_command_loads_what_is_stored_and_python_gives_the_same_numbers
     measured = [name for name, value in first.items() if isinstance(value, int | float)]
     assert len(measured) > 10
     assert [second[name] for name in measured] == [first[name] for name in measured]
-    result = pk.run_intervention(pk.open_run(intervened), pk.ImageSwap(), pk.ReplaySource())
+    result = pk.run_intervention(pk.open_run(intervened), pk.ImageSwap(), pk.ReplayFiles())
     assert result.table["reach_share"].tolist() == pytest.approx([first["reach_share"]], rel=1e-12)
 
 

@@ -17,7 +17,7 @@ from probe_kit.demo.pipeline import (
     TRAINED,
     UNTRAINED_NETWORK,
     VLM,
-    Finding,
+    OrganismVerdict,
     measure_truth,
     organism_table,
     settings_of,
@@ -139,7 +139,8 @@ def test_the_table_shows_the_margin_that_decides() -> None:
     changed_row = replace(table_row, success=replace(table_row.success, **margins))
     with out.capture() as printed:
         out.print(
-            organism_table([Finding("trained", "color", "used", verdict(changed_row), changed_row)]), width=160
+            organism_table([OrganismVerdict("trained", "color", "used", verdict(changed_row), changed_row)]),
+            width=160,
         )
     text = printed.get()
     assert "20.0" in text
@@ -148,9 +149,9 @@ def test_the_table_shows_the_margin_that_decides() -> None:
 
 def test_the_table_counts_the_true_verdicts() -> None:
     findings = [
-        Finding("trained", "color", "used", "used", row(0.9, 0.005)),
-        Finding("trained", "state", "not used", "absent", row(0.5, 0.3)),
-        Finding("early", "state", DOES_NOT_DECIDE, "undecided", row(0.5, 0.3)),
+        OrganismVerdict("trained", "color", "used", "used", row(0.9, 0.005)),
+        OrganismVerdict("trained", "state", "not used", "absent", row(0.5, 0.3)),
+        OrganismVerdict("early", "state", DOES_NOT_DECIDE, "undecided", row(0.5, 0.3)),
     ]
     with out.capture() as printed:
         out.print(organism_table(findings), width=160)
@@ -176,7 +177,7 @@ def test_the_table_counts_the_true_verdicts() -> None:
 )
 def test_a_verdict_is_true_undecided_or_wrong(expected: str, verdict: str, agreement: str) -> None:
     """An expert of random weights was not trained to choose by the answer, nor to ignore it."""
-    assert Finding("early", "state", expected, verdict, row(0.5, 0.3)).agreement == agreement
+    assert OrganismVerdict("early", "state", expected, verdict, row(0.5, 0.3)).agreement == agreement
 
 
 def test_every_compatible_verdict_is_one_that_the_instrument_gives() -> None:

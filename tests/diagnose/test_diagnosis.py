@@ -24,7 +24,7 @@ from probe_kit.extract import ExtractSettings, LeRobotSource, extract_run
 from probe_kit.hooks import Interventions, Policy
 from probe_kit.hooks.families.pi0.adapter import load_pi0_tiny
 from probe_kit.intervene.open_session import open_session
-from probe_kit.intervene.sessions import ReplaySource
+from probe_kit.intervene.sessions import ReplayFiles
 from probe_kit.runs import Run, verify_run
 from probe_kit.runs.layout import DIAGNOSES
 from probe_kit.runs.results import write_bundle
@@ -288,7 +288,7 @@ def test_paraphrases_must_differ(tmp_path: Path, folder: Path) -> None:
 @pytest.mark.slow
 def test_recordings_of_the_same_frames_have_the_same_diagnosis(run: Run, tmp_path: Path) -> None:
     pytest.importorskip("lerobot.datasets.lerobot_dataset", reason="the extra `datasets` is not installed")
-    with open_session(run, ReplaySource()) as session, session.ready():
+    with open_session(run, ReplayFiles()) as session, session.ready():
         frames = frames_of(session, 8)
     write_recording(tmp_path / "frames", [[frame.observation] for frame in frames])
     source = LeRobotSource(str(tmp_path / "frames"), cameras={"base": CAMERA})

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from probe_kit.diagnose.diagnosis import diagnose_run
-from probe_kit.extract import EnvSource, ExtractSettings, extract_run
+from probe_kit.extract import EnvironmentSettings, ExtractSettings, extract_run
 from probe_kit.runs import Run
 from tests.support.reach_env import Reach, ReachEnv
 
@@ -28,7 +28,7 @@ class DarkEnv(ReachEnv):
 
 
 def played(name: str, folder: Path) -> Run:
-    source = EnvSource(f"{__name__}:{name}", max_steps=1)
+    source = EnvironmentSettings(f"{__name__}:{name}", max_steps=1)
     return extract_run(ExtractSettings("pi0-tiny", source=source, env_workers=0, execute=1), folder / "run")
 
 

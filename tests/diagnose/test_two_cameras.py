@@ -12,9 +12,9 @@ from probe_kit.cli import app
 from probe_kit.diagnose.diagnosis import check_base, check_base_files, diagnose_run
 from probe_kit.diagnose.inputs import names_of
 from probe_kit.errors import UsageError
-from probe_kit.extract import EnvSource, ExtractSettings, extract_run
+from probe_kit.extract import EnvironmentSettings, ExtractSettings, extract_run
 from probe_kit.hooks.contract.card import shown_cameras
-from probe_kit.intervene.sessions import ReplaySource
+from probe_kit.intervene.sessions import ReplayFiles
 from probe_kit.runs import Run
 from probe_kit.runs.run_source import Origin
 from probe_kit.suite import Suite
@@ -33,7 +33,7 @@ def checkpoint(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> 
 
 @pytest.fixture(scope="module")
 def run(checkpoint: str, tmp_path_factory: pytest.TempPathFactory) -> Run:
-    source = EnvSource(ENVIRONMENT, max_steps=1)
+    source = EnvironmentSettings(ENVIRONMENT, max_steps=1)
     settings = ExtractSettings("smolvla", checkpoint, source=source, execute=1, env_workers=0, accept_units=True)
     return extract_run(settings, tmp_path_factory.mktemp("played") / "run")
 
@@ -96,8 +96,10 @@ def test_a_base_of_other_cameras_is_refused_by_its_configuration_alone(tmp_path:
             certificate={"policy": {"cameras": ["top", "wrist"], "needs": ["camera.wrist"]}},
         ),
     )
-    check_base(run, ReplaySource(), same)
+    check_base(run, ReplayFiles(), same, ("top", "wrist"))
     with pytest.raises(UsageError, match=r"other inputs: its cameras are .*front.*, those of .*tuned .*top"):
-        check_base(run, ReplaySource(), other)
+        check_base(run, ReplayFiles(), other, ("top", "wrist"))
     with pytest.raises(UsageError, match=f"those of {re.escape(same)} "):
-        check_base(run, ReplaySource(checkpoint=same), other)  # where a checkpoint is given, it is that one
+        check_base(
+            run, ReplayFiles(checkpoint=same), other, ("top", "wrist")
+        )  # where a checkpoint is given, it is that one

@@ -26,8 +26,8 @@ from tests.support.pi0_checkpoints import write_intact
 from tests.support.pi05_checkpoints import write_pi05
 from tests.support.smolvla_checkpoints import write_smolvla
 
-DECLARING = [name for name, family in own_families().items() if family.declared]
-RELEASED = [(name, size) for name in DECLARING for size in own_families()[name].declared]
+DECLARING = [name for name, family in own_families().items() if family.checkpoints.declared]
+RELEASED = [(name, size) for name in DECLARING for size in own_families()[name].checkpoints.declared]
 
 
 @pytest.fixture
@@ -46,10 +46,14 @@ def nowhere(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 def settings_of(name: str, suite: Suite, **options: Any) -> ExtractSettings | AskSettings:
     family = own_families()[name]
-    kind = ExtractSettings if family.acts else AskSettings
-    if family.needs_checkpoint:
+    kind = ExtractSettings if family.abilities.acts else AskSettings
+    if family.requirements.needs_checkpoint:
         options.setdefault("checkpoint", "lab/tuned")  # of the hub, and not here
-    if family.acts and "checkpoint" not in options and family.default_checkpoint in family.not_acting:
+    if (
+        family.abilities.acts
+        and "checkpoint" not in options
+        and family.default_checkpoint in family.checkpoints.not_acting
+    ):
         options["capture_only"] = True
     return kind(
         name, suite=suite.folder, categories=("color",), items=2, tokens="pooled", device="cuda", **options
@@ -61,7 +65,7 @@ def settings_of(name: str, suite: Suite, **options: Any) -> ExtractSettings | As
 def test_a_plan_needs_no_weights_no_network_and_no_gpu(name: str, size: str, small_suite: Suite) -> None:
     options = {"size": size} if size else {}
     planned = prepare(settings_of(name, small_suite, options=options), fetch=False)
-    declared = own_families()[name].declared[size]
+    declared = own_families()[name].checkpoints.declared[size]
     shapes = [
         (
             declaration.stream.name,
@@ -85,9 +89,9 @@ def test_a_plan_needs_no_weights_no_network_and_no_gpu(name: str, size: str, sma
 def test_memory_and_download_of_every_released_size_are_named(name: str, size: str) -> None:
     options = {"size": size} if size else {}
     family = own_families()[name]
-    count = family.parameters[size]
+    count = family.checkpoints.parameters[size]
     words = weights_needed(name, None, options, "bfloat16")
-    assert f"memory {(4 if family.always_float32 else 2) * count / 1e9:,.1f} GB" in words
+    assert f"memory {(4 if family.requirements.always_float32 else 2) * count / 1e9:,.1f} GB" in words
     assert f"or {4 * count / 1e9:,.1f} GB, as stored, estimated" in words or "nothing to download" in words
     assert weights_needed("pi0-tiny", None, {}, None) == ""
 
@@ -97,7 +101,9 @@ def test_a_checkpoint_in_a_folder_is_nothing_to_download(tmp_path: Path) -> None
     assert words.endswith("nothing to download")
 
 
-NOT_ACTING = [(name, checkpoint) for name, family in own_families().items() for checkpoint in family.not_acting]
+NOT_ACTING = [
+    (name, checkpoint) for name, family in own_families().items() for checkpoint in family.checkpoints.not_acting
+]
 
 
 @pytest.mark.usefixtures("nowhere")
@@ -140,7 +146,7 @@ def test_a_checkpoint_whose_configuration_is_in_the_cache_is_planned_with_its_ow
     folder = write(tmp_path / "model")
     model = load_model(name, str(folder), **options)
     repo = cached(monkeypatch, tmp_path / "cache", "lab/tiny", folder)
-    model_options: dict[str, Any] = {"capture_only": True} if own_families()[name].acts else {}
+    model_options: dict[str, Any] = {"capture_only": True} if own_families()[name].abilities.acts else {}
     settings = settings_of(name, small_suite, checkpoint=repo, options=options, **model_options)
     planned = prepare(settings, fetch=False)
     assert sizes(planned.plan.streams) == sizes(model.streams.values())
@@ -244,10 +250,12 @@ def test_a_download_is_counted_from_the_index_of_the_weights_in_the_cache(
 
 def test_every_family_of_the_hub_declares_its_sizes() -> None:
     for name, family in own_families().items():
-        on_the_hub = family.default_checkpoint is not None or family.needs_checkpoint
-        assert bool(family.declared) == on_the_hub, name
-        assert family.parameters.keys() == family.declared.keys(), name
-        assert family.sizes == () or [size for size, _ in family.sizes] == list(family.declared)
+        on_the_hub = family.default_checkpoint is not None or family.requirements.needs_checkpoint
+        assert bool(family.checkpoints.declared) == on_the_hub, name
+        assert family.checkpoints.parameters.keys() == family.checkpoints.declared.keys(), name
+        assert family.checkpoints.sizes == () or [size for size, _ in family.checkpoints.sizes] == list(
+            family.checkpoints.declared
+        )
 
 
 @pytest.mark.slow
@@ -256,13 +264,13 @@ def test_declared_sizes_are_those_of_the_released_network(name: str, size: str) 
     """Of every stream there is a list of so many blocks whose weights have its width; on the meta device."""
     family = own_families()[name]
     network = family.function("full_size")(*([size] if size else []))
-    assert sum(parameter.numel() for parameter in network.parameters()) == family.parameters[size]
+    assert sum(parameter.numel() for parameter in network.parameters()) == family.checkpoints.parameters[size]
     lists = [
         (len(module), {side for parameter in module[0].parameters() for side in parameter.shape})
         for module in network.modules()
         if isinstance(module, nn.ModuleList) and len(module)
     ]
-    for declaration in family.declared[size]:
+    for declaration in family.checkpoints.declared[size]:
         fits = [
             blocks
             for blocks, sides in lists
@@ -277,7 +285,8 @@ def test_declared_streams_have_the_names_and_roles_of_the_loaded_model(name: str
     write, options = WRITERS[name]
     model = load_model(name, str(write(tmp_path / "model")), **options)
     declared = {
-        declaration.stream.name: declaration for declaration in next(iter(own_families()[name].declared.values()))
+        declaration.stream.name: declaration
+        for declaration in next(iter(own_families()[name].checkpoints.declared.values()))
     }
     assert declared.keys() == model.streams.keys()
     for stream in model.streams.values():

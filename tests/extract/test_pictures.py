@@ -27,7 +27,7 @@ from probe_kit.extract.sources import kinds
 from probe_kit.extract.sources.pictures import PictureSource
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks import Observation, Policy
-from probe_kit.intervene import AttentionReadout, InstructionSwap, ReplaySource, run_intervention
+from probe_kit.intervene import AttentionReadout, InstructionSwap, ReplayFiles, run_intervention
 from probe_kit.intervene.frame_session import Frames, FrameSession
 from probe_kit.intervene.open_session import open_session
 from probe_kit.retention.displays import attention_on_picture
@@ -175,7 +175,7 @@ def test_a_table_of_a_spreadsheet_is_read_by_the_rules_of_all_tables(folder: Pat
 def test_pictures_are_shown_again_for_interventions_and_diagnoses(
     run: pk.Run, folder: Path, pi0_tiny: Policy
 ) -> None:
-    with open_session(run, ReplaySource(), lambda *_: pi0_tiny) as session:
+    with open_session(run, ReplayFiles(), lambda *_: pi0_tiny) as session:
         assert isinstance(session, FrameSession)
         frames = session.frames.index
         assert [frame.group for frame in frames] == [f"g{number}" for number in range(COUNT)]
@@ -195,9 +195,9 @@ def test_pictures_that_were_moved_are_given_by_the_options_of_extract(
     gone = {"folder": "/nowhere/photos", "table": "/nowhere/table.csv"}
     moved.__dict__["origins"] = tuple(replace(origin, files=gone) for origin in run.origins)
     with pytest.raises(UsageError, match="Give it with --pictures"):
-        Frames(moved, ReplaySource())
+        Frames(moved, ReplayFiles())
     places = moved_of(moved, {"pictures": tmp_path / "photos", "table": tmp_path / "photos" / "table.csv"})
-    frames = Frames(moved, ReplaySource(moved=places))
+    frames = Frames(moved, ReplayFiles(moved=places))
     assert len(frames.index) == COUNT
 
 

@@ -18,7 +18,14 @@ from probe_kit.cli import app
 from probe_kit.env import SceneSpec
 from probe_kit.env.spec import PRESETS
 from probe_kit.errors import RunDamagedError, SettingsMismatchError, UsageError
-from probe_kit.extract import AskSettings, EnvSource, ExtractSettings, LeRobotSource, extract_run, prepare
+from probe_kit.extract import (
+    AskSettings,
+    EnvironmentSettings,
+    ExtractSettings,
+    LeRobotSource,
+    extract_run,
+    prepare,
+)
 from probe_kit.extract.config_files import read_config
 from probe_kit.extract.extraction import open_checked
 from probe_kit.extract.parts import ModelSettings
@@ -114,7 +121,7 @@ def test_a_command_line_and_keywords_make_the_same_settings() -> None:
         "kitchen", episodes=(0, 1, 4), every=3, cameras={"base": "top"}, rotations={"base": 90}, pixels=False
     )
     played = "--model pi0 --env kitchen:Kitchen --env-option count=3 --max-steps 9 --episodes 1"
-    expected = EnvSource("kitchen:Kitchen", options={"count": "3"}, max_steps=9, episodes=[1])
+    expected = EnvironmentSettings("kitchen:Kitchen", options={"count": "3"}, max_steps=9, episodes=[1])
     assert typed(*played.split()).source == expected
 
 
@@ -253,7 +260,7 @@ def test_sources_share_the_options_that_mean_the_same() -> None:
         (ExtractSettings("openvla", options={"centre_crop": True}), "openvla · centre_crop=True"),
         (ExtractSettings("pi0", random_weights=True, weights_seed=2), "pi0 · twin 2"),
         (ExtractSettings("pi0", label="after fine-tuning"), "after fine-tuning"),
-        (ExtractSettings("pi0", source=EnvSource("kitchen:Kitchen")), "pi0 · in kitchen:Kitchen"),
+        (ExtractSettings("pi0", source=EnvironmentSettings("kitchen:Kitchen")), "pi0 · in kitchen:Kitchen"),
     ],
 )
 def test_what_sets_a_run_apart_is_in_its_label(settings: ExtractSettings, label: str) -> None:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from probe_kit.hooks import Observation, capture
 from probe_kit.hooks.capturing.capture_context import reason_of_change
 from probe_kit.hooks.family import Family
+from probe_kit.hooks.family_parts import Requirements
 from probe_kit.hooks.testing import example_observations
 from tests.support.encoder_vla.policy import EncoderPolicy, load, write_checkpoint
 
@@ -55,7 +56,13 @@ def test_torchs_fused_encoder_rounds_differently_under_hooks_and_is_named(checkp
 
 
 def test_a_family_loads_with_the_fused_encoder_switched_off(checkpoint: str) -> None:
-    family = Family("encoder-vla", "", None, "tests.support.encoder_vla.policy:load", needs_checkpoint=True)
+    family = Family(
+        "encoder-vla",
+        "",
+        None,
+        "tests.support.encoder_vla.policy:load",
+        requirements=Requirements(needs_checkpoint=True),
+    )
     policy = family.load(checkpoint)
     assert isinstance(policy, EncoderPolicy)
     np.testing.assert_array_equal(plain(policy), captured(policy))

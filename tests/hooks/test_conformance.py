@@ -25,7 +25,7 @@ from probe_kit.hooks import Family, Model, Observation, Roles, Site, Stream, Tap
 from probe_kit.hooks.checkpoints.weights import read_weights
 from probe_kit.hooks.conformance.check import (
     CheckFailedError,
-    Outcome,
+    CheckOutcome,
     SkipTest,
     check,
     expect_refusal,
@@ -36,6 +36,7 @@ from probe_kit.hooks.conformance.check import (
 )
 from probe_kit.hooks.conformance.subject import AnswerSubject, PolicySubject, Subject
 from probe_kit.hooks.families.pi0.adapter import Pi0
+from probe_kit.hooks.family_parts import Requirements
 from probe_kit.hooks.testing import ANSWER_CHECKS, POLICY_CHECKS
 from tests.support.contracts import GOLDEN
 from tests.support.encoder_vla.policy import CHUNK, STEPS, WIDTH, EncoderPolicy, EncoderVLA, load, write_checkpoint
@@ -43,7 +44,7 @@ from tests.support.parsed import package_nodes
 from tests.support.position_models import PositionModel, always, likes
 
 
-def of(error: BaseException | None) -> Outcome:
+def of(error: BaseException | None) -> CheckOutcome:
     def body() -> None:
         if error is not None:
             raise error
@@ -52,12 +53,12 @@ def of(error: BaseException | None) -> Outcome:
 
 
 def test_no_error_is_passed_and_a_skip_has_its_reason() -> None:
-    assert of(None) == Outcome("name", "passed", "A promise.")
-    assert of(SkipTest("no kv")) == Outcome("name", "skipped", "A promise.", reason="no kv")
+    assert of(None) == CheckOutcome("name", "passed", "A promise.")
+    assert of(SkipTest("no kv")) == CheckOutcome("name", "skipped", "A promise.", reason="no kv")
 
 
 def test_a_failure_has_what_was_seen_expected_and_to_be_changed() -> None:
-    assert of(CheckFailedError("this", "that")) == Outcome(
+    assert of(CheckFailedError("this", "that")) == CheckOutcome(
         "name", "failed", "A promise.", "this", "that", "Do it."
     )
     assert of(CheckFailedError("this", "that", "Do that.")).change == "Do that."
@@ -418,7 +419,13 @@ def load_sloppily(checkpoint: str, *_: object, **__: object) -> EncoderPolicy:
 
 
 def subject_of(loader: str, checkpoint: Path, monkeypatch: pytest.MonkeyPatch) -> Subject:
-    family = Family("encoder-vla", "", None, loader, needs_checkpoint=True)
+    family = Family(
+        "encoder-vla",
+        "",
+        None,
+        loader,
+        requirements=Requirements(needs_checkpoint=True),
+    )
     entry = SimpleNamespace(name="encoder-vla", load=lambda: family, value="x:y", dist=None)
     monkeypatch.setattr(registry, "family_entries", lambda: [entry])
     return PolicySubject("encoder-vla", checkpoint)

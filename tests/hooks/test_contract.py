@@ -46,9 +46,9 @@ from probe_kit.runs.layout import StoredStream
 FAMILIES = own_families()
 
 
-@pytest.mark.parametrize("name", [name for name, family in FAMILIES.items() if family.acts])
+@pytest.mark.parametrize("name", [name for name, family in FAMILIES.items() if family.abilities.acts])
 def test_every_family_that_acts_names_its_streams_and_gives_a_reason_for_what_it_lacks(name: str) -> None:
-    supported = FAMILIES[name].interventions
+    supported = FAMILIES[name].abilities.interventions
     assert supported.edits, "say which quantities of which streams can be rewritten"
     assert {"backbone"} < supported.edits.keys()
     assert supported.prompt_kv or "kv" in supported.instead
@@ -57,7 +57,7 @@ def test_every_family_that_acts_names_its_streams_and_gives_a_reason_for_what_it
     assert json.loads(json.dumps(supported.to_json()))["kinds"][:2] == ["swap", "edit"]
 
 
-@pytest.mark.parametrize("name", [name for name, family in FAMILIES.items() if not family.acts])
+@pytest.mark.parametrize("name", [name for name, family in FAMILIES.items() if not family.abilities.acts])
 def test_a_vlm_is_refused_because_it_does_not_act(name: str) -> None:
     with pytest.raises(UnsupportedInterventionError, match=f"{name}.*does not act"):
         FAMILIES[name].check_intervention("follow")

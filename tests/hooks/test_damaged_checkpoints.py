@@ -38,7 +38,7 @@ def copy_of(folder: Path) -> Callable[[Path], Path]:
 
 
 FAMILIES = {
-    **{name: pair for name, pair in WRITERS.items() if find_family(name).acts},
+    **{name: pair for name, pair in WRITERS.items() if find_family(name).abilities.acts},
     "pi0-tiny": (copy_of(embedded_checkpoint("pi0-tiny")), {}),
     "pi0": (copy_of(GOLDEN / "pi0" / "checkpoint"), {}),  # with the statistics that others leave to an evaluation
     "groot": (copy_of(GOLDEN / "groot" / "checkpoint"), {}),  # without the base's weights, which nothing reads
@@ -132,7 +132,7 @@ def edit_tensors(
 def test_every_family_of_ours_is_looked_at() -> None:
     from probe_kit.hooks.registry import own_families
 
-    acting = {name for name, entry in own_families().items() if entry.acts}
+    acting = {name for name, entry in own_families().items() if entry.abilities.acts}
     assert acting - {"pi0-tiny-early", "pi0-tiny-state"} == FAMILIES.keys()
 
 

@@ -86,7 +86,7 @@ def test_everything_a_family_still_needs_is_named(monkeypatch: pytest.MonkeyPatc
 
 
 def test_the_seven_models_of_the_papers_tables_can_be_loaded_by_name() -> None:
-    acting = {name for name, family in known_families().items() if family.acts}
+    acting = {name for name, family in known_families().items() if family.abilities.acts}
     assert acting >= {"pi0", "smolvla", "openvla", "spatialvla", "magma", "xiaomi-r0", "internvla-m1"}
 
 

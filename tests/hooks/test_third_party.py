@@ -92,7 +92,7 @@ def test_a_checkpoint_that_names_python_code_acts_without_it_or_is_refused(
     entry = find_family(family)
     try:
         model = entry.load(str(checkpoint), options=options)
-        if entry.acts:
+        if entry.abilities.acts:
             cameras = [need.removeprefix("camera.") for need in model.card.needs if need.startswith("camera.")]
             model.act(example_observations([QUESTIONS.get(family, "put the cube on the star")], cameras), [0])
     except MissingExtraError as error:

@@ -121,7 +121,9 @@ def test_the_network_of_a_released_size_has_the_recorded_tensors(
     verification = verify_keys(family, file)
     assert verification.passed, verification.comparisons
     size = file.name.split(".")[1]
-    assert not own_families()[family].sizes or verification.comparisons[0].output.endswith(f"keys of {size}")
+    assert not own_families()[family].checkpoints.sizes or verification.comparisons[0].output.endswith(
+        f"keys of {size}"
+    )
 
 
 @pytest.mark.parametrize(

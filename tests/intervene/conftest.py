@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from probe_kit.intervene import ReplaySource
+from probe_kit.intervene import ReplayFiles
 from probe_kit.intervene.open_session import open_session
 from probe_kit.intervene.sessions import ReplaySession
 from probe_kit.runs import Run, open_run
@@ -30,11 +30,11 @@ def copy(recorded_run: Run, tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 
 @pytest.fixture(scope="session")
-def source(small_suite: Suite) -> ReplaySource:
-    return ReplaySource(small_suite.folder)
+def source(small_suite: Suite) -> ReplayFiles:
+    return ReplayFiles(small_suite.folder)
 
 
 @pytest.fixture(scope="module")
-def session(copy: Run, source: ReplaySource, twin: "Policy") -> Iterator[ReplaySession]:
+def session(copy: Run, source: ReplayFiles, twin: "Policy") -> Iterator[ReplaySession]:
     with open_session(copy, source, lambda *_: twin) as opened, opened.ready():
         yield opened

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from probe_kit.errors import OtherFramesError, SettingsMismatchError, UsageError
-from probe_kit.extract import EnvSource, ExtractSettings, prepare
+from probe_kit.extract import EnvironmentSettings, ExtractSettings, prepare
 from probe_kit.extract.config_files import moved_of
 from probe_kit.hooks import Observation
 from probe_kit.intervene import AttentionReadout, ImageSwap, InstructionSwap, Interchange, run_intervention
 from probe_kit.intervene.frame_session import FrameSession
 from probe_kit.intervene.open_session import open_session
-from probe_kit.intervene.sessions import ReplaySource
+from probe_kit.intervene.sessions import ReplayFiles
 from probe_kit.runs import Run, open_run
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ def pi0_tiny(two_steps: Path) -> "Pi0":
 @pytest.fixture(scope="module")
 def played(_own_modules: None, pi0_tiny: "Pi0", tmp_path_factory: pytest.TempPathFactory) -> Run:
     """Six episodes in three groups, whose block and colour differ by the seed."""
-    source = EnvSource("reach_env:ReachEnv", max_steps=6, options={"count": str(EPISODES)})
+    source = EnvironmentSettings("reach_env:ReachEnv", max_steps=6, options={"count": str(EPISODES)})
     settings = ExtractSettings("pi0-tiny", source=source, captured_calls=2, execute=3, env_workers=0, batch=1)
     folder = tmp_path_factory.mktemp("played") / "run"
     prepare(settings, model=pi0_tiny).run(folder)
@@ -53,7 +53,7 @@ def played(_own_modules: None, pi0_tiny: "Pi0", tmp_path_factory: pytest.TempPat
 
 @pytest.fixture
 def session(played: Run, pi0_tiny: "Pi0") -> Iterator[FrameSession]:
-    with open_session(played, ReplaySource(), lambda *_: pi0_tiny, ImageSwap()) as opened, opened.ready():
+    with open_session(played, ReplayFiles(), lambda *_: pi0_tiny, ImageSwap()) as opened, opened.ready():
         assert isinstance(opened, FrameSession)
         yield opened
 
@@ -132,7 +132,7 @@ def test_another_version_of_the_environment_is_refused(
 
     monkeypatch.setattr(reach_env.ReachEnv, "revision", "reach 2")
     with pytest.raises((OtherFramesError, SettingsMismatchError), match="reach 2"):
-        open_session(played, ReplaySource(), lambda *_: pi0_tiny)
+        open_session(played, ReplayFiles(), lambda *_: pi0_tiny)
 
 
 @pytest.mark.slow
@@ -145,17 +145,17 @@ def test_an_environment_whose_module_was_moved_is_given_by_the_option_of_extract
         (tmp_path / folder).mkdir()
         (tmp_path / folder / f"{name}.py").write_text(text, encoding="utf-8")
     monkeypatch.syspath_prepend(str(tmp_path / "old"))
-    source = EnvSource("hand_env:ReachEnv", max_steps=1, options={"count": "6"})
+    source = EnvironmentSettings("hand_env:ReachEnv", max_steps=1, options={"count": "6"})
     settings = ExtractSettings("pi0-tiny", source=source, execute=1, env_workers=0, batch=1)
     prepare(settings, model=pi0_tiny).run(tmp_path / "run")
     run = open_run(tmp_path / "run")
     shutil.rmtree(tmp_path / "old")
     monkeypatch.delitem(sys.modules, "hand_env")
     with pytest.raises(UsageError, match=r"environment, which is not here any more. Give it with --env"):
-        open_session(run, ReplaySource(), lambda *_: pi0_tiny)
+        open_session(run, ReplayFiles(), lambda *_: pi0_tiny)
     monkeypatch.syspath_prepend(str(tmp_path / "new"))
     moved = moved_of(run, {"env": "hand_moved:ReachEnv", "device": "cpu"})
-    with open_session(run, ReplaySource(moved=moved), lambda *_: pi0_tiny) as opened:
+    with open_session(run, ReplayFiles(moved=moved), lambda *_: pi0_tiny) as opened:
         assert isinstance(opened, FrameSession)
         assert len(opened.frames.index) == len(run.episodes)
     with pytest.raises(UsageError, match=r"--dataset does not apply: .* is given with --env, --env-option"):
@@ -164,11 +164,11 @@ def test_an_environment_whose_module_was_moved_is_given_by_the_option_of_extract
 
 def test_a_mistyped_camera_and_an_unknown_frame_are_refused_before_the_model_is_loaded(played: Run) -> None:
     with pytest.raises(UsageError, match=r"vary is 'picture.wrist'; expected one of instruction, picture,"):
-        open_session(played, ReplaySource(), not_loaded, ImageSwap(vary="picture.wrist"))
+        open_session(played, ReplayFiles(), not_loaded, ImageSwap(vary="picture.wrist"))
     with pytest.raises(UsageError, match=r"no frame 1 of 'reach-00'.* it has of that episode 0"):
-        open_session(played, ReplaySource(), not_loaded, ImageSwap(pairs=(("reach-00", 1, "reach-01", 0),)))
+        open_session(played, ReplayFiles(), not_loaded, ImageSwap(pairs=(("reach-00", 1, "reach-01", 0),)))
 
 
 def test_fewer_episodes_than_the_run_has_are_refused(played: Run, pi0_tiny: "Pi0") -> None:
     with pytest.raises(OtherFramesError, match="has no episode 'reach-04' any more"):
-        open_session(played, ReplaySource(moved={"options": {"count": "4"}}), lambda *_: pi0_tiny)
+        open_session(played, ReplayFiles(moved={"options": {"count": "4"}}), lambda *_: pi0_tiny)

@@ -21,7 +21,7 @@ from probe_kit.intervene import (
     InterventionResult,
     JointPlaces,
     Knockout,
-    ReplaySource,
+    ReplayFiles,
     Steering,
     run_intervention,
 )
@@ -36,14 +36,14 @@ COMMON: dict[str, Any] = {"categories": ("color",), "items": ITEMS}
 
 
 def test_every_family_that_acts_is_here() -> None:
-    acting = {name for name, family in own_families().items() if family.acts}
+    acting = {name for name, family in own_families().items() if family.abilities.acts}
     assert acting - {"pi0-tiny-early", "pi0-tiny-state"} == FAMILIES.keys()
 
 
 @pytest.fixture(scope="module", params=FAMILIES)
 def measured_run(
     request: pytest.FixtureRequest, small_suite: Suite, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Run, ReplaySource]:
+) -> tuple[Run, ReplayFiles]:
     tiny = FAMILIES[request.param]
     checkpoint = tiny.prepare_checkpoint(small_suite, tmp_path_factory.mktemp("checkpoint"))
     settings = ExtractSettings(
@@ -51,7 +51,7 @@ def measured_run(
         scene=SceneSpec(max_steps=2), options=tiny.options, env_workers=0,
     )  # fmt: skip
     run = extract_run(settings, tmp_path_factory.mktemp("families") / request.param)
-    return run, ReplaySource(small_suite.folder, options=tiny.options)  # it loads the folder that the run names
+    return run, ReplayFiles(small_suite.folder, options=tiny.options)  # it loads the folder that the run names
 
 
 def asked_of(run: Run, kind: str) -> Intervention:
@@ -110,9 +110,9 @@ def asked_of(run: Run, kind: str) -> Intervention:
         "closed-loop",
     ],
 )
-def test_every_kind_runs_or_is_refused_by_name(measured_run: tuple[Run, ReplaySource], kind: str) -> None:
+def test_every_kind_runs_or_is_refused_by_name(measured_run: tuple[Run, ReplayFiles], kind: str) -> None:
     run, source = measured_run
-    intervention, supported = asked_of(run, kind), find_family(run.model).interventions
+    intervention, supported = asked_of(run, kind), find_family(run.model).abilities.interventions
     if any(not supported.supports(needed) for needed in intervention.required_capabilities):
         with pytest.raises(UnsupportedInterventionError, match=f"{run.model} does not support"):
             run_intervention(run, intervention, source, load=not_loaded)
@@ -126,13 +126,13 @@ def test_every_kind_runs_or_is_refused_by_name(measured_run: tuple[Run, ReplaySo
     _check_ledger(run, effects)
 
 
-def not_loaded(run: Run, _: ReplaySource) -> Policy:
+def not_loaded(run: Run, _: ReplayFiles) -> Policy:
     raise AssertionError(f"{run.model} was loaded before it was refused")
 
 
 def _check_ledger(run: Run, effects: InterventionResult) -> None:
     """Every change fired; what writes back what is there, or is read by nothing, changes nothing."""
-    supported = find_family(run.model).interventions
+    supported = find_family(run.model).abilities.interventions
     last = f"backbone.{run.streams['backbone'].layers - 1:02d}|"
     for name, counts in effects.certificate["edits"].items():
         assert counts["fires"] > 0, name

@@ -25,7 +25,7 @@ from probe_kit.intervene import (
     ConceptErasure,
     Interchange,
     JointPlaces,
-    ReplaySource,
+    ReplayFiles,
     Steering,
     run_intervention,
 )
@@ -241,7 +241,7 @@ def test_a_note_before_the_replay_names_what_is_really_patched(
     notes: list[str] = []
     places = ("backbone.02", "backbone.03")
     intervention = kind(sites=places, roles=("image",), categories=("color",), items=1, seed=int(is_noted))
-    source = ReplaySource(small_suite.folder)
+    source = ReplayFiles(small_suite.folder)
     result = run_intervention(copy, intervention, source, load=lambda *_: twin, on_note=notes.append)
     assert [note.startswith("unread: backbone.03. ") for note in notes] == [True] * is_noted
     assert any(note.startswith("unread: ") for note in result.notes) == is_noted
@@ -333,7 +333,7 @@ def test_tiles_are_exchanged_apart(copy: Run, small_suite: Suite, twin: "Policy"
         categories=("color",), items=1, sites=("backbone.00", "kv.01", "expert.00@0"),
         roles=("image", "image.left", "image.right"),
     )  # fmt: skip
-    effects = run_intervention(copy, intervention, ReplaySource(small_suite.folder), load=lambda *_: twin)
+    effects = run_intervention(copy, intervention, ReplayFiles(small_suite.folder), load=lambda *_: twin)
     edits = effects.certificate["edits"]
     roles = ("image", *TILES)
     assert set(edits) == {f"{site}|{role}" for site in ("backbone.00", "kv.01") for role in roles}

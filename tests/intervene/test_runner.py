@@ -29,7 +29,7 @@ from probe_kit.intervene import (
     ImageSwap,
     InstructionSwap,
     InterventionResult,
-    ReplaySource,
+    ReplayFiles,
     load_effects,
     run_intervention,
     stored_interventions,
@@ -53,7 +53,7 @@ FILES = ("episodes.npz", "effects.csv", "certificate.json")
 
 
 @pytest.fixture(scope="module")
-def effects(copy: Run, source: ReplaySource, twin: "Policy") -> InterventionResult:
+def effects(copy: Run, source: ReplayFiles, twin: "Policy") -> InterventionResult:
     return run_intervention(copy, ImageSwap(items=2), source, load=lambda *_: twin)
 
 
@@ -126,7 +126,7 @@ def test_what_is_stored_is_read_back_and_not_played_again(copy: Run, effects: In
     def load(*_: object) -> "Policy":
         raise AssertionError("it is stored")
 
-    again = run_intervention(copy, ImageSwap(items=2), ReplaySource(Path("nowhere")), load=load)
+    again = run_intervention(copy, ImageSwap(items=2), ReplayFiles(Path("nowhere")), load=load)
     assert again.key == effects.key
     assert again.to_csv() == effects.to_csv() == load_effects(copy).to_csv()
     assert json.loads(effects.to_json())["settings"]["items"] == 2
@@ -139,7 +139,7 @@ def test_an_intervened_run_is_whole(copy: Run, effects: InterventionResult) -> N
 
 
 def test_killed_and_resumed_gives_the_same_bytes(
-    copy: Run, effects: InterventionResult, mine: Run, source: ReplaySource, twin: "Policy"
+    copy: Run, effects: InterventionResult, mine: Run, source: ReplayFiles, twin: "Policy"
 ) -> None:
     folder = mine.path / "interventions" / effects.key
     shutil.rmtree(folder)
@@ -165,7 +165,7 @@ def test_killed_and_resumed_gives_the_same_bytes(
 
 @pytest.mark.parametrize("damage", ["cut", "emptied", "another piece"])
 def test_a_damaged_piece_is_said_and_computed_again(
-    damage: str, copy: Run, mine: Run, effects: InterventionResult, source: ReplaySource, twin: "Policy"
+    damage: str, copy: Run, mine: Run, effects: InterventionResult, source: ReplayFiles, twin: "Policy"
 ) -> None:
     """As a power cut leaves one: pieces are not flushed."""
     folder = mine.path / "interventions" / effects.key
@@ -188,7 +188,7 @@ def test_a_damaged_piece_is_said_and_computed_again(
 
 
 def test_a_piece_of_another_version_is_refused_with_what_to_do(
-    mine: Run, effects: InterventionResult, source: ReplaySource, twin: "Policy"
+    mine: Run, effects: InterventionResult, source: ReplayFiles, twin: "Policy"
 ) -> None:
     folder = mine.path / "interventions" / effects.key
     shutil.rmtree(folder)
@@ -275,7 +275,7 @@ def test_tables_of_other_runs_have_no_such_column(recorded_run: Run) -> None:
 
 
 def test_another_policy_another_suite_another_category_are_refused(
-    copy: Run, source: ReplaySource, twin: "Policy", pi0_tiny: "Policy", tmp_path: Path
+    copy: Run, source: ReplayFiles, twin: "Policy", pi0_tiny: "Policy", tmp_path: Path
 ) -> None:
     from probe_kit.suite import build_suite
 
@@ -283,7 +283,7 @@ def test_another_policy_another_suite_another_category_are_refused(
         run_intervention(copy, ImageSwap(items=1), source, load=lambda *_: pi0_tiny)
     other = build_suite(tmp_path / "other", ["color"], 2, seed=5)
     with pytest.raises(SuiteError):
-        run_intervention(copy, ImageSwap(items=1), ReplaySource(other.folder), load=lambda *_: twin)
+        run_intervention(copy, ImageSwap(items=1), ReplayFiles(other.folder), load=lambda *_: twin)
     with pytest.raises(UnknownCategoryError, match="color, shape"):
         run_intervention(copy, ImageSwap(categories=("colour",)), source, load=lambda *_: twin)
     with pytest.raises(UsageError, match="at least 1"):
@@ -295,16 +295,16 @@ def test_a_folder_called_embedded_is_not_taken_for_the_checkpoint_of_the_package
 ) -> None:
     (tmp_path / "embedded").mkdir()
     monkeypatch.chdir(tmp_path)
-    assert load_policy_of(copy, ReplaySource()).card.weights_sha256 == copy.weights_sha256
+    assert load_policy_of(copy, ReplayFiles()).card.weights_sha256 == copy.weights_sha256
 
 
 def test_the_seed_of_untrained_weights_is_that_of_the_run_unless_another_is_named(copy: Run) -> None:
     assert copy.origins[0].random_weights
-    assert load_policy_of(copy, ReplaySource()).card.weights_sha256 == copy.weights_sha256
+    assert load_policy_of(copy, ReplayFiles()).card.weights_sha256 == copy.weights_sha256
     run = open_run(copy.path)
     run.__dict__["origins"] = (replace(copy.origins[0], weights_seed=7),)
-    assert load_policy_of(run, ReplaySource()).card.weights_seed == 7
-    assert load_policy_of(run, ReplaySource(weights_seed=8)).card.weights_seed == 8
+    assert load_policy_of(run, ReplayFiles()).card.weights_seed == 7
+    assert load_policy_of(run, ReplayFiles(weights_seed=8)).card.weights_seed == 8
 
 
 def test_files_of_the_scene_are_those_of_the_run_as_long_as_they_are_there(
@@ -317,11 +317,11 @@ def test_files_of_the_scene_are_those_of_the_run_as_long_as_they_are_there(
     run.settings = {**run.settings, "scene": scene.to_json()}
     settings = ExtractSettings("pi0-tiny", scene=scene)
     run.__dict__["origins"] = (origin_of_process(settings, {}),)
-    with open_session(run, ReplaySource(), lambda *_: twin) as session:
+    with open_session(run, ReplayFiles(), lambda *_: twin) as session:
         assert session.scene.background == photo
     photo.unlink()
     with pytest.raises(SceneError, match="background"):
-        open_session(run, ReplaySource(), lambda *_: twin)
+        open_session(run, ReplayFiles(), lambda *_: twin)
 
 
 @pytest.mark.parametrize("where", ["drawn again", "found among more items"])
@@ -337,7 +337,7 @@ def test_without_a_named_suite_the_embedded_one_is_found_or_drawn_again(
     run = open_run(copy.path)
     run.__dict__["origins"] = ()  # as of a run from another machine
     with open_session(
-        run, ReplaySource(), lambda *_: twin
+        run, ReplayFiles(), lambda *_: twin
     ) as session:  # the first frames are the run's, or this raises
         assert len(session.pairs(str(copy.episodes["item_id"].iloc[0]))) == 2
     assert len(list((tmp_path / "suites").iterdir())) == 1

@@ -20,7 +20,7 @@ from probe_kit.intervene import (
     Interchange,
     InterventionResult,
     PatchEffect,
-    ReplaySource,
+    ReplayFiles,
     Steering,
     classify_use,
     load_effects,
@@ -48,7 +48,7 @@ LAST = 3
 
 
 @pytest.fixture(scope="module")
-def site_map(copy: Run, source: ReplaySource, twin: "Policy") -> InterventionResult:
+def site_map(copy: Run, source: ReplayFiles, twin: "Policy") -> InterventionResult:
     intervention = Interchange(
         categories=("color",),
         items=2,
@@ -100,7 +100,7 @@ def test_an_expert_is_changed_at_every_iteration_that_is_named(site_map: Interve
     ],
 )
 def test_a_role_that_nothing_plays_there_is_refused_and_nothing_is_stored(
-    copy: Run, source: ReplaySource, twin: "Policy", sites: tuple[str, ...], roles: tuple[str, ...], role: str
+    copy: Run, source: ReplayFiles, twin: "Policy", sites: tuple[str, ...], roles: tuple[str, ...], role: str
 ) -> None:
     before = Interchange.keys_in_use(copy)
     for intervention in (
@@ -125,7 +125,7 @@ def test_it_is_read_back_beside_what_else_is_stored(copy: Run, site_map: Interve
 
 @pytest.mark.slow
 def test_an_interchange_along_a_direction_takes_no_maps_place(
-    copy: Run, source: ReplaySource, twin: "Policy", site_map: InterventionResult
+    copy: Run, source: ReplayFiles, twin: "Policy", site_map: InterventionResult
 ) -> None:
     intervention = Interchange(
         categories=("color",), items=1, sites=("backbone.02",), roles=("image",), direction="mean-difference"
@@ -136,7 +136,7 @@ def test_an_interchange_along_a_direction_takes_no_maps_place(
 
 @pytest.mark.slow
 def test_steering_by_nothing_changes_nothing_and_controls_move_as_far(
-    copy: Run, source: ReplaySource, twin: "Policy"
+    copy: Run, source: ReplayFiles, twin: "Policy"
 ) -> None:
     intervention = Steering(
         categories=("color",), items=2, sites=("backbone.02",), role="image", coefficients=(2.0,), controls=1

@@ -14,7 +14,7 @@ from probe_kit.cli import app
 from probe_kit.errors import OtherFramesError, UsageError
 from probe_kit.extract import ExtractSettings, LeRobotSource, extract_run
 from probe_kit.hooks import Observation
-from probe_kit.intervene import AttributionPatching, ImageSwap, Interchange, ReplaySource, run_intervention
+from probe_kit.intervene import AttributionPatching, ImageSwap, Interchange, ReplayFiles, run_intervention
 from probe_kit.intervene.frame_session import FrameSession
 from probe_kit.intervene.open_session import open_session
 from probe_kit.intervene.outcomes import displacements_toward, sizes, spread_of
@@ -62,7 +62,7 @@ def table(shown_run: Run, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def observed(shown_run: Run, table: Path, twin: "Policy") -> Iterator[FrameSession]:
     choice = ImageSwap(pairs=read_pairs(table))
-    with open_session(shown_run, ReplaySource(), lambda *_: twin, choice) as opened, opened.ready():
+    with open_session(shown_run, ReplayFiles(), lambda *_: twin, choice) as opened, opened.ready():
         assert isinstance(opened, FrameSession)
         yield opened
 
@@ -149,7 +149,7 @@ def test_what_needs_sides_or_another_input_is_refused_by_name(
 @pytest.mark.slow
 def test_a_frame_with_two_donors_is_read_toward_each_of_them(shown_run: Run, table: Path, twin: "Policy") -> None:
     choice = ImageSwap(pairs=(*read_pairs(table), ("episode-000000", 0, "episode-000004", 0)))
-    with open_session(shown_run, ReplaySource(), lambda *_: twin, choice) as opened, opened.ready():
+    with open_session(shown_run, ReplayFiles(), lambda *_: twin, choice) as opened, opened.ready():
         assert isinstance(opened, FrameSession)
         near, far = (pair for pair in opened.pairs(opened.items[0]) if pair.row == 0)
         for pair in (near, far):
@@ -169,7 +169,7 @@ def test_recordings_that_were_changed_or_moved_are_refused(shown_run: Run, obser
     run = open_run(shown_run.path)
     run.__dict__["origins"] = (replace(shown_run.origins[0], files={}),)
     with pytest.raises(UsageError, match="--dataset"):
-        open_session(run, ReplaySource())
+        open_session(run, ReplayFiles())
     frame = observed.frames.index[0]
     run.episodes.loc[0, "content_blake2b"] = "0" * 32
     observed.frames.run = run

@@ -17,7 +17,7 @@ from probe_kit.models.magma import (
     UNUSED_WEIGHTS,
     Grid,
     MagmaConfig,
-    Picture,
+    MagmaPicture,
     PictureSettings,
     build_magma,
     chat_text,
@@ -94,7 +94,7 @@ IMAGE = IDS["<image>"]
 SHORT, LONG = [3, 40, IMAGE, 50, 9], [3, 41, 42, 43, IMAGE, 51, 52, 9]
 
 
-def picture(height: int, width: int, seed: int = 0) -> Picture:
+def picture(height: int, width: int, seed: int = 0) -> MagmaPicture:
     pixels = np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
     return prepare_picture(pixels, PictureSettings(64, 4))
 

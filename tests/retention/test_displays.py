@@ -14,10 +14,10 @@ from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
+from probe_kit._tables.content import heat_colour
 from probe_kit.env.spec import SceneSpec
 from probe_kit.errors import UnknownCategoryError, UnknownSiteError, UsageError
-from probe_kit.retention import RetentionTable, layer_curve, retention_table
-from probe_kit.retention.behaviour import Regime
+from probe_kit.retention import layer_curve, retention_table
 from probe_kit.retention.displays import (
     FinalPositionsDisplay,
     IterationMapDisplay,
@@ -25,10 +25,7 @@ from probe_kit.retention.displays import (
     LayerCurveDisplay,
     ModelDepthDisplay,
     PairedLayoutsDisplay,
-    RetentionTableDisplay,
     RoleCurvesDisplay,
-    SideTableDisplay,
-    SuccessTableDisplay,
     collect_figures,
     final_positions,
     iteration_maps,
@@ -37,7 +34,7 @@ from probe_kit.retention.displays import (
     save_figures,
 )
 from probe_kit.retention.displays.display import FILLED, OPEN, ProvenanceLine, caption
-from probe_kit.retention.displays.table_figures import heat_colour, place_labels
+from probe_kit.retention.displays.knowledge_action import place_labels
 from probe_kit.train import ArrayRun, load_results
 
 ProbedRun = Callable[..., ArrayRun]
@@ -188,38 +185,11 @@ def test_models_are_compared_by_accuracy_above_chance_averaged_over_categories(p
     assert "smolvla · " in figure.caption  # type: ignore[attr-defined]
 
 
-# -- tables ----------------------------------------------------------------------------------------------------
+# -- success against what probes read ------------------------------------------------------------------------
 
 
-def test_tables_hold_the_rows_numbers_with_the_mean_last(probed_run: ProbedRun) -> None:
-    table = retention_table([probed_run({"color": SIGNAL, "shape": NOISE})])
-    success = SuccessTableDisplay.from_table(table)
-    assert success.columns == ("color", "shape", "mean")
-    assert [cell.values for cell in success.cells[0]] == [(0.6,)] * 3
-    assert [cell.bold for cell in success.cells[0]] == [False] * 3, "above 0.5 + Δ = 0.569; the interval holds 0.5"
-    row, other = table.rows
-    known_row = replace(row, success=replace(row.success, regime=Regime.KNOWLEDGE))
-    bold = SuccessTableDisplay.from_table(RetentionTable([known_row, other], table.means)).cells[0]
-    assert [cell.bold for cell in bold] == [True, False, False]
-    assert SideTableDisplay.from_table(table).cells[0][0].values == (row.success.sr_left, row.success.sr_right)
-    color, shape, _ = RetentionTableDisplay.from_table(table).cells[0]
-    assert color.values == (row.retention.value, row.retention.published)
-    assert shape.values == (None, None), "the backbone is not shown"
-
-
-def test_a_table_prints_what_it_holds(probed_run: ProbedRun) -> None:
-    display = RetentionTableDisplay.from_table(
-        retention_table([probed_run({"color": SIGNAL, "shape": NOISE})])
-    ).plot()
-    texts = [text.get_text() for text in display.ax_.texts]
-    value, published = display.cells[0][0].values
-    assert texts[:4] == [f"{value:.2f}", f"{published:.2f}", "–", "–"]
-
-
-def test_a_run_without_probes_has_no_retention_table(tmp_path: Path, outcome_table: Any) -> None:
+def test_a_run_without_probes_has_no_point(tmp_path: Path, outcome_table: Any) -> None:
     table = retention_table([placed_run(tmp_path, outcome_table)])
-    with pytest.raises(UsageError, match="no rows"):
-        RetentionTableDisplay.from_table(table)
     with pytest.raises(UsageError, match="no run that acted has probes"):
         KnowledgeActionDisplay.from_table(table)
 

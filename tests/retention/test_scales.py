@@ -15,7 +15,7 @@ from probe_kit.retention.displays import (
     maps_side_by_side,
     model_depths,
 )
-from probe_kit.retention.displays.table_figures import KnowledgeActionDisplay
+from probe_kit.retention.displays.knowledge_action import KnowledgeActionDisplay
 from probe_kit.train import ArrayRun, ProbeResults, load_results
 
 if TYPE_CHECKING:

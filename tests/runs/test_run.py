@@ -34,7 +34,7 @@ from probe_kit.hooks.contract.sites import Site
 from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.retention import retention_table
 from probe_kit.runs import ActionErrors, Run, arrays, compare_actions, copy_run, export_run, open_run, verify_run
-from probe_kit.runs.arrays import Rows, decode_bfloat16, open_array, role_mask, token_blocks
+from probe_kit.runs.arrays import EpisodeRows, decode_bfloat16, open_array, role_mask, token_blocks
 from probe_kit.runs.layout import DATASET, OTHER_ACTIONS
 from probe_kit.runs.run_folders import find_runs, runs_in
 from probe_kit.runs.store import locate
@@ -122,7 +122,7 @@ def test_other_tools_read_all_of_a_finished_run_at_once(kind: str, request: pyte
     for name, path in every_array(run):
         array = zarr.open_array(path, mode="r")
         assert (array.shape[0], array.attrs["episodes"]) == (len(run.episodes),) * 2
-        full_array, rows = array[:], Rows(open_array(run.data, name), run.episodes["episode"].tolist())
+        full_array, rows = array[:], EpisodeRows(open_array(run.data, name), run.episodes["episode"].tolist())
         np.testing.assert_array_equal(full_array[run.episodes["episode"]], np.stack(list(rows)))
         np.testing.assert_array_equal(tree[name].load().values, full_array)
         names.append(name)
@@ -255,7 +255,7 @@ def bfloat16(values: NDArray[np.float32]) -> NDArray[np.uint16]:
 
 
 @pytest.fixture
-def stored() -> tuple[Rows, NDArray[np.float32]]:
+def stored() -> tuple[EpisodeRows, NDArray[np.float32]]:
     """Three planned episodes of one call and two layers, of which 0 and 2 are committed; and their values.
 
     Whole numbers below 256 have an exact bfloat16. The first position of every episode is NaN, the last infinite.
@@ -263,13 +263,13 @@ def stored() -> tuple[Rows, NDArray[np.float32]]:
     values = np.arange(3 * 1 * 2 * TOKENS * WIDTH, dtype=np.float32).reshape(3, 1, 2, TOKENS, WIDTH) + 1
     values[..., 0, :], values[..., -1, :] = np.nan, np.inf
     array = zarr.create_array(zarr.storage.MemoryStore(), data=bfloat16(values))
-    return Rows(array, [0, 2]), values[[0, 2]]
+    return EpisodeRows(array, [0, 2]), values[[0, 2]]
 
 
 @pytest.mark.parametrize("block", [1, 2, 3, TOKENS, 100])
 @pytest.mark.parametrize("role", ["language", "image", None])
 def test_every_token_of_a_role_comes_once_and_zeros_stand_for_all_others(
-    stored: tuple[Rows, NDArray[np.float32]], role: str | None, block: int
+    stored: tuple[EpisodeRows, NDArray[np.float32]], role: str | None, block: int
 ) -> None:
     rows, values = stored
     belongs = np.array(

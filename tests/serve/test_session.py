@@ -12,7 +12,7 @@ from probe_kit.hashing import derive_seed
 from probe_kit.hooks import Policy
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.intervene.frame_session import Frames
-from probe_kit.intervene.sessions import ReplaySource
+from probe_kit.intervene.sessions import ReplayFiles
 from probe_kit.runs import Run, open_run
 from probe_kit.runs.verify import verify_run
 from probe_kit.serve import session as sessions
@@ -73,7 +73,7 @@ def test_answers_are_those_of_the_policy_and_the_run_shows_them_again(opened: Op
         ("task/1", 1, 1),
     ]
 
-    frames = Frames(run, ReplaySource())
+    frames = Frames(run, ReplayFiles())
     for frame in frames.index:
         assert frame.stored is not None
         with torch_threads(1):
@@ -317,4 +317,4 @@ def test_every_third_inference_is_captured_and_small_pictures_are_not_shown_agai
     assert run.inputs is not None
     assert run.inputs.kinds == ("pixels", "prediction", "state")
     with pytest.raises(UsageError, match="--keep small"):
-        Frames(run, ReplaySource())
+        Frames(run, ReplayFiles())

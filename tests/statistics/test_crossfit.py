@@ -9,7 +9,7 @@ from scipy.stats import beta, t
 from probe_kit.errors import TooFewGroupsError, UnbalancedEpisodesError, UsageError
 from probe_kit.statistics.crossfit import (
     GroupSums,
-    StreamScores,
+    SiteScores,
     balanced_sums,
     crossfit,
     remove_fold_priors,
@@ -158,11 +158,11 @@ def drawn(seed: int, shares: np.ndarray, groups: int, size: int = 4) -> GroupSum
     return GroupSums(sums, np.full(groups, float(size)))
 
 
-def backbone(seed: int, top: float = 0.2, groups: int = 30) -> StreamScores:
+def backbone(seed: int, top: float = 0.2, groups: int = 30) -> SiteScores:
     return stream_of(drawn(seed, 0.5 + top * np.array([0.2, 0.6, 1.0, 0.5]), groups), np.arange(4))
 
 
-def expert(seed: int, top: float = 0.1, groups: int = 30) -> StreamScores:
+def expert(seed: int, top: float = 0.1, groups: int = 30) -> SiteScores:
     return stream_of(drawn(seed, np.full(12, 0.5 + top), groups), LAYERS, ITERATIONS)
 
 
@@ -181,7 +181,7 @@ def test_every_fold_is_scored_at_the_site_that_its_own_inner_folds_choose() -> N
     inner = np.where(fold_of == np.arange(FOLDS)[:, None], 0.0, 1.0) * np.ones((2, 1, 1))
     inner[0, 0] *= 0.5
     inner[1, 1:] *= 0.5
-    stream = StreamScores.of(sums, inner, fold_of, [0, 1])
+    stream = SiteScores.of(sums, inner, fold_of, [0, 1])
     assert stream.best.tolist() == [1, 0, 0, 0, 0]
     assert fitted(stream).above[0] == pytest.approx((2 * 0.5 + 8 * 1.0) / 10 - 0.5)
 
@@ -289,7 +289,7 @@ def test_groups_of_unequal_weight_count_by_their_episodes() -> None:
 
 
 def test_fewer_groups_than_outer_folds_are_refused() -> None:
-    stream_scores = StreamScores.of(GroupSums(np.ones((1, 4)), np.ones(4)), np.zeros((1, 4, 4)), np.arange(4), [0])
+    stream_scores = SiteScores.of(GroupSums(np.ones((1, 4)), np.ones(4)), np.zeros((1, 4, 4)), np.arange(4), [0])
     with pytest.raises(TooFewGroupsError, match="4 independent groups of items; expected at least 5"):
         crossfit([stream_scores], list("abcd"))
 
@@ -311,14 +311,14 @@ def test_streams_on_other_groups_nan_and_places_that_do_not_fit_are_refused() ->
 def test_inner_qualities_of_other_folds_or_of_tested_groups_are_refused() -> None:
     sums, folds = drawn(0, np.full(2, 0.6), 8), np.arange(8) % FOLDS
     with pytest.raises(UsageError, match=r"inner qualities \(2, 5, 7\) and folds \(8,\) for 2 sites and 8 groups"):
-        StreamScores.of(sums, np.zeros((2, FOLDS, 7)), folds, [0, 1])
+        SiteScores.of(sums, np.zeros((2, FOLDS, 7)), folds, [0, 1])
     with pytest.raises(UsageError, match="a group is tested by fold 4; expected folds 0 to 2"):
-        StreamScores.of(sums, np.zeros((2, 3, 8)), folds, [0, 1])
+        SiteScores.of(sums, np.zeros((2, 3, 8)), folds, [0, 1])
     with pytest.raises(UsageError, match="groups in the fold that tests them; expected 0 there"):
-        StreamScores.of(sums, np.ones((2, FOLDS, 8)), folds, [0, 1])
+        SiteScores.of(sums, np.ones((2, FOLDS, 8)), folds, [0, 1])
 
 
-def site_stream(share: float, groups: int, seed: int = 0) -> StreamScores:
+def site_stream(share: float, groups: int, seed: int = 0) -> SiteScores:
     sums = np.random.default_rng(seed).binomial(4, share, (6, groups)).astype(float)
     return stream_of(GroupSums(sums, np.full(groups, 4.0)), np.arange(6))
 
@@ -388,7 +388,7 @@ def test_quantiles_are_students(df: int) -> None:
     assert t_quantile(df, 0.05) == pytest.approx(t.ppf(0.95, df))
 
 
-def stream(seed: int, share: float, groups: int = 40, sites: int = 8) -> StreamScores:
+def stream(seed: int, share: float, groups: int = 40, sites: int = 8) -> SiteScores:
     sums = np.random.default_rng(seed).binomial(4, share, (sites, groups)).astype(float)
     return stream_of(GroupSums(sums, np.full(groups, 4.0)), np.arange(sites))
 

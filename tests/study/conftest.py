@@ -30,10 +30,6 @@ comparison = "light"
 kind = "overview"
 runs = ["main"]
 
-[figures.sides]
-kind = "sides"
-runs = ["main"]
-
 [figures.dose]
 kind = "dose"
 runs = ["main"]

@@ -17,8 +17,8 @@ from probe_kit.errors import RunDamagedError, RunIncompleteError, UsageError
 from probe_kit.extract import ExtractSettings
 from probe_kit.hooks import load_policy
 from probe_kit.runs import open_run
-from probe_kit.study import Failure, conduct_study, fit_probes, load_study, make_table, plan_study, playing
-from probe_kit.study.cells import Cell, Failures
+from probe_kit.study import StudyFailure, conduct_study, fit_probes, load_study, make_table, plan_study, playing
+from probe_kit.study.cells import Failures, PlannedRun
 from probe_kit.study.playing import EpisodeStored, ModelTask, RunFinished, RunTask
 from probe_kit.study.stored import open_cell
 from probe_kit.suite import Suite
@@ -53,7 +53,7 @@ def test_a_model_that_fails_stops_itself_alone_and_the_rest_is_played_once(file:
     failed_models: list[str] = []
     (failure,) = conduct_study(
         plan_study(load_study(file)),
-        lambda event: failed_models.append(event.model) if isinstance(event, Failure) else None,
+        lambda event: failed_models.append(event.model) if isinstance(event, StudyFailure) else None,
         env_workers=0,
     )
     assert (failure.model, failure.run, failed_models) == ("broken", "broken/short", ["broken"])
@@ -166,7 +166,7 @@ def test_every_scene_is_built_before_the_first_run_is_played(file: Path, tmp_pat
         ("checking", "broken/short"),
         ("checking", "idle/dark"),
     ]
-    assert [type(event).__name__ for event in events][:3] == ["Failure", "Failure", "EpisodeStored"]
+    assert [type(event).__name__ for event in events][:3] == ["StudyFailure", "StudyFailure", "EpisodeStored"]
     assert states(changed)["idle/short"] == ("waiting", 0)
     assert states(changed)["expert/short"] == ("whole", 4)
     changed.write_text(text, encoding="utf-8")  # what failed before it played is tried again unasked
@@ -345,7 +345,7 @@ def test_a_lost_model_comes_back_without_the_runs_that_are_made_or_given_up(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     finished = RunFinished("base", "base/plain")
-    failed = Failure(stage="episodes", model="base", run="base/dark", reason="two of them")
+    failed = StudyFailure(stage="episodes", model="base", run="base/dark", reason="two of them")
 
     def story(queue: TaskQueue[ModelTask]) -> Iterator[tuple[int, Any]]:
         queue.take(0)
@@ -387,7 +387,7 @@ def test_a_model_is_given_up_after_three_losses_without_an_episode_in_between(
     assert failure.reason.startswith("worker 0 ended with code -11, 3 times without an episode in between")
 
 
-FAILURE = Failure(stage="playing", model="base", run="base/dark", reason="no memory", when="noon")
+FAILURE = StudyFailure(stage="playing", model="base", run="base/dark", reason="no memory", when="noon")
 
 
 @pytest.fixture
@@ -398,7 +398,7 @@ def study_file(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def cell(study_file: Path) -> Cell:
+def cell(study_file: Path) -> PlannedRun:
     return next(cell for cell in load_study(study_file).cells if cell.name == "base/dark")
 
 
@@ -407,7 +407,7 @@ def failures(tmp_path: Path) -> Failures:
     return Failures(str(tmp_path / "out"))
 
 
-def test_a_failure_is_stored_once_and_cleared(cell: Cell, failures: Failures, tmp_path: Path) -> None:
+def test_a_failure_is_stored_once_and_cleared(cell: PlannedRun, failures: Failures, tmp_path: Path) -> None:
     assert failures.of(cell) is None
     failures.note(cell, FAILURE)
     (file,) = (tmp_path / "out" / "failures").iterdir()
@@ -422,7 +422,7 @@ def test_a_failure_is_stored_once_and_cleared(cell: Cell, failures: Failures, tm
     assert failures.of(cell, "main") is not None
 
 
-def test_what_a_killed_process_left_aside_is_removed(cell: Cell, failures: Failures, tmp_path: Path) -> None:
+def test_what_a_killed_process_left_aside_is_removed(cell: PlannedRun, failures: Failures, tmp_path: Path) -> None:
     failures.note(cell, FAILURE)
     draft = tmp_path / "out" / "failures" / "left.tmp"
     draft.touch()
@@ -431,7 +431,9 @@ def test_what_a_killed_process_left_aside_is_removed(cell: Cell, failures: Failu
 
 
 @pytest.mark.parametrize("content", ["", "[]", '{"run": 1}', '{"run": "base/dark"}'])
-def test_a_record_that_is_none_is_named(cell: Cell, failures: Failures, tmp_path: Path, content: str) -> None:
+def test_a_record_that_is_none_is_named(
+    cell: PlannedRun, failures: Failures, tmp_path: Path, content: str
+) -> None:
     failures.note(cell, FAILURE)
     (file,) = (tmp_path / "out" / "failures").iterdir()
     file.write_text(content, encoding="utf-8")
@@ -440,11 +442,11 @@ def test_a_record_that_is_none_is_named(cell: Cell, failures: Failures, tmp_path
 
 
 def test_a_failure_has_its_traceback_and_equals_the_same_one_later() -> None:
-    def failed() -> Failure:
+    def failed() -> StudyFailure:
         try:
             raise ValueError("no such layer")
         except ValueError as error:
-            return Failure.of("playing", "base", "base/dark", error)
+            return StudyFailure.of("playing", "base", "base/dark", error)
 
     failure, again = failed(), failed()
     assert str(failure) == "base failed at base/dark: no such layer"
@@ -455,7 +457,9 @@ def test_a_failure_has_its_traceback_and_equals_the_same_one_later() -> None:
     assert not failure.same(None)
 
 
-def test_a_plan_names_failures_and_what_waits_for_them(study_file: Path, cell: Cell, failures: Failures) -> None:
+def test_a_plan_names_failures_and_what_waits_for_them(
+    study_file: Path, cell: PlannedRun, failures: Failures
+) -> None:
     failures.note(cell, FAILURE)
     states = {
         planned.cell.name: (planned.state, planned.why) for planned in plan_study(load_study(study_file)).cells
@@ -467,7 +471,7 @@ def test_a_plan_names_failures_and_what_waits_for_them(study_file: Path, cell: C
     assert whys(study_file)["base/plain"] == "new"
 
 
-def test_a_failure_of_former_settings_is_none(study_file: Path, cell: Cell, failures: Failures) -> None:
+def test_a_failure_of_former_settings_is_none(study_file: Path, cell: PlannedRun, failures: Failures) -> None:
     failures.note(cell, FAILURE)
     text = study_file.read_text(encoding="utf-8")
     study_file.write_text(text.replace("light_level = 0.7", "light_level = 0.6"), encoding="utf-8")

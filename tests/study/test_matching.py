@@ -10,7 +10,7 @@ from probe_kit.extract import ExtractSettings
 from probe_kit.retention.compare.compare import common_items
 from probe_kit.runs import Run, open_run
 from probe_kit.runs.store import locate
-from probe_kit.study.cells import Cell, planned_suite
+from probe_kit.study.cells import PlannedRun, planned_suite
 from probe_kit.study.schema import SuiteTable
 from probe_kit.study.stored import check_same_items, check_same_weights, differences
 from probe_kit.suite import Suite
@@ -66,13 +66,13 @@ def test_a_run_of_another_checkpoint_of_the_hub_is_seen_though_its_card_has_a_co
     run = run_of(small_suite, tmp_path / "run")
     run.__dict__["certificate"] = {"policy": {"checkpoint": f"lab/first@{'c' * 40}"}}
     suite = planned_suite(SuiteTable(path=str(small_suite.folder)))[0]
-    cell = Cell("base", "plain", 0, ExtractSettings("pi0", checkpoint), {}, suite)
+    cell = PlannedRun("base", "plain", 0, ExtractSettings("pi0", checkpoint), {}, suite)
     assert any(words.startswith("checkpoint: stored 'lab/first") for words in differences(run, cell)) is differs
 
 
-def cell_of(suite: Suite, checkpoint: Path | None, way: str = "plain") -> Cell:
+def cell_of(suite: Suite, checkpoint: Path | None, way: str = "plain") -> PlannedRun:
     planned = planned_suite(SuiteTable(path=str(suite.folder)))[0]
-    return Cell("base", way, 0, ExtractSettings("pi0", checkpoint and str(checkpoint)), {}, planned)
+    return PlannedRun("base", way, 0, ExtractSettings("pi0", checkpoint and str(checkpoint)), {}, planned)
 
 
 def test_a_run_of_another_folder_of_weights_is_seen_unless_the_folder_was_moved(

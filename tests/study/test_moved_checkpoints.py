@@ -15,7 +15,7 @@ from probe_kit.runs import Run
 from probe_kit.runs.layout import RUN_FILE
 from probe_kit.runs.store import locate
 from probe_kit.study import conduct_study, file_contents, load_study, make_table, pack_study, plan_study
-from probe_kit.study.cells import Cell, planned_suite
+from probe_kit.study.cells import PlannedRun, planned_suite
 from probe_kit.study.file_contents import content_of, former_stamp
 from probe_kit.study.schema import SuiteTable
 from probe_kit.study.study_folder import RECORDS, PlayedModel, StudyFolder
@@ -227,7 +227,9 @@ def test_a_file_that_an_option_names_counts_by_content_too(small_suite: Suite, t
 
     def key(checkpoint: str, tokenizer: str) -> str:
         settings = ExtractSettings("magma", checkpoint, options={"tokenizer": tokenizer})
-        return Cell("m", "plain", 0, settings, {}, suite, find_key=StudyFolder(str(tmp_path / "out")).key).key
+        return PlannedRun(
+            "m", "plain", 0, settings, {}, suite, find_key=StudyFolder(str(tmp_path / "out")).key
+        ).key
 
     first, other = files_in(tmp_path / "first"), files_in(tmp_path / "other")
     weights = files_in(tmp_path / "weights")

@@ -15,7 +15,7 @@ from probe_kit.extract import ExtractSettings
 from probe_kit.extract.sizes import EPISODE, THUMBNAILS
 from probe_kit.runs.layout import StoredStream
 from probe_kit.study import LoadedStudy, StudyFileError, StudyPlan, load_study, make_table, plan_study
-from probe_kit.study.cells import Cell
+from probe_kit.study.cells import PlannedRun
 from probe_kit.study.expansion import control_of
 from probe_kit.study.plan import PlannedCell, State
 from probe_kit.suite import Suite
@@ -349,12 +349,12 @@ def study(tmp_path: Path) -> LoadedStudy:
 
 
 @pytest.fixture
-def cells(study: LoadedStudy) -> dict[str, Cell]:
+def cells(study: LoadedStudy) -> dict[str, PlannedRun]:
     return {cell.name: cell for cell in study.cells}
 
 
 def planned(
-    cell: Cell, missing: int, seconds: float | None = None, streams: tuple[StoredStream, ...] | None = None
+    cell: PlannedRun, missing: int, seconds: float | None = None, streams: tuple[StoredStream, ...] | None = None
 ) -> PlannedCell:
     """A cell of which these episodes are missing."""
     stored = cell.episodes - missing
@@ -363,7 +363,7 @@ def planned(
 
 
 def test_hours_come_from_stored_episodes_of_the_model_by_inferences(
-    study: LoadedStudy, cells: dict[str, Cell]
+    study: LoadedStudy, cells: dict[str, PlannedRun]
 ) -> None:
     plain, dark = cells["base/plain"], cells["base/dark"]
     short = replace(
@@ -377,7 +377,7 @@ def test_hours_come_from_stored_episodes_of_the_model_by_inferences(
     assert "hours unknown before a first episode is stored: reader" in plan.lines()
 
 
-def test_bytes_come_from_stored_streams_of_the_model(study: LoadedStudy, cells: dict[str, Cell]) -> None:
+def test_bytes_come_from_stored_streams_of_the_model(study: LoadedStudy, cells: dict[str, PlannedRun]) -> None:
     plain, dark = cells["base/plain"], cells["base/dark"]
     activations = 2 * 4 * 64 * 2 * 4  # rows and columns, of layers, features, views and float32
     expected = activations + 4 * 16 + EPISODE + THUMBNAILS
@@ -386,7 +386,7 @@ def test_bytes_come_from_stored_streams_of_the_model(study: LoadedStudy, cells: 
     assert StudyPlan(study, (new,)).bytes() == {"base": None}
 
 
-def test_every_inference_takes_bytes_at_most(study: LoadedStudy, cells: dict[str, Cell]) -> None:
+def test_every_inference_takes_bytes_at_most(study: LoadedStudy, cells: dict[str, PlannedRun]) -> None:
     plain = cells["base/plain"]
     most, fixed = plain.settings.scene.max_steps, 4 * 16 + EPISODE + THUMBNAILS
     for later, bytes_of_later in (("all", 2 * 4 * 64 * 2 * 4), ("mean", 2 * 4 * 64 * 2)):
@@ -395,6 +395,6 @@ def test_every_inference_takes_bytes_at_most(study: LoadedStudy, cells: dict[str
         assert StudyPlan(study, (planned(every, 1, 1.0, STREAMS),)).bytes() == {"base": expected}
 
 
-def test_nothing_missing_takes_nothing(study: LoadedStudy, cells: dict[str, Cell]) -> None:
+def test_nothing_missing_takes_nothing(study: LoadedStudy, cells: dict[str, PlannedRun]) -> None:
     plan = StudyPlan(study, (planned(cells["base/plain"], 0, 1.0, STREAMS),))
     assert (plan.hours(), plan.bytes(), plan.seconds) == ({}, {}, {})

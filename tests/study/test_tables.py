@@ -236,11 +236,10 @@ def test_a_report_is_one_page_with_state_tables_figures_and_the_file(played: Loa
         "table-score",
         "table-light",
         "figure-overview",
-        "figure-sides",
         "file",
     )
     assert all(f'id="{name}"' in html for name in made_of)
-    assert html.count('<img class="plot"') == 2
+    assert html.count('<img class="plot"') == 1
     assert "&lt;b&gt;Idle &amp; 5 %&lt;/b&gt;" in html
     assert "<b>Idle" not in html
     assert str(tmp_path.parent) not in html
@@ -336,10 +335,10 @@ def test_the_overview_says_what_has_no_episodes_and_takes_names_as_they_are(tmp_
 @pytest.mark.slow
 def test_figures_are_drawn_by_name_from_stored_runs(played: LoadedStudy, tmp_path: Path) -> None:
     out = tmp_path / "figures"
-    result = CliRunner().invoke(app, ["study", "figure", str(played.file), "sides", "--out", str(out)])
+    result = CliRunner().invoke(app, ["study", "figure", str(played.file), "overview", "--out", str(out)])
     assert result.exit_code == 0, result.output
-    assert sorted(path.name for path in out.iterdir()) == ["sides.pdf", "sides.png"]
-    assert result.stdout.strip() == str(out / "sides.png")
+    assert sorted(path.name for path in out.iterdir()) == ["overview.pdf", "overview.png"]
+    assert result.stdout.strip() == str(out / "overview.png")
 
 
 @pytest.mark.parametrize(

@@ -42,7 +42,7 @@ def label_results(
         sites=tuple(sites), labels=labels, episodes=np.array([f"episode-{number:04d}" for number in range(n)]),
         items=names, groups=names, fold_of=folds, decisions=np.tile(labels, (len(sites), 1)),
         strengths=np.ones((len(sites), 5)), null=null, inner=inner_of(scores - chances, folds, names),
-        parts=tuple(_PARTS[site.stream] for site in sites), task=task, is_side=False,  # type: ignore[arg-type]
+        parts=tuple(_PARTS[site.stream] for site in sites), task=task, balanced=False,  # type: ignore[arg-type]
         classes=() if task == "continuous" else ("no", "yes"), sample_scores=scores,
         inferences=np.zeros(n, np.int64), smallest_p=1 / (1 + permutations),
     )  # fmt: skip

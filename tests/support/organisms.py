@@ -14,9 +14,9 @@ from probe_kit.extract import ExtractSettings
 from probe_kit.extract.extraction import prepare
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.families.pi0.adapter import load_pi0_tiny
-from probe_kit.hooks.families.shared.lerobot.policy import MASK, TOKENS
+from probe_kit.hooks.families.shared.lerobot.packing import MASK, TOKENS
 from probe_kit.intervene.open_session import load_policy_of
-from probe_kit.intervene.sessions import LoadPolicy, ReplaySource
+from probe_kit.intervene.sessions import LoadPolicy, ReplayFiles
 from probe_kit.models.building import initialise
 from probe_kit.runs import Run
 
@@ -251,7 +251,7 @@ def forget_words(policy: Any, observations: Sequence[Observation], steps: int = 
 def edited(edit: Edit) -> LoadPolicy:
     """A loader of a run's policy that edits it; of a base, under any name, the policy as it is shipped."""
 
-    def load(run: Run, source: ReplaySource) -> "Policy":
+    def load(run: Run, source: ReplayFiles) -> "Policy":
         policy: Any = load_policy_of(run, replace(source, checkpoint=None))
         with torch.no_grad():
             if source.checkpoint is None:

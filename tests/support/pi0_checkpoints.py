@@ -144,7 +144,7 @@ def network_chunk(
 ) -> Any:
     """(chunk, 7) of the bare network: 5 lines of lerobot's own calls, around our adapter."""
     from probe_kit.hooks.families.shared.kinds import IMAGES, STATE
-    from probe_kit.hooks.families.shared.lerobot.policy import MASK, TOKENS
+    from probe_kit.hooks.families.shared.lerobot.packing import MASK, TOKENS
 
     tokens, mask = policy.tokenise([text])
     batch = {

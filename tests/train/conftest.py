@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks import Site, Stream
 from probe_kit.train import ArrayRun, ProbeSettings, Target
-from probe_kit.train.probe_sweep import Sweep
+from probe_kit.train.probe_sweep import ProbeSweep
 from probe_kit.train.problem import Problem
 
 PlantedRun = Callable[..., ArrayRun]
@@ -89,7 +89,7 @@ def problem_of(
         blank = np.zeros((len(episodes), 1), np.float32)
         run = ArrayRun(Path("nowhere"), "m", "s@1#0", episodes, {(Site("backbone", 0), "mean"): blank})
     options = {"views": ("mean",), "permutations": 30, "seed": 0, **options}
-    return Sweep.of(run, target, (category,), **options).problems[category]
+    return ProbeSweep.of(run, target, (category,), **options).problems[category]
 
 
 def settings_of(permutations: int, seed: int = 0) -> ProbeSettings:

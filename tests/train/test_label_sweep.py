@@ -218,7 +218,7 @@ def test_groups_that_cannot_exchange_have_scores_and_no_p(run: Run) -> None:
 def test_a_column_of_a_table_may_be_called_as_a_side_is_without_its_prefix(run: Run) -> None:
     frame = by_group(run, lambda draw: float(draw.normal())).rename(columns={"y": "correct"})
     results = train_probes(run, target=Target.read(frame, "correct"), permutations=1, controls=())
-    assert not results.settings.is_side
+    assert not results.settings.balanced
     assert load_results(run, target="correct").key == results.key
 
 

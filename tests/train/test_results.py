@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from probe_kit._tables.numbers import percent
 from probe_kit.errors import RunDamagedError, UnknownSiteError
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.runs.results import Bundle, read_bundle, write_bundle
@@ -285,11 +286,11 @@ def results_of() -> ProbeResults:
 
 
 def test_the_first_of_the_best_is_named_with_its_ties_and_the_first_iteration(results_of: ProbeResults) -> None:
-    backbone, expert = best_sites(results_of.scores, True)
-    assert site_cells(backbone, True)[0].text == "backbone.01.residual +1"
-    assert site_cells(backbone, True)[1].text.startswith("90.0 [")
-    assert [cell.text for cell in site_cells(backbone, True)[2:]] == ["50.0", "0.100"]
-    assert site_cells(expert, True)[0].text == "expert.00.residual@1"
+    backbone, expert = best_sites(results_of.scores)
+    assert site_cells(backbone, percent)[0].text == "backbone.01.residual +1"
+    assert site_cells(backbone, percent)[1].text.startswith("90.0 [")
+    assert [cell.text for cell in site_cells(backbone, percent)[2:]] == ["50.0", "0.100"]
+    assert site_cells(expert, percent)[0].text == "expert.00.residual@1"
     assert expert["first"] == pytest.approx(0.6)
     assert backbone["first"] != backbone["first"], "the stream runs once"
 
@@ -300,7 +301,7 @@ def test_categories_do_not_mix(results_of: ProbeResults) -> None:
         settings=replace(results_of.settings, categories=("shape", "color")),
         curves={("shape", "mean"): curve_of(0.2), **results_of.curves},
     )
-    rows = best_sites(both.scores, True)
+    rows = best_sites(both.scores)
     assert [row["category"] for row in rows] == ["color", "color", "shape", "shape"]
     assert [round(row["score"], 2) for row in rows] == [0.9, 0.8, 0.7, 0.6]
     assert [row["ties"] for row in rows] == [1, 0, 1, 0]

@@ -75,7 +75,7 @@ class AnswerController(ModelController["AnswerModel", "Prompt"]):
         blank = source.example(min(source.instructions))
         self.model, self._settings, self.template = model, settings, settings.task.prompt
         self._choose_positions()  # before `_streams`, whose lengths depend on it
-        self._has_sides = suite is not None
+        self._is_scene = suite is not None
         self._phrases = {} if suite is None else phrases(suite, settings.task.query, settings.seed)
         self._item_has_side_word = {} if suite is None else {item.item_id: item.side_word for item in suite.items}
         self._instructions = source.instructions
@@ -231,7 +231,7 @@ class AnswerController(ModelController["AnswerModel", "Prompt"]):
     def _outcome(
         self, turn: Turn, question: str, spoken: Sequence[str], forced: Sequence[Forced]
     ) -> dict[str, Any]:
-        if not self._has_sides:
+        if not self._is_scene:
             return self._statement(question, spoken[0], forced[0])
         episode = turn.row.content
         expected = side_expected(self._settings.task.query, episode.side_correct)
@@ -319,7 +319,7 @@ class AnswerController(ModelController["AnswerModel", "Prompt"]):
         """
         questions = self._blank_questions(blank)[:1]
         self.model.read(questions)
-        if self.template.lettered or self._settings.task.query == "absent" or not self._has_sides:
+        if self.template.lettered or self._settings.task.query == "absent" or not self._is_scene:
             return None
         lead = self.model.lead
         begun = f"{lead}Yes," if self.template.yes_or_no else ""

@@ -5,7 +5,7 @@ A task knows no particular source, and has no state: all choices are in the sett
 
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.extract.parts import SCRIPTED
@@ -29,7 +29,7 @@ Fitted = tuple[Settings, Source[Any], Controller, Calibration | None]
 """The settings and source as the model is shown them, the controller, and the calibration of `--batch auto`."""
 
 
-def task_of(settings: Settings) -> Any:
+def task_of(settings: Settings) -> "Task[Any, Any]":
     """Return the task of some settings: an `Act` or an `Ask`, whose methods take settings of their own class."""
     return Ask() if settings.asks else Act()
 
@@ -76,40 +76,63 @@ _SCRIPT_REFUSES = (
 _CAPTURE_REFUSES = ("captured_calls", "execute", "rotation", "video")
 
 
-class _Task:
-    """The steps of an extraction that depend on the task, with defaults for those that one task alone has.
+class Task[Chosen: Settings, Loaded: "Model"](Protocol):
+    """The steps of an extraction that depend on the task, in the order in which an extraction takes them.
 
-    In order: `check_meaningless` of settings, `declared_inputs` and `early_checks` of a family not yet loaded,
-    `planned` for settings that sizes decide, `check_loaded` of the loaded model, `view_of` the source as the model
-    is shown it, and its `rows`. Every check raises UsageError.
+    Every check raises UsageError, and what its own docstring says.
 
     Attributes:
         names_all_items: Whether it needs the whole suite besides the chosen items, for the names of other objects.
     """
 
-    names_all_items: ClassVar[bool] = False
+    names_all_items: ClassVar[bool]
 
-    def check_meaningless(self, *_: Any, **__: Any) -> None: ...
+    def check_meaningless(self, settings: Chosen) -> None:
+        """Check settings by themselves, before anything is opened."""
 
-    def check_loaded(self, *_: Any, **__: Any) -> None: ...
-
-    def declared_inputs(self, *_: Any, **__: Any) -> "DeclaredInputs | None": ...
-
-    def early_checks(self, *_: Any, **__: Any) -> list[Callable[[], object]]:
-        return []
-
-    def planned(self, settings: Any, _: PlannedSizes) -> Any:
-        return settings
+    def check_family(self, settings: Chosen, family: "Family | None") -> None:
+        """Check a family that is not loaded; None for a script."""
 
     def view_of(self, source: Source[Any]) -> Source[Any]:
+        """Return the source as the task goes through it."""
+
+    def texts(self, settings: Chosen, source: Source[Any]) -> Iterable[str]:
+        """Return the texts that the model must be able to read."""
+
+    def rows(self, settings: Chosen, source: Source[Any]) -> tuple[Row, ...]:
+        """Return the rows that are played."""
+
+    def check_loaded(self, settings: Chosen, model: Loaded) -> None:
+        """Check a model that the caller loaded."""
+
+    def early_checks(self, settings: Chosen, source: Source[Any], fetch: bool) -> list[Callable[[], object]]:
+        """Return the checks of a model by its small files, before its weights are read."""
+
+    def declared_inputs(self, settings: Chosen) -> "DeclaredInputs | None":
+        """Return the inputs that the files of the model declare; None where they declare none."""
+
+    def planned(self, settings: Chosen, sizes: PlannedSizes) -> Chosen:
+        """Return the settings with what sizes decide, for a plan."""
+
+    def load(self, settings: Chosen) -> "Loaded | None":
+        """Load the model; None for a script."""
+
+    def fit(self, settings: Chosen, source: Source[Any], model: "Loaded | None") -> Fitted:
+        """Fit source and model to each other."""
+
+
+class Act:
+    """The task in which a policy acts, or is captured once per row; a script acts and has no activations."""
+
+    names_all_items: ClassVar[bool] = False
+
+    def view_of(self, source: Source[Any]) -> Source[Any]:
+        """Return the source as it is."""
         return source
 
-    def rows(self, settings: Any, source: Source[Any]) -> tuple[Row, ...]:
+    def rows(self, settings: ExtractSettings, source: Source[Any]) -> tuple[Row, ...]:
+        """Return the rows of the source."""
         return source.rows(settings.seed)
-
-
-class Act(_Task):
-    """The task in which a policy acts, or is captured once per row; a script acts and has no activations."""
 
     def check_meaningless(self, settings: ExtractSettings) -> None:
         """Raise UsageError for settings that a script, or a policy that does not act, has no use for."""
@@ -127,7 +150,7 @@ class Act(_Task):
         """Raise UsageError for a model that answers, and in a scene the errors of `Family.check_acting`."""
         if family is None:
             return
-        if not family.acts:
+        if not family.abilities.acts:
             raise UsageError(f"{family.name} answers and does not act; use `probe-kit ask`, or a model that acts")
         if settings.source.is_scene and not settings.task.capture_only:
             family.check_acting(settings.model.checkpoint, settings.model.options)
@@ -262,17 +285,38 @@ def check_reachable(settings: ExtractSettings, card: "ModelCard", source: Source
         )
 
 
-class Ask(_Task):
+class Ask:
     """The task in which a model answers one question per row; its first inference may be captured."""
 
-    names_all_items = True  # an object that is asked for may be that of any item
+    names_all_items: ClassVar[bool] = True  # an object that is asked for may be that of any item
+
+    def check_meaningless(self, settings: AskSettings) -> None:
+        """Accept all settings: none is meaningless by itself."""
+
+    def check_loaded(self, settings: AskSettings, model: "AnswerModel") -> None:
+        """Accept every answer model."""
+
+    def early_checks(self, settings: AskSettings, source: Source[Any], fetch: bool) -> list[Callable[[], object]]:
+        """Return no checks: the questions are read when the model is there."""
+        del settings, source, fetch
+        return []
+
+    def declared_inputs(self, settings: AskSettings) -> "DeclaredInputs | None":
+        """Return None: the cameras of a question are chosen by the prompt."""
+        del settings
+        return None
+
+    def planned(self, settings: AskSettings, sizes: PlannedSizes) -> AskSettings:
+        """Return the settings: sizes decide nothing."""
+        del sizes
+        return settings
 
     def check_family(self, settings: AskSettings, family: "Family | None") -> None:
         """Raise UsageError for a model that acts."""
-        if family is None or not family.reads:
+        if family is None or not family.abilities.reads:
             from probe_kit.hooks.registry import known_families
 
-            reads = [name for name, candidate in known_families().items() if candidate.reads]
+            reads = [name for name, candidate in known_families().items() if candidate.abilities.reads]
             raise UsageError(
                 f"{settings.model.family} acts and does not answer questions; those that do: {', '.join(reads)}"
             )

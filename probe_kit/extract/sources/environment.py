@@ -99,7 +99,7 @@ EnvOptions = Annotated[
 ]
 
 
-class EnvSource(SourceSettings):
+class EnvironmentSettings(SourceSettings):
     """An environment of the user's own in place of a scene.
 
     Attributes:

@@ -13,7 +13,7 @@ from PIL import Image
 from probe_kit._execution.process_pool import Child
 from probe_kit._system.counting import plural
 from probe_kit.errors import MissingExtraError, ProbeKitError, UsageError
-from probe_kit.extract.sources.environment import EnvEpisode, EnvSource, OwnEnvironment, Step
+from probe_kit.extract.sources.environment import EnvEpisode, EnvironmentSettings, OwnEnvironment, Step
 from probe_kit.extract.sources.environment_source import (
     checked_step,
     fact_values,
@@ -63,7 +63,7 @@ class _Trial:
     episodes: list[EnvEpisode]
     steps: list[list[Step]]
 
-    def __init__(self, source: EnvSource, picture: Path | None = None) -> None:
+    def __init__(self, source: EnvironmentSettings, picture: Path | None = None) -> None:
         self.source, self.picture = source, picture
         self.notes: tuple[str, ...] = ()
 
@@ -209,11 +209,13 @@ _CHECKS: Sequence[tuple[str, str, Callable[[_Trial], str | None]]] = (
 )
 
 
-def check_environment(source: EnvSource | str, picture: Path | str | None = None) -> Iterator[EnvironmentCheck]:
+def check_environment(
+    source: EnvironmentSettings | str, picture: Path | str | None = None
+) -> Iterator[EnvironmentCheck]:
     """Check the promises of the contract, each on the first two episodes; an error is a failure.
 
     Args:
-        source: An `EnvSource`, or MODULE:CLASS.
+        source: An `EnvironmentSettings`, or MODULE:CLASS.
         picture: A file for the first pictures of all cameras, side by side, as a model gets them; None for none.
 
     Raises:
@@ -221,7 +223,7 @@ def check_environment(source: EnvSource | str, picture: Path | str | None = None
         MissingExtraError: If a simulator is not installed; the message names it.
     """
     file = None if picture is None else Path(picture)
-    trial = _Trial(EnvSource(source) if isinstance(source, str) else source, file)
+    trial = _Trial(EnvironmentSettings(source) if isinstance(source, str) else source, file)
     for name, sentence, check in _CHECKS:
         try:
             facts = check(trial)

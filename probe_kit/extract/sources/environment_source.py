@@ -33,7 +33,7 @@ from probe_kit.extract.sources.environment import (
     MOST_STEPS,
     SUCCESS,
     EnvEpisode,
-    EnvSource,
+    EnvironmentSettings,
     OwnEnvironment,
     Step,
 )
@@ -134,7 +134,7 @@ def factory_of(name: str) -> Callable[..., Any]:
     return typed_factory
 
 
-def open_environment(source: EnvSource) -> OwnEnvironment:
+def open_environment(source: EnvironmentSettings) -> OwnEnvironment:
     """Open a new environment. Raises OwnEnvironmentError if it breaks its contract, and as `factory_of`."""
     factory = factory_of(source.environment)
     with naming_environment(source.environment, "its constructor", partial(_options_of, factory)):
@@ -226,7 +226,7 @@ def check_members(environment: object, name: str) -> None:
         )
 
 
-def listed_episodes(environment: OwnEnvironment, source: EnvSource) -> list[tuple[int, EnvEpisode]]:
+def listed_episodes(environment: OwnEnvironment, source: EnvironmentSettings) -> list[tuple[int, EnvEpisode]]:
     """Return the chosen episodes with their indices. Raises OwnEnvironmentError for equal ids."""
     indices = source.episodes
     most = MOST_EPISODES if indices is None else indices[-1] + 1
@@ -446,17 +446,17 @@ SUCCEEDED, FAILED, ENDED = "success", "failure", "ended"
 """The outcomes: whether the fact `success` is true at the last step; the last one where there is no such fact."""
 
 
-def limit_in(settings: EnvSource, episode: EnvEpisode) -> int | None:
+def limit_in(settings: EnvironmentSettings, episode: EnvEpisode) -> int | None:
     """Return the actions after which the benchmark ends an episode; None where nothing declares a number."""
     return episode.max_steps or settings.limit
 
 
-def most_steps(settings: EnvSource, episode: EnvEpisode) -> int:
+def most_steps(settings: EnvironmentSettings, episode: EnvEpisode) -> int:
     """Return the actions after which an episode ends: those that were typed, else the benchmark's."""
     return settings.max_steps or min(episode.max_steps or settings.steps(), MOST_STEPS)
 
 
-class EnvironmentSource(Source[EnvSource]):
+class EnvironmentSource(Source[EnvironmentSettings]):
     """The names and chosen episodes of an environment, read once.
 
     Attributes:
@@ -471,7 +471,7 @@ class EnvironmentSource(Source[EnvSource]):
     """
 
     def __init__(
-        self, settings: EnvSource, revision: str, actions: Sequence[str], episodes: Sequence[Any]
+        self, settings: EnvironmentSettings, revision: str, actions: Sequence[str], episodes: Sequence[Any]
     ) -> None:
         """Keep what the environment says; `episodes` has pairs of the index in the environment and the episode."""
         self.settings, self.revision, self.actions = settings, revision, tuple(actions)
@@ -489,7 +489,7 @@ class EnvironmentSource(Source[EnvSource]):
         self.renamed = ""
 
     @classmethod
-    def open(cls, settings: EnvSource, selects_only: bool) -> Self:
+    def open(cls, settings: EnvironmentSettings, selects_only: bool) -> Self:
         """Open the environment once, list its episodes, and read after how many actions it ends them.
 
         An environment that declares no limit before its first episode may hold its simulator from then on.
@@ -880,7 +880,11 @@ class EnvironmentPlayer(InputsPlayer):
     """
 
     def __init__(
-        self, settings: EnvSource, facts: Sequence[str], played: Played, starts: Mapping[str, str] | None = None
+        self,
+        settings: EnvironmentSettings,
+        facts: Sequence[str],
+        played: Played,
+        starts: Mapping[str, str] | None = None,
     ) -> None:
         self._settings, self._facts, self._played = settings, tuple(facts), played
         self._starts = dict(starts or {})

@@ -13,6 +13,7 @@ from itertools import groupby
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._system.types import PictureArray
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.suite.pictures import through_jpeg
 
@@ -21,7 +22,6 @@ STATE_SHARE = 0.01
 """The share of its spread over frames by which a control moves a state."""
 FIRST = ""
 """The name of the first camera, among the names of cameras."""
-Picture = NDArray[np.uint8]
 
 
 def with_input(clean: Observation, vary: str, donor: Observation) -> Observation:
@@ -201,7 +201,7 @@ class InputComparison:
         return self._least[at, camera]
 
 
-def block_means(picture: Picture) -> NDArray[np.float64]:
+def block_means(picture: PictureArray) -> NDArray[np.float64]:
     """Return the means (h, w, 3) of a picture's blocks, of 8 × 8 pixels each or fewer at its ends."""
     height, width = picture.shape[:2]
     rows, columns = np.arange(0, height, BLOCK), np.arange(0, width, BLOCK)
@@ -255,7 +255,7 @@ def blank_of(observations: Sequence[Observation]) -> Observation:
     """Return an observation without content: no words, pictures of the mean color of all, the mean state."""
     first = observations[0]
     states = np.stack([observation.state for observation in observations]).astype(np.float64)
-    cameras: Mapping[str, Picture] = {
+    cameras: Mapping[str, PictureArray] = {
         name: _mean_colour([observation.cameras[name] for observation in observations]) for name in first.cameras
     }
     return replace(
@@ -267,12 +267,12 @@ def blank_of(observations: Sequence[Observation]) -> Observation:
     )
 
 
-def _mean_colour(pictures: Sequence[Picture]) -> Picture:
+def _mean_colour(pictures: Sequence[PictureArray]) -> PictureArray:
     colour = np.mean([picture.mean(axis=(0, 1)) for picture in pictures], axis=0)
     return np.broadcast_to(np.rint(colour).astype(np.uint8), pictures[0].shape).copy()
 
 
-def with_pictures(clean: Observation, vary: str, picture: Callable[[str], Picture]) -> Observation:
+def with_pictures(clean: Observation, vary: str, picture: Callable[[str], PictureArray]) -> Observation:
     """Return the observation with other pictures of the cameras that an input names, by the camera's name."""
     pictures = {name: picture(name) for name in _cameras(clean, vary)}
     image = pictures.pop(FIRST, clean.image)
@@ -286,7 +286,7 @@ def _cameras(observation: Observation, vary: str) -> tuple[str, ...]:
     return (camera,) if camera in observation.cameras else (FIRST,)
 
 
-def picture_of(observation: Observation, camera: str) -> Picture:
+def picture_of(observation: Observation, camera: str) -> PictureArray:
     """Return the picture (H, W, 3) of a camera; of the first one for a name that no further camera has."""
     return observation.cameras.get(camera, observation.image)
 

@@ -11,7 +11,7 @@ from typing import Any
 from probe_kit._system.imports import entry_points
 from probe_kit._terminal.field_options import options_of
 from probe_kit.errors import UsageError
-from probe_kit.extract.sources.environment import EnvSource
+from probe_kit.extract.sources.environment import EnvironmentSettings
 from probe_kit.extract.sources.pictures import PictureFolder
 from probe_kit.extract.sources.recording import LeRobotSource
 from probe_kit.extract.sources.scene import SceneSettings
@@ -19,7 +19,7 @@ from probe_kit.extract.sources.served import ServedSettings
 from probe_kit.extract.sources.source import SourceSettings
 
 ENTRY_POINTS = "probe_kit.sources"
-OWN: tuple[type[SourceSettings], ...] = (SceneSettings, LeRobotSource, EnvSource, PictureFolder)
+OWN: tuple[type[SourceSettings], ...] = (SceneSettings, LeRobotSource, EnvironmentSettings, PictureFolder)
 SERVED: tuple[type[SourceSettings], ...] = (ServedSettings,)
 """The sources of other commands than `extract` and `ask`, which do not offer their options."""
 

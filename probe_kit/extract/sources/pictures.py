@@ -110,7 +110,7 @@ class PictureFolder(SourceSettings):
 
 
 @dataclass(frozen=True)
-class Line:
+class PictureLine:
     """A line of the table.
 
     Attributes:
@@ -138,7 +138,7 @@ class PictureSource(Source[PictureFolder]):
         settings: PictureFolder,
         columns: Sequence[str],
         names: Mapping[str, list[str]],
-        lines: Sequence[tuple[Cells, Line]],
+        lines: Sequence[tuple[Cells, PictureLine]],
         digest: str,
     ) -> None:
         """Keep the lines of a table.
@@ -322,7 +322,7 @@ class PicturePlayer(InputsPlayer):
         return self._ending({"outcome": CAPTURE_ONLY})
 
 
-def read_picture(line: Line) -> NDArray[np.uint8]:
+def read_picture(line: PictureLine) -> NDArray[np.uint8]:
     """Return the picture (H, W, 3) uint8. Raises RecordingError for a file that changed, or is no picture."""
     content, where = _read(line.picture), line.picture.name
     if _digest(content) != line.content:
@@ -368,7 +368,7 @@ def _with_groups(table: TextTable, lines: list[tuple[int, Cells]]) -> list[tuple
     return [(number, text | {GROUP: names.get(number)}) for number, text in lines]
 
 
-def _line(text: Cells, folder: Path, where: str, numbers: tuple[float, ...]) -> Line:
+def _line(text: Cells, folder: Path, where: str, numbers: tuple[float, ...]) -> PictureLine:
     """Return a line of the table. Raises RecordingError naming what is wrong with it."""
     for name in (PICTURE, INSTRUCTION, ID, GROUP):  # labels are checked by `LabelTable`
         cell = text.get(name) or ""
@@ -382,7 +382,7 @@ def _line(text: Cells, folder: Path, where: str, numbers: tuple[float, ...]) -> 
             f"{where} names {path}, a link to a file outside the folder of --pictures; expected a file in it. "
             "Copy the picture into the folder (cp -L)"
         )
-    return Line(folder / path, _digest(_read(folder / path)), numbers)
+    return PictureLine(folder / path, _digest(_read(folder / path)), numbers)
 
 
 def _id(text: Cells, number: int) -> str:

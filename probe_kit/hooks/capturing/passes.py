@@ -46,7 +46,7 @@ def outside_inference_mode() -> Iterator[None]:
 
 
 @dataclass(frozen=True)
-class Block:
+class PassBlock:
     """A tensor of what is kept of n sites that fired one after another.
 
     Attributes:
@@ -83,7 +83,7 @@ class BlockPart:
     """
 
     settle: Callable[[], None] | None
-    block: Block | None = None
+    block: PassBlock | None = None
     position: int = 0
 
     def tensor(self) -> Tensor:
@@ -93,7 +93,7 @@ class BlockPart:
             part = block.of(self.position)
             return part if block.flat.shape[0] == part.shape[0] else part.clone()
 
-    def settled(self) -> Block:
+    def settled(self) -> PassBlock:
         """Return the block."""
         if self.block is None:
             assert self.settle is not None
@@ -105,12 +105,12 @@ class BlockPart:
 def block_of(parts: Sequence[Tensor | BlockPart]) -> Tensor:
     """Return what is kept of these sites as one tensor (n, B, …), from as few operations as their blocks allow."""
     with outside_inference_mode():
-        pieces: list[Block] = []
+        pieces: list[PassBlock] = []
         at = 0
         while at < len(parts):
             part = parts[at]
             if isinstance(part, Tensor):
-                pieces.append(Block(part, 1))
+                pieces.append(PassBlock(part, 1))
                 at += 1
                 continue
             block = part.settled()
@@ -121,13 +121,13 @@ def block_of(parts: Sequence[Tensor | BlockPart]) -> Tensor:
                 pieces.append(block)
                 at += block.sites
             else:
-                pieces.append(Block(block.of(part.position), 1))
+                pieces.append(PassBlock(block.of(part.position), 1))
                 at += 1
         if len({piece.rows for piece in pieces}) > 1:
             return torch.cat([piece.tensor() for piece in pieces])
         flats = [piece.flat for piece in pieces]
         flat = flats[0] if len(flats) == 1 else torch.cat(flats)
-        return Block(flat, len(parts), pieces[0].rows).tensor()
+        return PassBlock(flat, len(parts), pieces[0].rows).tensor()
 
 
 def _position_of(part: Tensor | BlockPart) -> tuple[int, int] | None:
@@ -329,7 +329,7 @@ class PassCapture:
                     if key not in joined:
                         joined[key] = self._join(reading, reading.tensors[same])
                     rows = ALL_ROWS if reading.is_selected else reading.tap.rows
-                    self._assign(reading, same, 1, Block(joined[key], same.stop - same.start, rows))
+                    self._assign(reading, same, 1, PassBlock(joined[key], same.stop - same.start, rows))
                     if reading.weights is not None:
                         alone = id(reading) if rows.blocks == 1 else 0
                         products[key, rows.blocks, reading.weights.shape[1], alone].append((reading, same))
@@ -340,7 +340,7 @@ class PassCapture:
                 flat = _product(weights, joined[key])
                 for reading, of_reading in members:
                     rows = ALL_ROWS if reading.is_selected else reading.tap.rows
-                    self._assign(reading, of_reading, 0, Block(flat, count, rows))
+                    self._assign(reading, of_reading, 0, PassBlock(flat, count, rows))
         for reading in stack_pass.readings:
             reading.clear()
         self._size, stack_pass.size = self._size - stack_pass.size, 0
@@ -365,7 +365,7 @@ class PassCapture:
         part = flat[:, tokens]
         return part if self._tokens is None or 2 * part.shape[1] > flat.shape[1] else part.clone()
 
-    def _assign(self, reading: _Reading, same: slice, which: int, block: Block) -> None:
+    def _assign(self, reading: _Reading, same: slice, which: int, block: PassBlock) -> None:
         for position, parts in enumerate(reading.parts[same]):
             part = parts[which]
             if part is not None:

@@ -18,7 +18,7 @@ from probe_kit.hooks.checkpoints.third_party import contain_policy, in_words
 __all__ = [
     "Check",
     "CheckFailedError",
-    "Outcome",
+    "CheckOutcome",
     "SkipTest",
     "check",
     "checks_of",
@@ -132,7 +132,7 @@ _FROM_THE_ERROR = "no error"
 
 
 @dataclass(frozen=True)
-class Outcome:
+class CheckOutcome:
     """The outcome of one check.
 
     Attributes:
@@ -156,7 +156,7 @@ class Outcome:
         return asdict(self)
 
 
-def try_check(name: str, sentence: str, change: str, body: Callable[[], object], package: str) -> Outcome:
+def try_check(name: str, sentence: str, change: str, body: Callable[[], object], package: str) -> CheckOutcome:
     """Run a check; whatever the adapter raises is a failure.
 
     Ctrl-C is raised. Changes of the adapter in this process are put back.
@@ -172,14 +172,14 @@ def try_check(name: str, sentence: str, change: str, body: Callable[[], object],
         with contain_policy() as interruptions:
             body()
     except SkipTest as skipped:
-        return Outcome(name, "skipped", sentence, reason=str(skipped))
+        return CheckOutcome(name, "skipped", sentence, reason=str(skipped))
     except CheckFailedError as failed:
-        return Outcome(name, "failed", sentence, failed.actual, failed.expected, failed.change or change)
+        return CheckOutcome(name, "failed", sentence, failed.actual, failed.expected, failed.change or change)
     except BaseException as error:  # some of these end a process, and are the adapter's own here
         if isinstance(error, KeyboardInterrupt) and interruptions.asked:
             raise
-        return Outcome(name, "failed", sentence, _in_words(error, package), _FROM_THE_ERROR, change)
-    return Outcome(name, "passed", sentence)
+        return CheckOutcome(name, "failed", sentence, _in_words(error, package), _FROM_THE_ERROR, change)
+    return CheckOutcome(name, "passed", sentence)
 
 
 def _in_words(error: BaseException, package: str) -> str:

@@ -120,7 +120,7 @@ def _acting(subject: PolicySubject) -> Policy:
 def policy_and_family_declare_the_same(subject: PolicySubject) -> None:
     policy, interventions = subject.policy, subject.policy.interventions
     if subject.name:
-        declared = find_family(subject.name).interventions
+        declared = find_family(subject.name).abilities.interventions
         require(
             declared == interventions,
             f"the family declares {declared}",

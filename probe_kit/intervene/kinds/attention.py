@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._system.types import Matrix
 from probe_kit._tables.content import Cell as TableCell
 from probe_kit._tables.numbers import percent, points
 from probe_kit.errors import CaptureChangedActionError, CaptureError, EmptyRoleError, UsageError
@@ -28,7 +29,6 @@ from probe_kit.intervene.outcomes import (
 )
 from probe_kit.intervene.places import ALL, TILE_ROLES, TILES, roles_of
 from probe_kit.intervene.replay import CLEAN_RUN, Condition, ConditionContext, ConditionResult
-from probe_kit.intervene.settings import has_sides
 from probe_kit.intervene.stored import Measurement, StoredResult, stored_results
 from probe_kit.intervene.tokens import shown_cameras, token_boxes
 from probe_kit.runs.reader import RunReader
@@ -115,7 +115,7 @@ class AttentionReadout(Intervention):
         episodes, groups, categories = (
             rows[name].to_numpy(dtype=str) for name in ("episode_id", "group_id", "category")
         )
-        sides = rows["side_correct"].to_numpy(dtype=str) if has_sides(run) else np.full(len(rows), "")
+        sides = rows["side_correct"].to_numpy(dtype=str) if run.source.is_scene else np.full(len(rows), "")
         shares = AttentionShares(
             tuple(entries["roles"]), episodes, groups, categories, sides, calls, outcomes.mass
         )
@@ -332,7 +332,6 @@ Axis = Literal["block", "iteration", "head", "call"]
 _AXES: Mapping[str, int] = {"block": 1, "iteration": 2, "head": 3}
 CORRECT, OTHER, ACTION = "image.correct", "image.other", "action"
 """Roles made of the stored ones: the correct picture's tile, the other tile, and the acting stream itself."""
-Shares = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -387,7 +386,7 @@ class AttentionShares:
         """Return every category with its inferences, in the order of the episodes."""
         return [(name, self.only(self.categories == name)) for name in dict.fromkeys(map(str, self.categories))]
 
-    def shares(self) -> dict[str, Shares]:
+    def shares(self) -> dict[str, Matrix]:
         """Return the shares (N, B, I, H) by role.
 
         These are the stored ones, tiles also by the answer's side, and the difference to 1.
@@ -521,7 +520,7 @@ def preferred_attention(run: RunReader) -> dict[str, tuple[StoredResult, Attenti
     return preferred
 
 
-def _per_episode(values: Shares, episodes: NDArray[np.int64]) -> Shares:
+def _per_episode(values: Matrix, episodes: NDArray[np.int64]) -> Matrix:
     """Return the means (E, …) over the inferences of every episode, of values that are not NaN."""
     sums, counts = (np.zeros((episodes.max() + 1, *values.shape[1:])) for _ in range(2))
     has_share = ~np.isnan(values)
@@ -530,7 +529,7 @@ def _per_episode(values: Shares, episodes: NDArray[np.int64]) -> Shares:
     return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
 
 
-def _mean(values: Shares, axes: tuple[int, ...]) -> Shares:
+def _mean(values: Matrix, axes: tuple[int, ...]) -> Matrix:
     """Return the mean over some axes of values that are not NaN; NaN where there are none."""
     has_share = ~np.isnan(values)
     counts = has_share.sum(axis=axes)

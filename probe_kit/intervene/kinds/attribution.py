@@ -124,7 +124,7 @@ class AttributionPatching(Intervention):
         from probe_kit.hooks.registry import get_family
 
         family = get_family(run.model)
-        if "sites" not in options and family is not None and not family.interventions.prompt_kv:
+        if "sites" not in options and family is not None and not family.abilities.interventions.prompt_kv:
             options["sites"] = SITES[1:]
         return super().from_options(run, **options)
 

@@ -11,8 +11,8 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from probe_kit._system.types import Matrix
 from probe_kit._tables.content import Cell as TableCell
 from probe_kit._tables.numbers import NONE as NO_NUMBER
 from probe_kit._tables.numbers import Write, number, percent, with_sign
@@ -30,7 +30,7 @@ from probe_kit.intervene.pairs import Pair
 from probe_kit.intervene.patching.patch import Cell
 from probe_kit.intervene.places import TILES
 from probe_kit.intervene.replay import Condition, replay
-from probe_kit.intervene.settings import FIRST_CHUNK, PER_STEP, Choice, categories_in, has_sides
+from probe_kit.intervene.settings import FIRST_CHUNK, PER_STEP, Choice, categories_in
 from probe_kit.intervene.stored import Measurement
 from probe_kit.runs.direction_files import FileDirection, names_file, read_direction
 from probe_kit.runs.reader import RunReader
@@ -46,7 +46,6 @@ if TYPE_CHECKING:
     from probe_kit.intervene.directions import Directions
     from probe_kit.intervene.sessions import ReplaySession
 
-Values = NDArray[np.float64]
 OPTIONS = (
     "sites", "roles", "direction", "controls", "coefficients", "target_side", "seed", "window", "readers", "heads",
     "closed_loop", "untrained",
@@ -73,7 +72,7 @@ class Intervention(Choice, ABC):
         has_verdict: Whether `classify_use` classifies its rows.
         is_descriptive: Whether it edits and tests nothing.
         asks_where: Whether it edits places of the network, so that a line says which layer matters.
-        needs_sides: Whether it applies to runs of the scene alone.
+        needs_scene: Whether it applies to runs of the scene alone.
         categories: Categories of the run; None for all.
         items: Number of items of each category, the first ones; None for all.
         readout: Part of the policy's answer that is read, see `Readout`.
@@ -92,7 +91,7 @@ class Intervention(Choice, ABC):
     has_verdict: ClassVar[bool] = False
     is_descriptive: ClassVar[bool] = False
     asks_where: ClassVar[bool] = False
-    needs_sides: ClassVar[bool] = False
+    needs_scene: ClassVar[bool] = False
 
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)
@@ -154,14 +153,14 @@ class Intervention(Choice, ABC):
             UsageError: For a run that does not fit.
         """
         categories_in(run, self.categories)
-        if has_sides(run):
+        if run.source.is_scene:
             if self.vary or self.frames or self.pairs or self.instructions:
                 raise UsageError(
                     "--vary, --frames, --pairs and --instructions are for runs on recordings or in your own "
                     "environment; in the scene the pictures are swapped. Leave them out"
                 )
-        elif self.needs_sides or self.readout != FIRST_CHUNK:
-            option = f"--kind {self.kind}" if self.needs_sides else f"--readout {self.readout}"
+        elif self.needs_scene or self.readout != FIRST_CHUNK:
+            option = f"--kind {self.kind}" if self.needs_scene else f"--readout {self.readout}"
             raise UsageError(
                 f"{run.location} has no correct picture on a side, which {option} needs. Take --kind interchange, "
                 "or a run of the scene"
@@ -337,7 +336,7 @@ class AlongDirection(Intervention):
             UsageError: For a direction of an answer in a run without sides.
         """
         super().check_run(run)
-        if not has_sides(run) and self.direction != NONE and self.vector is None:
+        if not run.source.is_scene and self.direction != NONE and self.vector is None:
             raise UsageError(
                 f"{run.location} has no correct picture on a side, so that {self.direction} is no direction "
                 "there. Give one of a file: --direction FILE#NAME"
@@ -387,7 +386,7 @@ class EffectRow(Effect):
         return " ".join(filter(None, (self.sites, self.role, self.direction)))
 
 
-def common_columns(outcomes: ConditionOutcomes, row: int, cell: EditedCell, gains: Values) -> dict[str, Any]:
+def common_columns(outcomes: ConditionOutcomes, row: int, cell: EditedCell, gains: Matrix) -> dict[str, Any]:
     """Return the columns of `EffectRow` for one condition.
 
     Args:
@@ -414,7 +413,7 @@ def common_columns(outcomes: ConditionOutcomes, row: int, cell: EditedCell, gain
     }
 
 
-def net_interval(gains: Values, outcomes: ConditionOutcomes) -> tuple[float, float]:
+def net_interval(gains: Matrix, outcomes: ConditionOutcomes) -> tuple[float, float]:
     """Return the 95 % interval by groups of the mean over episodes of (E,) gains."""
     drawn = units_seed(outcomes.groups, outcomes.seed_text)
     low, high = group_bootstrap(gains[:, None], outcomes.groups, drawn, bounds=GAINS)
@@ -435,14 +434,14 @@ class ControlTest(NamedTuple):
     """
 
     controls: list[int]
-    beyond: Values | None = None
+    beyond: Matrix | None = None
     t: float | None = None
     p: float | None = None
     p_fwe: float | None = None
 
 
 def compare_with_controls(
-    values: Values,
+    values: Matrix,
     cells: Sequence[EditedCell],
     outcomes: ConditionOutcomes,
     *,
@@ -477,7 +476,7 @@ def compare_with_controls(
     return tests
 
 
-def mean_of(values: Values) -> float | None:
+def mean_of(values: Matrix) -> float | None:
     """Return the mean of some numbers; None if there are none."""
     return float(values.mean()) if values.size else None
 

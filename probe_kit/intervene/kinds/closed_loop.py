@@ -57,7 +57,7 @@ MIN_IN_ZONE_RATIO = 0.5
 """Share of the clean in-zone share below which the task is called disrupted: most of the placing is gone."""
 CORRECT, WRONG = "correct", "wrong"
 """Outcomes of `env.scoring` with the cube in a zone; the third, `oob`, is outside both."""
-Finding = Literal["identity patch", "control", "task disrupted", "confirmed", "not confirmed"]
+LoopFinding = Literal["identity patch", "control", "task disrupted", "confirmed", "not confirmed"]
 
 
 def identity_patch(sites: Sequence[Site]) -> Condition:
@@ -93,7 +93,7 @@ class ClosedLoop(AlongDirection):
     kind: ClassVar[str] = "closed-loop"
     summary: ClassVar[str] = "Interchange at every inference; whole episodes are played."
     position: ClassVar[int] = 7
-    needs_sides: ClassVar[bool] = True
+    needs_scene: ClassVar[bool] = True
     options: ClassVar[Mapping[str, str]] = {
         "sites": "default the last place, of each category, that the newest interchange localised",
         "roles": "with --sites; default all",
@@ -267,7 +267,7 @@ class ClosedLoopEffect(EffectRow):
     disrupted: bool
 
     @property
-    def finding(self) -> Finding:
+    def finding(self) -> LoopFinding:
         """The finding: `confirmed` if, beyond controls and chance, enough episodes turn to the other picture."""
         if self.sites == CLEAN:
             return "identity patch"

@@ -62,7 +62,7 @@ if TYPE_CHECKING:
 LEACE = "leace"
 PROBE_ACCURACY = "probe_accuracy"
 """Entry of the certificate: accuracies of probes behind each condition, by category."""
-Finding = Literal[
+ErasureFinding = Literal[
     "identity patch", "control", "no baseline effect", "controls also disrupt", "effect", "no effect"
 ]
 UNTOUCHED, ZERO = "none", "0"
@@ -98,7 +98,7 @@ class ConceptErasure(Intervention):
     summary: ClassVar[str] = "Remove the decodable answer (weaker than interchange)."
     position: ClassVar[int] = 8
     fits_always: ClassVar[bool] = True
-    needs_sides: ClassVar[bool] = True
+    needs_scene: ClassVar[bool] = True
     options: ClassVar[Mapping[str, str]] = {
         "sites": "where tokens are erased, one site each; required",
         "roles": "of the erased tokens; default image",
@@ -329,7 +329,7 @@ class ErasureEffect(EffectRow):
     probe_accuracy: float | None
 
     @property
-    def finding(self) -> Finding:
+    def finding(self) -> ErasureFinding:
         """The finding: `effect` if, beyond controls and chance, enough of the answer is gone from the action."""
         if self.direction == UNTOUCHED:
             return "identity patch"

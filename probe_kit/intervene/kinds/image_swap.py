@@ -42,7 +42,7 @@ from probe_kit.intervene.kinds.base import (
 )
 from probe_kit.intervene.outcomes import CLEAN, CONTROL_INPUT, DONOR, IMAGE_SWAP, NOISE, ConditionOutcomes, Effect
 from probe_kit.intervene.replay import CLEAN_RUN, CONTROL_RUN, DONOR_RUN, NOISE_RUN, SOURCE_RUN, Condition
-from probe_kit.intervene.settings import FIRST_CHUNK, has_sides
+from probe_kit.intervene.settings import FIRST_CHUNK
 from probe_kit.intervene.stored import TILES_APART, Measurement, preferred_by_category
 from probe_kit.runs.reader import RunReader
 from probe_kit.statistics.bootstrap import unbounded_student_interval
@@ -78,7 +78,7 @@ _REACH = {
 # -- the exchange of an input, without sides -----------------------------------------------------------------
 
 
-Finding = Literal["decides", "moves", "no effect", "open"]
+SwapFinding = Literal["decides", "moves", "no effect", "open"]
 DECIDES = 0.5
 """Share of the exchange of all inputs from which an input decides; within ±`NOTHING` it has no effect."""
 
@@ -115,7 +115,7 @@ class InputEffect(Effect):
     share: float | None
     share_ci: tuple[float, float] | None
     p: float
-    finding: Finding
+    finding: SwapFinding
     every: float = 1.0
     seed: float | None = None
     key: str = ""
@@ -163,7 +163,7 @@ def input_effect(outcomes: ConditionOutcomes, swapped: str, vary: str) -> InputE
     )
 
 
-def _finding(share: SwapShare | None, p: float, ratio: float, by_seed: bool, is_trace: bool) -> Finding:
+def _finding(share: SwapShare | None, p: float, ratio: float, by_seed: bool, is_trace: bool) -> SwapFinding:
     """Return the verdict of an input.
 
     Where the seed decides, a share of the exchange of all inputs is a share of nothing; the rules are then those
@@ -476,7 +476,7 @@ class Swap(Intervention):
     @classmethod
     def sentences(cls, rows: Sequence[Any], context: Measurement) -> list[str]:
         """Return one sentence per category."""
-        if context.lacks_sides:
+        if not context.is_scene:
             return [f"{row.n_episodes} frames of {row.n_items} episodes: {_describe_input(row)}." for row in rows]
         return [
             f"{category_of(row.category).title} ({plural(row.n_items, 'item')}): {cls.describe(row, context)}"
@@ -508,20 +508,20 @@ class ImageSwap(Swap):
 
     def conditions(self, session: "ReplaySession") -> Sequence[Condition]:
         """Return clean, and with swapped images; without sides also the donor's inputs, the control and a seed."""
-        unpaired = () if has_sides(session.run) else (DONOR_RUN, CONTROL_RUN, NOISE_RUN)
+        unpaired = () if session.run.source.is_scene else (DONOR_RUN, CONTROL_RUN, NOISE_RUN)
         return CLEAN_RUN, SOURCE_RUN, *unpaired
 
     @classmethod
     def effects(cls, measurement: Measurement) -> Sequence[Effect]:
         """Return one row per category."""
-        if not measurement.outcomes.has_sides:
+        if not measurement.outcomes.is_scene:
             return super().effects(measurement)
         return image_swap_effects(measurement)
 
     @classmethod
     def table(cls, rows: Sequence[Any], context: Measurement) -> "Table":
         """Return one line per category with its verdict."""
-        if context.lacks_sides:
+        if not context.is_scene:
             return super().table(rows, context)
         verdicts = context.verdicts
         reaches = [_REACH[row.reach_source].format(100 * row.reach) for row in rows]
@@ -546,7 +546,7 @@ class ImageSwap(Swap):
     @classmethod
     def finding(cls, rows: Sequence[Any], context: Measurement) -> str:
         """Return the verdict, and how often a swap turns the action."""
-        if context.lacks_sides:
+        if not context.is_scene:
             return super().finding(rows, context)
         (row,) = rows
         turned = f"a swap turns it in {100 * row.follow_rate:.0f} % of the episodes"

@@ -31,7 +31,6 @@ from probe_kit.intervene.replay import (
     ConditionContext,
     ConditionResult,
 )
-from probe_kit.intervene.settings import has_sides
 from probe_kit.intervene.stored import Measurement
 from probe_kit.statistics.significance import SIGNIFICANCE
 
@@ -141,14 +140,14 @@ class InstructionSwap(Swap):
         Without sides, the images are those of a donor, and a control is added.
         """
         swapped = Condition(INSTRUCTION_SWAP, _ask_for_the_other)
-        if has_sides(session.run):
+        if session.run.source.is_scene:
             return CLEAN_RUN, swapped, SOURCE_RUN, NOISE_RUN
         return CLEAN_RUN, swapped, DONOR_RUN, CONTROL_RUN, NOISE_RUN
 
     @classmethod
     def effects(cls, measurement: Measurement) -> Sequence[Effect]:
         """Return one row per category, in the order of the episodes."""
-        if not measurement.outcomes.has_sides:
+        if not measurement.outcomes.is_scene:
             return super().effects(measurement)
         reach = Reach.of(measurement.outcomes.of(CLEAN), measurement.tiles_apart)
 
@@ -162,7 +161,7 @@ class InstructionSwap(Swap):
     @classmethod
     def table(cls, rows: Sequence[Any], context: Measurement) -> "Table":
         """Return one line per category with the sensitivity of one step."""
-        if context.lacks_sides:
+        if not context.is_scene:
             return super().table(rows, context)
         swap = [replace(each, term=_FOLLOW if each.heading == "follow %" else "") for each in SWAP_COLUMNS]
         parts = {"Does the action follow the instruction?": swap, "What one step owes to": _STEP_COLUMNS}
@@ -179,7 +178,7 @@ class InstructionSwap(Swap):
     @classmethod
     def finding(cls, rows: Sequence[Any], context: Measurement) -> str:
         """Return whether the action follows a swap of the instruction."""
-        if context.lacks_sides:
+        if not context.is_scene:
             return super().finding(rows, context)
         (row,) = rows
         follows = "followed" if row.is_resolved and row.follow_p < SIGNIFICANCE else "not shown"

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 
+from probe_kit._system.types import Matrix
 from probe_kit._tables.content import Cell as TableCell
 from probe_kit._tables.numbers import number, with_sign
 from probe_kit.errors import UsageError
@@ -28,7 +29,6 @@ from probe_kit.intervene.kinds.base import (
     AlongDirection,
     EffectColumn,
     EffectRow,
-    Values,
     centimetres,
     common_columns,
     compare_with_controls,
@@ -141,7 +141,7 @@ class PatchEffect(EffectRow):
         return " ".join(filter(None, (super().name, self.coefficient and f"coefficient {self.coefficient}")))
 
 
-def target_sign(outcomes: ConditionOutcomes, target_side: str) -> Values:
+def target_sign(outcomes: ConditionOutcomes, target_side: str) -> Matrix:
     """Return (E,) the target side of every episode, +1 for left."""
     correct = outcomes.correct_sign
     sides = {"left": np.ones_like(correct), "right": -np.ones_like(correct), "correct": correct}
@@ -165,7 +165,7 @@ def patch_effects(outcomes: ConditionOutcomes, target_side: str = IMAGE_SWAP) ->
         IMAGE_SWAP in outcomes.conditions,
     )
     # Above zero on the left; without sides, where the action is nearer to the source's.
-    middle = 0.0 if outcomes.has_sides or not has_swap else outcomes.of(IMAGE_SWAP) / 2
+    middle = 0.0 if outcomes.is_scene or not has_swap else outcomes.of(IMAGE_SWAP) / 2
     toward = None if outcomes.toward is None or not has_swap else outcomes.toward
     cells = [outcomes.cells[row] for row in rows]
     displacements = push * (outcomes.displacement[rows] - clean)
@@ -480,7 +480,7 @@ class PatchKind(AlongDirection):
             f"Where is it used? {context.subject}, {context.kind}",
             ("category", "edit"),
             lines_of(edits, lambda row: f"{row.name}{' (unread)' if row.sites in unread else ''}"),
-            {"What the action does": _columns(context.exchange, not context.lacks_sides)},
+            {"What the action does": _columns(context.exchange, context.is_scene)},
             lambda row: row.is_localised and not row.is_by_construction,
             marks={BY_CONSTRUCTION: "carries the effect by construction and locates nothing"},
             after=["unread: nothing that acts reads this place", legend_of_doses(edits), legend_of_p(edits)],
@@ -599,12 +599,12 @@ def _share(effect: float | None) -> str:
     return "n/a" if effect is None else number(effect)
 
 
-def _columns(exchange: str, has_sides: bool) -> list[EffectColumn[PatchEffect]]:
+def _columns(exchange: str, is_scene: bool) -> list[EffectColumn[PatchEffect]]:
     """Return the columns of edits.
 
     Args:
         exchange: The change of inputs of which effects are shares.
-        has_sides: Whether displacements are in cm toward a side. Else they are in spreads of clean actions, toward
+        is_scene: Whether displacements are in cm toward a side. Else they are in spreads of clean actions, toward
             the source's action.
     """
     effect = EffectColumn[PatchEffect](
@@ -624,7 +624,7 @@ def _columns(exchange: str, has_sides: bool) -> list[EffectColumn[PatchEffect]]:
         lambda row: TableCell(row.relative_change, number),
         "relative change: how far tokens were moved, in their own norms",
     )
-    if not has_sides:
+    if not is_scene:
         return [
             effect,
             EffectColumn(

@@ -8,7 +8,7 @@ table. To add a column: compute the field where its part is made, and declare th
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from operator import attrgetter
-from typing import Any
+from typing import Any, Literal
 
 from probe_kit._tables.numbers import number, p_text, percent, points, with_sign
 from probe_kit._tables.table import Cell, absent
@@ -30,9 +30,10 @@ from probe_kit.retention.columns.text import (
     verdict_text,
 )
 from probe_kit.retention.compare.compare import Difference
-from probe_kit.retention.rows.row import RetentionRow, StreamPart
+from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.statistics.significance import SIGNIFICANCE
 
+Labels = Literal["none", "some", "all"]
 Show = Callable[[RetentionRow], Cell]
 Sort = Callable[[RetentionRow], Any]
 
@@ -55,6 +56,7 @@ class Column:
         note: Text that the report shows on pointing at the cell.
         answers: Heading and help where the rows are of models that were asked, if these differ.
         both: Heading where the rows are of both, if it is not the one behind the other.
+        labels: Heading and help where the rows are of labels, if these differ.
     """
 
     key: str
@@ -70,9 +72,21 @@ class Column:
     note: Callable[[RetentionRow], str] | None = None
     answers: tuple[str, str] | None = None
     both: str = ""
+    labels: tuple[str, str] | None = None
 
-    def worded(self, modes: Modes) -> "Column":
-        """Return the column with the words for rows of policies, of models that were asked, or of both."""
+    def worded(self, modes: Modes, labels: Labels = "none") -> "Column":
+        """Return the column with the words for its rows.
+
+        Args:
+            modes: Whether they are of policies, of models that were asked, or of both.
+            labels: Whether none, some or all of them are of labels.
+        """
+        if self.labels is not None and labels == "all":
+            heading, meaning = self.labels
+            return replace(self, heading=heading, help=meaning)
+        if self.labels is not None and labels == "some":
+            (heading, meaning), side = self.labels, self.worded(modes)
+            return replace(side, heading=f"{side.heading} / {heading}", help=f"{side.help} Of a label: {meaning}")
         if self.answers is None or modes == "acts":
             return self
         heading, meaning = self.answers
@@ -489,6 +503,15 @@ _P = (
     "allows for having looked at all layers (family-wise)."
 )
 _PEAK = "Accuracy of the site that is best on all questions, scored on them too; too high by having been chosen."
+_CHANCE = "Mean score of a label with labels exchanged between groups, at the site with the largest excess."
+_LABEL_PEAK = (
+    "Held-out score at the site of a label with the largest excess over its own chance: accuracy balanced between "
+    "classes, or R²; too high by having been chosen."
+)
+_ABOVE_CHANCE = (
+    "Score of a label above chance at sites that other groups chose, with its 95 % interval. Chance is subtracted "
+    "at each site. Bold: the signal is shown."
+)
 _LAYER = (
     "Where the best probe reads: 0 enters the first block, the last one leaves the last block. The first of "
     "several that are equally good; after +: how many others are."
@@ -506,14 +529,52 @@ _EXCEEDS = (
     "The controls that the best site is shown to exceed, paired by question: chance; random-features, an "
     "untrained conjunction of pictures and words; untrained, the same network with random weights."
 )
-BACKBONE = interval(
-    "backbone.score",
-    "backbone.ci",
-    "backbone % [95 %]",
-    f"In the vision-language backbone. {_SCORE}",
-    difference=lambda row: Cell(row.backbone, points, row.backbone_ci),
-    strong=lambda row: row.backbone.has_signal,
-)
+
+
+def _score(part: str, name: str, **words: Any) -> Column:
+    """Return the column of the cross-fitted score of a stream: accuracy of a side, or a label's above chance."""
+    read = attrgetter(part)
+
+    def cell(row: RetentionRow) -> Cell:
+        of = read(row)
+        return above_chance(of) if row.label else Cell(of.score, percent, of.ci)
+
+    return Column(
+        key=f"{part}.score",
+        heading=f"{name} % [95 %]",
+        cell=cell,
+        sort=lambda row: read(row).above if row.label else read(row).score,
+        difference=lambda row: Cell(getattr(row, part), points, getattr(row, f"{part}_ci")),
+        averaged=True,
+        strong=lambda row: read(row).has_signal,
+        labels=(f"{part} above chance", _ABOVE_CHANCE),
+        **words,
+    )
+
+
+def _peak(part: str, **words: Any) -> Column:
+    """Return the column of the score of a stream's best site: accuracy of a side, or the metric of a label."""
+    read = attrgetter(part)
+    return Column(
+        key=f"{part}.peak",
+        heading=f"{part} peak %",
+        help=_PEAK,
+        cell=lambda row: Cell(read(row).peak, number if row.label else percent),
+        averaged=True,
+        labels=(f"{part} peak", _LABEL_PEAK),
+        **words,
+    )
+
+
+def _chance(part: str) -> Column:
+    """Return the column of a label's chance at the best site of a stream; one half for a side, without a cell."""
+    read = attrgetter(f"{part}.chance")
+    return Column(
+        key=f"{part}.chance", heading=f"{part} chance", help=_CHANCE, cell=lambda row: Cell(read(row), number)
+    )
+
+
+BACKBONE = _score("backbone", "backbone", help=f"In the vision-language backbone. {_SCORE}")
 BACKBONE_VERDICT = Column(
     key="backbone.verdict",
     heading="in the backbone",
@@ -528,12 +589,7 @@ BACKBONE_LAYER = Column(
     cell=lambda row: site_cell(row.backbone.layer, None, row.backbone.ties),
 )
 BACKBONE_P = p_value("backbone.p_fwe", "backbone p", _P)
-BACKBONE_PEAK = share(
-    "backbone.peak",
-    "backbone peak %",
-    _PEAK,
-    cell=lambda row: Cell(row.backbone.peak if row.is_side else None, percent),
-)
+BACKBONE_PEAK, BACKBONE_CHANCE = _peak("backbone"), _chance("backbone")
 EXCEEDS = Column(
     key="backbone.exceeds",
     heading="backbone exceeds",
@@ -542,14 +598,11 @@ EXCEEDS = Column(
     sort=lambda row: exceeds_text(row.backbone),
 )
 _IN_ACTION = "Where the action is made: in the action expert, or at the positions that choose action tokens."
-ACTION = interval(
-    "action.score",
-    "action.ci",
-    "action % [95 %]",
-    f"{_IN_ACTION} {_SCORE}",
+ACTION = _score(
+    "action",
+    "action",
+    help=f"{_IN_ACTION} {_SCORE}",
     answers=("answer % [95 %]", f"At the position that chooses the first token of the answer. {_SCORE}"),
-    difference=lambda row: Cell(row.action, points, row.action_ci),
-    strong=lambda row: row.action.has_signal,
 )
 ACTION_VERDICT = Column(
     key="action.verdict",
@@ -568,14 +621,8 @@ ACTION_LAYER = Column(
     answers=("answer layer", _LAYER),
 )
 ACTION_P = p_value("action.p_fwe", "action p", _P, answers=("answer p", _P))
-ACTION_PEAK = share(
-    "action.peak",
-    "action peak %",
-    _PEAK,
-    cell=lambda row: Cell(row.action.peak if row.is_side else None, percent),
-    answers=("answer peak %", _PEAK),
-    both="action peak / answer peak %",
-)
+ACTION_PEAK = _peak("action", answers=("answer peak %", _PEAK), both="action peak / answer peak %")
+ACTION_CHANCE = _chance("action")
 FIRST_ITERATION = share(
     "action.first_peak",
     "first iteration %",
@@ -583,42 +630,12 @@ FIRST_ITERATION = share(
     "itself, as a noisy action or as the tokens before.",
     answers=("first iteration %", "Best layer at the first iteration."),
 )
-_SITE = "The site of a label that has the largest score above its own chance."
-_CHANCE = "Mean score with labels exchanged between groups, at that site."
-_LABEL_SCORE = (
-    "Held-out score of a probe of a label at that site: accuracy balanced between classes, or R². Bold: the "
-    "signal is shown."
-)
-_ABOVE_CHANCE = (
-    "Score of a label above chance at sites that other groups chose, with its 95 % interval. Chance is subtracted "
-    "at each site. Bold: the signal is shown."
-)
 METRIC = Column(
     key="task",
     heading="metric",
     help="The score of a label: accuracy balanced between its classes, or R² of a quantity.",
-    cell=lambda row: Cell(None if row.is_side else row.metric),
+    cell=lambda row: Cell(row.metric if row.label else None),
 )
-
-
-def _of_label(part: str, name: str, meaning: str, show: Callable[[StreamPart], Cell], **more: Any) -> Column:
-    """Return a column of one stream's probes of a label; empty for a side, which has columns of its own."""
-    stream, read = part.partition(".")[0], attrgetter(part.partition(".")[0])
-
-    def cell(row: RetentionRow) -> Cell:
-        return Cell(None) if row.is_side else show(read(row))
-
-    return replace(Column(key=part, heading=f"{stream} {name}", help=meaning, cell=cell), **more)
-
-
-def _label_columns(part: str) -> tuple[Column, ...]:
-    strong = {"strong": lambda row: not row.is_side and attrgetter(part)(row).has_signal}
-    return (
-        _of_label(f"{part}.site", "site", _SITE, lambda of: Cell(of.site or None)),
-        _of_label(f"{part}.peak", "score", _LABEL_SCORE, lambda of: Cell(of.peak, number), **strong),
-        _of_label(f"{part}.chance", "chance", _CHANCE, lambda of: Cell(of.chance, number)),
-        _of_label(f"{part}.above", "above chance", _ABOVE_CHANCE, above_chance, **strong),
-    )
 
 
 GROUPS = Column(
@@ -687,17 +704,17 @@ TABLES: Mapping[str, tuple[ColumnGroup, ...]] = {
         ),
         ColumnGroup(
             "In the backbone",
-            (*_label_columns("backbone"), BACKBONE, BACKBONE_VERDICT, BACKBONE_LAYER, BACKBONE_P, EXCEEDS),
+            (BACKBONE, BACKBONE_VERDICT, BACKBONE_LAYER, BACKBONE_P, EXCEEDS),
             section="probes",
         ),
         ColumnGroup(
             "Where the action is made",
-            (*_label_columns("action"), ACTION, ACTION_VERDICT, ACTION_LAYER, ACTION_P, FIRST_ITERATION),
+            (ACTION, ACTION_VERDICT, ACTION_LAYER, ACTION_P, FIRST_ITERATION),
             section="probes",
         ),
         ColumnGroup(
             "Best sites, not corrected for having been chosen",
-            (BACKBONE_PEAK, ACTION_PEAK, GROUPS),
+            (BACKBONE_PEAK, BACKBONE_CHANCE, ACTION_PEAK, ACTION_CHANCE, GROUPS),
             True,
             section="probes",
         ),

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 from probe_kit._system.escaping import as_argument
 from probe_kit._tables.numbers import Limits, points, whole_percent, with_sign
-from probe_kit._tables.table import Cell, Heading, Row, Table, absent
+from probe_kit._tables.table import Cell, Heading, Table, TableRow, absent
 from probe_kit.intervene.verdict import UseVerdict, describe_readouts, more_groups, size_of_groups
 from probe_kit.retention.behaviour import Regime
 from probe_kit.retention.columns.text import (
@@ -52,7 +52,7 @@ def finding(row: RetentionRow, vlm: RetentionRow | None = None) -> str:
         row: The row of a policy, of a VLM or of a label.
         vlm: The row of a VLM that answered the same questions; None without one.
     """
-    if not row.is_side:
+    if row.label:
         return label_finding(row)
     if is_vlm(row):
         return _of_vlm(row)
@@ -228,7 +228,7 @@ def _without_swap(row: RetentionRow, vlm: RetentionRow | None) -> str:
 
 def next_step(rows: Sequence[RetentionRow]) -> str:
     """Return the command for the open question of the first run, and its purpose; empty without a policy."""
-    acts = [row for row in rows if row.is_side and row.category != MEAN and not is_vlm(row)]
+    acts = [row for row in rows if not row.label and row.category != MEAN and not is_vlm(row)]
     if not acts:
         return ""
     of_run = [row for row in acts if row.key == acts[0].key]
@@ -306,7 +306,7 @@ class CategorySummary:
         """The cells under `HEADINGS`."""
         row, vlm = self.row, self.row if is_vlm(self.row) else self.vlm
         acts = None if is_vlm(row) else row
-        if not row.is_side:
+        if row.label:
             label = Cell(row.metric), *map(_above, (row.backbone, row.action))
             return (*label, *[Cell(None)] * 4, _retention(row), Cell(""))
         return (
@@ -327,7 +327,7 @@ class CategorySummary:
     @property
     def details(self) -> str:
         """The conclusion from all numbers of the row, and what to do next; the numbers are in tables."""
-        return f"{self.name}{':' if self.row.is_side else ''} {conclusion(self.row)}"
+        return f"{self.name}{'' if self.row.label else ':'} {conclusion(self.row)}"
 
 
 HEADINGS = (
@@ -403,7 +403,7 @@ def summary_table(summaries: Sequence[RunSummary], differences: Sequence[Differe
     names = list(dict.fromkeys(category.name for category in every if category.row.category != MEAN))
     if any(len(run.categories) > 1 for run in summaries):
         names += [category.name for category in every if category.row.category == MEAN][:1]
-    lines: list[Row] = []
+    lines: list[TableRow] = []
     for name in names:
         for run in summaries:
             of_name = [category for category in run.rows if category.name == name]
@@ -411,18 +411,18 @@ def summary_table(summaries: Sequence[RunSummary], differences: Sequence[Differe
         for row in differences:
             if title_of(row.category) == name:
                 cells = (Cell(name), Cell(f"{row.group} − {row.minus}"), Cell(""), *_difference_cells(row))
-                lines.append(Row(cells, row.category == MEAN, is_difference=True))
-    is_of_sides = all(category.row.is_side for category in every)
-    headings = ("category" if is_of_sides else "label", "run", "view", *HEADINGS, *_TESTS)
+                lines.append(TableRow(cells, row.category == MEAN, is_difference=True))
+    of_labels = any(category.row.label for category in every)
+    headings = ("label" if of_labels else "category", "run", "view", *HEADINGS, *_TESTS)
     title = " · ".join(dict.fromkeys(run.title for run in summaries))
     table = Table(
-        title=f"Summary: {title}" if is_of_sides else f"Labels, and what reaches the action: {title}",
+        title=f"Labels, and what reaches the action: {title}" if of_labels else f"Summary: {title}",
         headings=tuple(Heading(name, HEADING_HELP.get(name, "")) for name in headings),
         rows=tuple(lines),
         names=3,
         overflow="fold",
     )
-    has_views = not is_of_sides and len({category.row.view for category in every}) > 1
+    has_views = of_labels and len({category.row.view for category in every}) > 1
     is_needed = {"run": len(summaries) > 1 or bool(differences), "view": has_views}
     table = table.only([at for at, name in enumerate(headings) if is_needed.get(name, True)]).filled()
     legend = [": ".join(_TERMS[name]) for name in table.columns if name in _TERMS]
@@ -434,9 +434,9 @@ def summary_table(summaries: Sequence[RunSummary], differences: Sequence[Differe
     return replace(table, notes=(*legend, *filter(None, [readouts, size]), *_marks(summaries, table)))
 
 
-def _row(category: CategorySummary, run: str) -> Row:
+def _row(category: CategorySummary, run: str) -> TableRow:
     names = map(Cell, (category.name, run, category.row.view or ""))
-    return Row((*names, *category.cells, *[Cell("")] * len(_TESTS)), category.row.category == MEAN)
+    return TableRow((*names, *category.cells, *[Cell("")] * len(_TESTS)), category.row.category == MEAN)
 
 
 def _marks(summaries: Sequence[RunSummary], table: Table) -> list[str]:
@@ -445,7 +445,7 @@ def _marks(summaries: Sequence[RunSummary], table: Table) -> list[str]:
     if any(MARK in text for line in table.texts for text in line):
         notes.append(f"{MARK} above chance, and above every control that was run")
     warning = chance_only(
-        [category.row for run in summaries for category in run.categories if category.row.is_side]
+        [category.row for run in summaries for category in run.categories if not category.row.label]
     )
     return [*notes, warning] if warning else notes
 
@@ -470,10 +470,10 @@ def summarise_runs(all_rows: Sequence[RetentionRow]) -> list[RunSummary]:
     """
     labels = [
         RunSummary(model_name(rows[0]), "", tuple(map(CategorySummary, rows)), None)
-        for rows in by_run([row for row in all_rows if not row.is_side])
+        for rows in by_run([row for row in all_rows if row.label])
     ]
-    rows = [row for row in all_rows if row.is_side and row.category != MEAN]
-    means = [row for row in all_rows if row.is_side and row.category == MEAN]
+    rows = [row for row in all_rows if not row.label and row.category != MEAN]
+    means = [row for row in all_rows if not row.label and row.category == MEAN]
     answers = [
         row
         for row in rows

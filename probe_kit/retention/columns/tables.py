@@ -8,10 +8,10 @@ from pathlib import Path
 
 from probe_kit._system.counting import plural
 from probe_kit._tables.numbers import NONE, number, percent, plain, points, span
-from probe_kit._tables.table import Cell, Cells, Heading, Legend, Row, Table, absent
+from probe_kit._tables.table import Cell, Cells, Heading, Legend, Table, TableRow, absent
 from probe_kit.retention.behaviour import rule_sentence
 from probe_kit.retention.choices import Section
-from probe_kit.retention.columns.columns import TABLES, Column, ColumnGroup, radius_columns
+from probe_kit.retention.columns.columns import TABLES, Column, ColumnGroup, Labels, radius_columns
 from probe_kit.retention.columns.text import (
     P_DECIDES,
     TERMS,
@@ -34,7 +34,7 @@ from probe_kit.retention.rows.row import MEAN, RetentionRow
 from probe_kit.runs.reader import full_name
 from probe_kit.statistics.significance import detectable
 
-TableRow = RetentionRow | Difference
+RowOrDifference = RetentionRow | Difference
 SUBJECTS = {
     "Accuracy of answers": "behaviour",
     "Success rate": "behaviour",
@@ -65,8 +65,8 @@ def retention_tables(
     once, probed = once_per_category(rows), [row for row in rows if row.view is not None]
     is_controlled = any(row.controls.baselines or row.controls.untrained for row in probed)
     rows_of = {
-        "Accuracy of answers": [row for row in once if row.is_side and is_vlm(row)],
-        "Success rate": [row for row in once if row.is_side and not is_vlm(row)],
+        "Accuracy of answers": [row for row in once if not row.label and is_vlm(row)],
+        "Success rate": [row for row in once if not (row.label or is_vlm(row))],
         "Retention": probed,
         "Controls": probed if is_controlled else [],
     }
@@ -82,6 +82,12 @@ def retention_tables(
             if len(table.headings) > table.names:
                 tables[title] = table
     return tables
+
+
+def labels_of(rows: Sequence[RetentionRow]) -> Labels:
+    """Return whether none, some or all of the rows are of labels."""
+    labelled = [bool(row.label) for row in rows]
+    return "all" if all(labelled) else "some" if any(labelled) else "none"
 
 
 def _groups(title: str, rows: Sequence[RetentionRow]) -> list[ColumnGroup]:
@@ -120,10 +126,10 @@ def _table(
     differences: Sequence[Difference],
     why_unpaired: Sequence[str],
 ) -> Table:
-    modes = modes_of(rows)
+    modes, labels = modes_of(rows), labels_of(rows)
     lines = _ordered(rows, differences)
     columns = [
-        (column.worded(modes), group)
+        (column.worded(modes, labels), group)
         for group in groups
         for column in group.columns
         if any(_cell(column, line).text not in (NONE, "") for line in lines)
@@ -138,7 +144,7 @@ def _table(
             *(Heading(column.heading, column.help, group.title, group.detail) for column, group in columns),
         ),
         rows=tuple(
-            Row(
+            TableRow(
                 (*(Cell(text(line)) for _, text in names), *(_cell(column, line) for column, _ in columns)),
                 is_mean=line.category == MEAN,
                 is_difference=isinstance(line, Difference),
@@ -150,13 +156,13 @@ def _table(
     )
 
 
-def _ordered(rows: Sequence[RetentionRow], differences: Sequence[Difference]) -> list[TableRow]:
+def _ordered(rows: Sequence[RetentionRow], differences: Sequence[Difference]) -> list[RowOrDifference]:
     """Return the lines by category, means last; in each the runs of a view, followed by their differences."""
     categories = list(dict.fromkeys(row.category for row in rows))
     views = list(dict.fromkeys(row.view for row in rows))
     by_view = {view: at for at, view in enumerate(views)}
     several = len({row.key for row in rows}) > 1
-    lines: list[TableRow] = [*rows, *differences]
+    lines: list[RowOrDifference] = [*rows, *differences]
     if not several and len(views) < 2:
         return lines
     return sorted(
@@ -170,22 +176,22 @@ def _ordered(rows: Sequence[RetentionRow], differences: Sequence[Difference]) ->
 
 def _name_columns(
     title: str, rows: Sequence[RetentionRow], differences: Sequence[Difference]
-) -> list[tuple[Heading, Callable[[TableRow], str]]]:
+) -> list[tuple[Heading, Callable[[RowOrDifference], str]]]:
     """Return the columns that distinguish rows: the category, and run, view or call where there are several."""
 
-    def name(line: TableRow) -> str:
+    def name(line: RowOrDifference) -> str:
         return title_of(line.category) if isinstance(line, Difference) else name_of(line)
 
-    def run(line: TableRow) -> str:
+    def run(line: RowOrDifference) -> str:
         return difference_name(line) if isinstance(line, Difference) else model_name(line)
 
-    def call(line: TableRow) -> str:
+    def call(line: RowOrDifference) -> str:
         return plain(line.call if isinstance(line, Difference) else line.run.call)
 
-    names: list[tuple[Heading, Callable[[TableRow], str]]] = [
-        (Heading("category", "Kind of question."), name)
-        if all(row.is_side for row in rows)
-        else (Heading("label", "What the probes decode, and in which category."), name)
+    names: list[tuple[Heading, Callable[[RowOrDifference], str]]] = [
+        (Heading("label", "What the probes decode, and in which category."), name)
+        if any(row.label for row in rows)
+        else (Heading("category", "Kind of question."), name)
     ]
     if differences or len({row.key for row in rows}) > 1:
         names.append((Heading("run", "A run, or two of which the second is subtracted."), run))
@@ -204,12 +210,12 @@ def _title(title: str, rows: Sequence[RetentionRow]) -> str:
     views, runs = ({row.view for row in rows}, {model_name(row): None for row in rows})
     view = f", view {rows[0].view}" if title not in BEHAVIOUR and len(views) == 1 else ""
     model = f"{next(iter(runs))} on " if len(runs) == 1 else ""
-    targets = list(dict.fromkeys(row.target for row in rows if not row.is_side))
-    of_label = f" of {'labels' if len(targets) > 1 else targets[0]}" if targets else ""
+    labels = list(dict.fromkeys(row.label for row in rows if row.label))
+    of_label = f" of {'labels' if len(labels) > 1 else labels[0]}" if labels else ""
     return f"{title}{of_label}{view}: {model}{', '.join(dict.fromkeys(row.run.suite for row in rows))}"
 
 
-def _cell(column: Column, line: TableRow) -> Cell:
+def _cell(column: Column, line: RowOrDifference) -> Cell:
     """Return the cell of a column; an empty one where differences have no such number."""
     if isinstance(line, Difference):
         return absent("") if column.difference is None else column.difference(line)
@@ -250,7 +256,7 @@ def _legend(title: str, rows: Sequence[RetentionRow]) -> list[str]:
         return [_OUTCOMES, *dict.fromkeys(rule_sentence(row.rules) for row in rows if row.category == MEAN)]
     calls = sorted({row.run.call for row in rows if row.run.call is not None})
     of_call = [call_words(calls[0])] if len(calls) == 1 else []
-    if not all(row.is_side for row in rows):
+    if any(row.label for row in rows):
         return [_ABOVE, *_undefined(rows)]
     if title == "Retention":
         sites = _ANSWER_SITES if modes_of(rows) == "answers" else _SITES
@@ -308,14 +314,14 @@ def _sizes(rows: Sequence[RetentionRow]) -> list[str]:
 
 
 def _size(rows: Sequence[RetentionRow]) -> str:
-    is_of_sides = all(row.is_side for row in rows)
-    samples = [row.success.n_episodes if is_of_sides else row.controls.n_samples or 0 for row in rows]
-    parts = [f"{span(samples)} {'episodes' if is_of_sides else 'samples'}"]
-    if is_of_sides:
+    of_labels = any(row.label for row in rows)
+    samples = [row.controls.n_samples or 0 if of_labels else row.success.n_episodes for row in rows]
+    parts = [f"{span(samples)} {'samples' if of_labels else 'episodes'}"]
+    if not of_labels:
         parts.append(f"{span([row.success.n_items for row in rows])} items")
     if groups := [row.controls.n_groups for row in rows if row.controls.n_groups is not None]:
         parts.append(f"{span(groups)} groups")
-    return f"per {'category' if is_of_sides else 'label'} {', '.join(parts)}"
+    return f"per {'label' if of_labels else 'category'} {', '.join(parts)}"
 
 
 # -- what was compared ----------------------------------------------------------------------------------------

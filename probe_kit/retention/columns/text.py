@@ -13,7 +13,7 @@ from probe_kit.intervene.verdict import UNTESTED, UseVerdict
 from probe_kit.retention.behaviour import Regime, SuccessRate
 from probe_kit.retention.compare.compare import Difference
 from probe_kit.retention.compare.models import ModelTest
-from probe_kit.retention.rows.build import NO_STEP
+from probe_kit.retention.estimators import NO_STEP
 from probe_kit.retention.rows.row import RetentionRow, StreamPart
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.statistics.sufficiency import GROUPS_FOR_PROBES, items_for_absence
@@ -409,7 +409,7 @@ _LATER = "Yet the policy succeeds: actions after the first inference may follow.
 
 def conclusion(row: RetentionRow) -> str:
     """Return the conclusion from a row, and what to do next; of a label with its numbers."""
-    if not row.is_side:
+    if row.label:
         return label_details(row)
     if is_vlm(row):
         return "The VLM knows the answer." if knows(row) else "Not shown that the VLM knows the answer."

@@ -10,11 +10,12 @@ from fractions import Fraction
 from functools import reduce
 from itertools import combinations, product
 from math import lcm
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._tables.numbers import Limits
 from probe_kit.errors import UsageError
 from probe_kit.retention.behaviour import TableRun, shares_of, success_share, units_of
 from probe_kit.retention.compare.models import (
@@ -26,11 +27,12 @@ from probe_kit.retention.compare.models import (
     retention_of_model,
     success_of_model,
 )
-from probe_kit.retention.estimators import ACTION, BACKBONE, Limits, PooledScores, Rate, limits
+from probe_kit.retention.estimators import ACTION, BACKBONE, PooledScores, Rate, limits
 from probe_kit.retention.rows.build import RowSettings, RowWithEstimates, run_rows
 from probe_kit.retention.rows.row import MEAN, Mode
 from probe_kit.runs.layout import FIRST_FRAME
 from probe_kit.runs.reader import RunReader
+from probe_kit.runs.run_view import view_run
 from probe_kit.statistics.paired_tests import flip_gains_p, holm_corrected
 from probe_kit.statistics.retention import Ratio, Scores, retention_difference
 
@@ -678,17 +680,6 @@ def _same_frames(
 # -- wordings ----------------------------------------------------------------------------------------------------
 
 
-class _InWording:
-    """A run with the episodes of one wording, which are not read again; everything else is the run's own."""
-
-    def __init__(self, run: RunReader, wording: str) -> None:
-        self._run = run
-        self.episodes = run.episodes[run.episodes["wording"] == wording]
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._run, name)
-
-
 def compare_wordings(runs: Sequence[RunReader]) -> list[Difference]:
     """Return every two wordings of each run against each other, the earlier one minus the later.
 
@@ -701,10 +692,11 @@ def compare_wordings(runs: Sequence[RunReader]) -> list[Difference]:
     settings = RowSettings(None, "all", ())
     differences: list[Difference] = []
     for run in runs:
-        every_wording = run.all_wordings
+        every_wording: RunReader = run.all_wordings
         sides = {}
         for wording in run.wordings:
-            in_wording = cast("RunReader", _InWording(every_wording, wording))
+            episodes = every_wording.episodes
+            in_wording = view_run(every_wording, episodes[episodes["wording"] == wording])
             if len(in_wording.episodes):
                 rows = run_rows(TableRun.of(in_wording, with_behaviour=False), None, settings)
                 sides[wording] = Side.of(wording, in_wording, rows)

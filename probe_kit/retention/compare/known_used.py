@@ -43,7 +43,7 @@ _MOST_NAMED = 3
 
 
 @dataclass(frozen=True)
-class Comparison:
+class StageTest:
     """A test whether two of the three are right of equally many items.
 
     Attributes:
@@ -95,7 +95,7 @@ class CategoryCounts:
     guessed: Mapping[str, float]
     episodes: Mapping[str, int]
     has_signal: bool | None
-    comparisons: tuple[Comparison, ...]
+    comparisons: tuple[StageTest, ...]
     answered_and_encoded: int | None = None
     not_acted_on: int | None = None
     share_not_acted_on: float | None = None
@@ -393,9 +393,7 @@ def _joined(category: str, items: "pd.DataFrame", clear: bool | None) -> Categor
     )
 
 
-def _comparisons(
-    answered: Bools, encoded: Bools | None, used: Bools, groups: NDArray[np.str_]
-) -> list[Comparison]:
+def _comparisons(answered: Bools, encoded: Bools | None, used: Bools, groups: NDArray[np.str_]) -> list[StageTest]:
     values = {"answered": answered, "acted": used} | ({} if encoded is None else {"encoded": encoded})
     comparisons = []
     for first, second in PAIRS:
@@ -403,7 +401,7 @@ def _comparisons(
             mine, theirs = values[first], values[second]
             ps = mcnemar_p(mine, theirs), flip_p(mine, theirs, groups)
             comparisons.append(
-                Comparison(first, second, int((mine & ~theirs).sum()), int((~mine & theirs).sum()), *ps, max(ps))
+                StageTest(first, second, int((mine & ~theirs).sum()), int((~mine & theirs).sum()), *ps, max(ps))
             )
     return comparisons
 

@@ -8,9 +8,10 @@ from typing import Any, Literal
 
 import numpy as np
 
+from probe_kit._tables.numbers import Limits
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.lineage import first_checkpoint
-from probe_kit.retention.estimators import ACTION, BACKBONE, Limits, PooledScores, limits
+from probe_kit.retention.estimators import ACTION, BACKBONE, PooledScores, limits
 from probe_kit.retention.rows.build import RowWithEstimates
 from probe_kit.runs.reader import RunReader
 from probe_kit.statistics.model_groups import exchange_p, is_exchangeable, welch_interval

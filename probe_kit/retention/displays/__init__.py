@@ -20,6 +20,9 @@ from probe_kit.retention.displays.interventions import (
     site_effect_curve,
 )
 from probe_kit.retention.displays.iteration_maps import IterationMapDisplay, iteration_maps
+from probe_kit.retention.displays.knowledge_action import (
+    KnowledgeActionDisplay,
+)
 from probe_kit.retention.displays.label_figures import (
     ClassConfusionDisplay,
     PredictedValuesDisplay,
@@ -38,13 +41,6 @@ from probe_kit.retention.displays.side_by_side import (
     model_depths,
     role_curves,
 )
-from probe_kit.retention.displays.table_figures import (
-    HeatTableDisplay,
-    KnowledgeActionDisplay,
-    RetentionTableDisplay,
-    SideTableDisplay,
-    SuccessTableDisplay,
-)
 
 __all__ = [
     "AttentionDisplay",
@@ -52,7 +48,6 @@ __all__ = [
     "ClassConfusionDisplay",
     "DoseResponseDisplay",
     "FinalPositionsDisplay",
-    "HeatTableDisplay",
     "IterationMapDisplay",
     "KnockoutDisplay",
     "KnowledgeActionDisplay",
@@ -64,12 +59,9 @@ __all__ = [
     "PredictedValuesDisplay",
     "ProvenanceLine",
     "ReportFigure",
-    "RetentionTableDisplay",
     "RoleCurvesDisplay",
-    "SideTableDisplay",
     "SiteEffectDisplay",
     "StepScoresDisplay",
-    "SuccessTableDisplay",
     "aligned_curves",
     "attention_curve",
     "attention_on_picture",

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._system.types import Matrix
 from probe_kit.env.scoring import EVENTS, Events
 from probe_kit.errors import TooFewGroupsError, UsageError
 from probe_kit.hooks.contract.sites import label_of
@@ -46,7 +47,6 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
 
-Shares = NDArray[np.float64]
 EventCalls = Mapping[str, Mapping[str, int]]
 """By event and episode id, the captured inference before it."""
 
@@ -70,11 +70,11 @@ class CallLine:
     stream: str
     part: str
     calls: NDArray[np.int64]
-    accuracy: Shares
-    low: Shares
-    high: Shares
+    accuracy: Matrix
+    low: Matrix
+    high: Matrix
     significant: NDArray[np.bool_]
-    null: Shares
+    null: Matrix
     episodes: NDArray[np.int64]
 
 
@@ -92,7 +92,7 @@ class AlignedLine:
     stream: str
     part: str
     offsets: NDArray[np.int64]
-    accuracy: Shares
+    accuracy: Matrix
     episodes: NDArray[np.int64]
 
 

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from matplotlib.lines import Line2D
     from numpy.typing import ArrayLike
 
-    from probe_kit.retention.displays.shown_figure import Picture
+    from probe_kit.retention.displays.shown_figure import DrawnPicture
 
 
 # -- the look that all figures share --------------------------------------------------------------------------
@@ -150,7 +150,7 @@ _LEGEND_ROWS, _ROW_HEIGHT = 2, 0.17
 
 
 @dataclass(frozen=True)
-class Line:
+class LineLook:
     """The look of one series; colour is never the only difference."""
 
     colour: str
@@ -160,27 +160,27 @@ class Line:
 
 PARTS = MappingProxyType(
     {
-        "backbone": Line(BLUE, "o"),
-        "action": Line(VERMILION, "s"),
-        "vision": Line(GREEN, "^"),
-        "bridge": Line(PURPLE, "D"),
+        "backbone": LineLook(BLUE, "o"),
+        "action": LineLook(VERMILION, "s"),
+        "vision": LineLook(GREEN, "^"),
+        "bridge": LineLook(PURPLE, "D"),
     }
 )
 """The look of the streams of one part of a model."""
 
 SERIES = (
-    Line(BLUE, "o"),
-    Line(VERMILION, "s", "--"),
-    Line(GREEN, "^", "-."),
-    Line(PURPLE, "D", ":"),
-    Line(ORANGE, "v", (0, (5, 1))),  # type: ignore[arg-type]  # matplotlib also takes (offset, dashes)
-    Line(BLACK, "P", (0, (3, 1, 1, 1))),  # type: ignore[arg-type]
-    Line(SKY, "X", "-"),
+    LineLook(BLUE, "o"),
+    LineLook(VERMILION, "s", "--"),
+    LineLook(GREEN, "^", "-."),
+    LineLook(PURPLE, "D", ":"),
+    LineLook(ORANGE, "v", (0, (5, 1))),  # type: ignore[arg-type]  # matplotlib also takes (offset, dashes)
+    LineLook(BLACK, "P", (0, (3, 1, 1, 1))),  # type: ignore[arg-type]
+    LineLook(SKY, "X", "-"),
 )
 """The looks of models or roles, in order; an eighth one begins again."""
 
 
-def series(position: int) -> Line:
+def series(position: int) -> LineLook:
     """Return the look of the series at `position`."""
     return SERIES[position % len(SERIES)]
 
@@ -397,7 +397,7 @@ class Display(ABC):
     def annotate(self) -> None:  # noqa: B027 - most displays have nothing to write
         """Write texts that need the marks' final places: after the layout of a figure of its own, else at once."""
 
-    def _repr_png_(self) -> "Picture | None":
+    def _repr_png_(self) -> "DrawnPicture | None":
         """Return the figure, whatever pyplot's backend is."""
         if self.ax_ is None:
             return None
@@ -450,7 +450,7 @@ def in_panels(
 
 def draw_series(
     axes: "Axes",
-    line: Line,
+    line: LineLook,
     x: NDArray[np.float64],
     y: NDArray[np.float64],
     filled: NDArray[np.bool_],

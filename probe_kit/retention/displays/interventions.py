@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit._system.escaping import as_argument
+from probe_kit._system.types import PictureArray
 from probe_kit.errors import NoInterventionsError
 from probe_kit.hooks.contract.sites import KV_STREAM
 from probe_kit.intervene.kinds.attention import (
@@ -221,7 +222,6 @@ def site_effect_figures(source: FigureSource) -> Iterator[ReportFigure]:
 # -- attention -----------------------------------------------------------------------------------------------
 
 Percent = NDArray[np.float64]
-Picture = NDArray[np.uint8]
 Boxes = NDArray[np.float32]
 _LABELS = {CORRECT: "correct picture's tile", OTHER: "other picture's tile", ACTION: "its own tokens"}
 
@@ -372,7 +372,7 @@ def _draw_on_picture(pictured: "_Pictured", certificate: ProvenanceLine) -> "Fig
     return figure
 
 
-_Pictured = tuple[str, Picture, Boxes, Percent]
+_Pictured = tuple[str, PictureArray, Boxes, Percent]
 """An episode: its id, its picture, (P, 4) boxes of patches and (B, P) shares of the attention."""
 
 

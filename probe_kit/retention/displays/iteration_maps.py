@@ -84,7 +84,7 @@ class IterationMapDisplay(Display):
         curve = curve_of(results, category, view)
         scores = scores_of(results, category, view)
         stream = stream or curve.action_stream
-        if not curve.is_side:
+        if not curve.balanced:
             raise UsageError(
                 f"a map of iterations is of a side; these probes are of {results.settings.target!r}. "
                 "Draw their layer curve with iterations='all'"

@@ -15,7 +15,7 @@ from probe_kit.retention.displays.display import (
     GREEN,
     PARTS,
     Display,
-    Line,
+    LineLook,
     ProvenanceLine,
     best_row,
     in_panels,
@@ -24,7 +24,7 @@ from probe_kit.retention.displays.display import (
     significance_handles,
 )
 from probe_kit.retention.displays.report_figure import FigureSource, ReportFigure, in_report, probed_views
-from probe_kit.retention.rows.build import STEP
+from probe_kit.retention.estimators import STEP
 from probe_kit.train.crossval.task_scores import METRICS, score_interval
 from probe_kit.train.results.control_scores import ControlScore
 from probe_kit.train.results.probe_curve import ProbeCurve
@@ -257,7 +257,7 @@ def predicted_figures(source: FigureSource) -> Iterator[ReportFigure]:
 
 # -- scores by step ------------------------------------------------------------------------------------------
 
-_CONTROLS = (Line("black", "", ":"), Line(GREEN, "", (0, (5, 1))))  # type: ignore[arg-type]  # as `SERIES`
+_CONTROLS = (LineLook("black", "", ":"), LineLook(GREEN, "", (0, (5, 1))))  # type: ignore[arg-type]  # as `SERIES`
 
 
 @dataclass(kw_only=True)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._system.types import Matrix
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.sites import label_of
 from probe_kit.retention.choices import Iterations
@@ -15,7 +16,7 @@ from probe_kit.retention.columns.text import name_of_target
 from probe_kit.retention.displays.display import (
     PARTS,
     Display,
-    Line,
+    LineLook,
     ProvenanceLine,
     accuracy_axis,
     best_of,
@@ -50,9 +51,6 @@ if TYPE_CHECKING:
     from matplotlib.lines import Line2D
 
 
-Shares = NDArray[np.float64]
-
-
 def of_iterations(scores: "pd.DataFrame", iterations: Iterations) -> "pd.DataFrame":
     """Return the rows of one stream that take part; all of a stream that runs once.
 
@@ -84,9 +82,9 @@ class LayerLine:
 
     iteration: int | None
     layers: NDArray[Any]
-    score: Shares
-    low: Shares
-    high: Shares
+    score: Matrix
+    low: Matrix
+    high: Matrix
     significant: NDArray[np.bool_]
 
     @classmethod
@@ -115,7 +113,7 @@ class StreamCurve(LayerLine):
     stream: str
     part: str
     sites: tuple[str, ...]
-    depth: Shares
+    depth: Matrix
     iterations: int
     lines: tuple[LayerLine, ...]
     peaks: tuple[tuple[int, int | None], ...]
@@ -197,9 +195,9 @@ class Ground:
         rows = [names.index(site) for site in stream.sites]
         every = np.broadcast_to(curve.null.ravel(), (len(rows), curve.null.size))
         # All sites of a side have chance one half, so that one band serves them; a label's chance differs by site.
-        null = every if curve.is_side else curve.null[rows]
+        null = every if curve.balanced else curve.null[rows]
         ends = np.percentile(null, [2.5, 97.5], axis=1) if curve.null.shape[1] >= FEWEST_PERMUTATIONS else None
-        controls = () if curve.is_side else results.controls.of_stream(category, view, stream.stream)
+        controls = () if curve.balanced else results.controls.of_stream(category, view, stream.stream)
         return cls(
             curve.chance[rows],
             None if ends is None else (ends[0], ends[1]),
@@ -282,11 +280,11 @@ class LayerCurveDisplay(Display):
         streams = tuple(
             StreamCurve.of_stream(rows, iterations) for _, rows in scores.groupby("stream", sort=False)
         )
-        metric, is_side = METRICS[settings.task], settings.is_side
+        metric = METRICS[settings.task]
         return cls(
             title=name_of_target(settings.target, category),
-            measure="held-out accuracy (%)" if is_side else f"held-out {metric}",
-            is_level=not is_side,  # panels of accuracies have a fixed range
+            measure="held-out accuracy (%)" if settings.balanced else f"held-out {metric}",
+            is_level=not settings.balanced,  # panels of accuracies have a fixed range
             figure_size=(2.75, 2.9),
             target=settings.target,
             metric=metric,
@@ -294,12 +292,12 @@ class LayerCurveDisplay(Display):
             view=view,
             streams=streams,
             grounds=tuple(Ground.of(results, category, view, stream) for stream in streams),
-            certificates=(ProvenanceLine.of_results(results, view, None if is_side else category),),
+            certificates=(ProvenanceLine.of_results(results, view, None if settings.balanced else category),),
         )
 
     @property
-    def is_side(self) -> bool:
-        """Whether the target is a side, whose accuracies are drawn in percent on one scale."""
+    def in_percent(self) -> bool:
+        """Whether scores are drawn in percent on one scale, as the accuracies of a side."""
         return self.target in SIDES
 
     @property
@@ -321,11 +319,11 @@ class LayerCurveDisplay(Display):
 
     def draw(self, axes: "Axes") -> None:
         """Draw the ground of the first stream, and all streams."""
-        scale = PERCENT if self.is_side else 1.0
+        scale = PERCENT if self.in_percent else 1.0
         self.grounds[0].draw(axes, self.streams[0].layers, scale)
         for number, curve in enumerate(self.streams):
             _draw_stream(axes, curve, _SIDESTEP * (number - (len(self.streams) - 1) / 2), scale)
-        if self.is_side:
+        if self.in_percent:
             accuracy_axis(axes)
         else:
             low, high = axes.get_ylim()
@@ -411,7 +409,7 @@ def _draw_stream(axes: "Axes", curve: StreamCurve, sidestep: float = 0.0, scale:
     else:
         colours = _colours()
         for number, layers in enumerate(curve.lines):
-            shade = Line(colours(number / (len(curve.lines) - 1)), line.marker)  # type: ignore[arg-type]
+            shade = LineLook(colours(number / (len(curve.lines) - 1)), line.marker)  # type: ignore[arg-type]
             draw_line(axes, layers, shade, f"{_ITERATION}{layers.iteration}", sidestep, bars=False, scale=scale)
         axes.plot([], [], color=line.colour, marker=line.marker, ms=4, lw=1.3, label=f"{curve.name}, by iteration")
     mark_peaks(axes, curve, sidestep, scale)
@@ -425,7 +423,7 @@ def _has_bars(curve: StreamCurve) -> bool:
 def draw_line(
     axes: "Axes",
     line: LayerLine,
-    style: Line,
+    style: LineLook,
     name: str,
     sidestep: float = 0.0,
     bars: bool = True,

@@ -82,7 +82,7 @@ class FigureSource:
         """
         table_runs = table.runs_of(runs)
         numbered = list(enumerate(zip(table_runs, file_names([run.location.name for run in runs]), strict=True)))
-        if table.is_of_sides:
+        if not table.labels:
             drawn = [DrawnRun(run, stem, at, table.results_of(run.location)) for at, (run, stem) in numbered]
         else:
             labels = dict(zip(table.targets, file_names(table.targets), strict=True))
@@ -103,7 +103,7 @@ class FigureSource:
 
         Figures of labels come one label after the other; their `subject` is the label.
         """
-        figures = [figure for make in _makers(self.table.is_of_sides) for figure in make(self)]
+        figures = [figure for make in _makers("labels" if self.table.labels else "sides") for figure in make(self)]
         order = {target: at for at, target in enumerate(self.table.targets)}
         return sorted(
             figures, key=lambda figure: (order.get(figure.subject, 0), -1 if figure.run is None else figure.run)
@@ -120,7 +120,6 @@ class ReportFigure:
         reading: Explanation of the figure, in plain language.
         run: Its position among the runs, None if it shows all of them.
         draw: Makes the figure.
-        is_table: Whether its numbers are a table that is printed as such elsewhere.
         is_detail: Whether the main figures can be read without it.
     """
 
@@ -130,7 +129,6 @@ class ReportFigure:
     reading: str
     run: int | None
     draw: "Callable[[], Figure]"
-    is_table: bool = False
     is_detail: bool = False
 
     @contextmanager
@@ -229,7 +227,7 @@ class ProbedView:
         of_category = "" if category == EVERYWHERE else f"-{file_names([category])[0]}"
         return ReportFigure(
             f"{self.drawn.stem}{of_category}-{name}{view_suffix(self.view, views)}",
-            in_view(title, self.view, views), "probes" if settings.is_side else settings.target, reading,
+            in_view(title, self.view, views), "probes" if settings.balanced else settings.target, reading,
             self.drawn.position, partial(draw, self.results, self.view, *more),
             is_detail=is_detail or self.view != views[0],
         )  # fmt: skip
@@ -241,7 +239,7 @@ def probed_views(source: FigureSource) -> Iterator[ProbedView]:
         results = drawn.results
         if results is None:
             continue
-        if results.settings.is_side:
+        if results.settings.balanced:
             for view in results.settings.views:
                 yield ProbedView(drawn, results, view, None)
             continue
@@ -273,9 +271,8 @@ def collect_figures(runs: Sequence[RunReader], table: RetentionTable) -> list[Re
     return FigureSource.of(runs, table).figures()
 
 
-def _makers(of_sides: bool) -> list[Maker]:
+def _makers(target: str) -> list[Maker]:
     """Return the functions of this folder that `in_report` marks, in their order."""
-    target = "sides" if of_sides else "labels"
     makers: dict[Maker, int] = {}
     for file in iter_modules(import_module(__package__).__path__):
         functions = filter(isfunction, vars(import_module(f"{__package__}.{file.name}")).values())

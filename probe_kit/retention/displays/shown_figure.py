@@ -6,14 +6,14 @@ from typing import Any
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-Picture = tuple[bytes, dict[str, int]]
+DrawnPicture = tuple[bytes, dict[str, int]]
 """A PNG, and the size in pixels at which a page shows it."""
 PRINT_DPI = 300
 _DPI = 160  # of the PNG in a notebook
 _PAGE_DPI = 90  # fewer than the picture has, so that it is sharp on fine screens
 
 
-def picture_of(figure: Figure) -> Picture:
+def picture_of(figure: Figure) -> DrawnPicture:
     """Return the figure in the form that a notebook's front end takes."""
     file = BytesIO()
     figure.savefig(file, format="png", dpi=_DPI)
@@ -41,5 +41,5 @@ class ShownFigure(Figure):
         """Save, by default 300 pixels per inch."""
         super().savefig(fname, **{"dpi": PRINT_DPI, **options})
 
-    def _repr_png_(self) -> Picture:
+    def _repr_png_(self) -> DrawnPicture:
         return picture_of(self)

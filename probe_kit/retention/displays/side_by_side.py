@@ -238,7 +238,7 @@ class ModelDepthDisplay(Display):
             UsageError: If no run has that stream, or for probes of a target that is no side: other metrics have no
                 common scale.
         """
-        if labels := [probes.settings.target for probes in results if not probes.settings.is_side]:
+        if labels := [probes.settings.target for probes in results if not probes.settings.balanced]:
             raise UsageError(
                 f"models are compared by accuracies of a side; some probes are of {labels[0]!r}. Draw their layer "
                 "curves"

@@ -78,7 +78,7 @@ _TASKS: dict[Task, str] = {"binary": "binary", "classes": "categorical", "contin
 
 
 @dataclass(frozen=True)
-class Picture:
+class PageFigure:
     """A figure in the page.
 
     Attributes:
@@ -97,7 +97,7 @@ class Picture:
     extra: bool
 
 
-PicturesBySubject = Mapping[str, Sequence[Sequence[Picture]]]
+PicturesBySubject = Mapping[str, Sequence[Sequence[PageFigure]]]
 """By subject, the figures of each kind, those of several runs side by side."""
 
 
@@ -134,11 +134,11 @@ def report_html(
     source = FigureSource.of(runs, table)
     paths = tuple(path for run in runs for path in (run.location.address, str(run.location)))
     names = [without_folders(run.name, paths) for run in source.table_runs]
-    opening = opening_row(source) if table.is_of_sides else None
+    opening = None if table.labels else opening_row(source)
     pictures_of = arranged([*source.figures(), *_opening_curves(opening, table.iterations)], names, paths)
     sides: dict[str, Any] = {}
     tables = [table.summary_table]
-    if table.is_of_sides:
+    if not table.labels:
         grid = episode_grid([run.judged for run in source.table_runs], names, pictures)
         question = None if opening is None else _question(opening[0], names[opening[1].position], grid)
         sides = {"grid": grid, "question": question, **_sides(source, pictures_of)}
@@ -152,8 +152,8 @@ def report_html(
     return render(
         "page.html.jinja",
         paths,
-        is_of_sides=table.is_of_sides,
-        title=list_names(names if table.is_of_sides else table.targets),
+        of_labels=bool(table.labels),
+        title=list_names(table.targets if table.labels else names),
         suites=list(dict.fromkeys(run.suite for run in runs)),
         version=__version__,
         finding=table.summary,
@@ -379,20 +379,16 @@ def arranged(
         names: The name of each run.
         paths: Paths that are shortened in texts, see `data_uri`.
     """
-    subjects: dict[str, dict[str, list[Picture]]] = {}
-    together = {
-        (figure.subject, _kind(figure)) for figure in figures if figure.run is None and not figure.is_table
-    }
+    subjects: dict[str, dict[str, list[PageFigure]]] = {}
+    together = {(figure.subject, _kind(figure)) for figure in figures if figure.run is None}
     for figure in figures:
-        if figure.is_table:
-            continue
         by_title = subjects.setdefault(figure.subject, {})
         run = "" if figure.run is None else names[figure.run]
         kind = _kind(figure)
         before = [other for pictures in by_title.values() for other in pictures]
         extra = any(other.run == run and other.title.partition(",")[0] == kind for other in before)
         extra |= figure.run is not None and (figure.subject, f"{kind} side by side") in together
-        picture = Picture(figure.title, run, figure.reading, *data_uri(figure, paths), extra)
+        picture = PageFigure(figure.title, run, figure.reading, *data_uri(figure, paths), extra)
         by_title.setdefault(figure.title, []).append(picture)
     return {subject: list(by_title.values()) for subject, by_title in subjects.items()}
 
@@ -561,7 +557,7 @@ def _stream(run: RunReader, name: str) -> str:
 
 
 def _of_target(probes: ProbeResults) -> str:
-    return "" if probes.settings.is_side else f" of {probes.settings.target}"
+    return "" if probes.settings.balanced else f" of {probes.settings.target}"
 
 
 # -- glossary ----------------------------------------------------------------------------------------------------

@@ -2,17 +2,17 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from math import isfinite, isnan
+from math import isfinite, isnan, nan
 from operator import attrgetter
 from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from probe_kit._system.counting import list_names
-from probe_kit._tables.numbers import p_text
+from probe_kit._tables.numbers import Limits
 from probe_kit.env.scoring import DEFAULT_RULE
 from probe_kit.errors import UnknownSiteError
+from probe_kit.hooks.contract.sites import Site
 from probe_kit.intervene.evidence import StoredEvidence, stored_ties
 from probe_kit.retention.behaviour import (
     OutcomeRuleScores,
@@ -29,14 +29,15 @@ from probe_kit.retention.choices import Iterations
 from probe_kit.retention.estimators import (
     ACTION,
     BACKBONE,
-    Limits,
     Peak,
     Rate,
     StreamScores,
     best_site,
     curve_scores,
-    estimate_retention,
+    estimate_of_peaks,
     limits,
+    missing_condition,
+    probed_curve,
     stream_peaks,
 )
 from probe_kit.retention.rows.row import (
@@ -113,7 +114,7 @@ def run_rows(table_run: TableRun, results: ProbeResults | None, settings: RowSet
     Raises:
         UnknownSiteError: For a view that was not probed.
     """
-    if results is not None and not results.settings.is_side:
+    if results is not None and not results.settings.balanced:
         return [
             RowWithEstimates(target_row(table_run, results, category, view, settings.iterations))
             for category in results.settings.categories
@@ -364,13 +365,6 @@ def _mean_by_key(columns: Sequence[dict[str, float]]) -> dict[str, float]:
 # -- parts that probes give -----------------------------------------------------------------------------------
 
 
-LEAST_EXCESS = 0.05
-"""Least R² above chance of a backbone; a ratio with less in the denominator is the ratio of two errors."""
-STEP = "step"
-"""The control that labels of several inferences need: the number of the inference alone may say as much."""
-NO_STEP = "n/a (control step was not run)"
-
-
 def with_probes(
     row: RetentionRow,
     results: ProbeResults,
@@ -387,8 +381,9 @@ def with_probes(
         absent_below: Accuracy below which a stream without signal counts as absent, see `verdict`.
         seed_text: Seed text of the run; scores on equal groups of one are paired.
     """
-    curve = None if row.view is None else results.curves.get((row.category, row.view))
-    if row.view is None or curve is None:
+    view = row.view
+    curve = None if view is None else results.curves.get((row.category, view))
+    if view is None or curve is None:
         note = f"n/a (probes {results.key} are of {', '.join(results.settings.categories)})"
         return replace(row, retention=RetentionPart(note=note)), None
     streams, peaks = curve_scores(curve, iterations, seed_text), stream_peaks(curve, iterations)
@@ -400,19 +395,16 @@ def with_probes(
         backbone=BackbonePart(**parts.get(BACKBONE, {})),
         action=ActionPart(**parts.get(ACTION, {}), **_iterations(curve, peaks.get(ACTION))),
     )
-    estimate = RetentionPart(note="n/a (one stream only)")
-    if len(peaks) == 2:
-        ratio = estimate_retention(peaks, streams, parts[BACKBONE]["exceeds"], absent_below)
-        estimate = RetentionPart(
-            value=number_or_none(ratio.value),
-            ci=limits(ratio.interval),
-            # The paper's ratio is of accuracies above one half, which the metric of a label is not.
-            published=number_or_none(ratio.published) if curve.is_side else None,
-            defined=ratio.defined,
-            note=ratio.note,
-        )
-    row = replace(row, retention=estimate, controls=_controls(row, results, curve, peaks))
-    return row if curve.is_side else with_reason(row, results), streams
+    retained = estimate_of_peaks(results, row.category, view, peaks, streams, absent_below)
+    estimate = RetentionPart(
+        value=number_or_none(retained.value),
+        ci=limits(retained.interval) if len(peaks) == 2 else None,
+        published=number_or_none(retained.published),
+        defined=retained.defined,
+        note=retained.note,
+        reason=retained.reason,
+    )
+    return replace(row, retention=estimate, controls=_controls(row, results, curve, peaks)), streams
 
 
 def _stream_part(
@@ -430,7 +422,7 @@ def _stream_part(
     part: dict[str, Any] = {
         "stream": peak.site.stream,
         "peak": peak.score,
-        "chance": None if curve.is_side else number_or_none(peak.chance),
+        "chance": None if curve.balanced else number_or_none(peak.chance),
         "site": str(peak.site),
         "layer": peak.site.layer,
         "depth": curve.depth(peak.site),
@@ -439,7 +431,7 @@ def _stream_part(
         "exceeds": exceeds,
         "remedy": results.remedy(row.category, view),
     }
-    if not curve.is_side:
+    if not curve.balanced:
         if streams is not None:
             part |= {"above": streams.above(name), "above_ci": limits(streams.above_interval(name))}
         return part
@@ -469,7 +461,7 @@ def _iterations(curve: ProbeCurve, peak: Peak | None) -> dict[str, Any]:
         return {}
     iterations = [site.iteration for site in curve.sites if site.stream == peak.site.stream]
     steps = [step for step in iterations if step is not None]
-    first = best_site(curve, peak.site.stream, min(steps)) if steps and curve.is_side else None
+    first = best_site(curve, peak.site.stream, min(steps)) if steps and curve.balanced else None
     return {
         "iteration": peak.site.iteration,
         "first_peak": None if first is None else first.score,
@@ -482,7 +474,7 @@ def _controls(
 ) -> ControlScores:
     """Return the scores that the best sites are compared with."""
     sizes = ControlScores(n_groups=curve.n_groups, n_samples=int(curve.labels.size))
-    if not curve.is_side:
+    if not curve.balanced:
         return sizes
     baselines = results.controls.of_category(row.category)
     untrained = (
@@ -493,7 +485,7 @@ def _controls(
     return replace(
         sizes,
         missing={
-            side: 1 - len(set(curve.items[is_side].tolist())) / len(items) for side, is_side in sides.items()
+            side: 1 - len(set(curve.items[on_side].tolist())) / len(items) for side, on_side in sides.items()
         },
         probe_minus_sr=None if accuracy is None or success is None else accuracy - success,
         baselines={name: score.score for name, score in baselines.items()},
@@ -510,76 +502,36 @@ def number_or_none(value: float) -> float | None:
 # -- targets that are no side --------------------------------------------------------------------------------
 
 
-def with_reason(row: RetentionRow, results: ProbeResults, tests: int = 1) -> RetentionRow:
-    """Return a row of a label that states whether there is something to retain, and else the missing condition.
+def with_corrected_p(
+    row: RetentionRow, results: ProbeResults, backbone: float | None, action: float | None, tests: int
+) -> RetentionRow:
+    """Return a row of a label with p of both streams corrected for so many tests; None for no p.
 
     Args:
         row: A row of a label, with its probes.
         results: Probes of the label.
+        backbone: Corrected p of the backbone.
+        action: Corrected p of the action.
         tests: Number of tests that p is corrected for.
     """
-    note, reason = _missing(row, results, tests)
-    return replace(row, retention=replace(row.retention, defined=not note, note=note, reason=reason))
-
-
-def with_corrected_p(
-    row: RetentionRow, results: ProbeResults, backbone: float | None, action: float | None, tests: int
-) -> RetentionRow:
-    """Return a row of a label with p of both streams corrected for so many tests; None for no p."""
     parts: dict[str, Any] = {
         name: replace(part, p_fwe=p, exceeds=part.exceeds | {"chance": p < SIGNIFICANCE})
         for name, part, p in ((BACKBONE, row.backbone, backbone), (ACTION, row.action, action))
         if p is not None
     }
-    return with_reason(replace(row, **parts), results, tests)
+    row = replace(row, **parts)
+    peaks = {
+        name: Peak(Site.parse(part.site), part.peak, _or_nan(part.p_fwe), chance=_or_nan(part.chance))
+        for name, part in ((BACKBONE, row.backbone), (ACTION, row.action))
+        if part.site is not None and part.peak is not None
+    }
+    above, exceeds = row.backbone.above, row.backbone.exceeds
+    note, reason = missing_condition(results, row.category, row.view or "", peaks, above, exceeds, tests)
+    return replace(row, retention=replace(row.retention, defined=not note, note=note, reason=reason))
 
 
-def _missing(row: RetentionRow, results: ProbeResults, tests: int) -> tuple[str, str]:
-    """Return the reason why there is nothing to retain, in few words and in full; two empty texts otherwise."""
-    settings, backbone = results.settings, row.backbone
-    if backbone.peak is None or row.action.peak is None:
-        part = "backbone" if backbone.peak is None else "action"
-        probed = ", ".join(
-            dict.fromkeys(site.stream for site in results.curves[row.category, row.view or ""].sites)
-        )
-        return "n/a (one stream only)", (
-            f"no site of the {part} was probed, so there is no retention; probed: {probed}. Extract a policy "
-            "whose backbone and action stream are captured"
-        )
-    best = f"the backbone's best site {backbone.site} has {row.metric} {backbone.peak:.2f}"
-    if backbone.p_fwe is None or backbone.chance is None:
-        return "n/a (no permutations)", (
-            f"{best}, and no permuted labels say what chance is. Train with --permutations 200, on groups that "
-            "can exchange labels"
-        )
-    if settings.window > 1 and STEP not in results.controls.names:
-        return NO_STEP, (
-            f"{best}, and labels change within episodes, so their step may say as much. Train with the control "
-            f"step: `--controls {','.join([STEP, *results.controls.names])}`"
-        )
-    if missed := backbone.missed:
-        scores = {
-            control.name: control.score
-            for control in results.controls.scores
-            if control.category == row.category and control.stream in ("", backbone.stream)
-        }
-        facts = [f"chance {backbone.chance:.2f}, p {p_text(backbone.p_fwe)}"]
-        facts += [f"{name} {scores[name]:.2f}" for name in missed if name in scores]
-        advice = "Label more groups, or choose a label that these controls do not decode"
-        if remedy := results.remedy(row.category, row.view or "", tests):
-            advice = f"No p can be below it: {remedy}"
-        return f"n/a (backbone not shown to exceed {list_names(missed)})", (
-            f"{best} ({'; '.join(facts)}). Expected p < {SIGNIFICANCE} and more than every control that was run. "
-            f"{advice}"
-        )
-    if row.backbone.above is None:
-        return row.retention.note, f"{best}, and too few groups to choose a site on others. Label more groups"
-    if row.task == "continuous" and row.backbone.above < LEAST_EXCESS:
-        return f"n/a (backbone {row.backbone.above:.2f} above chance)", (
-            f"{best}, {row.backbone.above:.2f} above chance where a site is chosen on other groups; expected "
-            f"{LEAST_EXCESS} or more to divide by. Label more groups"
-        )
-    return "", ""
+def _or_nan(value: float | None) -> float:
+    return nan if value is None else value
 
 
 Results = Mapping[tuple[str, str], ProbeResults]
@@ -601,10 +553,7 @@ def target_row(
     Raises:
         UnknownSiteError: If category or view was not probed.
     """
-    settings = results.settings
-    if (category, view) not in results.curves:
-        raise UnknownSiteError(f"view {view!r} was not probed; probed: {', '.join(settings.views)}")
-    curve = results.curves[category, view]
+    settings, curve = results.settings, probed_curve(results, category, view)
     row = RetentionRow(
         category=category,
         view=view,

@@ -3,15 +3,15 @@
 from dataclasses import dataclass, field
 from typing import Literal, Self
 
+from probe_kit._tables.numbers import Limits
 from probe_kit.hooks.contract.sites import first_of, label_of
 from probe_kit.intervene.verdict import UseVerdict
 from probe_kit.retention.behaviour import OutcomeRuleScores, SuccessRate, TableRun
-from probe_kit.retention.estimators import Limits
 from probe_kit.runs.reader import full_name
 from probe_kit.statistics.sufficiency import Verdict
 from probe_kit.train.choices import CORRECT, SIDES, Task
 from probe_kit.train.crossval.task_scores import METRICS
-from probe_kit.train.results.control_scores import has_signal
+from probe_kit.train.results.control_scores import has_signal, missed_controls
 from probe_kit.train.results.probe_results import ProbeResults
 
 Mode = Literal["answers", "acts"]
@@ -207,9 +207,7 @@ class StreamPart:
     @property
     def missed(self) -> tuple[str, ...]:
         """The names of chance and controls that its best site is not shown to exceed."""
-        return tuple(
-            name for name, better in self.exceeds.items() if not better and (better is False or name == "chance")
-        )
+        return missed_controls(self.exceeds)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -323,9 +321,9 @@ class RetentionRow:
         return self.group, self.run.location
 
     @property
-    def is_side(self) -> bool:
-        """Whether the target is a side of a picture; success and answers are numbers of these rows alone."""
-        return self.target in SIDES
+    def label(self) -> str:
+        """The label that is decoded; empty where it is the answer's side, whose rows alone have success rates."""
+        return "" if self.target in SIDES else self.target
 
     @property
     def metric(self) -> str:

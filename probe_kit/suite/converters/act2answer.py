@@ -43,7 +43,7 @@ _UNREADABLE = (
 
 
 @dataclass(frozen=True)
-class Tile:
+class SetTile:
     """A tile of a set in Act2Answer's format.
 
     Attributes:
@@ -59,7 +59,7 @@ Top = tuple[NDArray[np.float64], NDArray[np.float64], Any]
 """Corners of the upper face: (N, 2) in metres, (N, 2) in the texture with v downwards; and their material."""
 
 
-def read_tile(path: Path, yaw: int = RELEASE_YAW) -> Tile:
+def read_tile(path: Path, yaw: int = RELEASE_YAW) -> SetTile:
     """Read the tile in a binary glTF.
 
     Args:
@@ -85,7 +85,7 @@ def read_tile(path: Path, yaw: int = RELEASE_YAW) -> Tile:
     low, high = every.min(axis=0), every.max(axis=0)
     top = _top(meshes, float(low[2]), float(high[2]), path)
     width, depth, height = (float(extent) for extent in high - low)
-    return Tile(_render_top(top, yaw, path), (width, depth, height))
+    return SetTile(_render_top(top, yaw, path), (width, depth, height))
 
 
 def _meshes(scene: Any) -> Iterator[tuple[NDArray[np.float64], Any]]:
@@ -187,7 +187,7 @@ _SIDES: dict[str, Side] = {"left": "left", "right": "right"}
 
 
 @dataclass(frozen=True)
-class Pair:
+class SetQuestion:
     """One question of a set.
 
     Attributes:
@@ -205,7 +205,7 @@ class Pair:
     concepts: tuple[str, str]
 
 
-def read_pairs(root: Path) -> list[Pair]:
+def read_pairs(root: Path) -> list[SetQuestion]:
     """Read every question in the order of its index.
 
     Raises:
@@ -228,7 +228,7 @@ def read_pairs(root: Path) -> list[Pair]:
     return pairs
 
 
-def _pair(record: Any, position: int, path: Path) -> Pair:
+def _pair(record: Any, position: int, path: Path) -> SetQuestion:
     where = f"question {position} of {path}"
     index = record.get("index", position) if isinstance(record, dict) else position
     if not isinstance(index, int) or isinstance(index, bool):
@@ -249,7 +249,7 @@ def _pair(record: Any, position: int, path: Path) -> Pair:
         raise SuiteError(f"{SOURCE}: {where}: question is {question!r}; expected one line of words.")
     labels = tuple(str(record.get(f"{side}_label") or "").strip() for side in _SIDES)
     concepts = (labels[0], labels[1]) if all(labels) and labels[0] != labels[1] else (left, right)
-    return Pair(index, left, right, question, _SIDES[side], concepts)
+    return SetQuestion(index, left, right, question, _SIDES[side], concepts)
 
 
 def object_of(question: str) -> tuple[str, str]:
@@ -338,7 +338,7 @@ class _Assets:
 
     def __init__(self, root: Path, options: Act2AnswerOptions) -> None:
         self._root, self._options = root, options
-        self._tiles: dict[str, tuple[Tile, Picture]] = {}
+        self._tiles: dict[str, tuple[SetTile, Picture]] = {}
         self.files: dict[str, bytes] = {}
         self.notes: list[str] = []
 
@@ -347,7 +347,7 @@ class _Assets:
         records: dict[str, Any] = read_annotations(self._root / TILES, SOURCE, REMEDY)
         return records
 
-    def item(self, category: str, pair: Pair) -> Item:
+    def item(self, category: str, pair: SetQuestion) -> Item:
         """Make the item of one question.
 
         Raises:
@@ -401,7 +401,7 @@ class _Assets:
             side_word=bool(side_words(pair.question)),
         )
 
-    def _stored(self, name: str, pair: Pair) -> Picture:
+    def _stored(self, name: str, pair: SetQuestion) -> Picture:
         if name not in self._tiles:
             if name not in self._records:
                 raise SuiteError(

@@ -90,7 +90,7 @@ class Candidate:
 
 
 @dataclass
-class Reading:
+class SourceContent:
     """The content of a source: candidates, the number of records per category, and why others were left out.
 
     `license`, `attribution`, `url` and `revision` are those of the source.

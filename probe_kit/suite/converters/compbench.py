@@ -8,7 +8,7 @@ from probe_kit.errors import SuiteError
 from probe_kit.suite.converters.candidates import (
     Candidate,
     CompBenchOptions,
-    Reading,
+    SourceContent,
     SourcePicture,
     field_of,
     first_existing,
@@ -34,13 +34,13 @@ _FACES = ("celebA_label", "fer2013_label")
 _REMEDY = "pass image_root (--image-root) or check that the processed archive is unpacked."
 
 
-def read(root: Path, categories: Sequence[str], options: CompBenchOptions) -> Reading:
+def read(root: Path, categories: Sequence[str], options: CompBenchOptions) -> SourceContent:
     """Read every comparison of the sets that are present.
 
     Raises:
         SuiteError: If no set is present, or if one is broken.
     """
-    reading = Reading(
+    reading = SourceContent(
         license="LicenseRef-MLLM-CompBench-pictures",
         attribution="MLLM-CompBench (questions CC-BY-4.0; pictures under the terms of their own sets)",
         url="https://github.com/RaptorMai/MLLM-CompBench",
@@ -83,7 +83,7 @@ def _read_file(
     category: str | None,
     categories: Sequence[str],
     options: CompBenchOptions,
-    reading: Reading,
+    reading: SourceContent,
 ) -> None:
     records = read_annotations(path, SOURCE, "Unpack the archive `Annotations` again.", list)
     for number, record in enumerate(records):

@@ -23,7 +23,7 @@ from probe_kit.suite.converters.candidates import (
     IconQaOptions,
     MmbenchOptions,
     OkVqaOptions,
-    Reading,
+    SourceContent,
     SourcePicture,
     VlThinkOptions,
     options_from,
@@ -62,7 +62,7 @@ class _Source:
     name: str
     categories: tuple[str, ...]
     options: type[ConvertOptions]
-    read: Callable[[Path, Sequence[str], Any], Reading]
+    read: Callable[[Path, Sequence[str], Any], SourceContent]
     reuse: bool = False
 
 
@@ -145,7 +145,7 @@ class _Conversion:
 
     kind: _Source
     options: ConvertOptions
-    reading: Reading
+    reading: SourceContent
     n: int
     seed: int
 

@@ -11,7 +11,7 @@ from probe_kit.hashing import derive_seed
 from probe_kit.suite.converters.candidates import (
     Candidate,
     IconQaOptions,
-    Reading,
+    SourceContent,
     SourcePicture,
     Wording,
     by_key,
@@ -45,14 +45,14 @@ _HOW_MANY = re.compile(
 )
 
 
-def read(root: Path, categories: Sequence[str], options: IconQaOptions) -> Reading:
+def read(root: Path, categories: Sequence[str], options: IconQaOptions) -> SourceContent:
     """Read every self-contained problem of the requested categories.
 
     Raises:
         SuiteError: For a tree that is not IconQA's.
     """
     base = root / "iconqa_data" if (root / "iconqa_data").is_dir() else root
-    reading = Reading(
+    reading = SourceContent(
         license="LicenseRef-CC-BY-NC-SA-4.0",
         attribution="IconQA (Lu et al.), CC BY-NC-SA 4.0",
         url="https://github.com/lupantech/IconQA",
@@ -86,7 +86,7 @@ def read(root: Path, categories: Sequence[str], options: IconQaOptions) -> Readi
     return reading
 
 
-def _mapping(path: Path, reading: Reading) -> dict[str, Any]:
+def _mapping(path: Path, reading: SourceContent) -> dict[str, Any]:
     value: dict[str, Any] = read_annotations(
         path, SOURCE, f"Name the folder that holds problems.json, and {_REMEDY}"
     )
@@ -138,7 +138,7 @@ def _problem_folder(base: Path, split: str, pid: str) -> Path:
 
 
 def _candidates(
-    problem: Any, category: str, pid: str, folder: Path, where: str, options: IconQaOptions, reading: Reading
+    problem: Any, category: str, pid: str, folder: Path, where: str, options: IconQaOptions, reading: SourceContent
 ) -> Iterator[Candidate]:
     if problem["ques_type"] != "choose_img":
         yield from _counted_stem(problem, pid, folder, where, options, reading)
@@ -181,7 +181,7 @@ def _stem_is_idle(stem: Path, pictures: Sequence[SourcePicture]) -> bool:
 
 
 def _counted_stem(
-    problem: Any, pid: str, folder: Path, where: str, options: IconQaOptions, reading: Reading
+    problem: Any, pid: str, folder: Path, where: str, options: IconQaOptions, reading: SourceContent
 ) -> Iterator[Candidate]:
     """Yield the candidate of a picture that shows a known number of known things; pairs are made of two such."""
     match = _HOW_MANY.search(_plain(problem["question"]))

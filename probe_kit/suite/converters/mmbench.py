@@ -12,7 +12,7 @@ from PIL import Image
 from probe_kit._system.table_cells import is_count, number_of
 from probe_kit._system.text_tables import open_table
 from probe_kit.errors import SuiteError, UsageError
-from probe_kit.suite.converters.candidates import Candidate, MmbenchOptions, Reading, SourcePicture
+from probe_kit.suite.converters.candidates import Candidate, MmbenchOptions, SourceContent, SourcePicture
 from probe_kit.suite.converters.rewriting import rewrite
 from probe_kit.suite.pictures import decode_bytes
 
@@ -30,7 +30,7 @@ _MOST_CHARACTERS = (1 << 31) - 1  # a picture is one cell
 Row = Mapping[str, str]
 
 
-def read(root: Path, categories: Sequence[str], options: MmbenchOptions) -> Reading:
+def read(root: Path, categories: Sequence[str], options: MmbenchOptions) -> SourceContent:
     """Read every identity question.
 
     Raises:
@@ -45,7 +45,7 @@ def read(root: Path, categories: Sequence[str], options: MmbenchOptions) -> Read
         )
     path = _file(root)
     rows = _read_rows(path)
-    reading = Reading(
+    reading = SourceContent(
         license="LicenseRef-MMBench-pictures",
         attribution="MMBench (questions CC-BY-4.0; rights in the pictures are not stated)",
         url="https://github.com/open-compass/MMBench",
@@ -112,7 +112,9 @@ def _read_rows(path: Path) -> dict[int, Row]:
     return rows
 
 
-def _candidate(index: int, row: Row, rows: Mapping[int, Row], path: Path, reading: Reading) -> Candidate | None:
+def _candidate(
+    index: int, row: Row, rows: Mapping[int, Row], path: Path, reading: SourceContent
+) -> Candidate | None:
     where = f"row with index {index} of {path.name}"
     answer = row["answer"]
     if not answer:

@@ -10,7 +10,7 @@ from probe_kit.errors import SuiteError
 from probe_kit.suite.converters.candidates import (
     Candidate,
     OkVqaOptions,
-    Reading,
+    SourceContent,
     SourcePicture,
     by_key,
     field_of,
@@ -81,14 +81,14 @@ Boxes = Mapping[int, Mapping[str, float]]
 """The share of a picture's area that the largest box of each COCO class covers, by picture."""
 
 
-def read(root: Path, categories: Sequence[str], options: OkVqaOptions) -> Reading:
+def read(root: Path, categories: Sequence[str], options: OkVqaOptions) -> SourceContent:
     """Read every question of those of the two splits that are present.
 
     Raises:
         SuiteError: If no split is present, or if one is broken.
     """
     del categories  # there is only one
-    reading = Reading(
+    reading = SourceContent(
         license="LicenseRef-COCO-Flickr",
         attribution="OK-VQA (Marino et al.) on COCO 2014; each picture under its own Flickr licence",
         url="https://okvqa.allenai.org",
@@ -108,7 +108,7 @@ def read(root: Path, categories: Sequence[str], options: OkVqaOptions) -> Readin
     return reading
 
 
-def _read_split(root: Path, split: str, questions: Path, options: OkVqaOptions, reading: Reading) -> None:
+def _read_split(root: Path, split: str, questions: Path, options: OkVqaOptions, reading: SourceContent) -> None:
     annotations = root / f"mscoco_{split}_annotations.json"
     texts = _by_question(questions, "questions", "question")
     boxes = _read_boxes(options, split, reading)
@@ -200,7 +200,7 @@ def _candidate(
     )
 
 
-def _read_boxes(options: OkVqaOptions, split: str, reading: Reading) -> Boxes | None:
+def _read_boxes(options: OkVqaOptions, split: str, reading: SourceContent) -> Boxes | None:
     if options.instances is None:
         return None
     path = Path(options.instances) / f"instances_{split}.json"

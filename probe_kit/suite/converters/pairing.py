@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image
 
 from probe_kit.hashing import sha256_json
-from probe_kit.suite.converters.candidates import Candidate, Reading, SourcePicture, Wording
+from probe_kit.suite.converters.candidates import Candidate, SourceContent, SourcePicture, Wording
 from probe_kit.suite.items import Item, Side, instruction_for, other_side
 from probe_kit.suite.suite import Picture, make_item, squared_picture
 
@@ -174,7 +174,7 @@ def sample(bundles: Sequence[Bundle], count: int) -> list[Bundle]:
 
 
 def emit(
-    source: str, bundles: Sequence[Bundle], reading: Reading, render: Callable[[SourcePicture], Image.Image],
+    source: str, bundles: Sequence[Bundle], reading: SourceContent, render: Callable[[SourcePicture], Image.Image],
     rng: np.random.Generator,
 ) -> tuple[list[Item], dict[str, bytes]]:  # fmt: skip
     """Make the items of the bundles, without groups, and their pictures by file name.
@@ -221,7 +221,7 @@ def _side(proposal: Proposal, first: Proposal, side_of_first: Side) -> Side:
 
 
 def _item(
-    source: str, proposal: Proposal, side: Side, target: Picture, distractor: Picture, reading: Reading
+    source: str, proposal: Proposal, side: Side, target: Picture, distractor: Picture, reading: SourceContent
 ) -> Item:
     left, right = (target, distractor) if side == "left" else (distractor, target)
     assert proposal.wording is not None

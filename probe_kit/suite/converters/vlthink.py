@@ -14,7 +14,7 @@ from probe_kit._system.bounded_files import parse_json, read_regular
 from probe_kit.errors import SuiteError
 from probe_kit.suite.converters.candidates import (
     Candidate,
-    Reading,
+    SourceContent,
     SourcePicture,
     VlThinkOptions,
     Wording,
@@ -40,14 +40,14 @@ _BEHIND_WHITE = (196, 196, 196)
 ALIASES = {"stop give way": "stop", "do not dryclean": "do not dry clean", "dryclean": "dry clean"}
 
 
-def read(root: Path, categories: Sequence[str], options: VlThinkOptions) -> Reading:
+def read(root: Path, categories: Sequence[str], options: VlThinkOptions) -> SourceContent:
     """Read every board of the requested categories.
 
     Raises:
         SuiteError: If there is no board for them, or for an unknown set or a broken board.
     """
     base = root / _BOARDS if (root / _BOARDS).is_dir() else root
-    reading = Reading(
+    reading = SourceContent(
         license="MIT",
         attribution="VL-Think boards of BlindVLA (MIT); the sign artwork has no separate statement",
         url="https://github.com/CognitiveAISystems/BlindVLA",
@@ -71,7 +71,7 @@ def read(root: Path, categories: Sequence[str], options: VlThinkOptions) -> Read
     return reading
 
 
-def _read_set(folder: Path, name: str, category: str, options: VlThinkOptions, reading: Reading) -> None:
+def _read_set(folder: Path, name: str, category: str, options: VlThinkOptions, reading: SourceContent) -> None:
     path = folder / "model_db.json"
     records = read_annotations(path, SOURCE, "Check out the repository with its assets.")
     reading.files.append(path)

@@ -238,7 +238,7 @@ _MASK_PIXELS = 128
 
 
 @dataclass(frozen=True)
-class Outline(Tile):
+class ShapeOutline(Tile):
     """Everything that the picture is drawn from; the widths run along the axis, one list for each of its sides."""
 
     color: str
@@ -300,13 +300,13 @@ def _sides(symmetric: bool, rng: np.random.Generator) -> tuple[tuple[float, ...]
             return widths, shifted
 
 
-def _outline(concept: Concept, rng: np.random.Generator) -> Outline:
+def _outline(concept: Concept, rng: np.random.Generator) -> ShapeOutline:
     color = str(rng.choice(list(COLORS)))
     ink = jitter(COLORS[color], rng)
     left_widths, right_widths = _sides(concept.name == "symmetric", rng)
     placement = random_placement(rng, (0.88, 1.0), turn=7)
     lying = bool(rng.integers(2))
-    return Outline(
+    return ShapeOutline(
         color, left_widths, right_widths, lying, placement, ink=ink, background=background_for(ink, rng)
     )
 

@@ -284,7 +284,7 @@ _THINGS = {name: states for states in TWO_STATES for name in (states.first, stat
 
 
 @dataclass(frozen=True)
-class Condition(Tile):
+class StateDrawing(Tile):
     """Everything that the picture is drawn from: a thing in the state in which it is asked for."""
 
     state: str
@@ -295,11 +295,11 @@ class Condition(Tile):
         states.draw(canvas.pen(self.placement), self.state == states.first, self.ink)
 
 
-def _condition(concept: Concept, rng: np.random.Generator) -> Condition:
+def _condition(concept: Concept, rng: np.random.Generator) -> StateDrawing:
     color = str(rng.choice(_THINGS[concept.name].colors))
     ink = jitter(COLORS[color], rng)
     background = background_for(ink, rng)
-    return Condition(concept.name, random_placement(rng, FULL_DISK, turn=8), ink=ink, background=background)
+    return StateDrawing(concept.name, random_placement(rng, FULL_DISK, turn=8), ink=ink, background=background)
 
 
 STATE = Generator(

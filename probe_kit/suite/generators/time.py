@@ -34,7 +34,7 @@ _HOURS_APART = (2, 3, 4)  # one hour is 30 degrees and vanishes on the far tile
 
 
 @dataclass(frozen=True)
-class Reading(Concept):
+class ClockTime(Concept):
     """A time on a twelve-hour clock."""
 
     hour: int = 12
@@ -93,17 +93,17 @@ def _draw_dial(pen: Pen, numerals: Numerals) -> None:
         pen.fill(polygon((-0.16, -0.84), (0.16, -0.84), (0, -0.56)), _HANDS)
 
 
-def _reading(hour: int, minute: int) -> Reading:
+def _reading(hour: int, minute: int) -> ClockTime:
     time = f"{hour}:{minute:02d}"
-    return Reading(time, f"clock showing {time}", hour=hour, minute=minute)
+    return ClockTime(time, f"clock showing {time}", hour=hour, minute=minute)
 
 
-def _readable(reading: Reading) -> bool:
+def _readable(reading: ClockTime) -> bool:
     apart = abs(reading.hour_angle - reading.minute_angle) % 360
     return min(apart, 360 - apart) >= _LEAST_ANGLE
 
 
-def _confusable(first: Reading, second: Reading) -> bool:
+def _confusable(first: ClockTime, second: ClockTime) -> bool:
     """Whether the two differ in exactly one hand, or in which hand is which."""
     apart = (first.hour - second.hour) % 12
     if first.minute == second.minute:
@@ -112,7 +112,7 @@ def _confusable(first: Reading, second: Reading) -> bool:
     return apart == 0 or exchanged
 
 
-def _tiles(left: Reading, right: Reading, rng: np.random.Generator) -> tuple[Clock, Clock]:
+def _tiles(left: ClockTime, right: ClockTime, rng: np.random.Generator) -> tuple[Clock, Clock]:
     """Draw two clocks, of one make in half of the pairs."""
     makes = rng.integers((3, len(_RIMS), 3), size=(2, 3)).tolist()
     if rng.integers(2):
@@ -123,7 +123,7 @@ def _tiles(left: Reading, right: Reading, rng: np.random.Generator) -> tuple[Clo
     return left_clock, right_clock
 
 
-def _clock(reading: Reading, rng: np.random.Generator, numerals: int, rim: int, face: int) -> Clock:
+def _clock(reading: ClockTime, rng: np.random.Generator, numerals: int, rim: int, face: int) -> Clock:
     ink = COLORS[_RIMS[rim]]
     return Clock(
         hour=reading.hour,

@@ -12,10 +12,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._system.types import Matrix
 from probe_kit.errors import TooFewGroupsError
 from probe_kit.statistics.folds import Fold
 from probe_kit.train.crossval.joint_objective import JointProblems, JointSite, solve
-from probe_kit.train.crossval.nested_folds import STRENGTHS, FittedFold, InnerQuality, Matrix, NestedFold, select_c
+from probe_kit.train.crossval.nested_folds import STRENGTHS, FittedFold, InnerQuality, NestedFold, select_c
 from probe_kit.train.crossval.task_scores import log_loss, log_losses
 from probe_kit.train.samples import Samples
 from probe_kit.train.solver.arrays import Array, array_namespace, to_device_of, to_numpy

@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from probe_kit._system.types import Matrix
 from probe_kit.statistics.folds import INNER_FOLDS, OUTER_FOLDS, Fold, grouped_folds
 from probe_kit.train.solver.arrays import Array, to_numpy
 from probe_kit.train.solver.design_matrix import Projection
-
-Matrix = NDArray[np.float64]
 
 STRENGTHS: Matrix = np.array([1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0])
 """The grid of C, ascending, because `LogisticSolver.path` starts from the solution before.

@@ -17,11 +17,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._system.types import Matrix
 from probe_kit.errors import NonFiniteActivationError
 from probe_kit.statistics.folds import Fold
 from probe_kit.train.choices import Task
 from probe_kit.train.crossval.logistic_folds import cross_validate
-from probe_kit.train.crossval.nested_folds import FittedFold, InnerQuality, Matrix, NestedFold
+from probe_kit.train.crossval.nested_folds import FittedFold, InnerQuality, NestedFold
 from probe_kit.train.crossval.task_scores import balanced_scores, correctness, explained_scores
 from probe_kit.train.samples import Samples
 from probe_kit.train.solver.arrays import Standardiser, to_numpy

@@ -9,12 +9,11 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._system.types import Matrix
 from probe_kit.statistics.bootstrap import explained_interval
 from probe_kit.statistics.folds import SHARED_TRAINING, Fold
 from probe_kit.statistics.intervals import Accuracy
 from probe_kit.train.choices import Task
-
-Matrix = NDArray[np.float64]
 
 METRICS: dict[Task, str] = {"binary": "balanced accuracy", "classes": "balanced accuracy", "continuous": "R²"}
 

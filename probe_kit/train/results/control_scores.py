@@ -96,6 +96,11 @@ def has_signal(exceeds: Exceeds) -> bool:
     return exceeds["chance"] is True and False not in exceeds.values()
 
 
+def missed_controls(exceeds: Exceeds) -> tuple[str, ...]:
+    """Return the names of chance and controls that a site is not shown to exceed."""
+    return tuple(name for name, better in exceeds.items() if not better and (better is False or name == "chance"))
+
+
 @dataclass(frozen=True)
 class Controls:
     """The scores of the controls so far.

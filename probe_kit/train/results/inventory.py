@@ -122,12 +122,12 @@ def stored_probes(run: Any) -> list[StoredProbes]:
 def _probes(readers: Sequence[RunReader], bundle: Bundle, used: Collection[str]) -> StoredProbes:
     settings = settings_of(bundle)
     current = [run for run in readers if is_current(settings, run)]
-    state = "other episodes" if not current else "other" if settings.is_side else "label"
+    state = "other episodes" if not current else "other" if settings.balanced else "label"
     return StoredProbes(
         key=bundle.key,
         state="used" if bundle.key in used else state,
         created=bundle.times.get("created", ""),
-        target=settings.target if settings.is_side else f"{settings.target} ({settings.task})",
+        target=settings.target if settings.balanced else f"{settings.target} ({settings.task})",
         views=settings.views,
         categories=settings.categories,
         permutations=settings.permutations,

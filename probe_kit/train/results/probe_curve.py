@@ -8,16 +8,15 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._system.types import Matrix
 from probe_kit.hooks.contract.sites import Site, part_of
-from probe_kit.statistics.crossfit import CHANCE, GroupSums, StreamScores, balanced_sums
+from probe_kit.statistics.crossfit import CHANCE, GroupSums, SiteScores, balanced_sums
 from probe_kit.statistics.folds import Fold, fold_of_groups, split_by_fold, sums_by_group
 from probe_kit.statistics.intervals import Accuracy
 from probe_kit.statistics.label_permutations import max_statistic_p, smallest_p
 from probe_kit.statistics.paired_tests import SHARED_PROBE
 from probe_kit.train.choices import Task
 from probe_kit.train.crossval.task_scores import class_weights, correctness, score_interval, squared_deviations
-
-Matrix = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -42,8 +41,9 @@ class ProbeCurve:
             quality that chooses the penalty, above its mean over the permutations.
         parts: (S,) part of the model that the site's stream belongs to, see `Stream.part`; default by the stream's
             name.
+        balanced: Whether accuracies are balanced between two sides, see `Target`: chance is one half.
         classes: Names of the classes, empty for a quantity.
-        sample_scores: (S, E) held-out scores, None for a side, see `scores`.
+        sample_scores: (S, E) held-out scores, None where `balanced`, see `scores`.
         inferences: (E,) captured inference.
         aligned: (E,) place behind the event where windows begin, None where they begin at the first inference.
         smallest_p: Lower bound of every p; None where the number of permutations gives it.
@@ -61,7 +61,7 @@ class ProbeCurve:
     inner: NDArray[np.float32]
     parts: tuple[str, ...] = ()
     task: Task = "binary"
-    is_side: bool = True
+    balanced: bool = True
     classes: tuple[str, ...] = ("right", "left")
     sample_scores: Matrix | None = None
     inferences: NDArray[np.int64] | None = None
@@ -116,7 +116,7 @@ class ProbeCurve:
 
         NaN without any permutations.
         """
-        return np.full(len(self.sites), CHANCE) if self.is_side else self.null_mean
+        return np.full(len(self.sites), CHANCE) if self.balanced else self.null_mean
 
     @cached_property
     def sums(self) -> GroupSums:
@@ -137,7 +137,7 @@ class ProbeCurve:
 
         The accuracy of a side is balanced between its two pictures.
         """
-        if self.is_side:
+        if self.balanced:
             sums = self.sums.only(rows)
             accuracy = Accuracy(np.unique(self.groups), sums.sums.mean(axis=0), sums.sizes)
             interval = accuracy.interval()
@@ -154,15 +154,14 @@ class ProbeCurve:
     def p_fwe(self) -> Matrix:
         """Return the family-wise p of every site, (S,): each stream's sites are one family.
 
-        Chance of a target other than a side differs between sites, so the largest excess over a site's own mean
-        counts. The real labels take part in that mean, as each permutation does; only so is the p exact.
+        The largest excess over chance counts: over one half, or over the site's own mean, where chance differs
+        between sites. The real labels take part in that mean, as each permutation does; only so is the p exact.
         """
         p = np.empty(len(self.sites))
         for name in self.streams:
             rows = self.stream(name)
             every = np.column_stack([self.metric[rows], self.null[rows]])
-            if not self.is_side:
-                every -= every.mean(axis=1, keepdims=True)
+            every -= CHANCE if self.balanced else every.mean(axis=1, keepdims=True)
             p[rows] = max_statistic_p(every[:, 0], every[:, 1:])
         return p
 
@@ -269,23 +268,22 @@ class ProbeCurve:
 
     def largest_excess(self, rows: NDArray[np.intp]) -> int:
         """Return the row of `rows` with the largest metric above its own chance, where chance is known."""
-        chance = 0.0 if self.is_side else np.nan_to_num(self.chance[rows])
-        return int(rows[np.argmax(self.metric[rows] - chance)])
+        return int(rows[np.argmax(self.metric[rows] - np.nan_to_num(self.chance[rows]))])
 
     def depth(self, site: Site) -> float:
         """Return the layer of `site` as a fraction of its stream: 0 enters the first block, 1 leaves the last."""
         last = max(other.layer for other in self.sites if other.stream == site.stream)
         return site.layer / max(1, last)  # a stream of one layer has depth 0
 
-    def fit_stream(self, rows: NDArray[np.intp]) -> StreamScores:
+    def fit_stream(self, rows: NDArray[np.intp]) -> SiteScores:
         """Return the sites at `rows`, which are one stream or a part of it, for cross-fitted scores.
 
         Of a side they are balanced accuracies, else scores above the chance of each site. Raises as `sums`, and as
-        `StreamScores.of`.
+        `SiteScores.of`.
         """
         sites = [self.sites[row] for row in rows]
-        return StreamScores.of(
-            self.sums.only(rows) if self.is_side else self._above_chance(rows),
+        return SiteScores.of(
+            self.sums.only(rows) if self.balanced else self._above_chance(rows),
             self.inner[rows],
             fold_of_groups(self.fold_of, self.groups),
             [site.layer for site in sites],

@@ -1,6 +1,6 @@
 """Probe results: settings, directions, the table of scores with its best sites, and the decisions behind it."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, fields
 from datetime import UTC, datetime
@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit._system.bounded_files import UNREADABLE, open_arrays
-from probe_kit._tables.numbers import Limits, number, p_text, percent
+from probe_kit._system.types import Matrix
+from probe_kit._tables.numbers import number, p_text, percent
 from probe_kit._tables.table import Cell, Legend, Table
 from probe_kit.errors import UnknownSiteError
 from probe_kit.hashing import sha256_json
@@ -26,7 +27,7 @@ from probe_kit.statistics.share_limits import wilson_limits
 from probe_kit.train.choices import EVERYWHERE, SIDES, Incomplete, Task
 from probe_kit.train.crossval.task_scores import METRICS, fold_auc, fold_spearman, log_loss
 from probe_kit.train.results.control_scores import Controls, has_signal
-from probe_kit.train.results.probe_curve import Matrix, ProbeCurve
+from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.samples import is_token_view
 
 if TYPE_CHECKING:
@@ -88,9 +89,14 @@ class ProbeSettings:
         return sha256_json(asdict(self))[:12]
 
     @property
-    def is_side(self) -> bool:
-        """Whether the target is the side of a picture."""
+    def balanced(self) -> bool:
+        """Whether accuracies are balanced between two sides of a picture, see `Target.balanced`."""
         return self.target in SIDES
+
+    @property
+    def write_score(self) -> Callable[[float | None], str]:
+        """The function that writes a score: an accuracy of a side in percent, others as they are."""
+        return percent if self.balanced else three_digits
 
 
 # -- directions ----------------------------------------------------------------------------------------------
@@ -263,7 +269,7 @@ def score_rows(
         exceeds = {
             name: better
             for name, better in controls.exceeds(*key, site, float(p_fwe[row])).items()
-            if curve.is_side or name == "chance" or better is not None
+            if curve.balanced or name == "chance" or better is not None
         }
         yield {
             "model": settings.model,
@@ -288,7 +294,7 @@ def score_rows(
             "smallest_p": curve.least_p,
             **{exceeds_column(name): better for name, better in exceeds.items() if name != "chance"},
             "signal": has_signal(exceeds),
-            **(_of_side(curve, row, score[row]) if curve.is_side else _of_label(controls, key, curve, row)),
+            **(_of_side(curve, row, score[row]) if curve.balanced else _of_label(controls, key, curve, row)),
             "n": curve.labels.size,
             "episodes": np.unique(curve.episodes).size,
             "items": np.unique(curve.items).size,
@@ -304,7 +310,7 @@ def exceeds_column(control: str) -> str:
 
 def _estimates(curve: ProbeCurve) -> tuple[Matrix, Matrix, Matrix]:
     """Return the scores (S,) with the lower and upper ends of their intervals."""
-    if curve.is_side:
+    if curve.balanced:
         sums = curve.sums
         return sums.accuracies, *wilson_limits(sums.sums, sums.sizes)
     limits = np.array([curve.estimate(np.array([row]))[1] for row in range(len(curve.sites))])
@@ -333,15 +339,15 @@ def _of_label(controls: Controls, key: tuple[str, str], curve: ProbeCurve, row: 
     }
 
 
-def best_sites(scores: "pd.DataFrame", is_side: bool) -> "list[pd.Series]":
+def best_sites(scores: "pd.DataFrame") -> "list[pd.Series]":
     """Return the best site of every category, view and stream: a row of `ProbeResults.scores`, by category.
 
-    The best site of a side has the largest accuracy, of other targets the largest excess over its own chance; the
-    first on ties. There are two columns besides those of `scores`. `ties` is how many other sites are as good.
-    `first` is the best score at the stream's first iteration, NaN where it runs once.
+    The best site has the largest excess over its own chance, which is one half for a side; the first on ties.
+    There are two columns besides those of `scores`. `ties` is how many other sites are as good. `first` is the
+    best score at the stream's first iteration, NaN where it runs once.
     """
     names = ["category", "view", "stream"]
-    worth = scores["score"] if is_side else scores["score"] - scores["chance"].fillna(0.0)
+    worth = scores["score"] - scores["chance"].fillna(0.0)
     by_stream = worth.groupby([scores[name] for name in names], sort=False)
     iterations = scores["iteration"].groupby([scores[name] for name in names], sort=False)
     begins = scores["iteration"].eq(iterations.transform("min")).fillna(False).astype(bool)
@@ -352,19 +358,20 @@ def best_sites(scores: "pd.DataFrame", is_side: bool) -> "list[pd.Series]":
     return [row for _, row in best.iterrows()]
 
 
-def site_cells(row: "pd.Series", is_side: bool) -> tuple[Cell, Cell, Cell, Cell]:
-    """Return a row of `best_sites`: the site with its ties, score, chance and p; a dash for none."""
+def site_cells(row: "pd.Series", write: Callable[[float | None], str]) -> tuple[Cell, Cell, Cell, Cell]:
+    """Return a row of `best_sites`: the site with its ties, score, chance and p; a dash for none.
+
+    Args:
+        row: A row of `best_sites`.
+        write: Function that writes a score, see `ProbeSettings.write_score`.
+    """
     site = Cell(str(row["site"]), after=f" +{row['ties']}" if row["ties"] else "")
-    score = score_cell(row["score"], is_side, (row["ci_low"], row["ci_high"]))
-    return site, score, score_cell(row["chance"], is_side), Cell(row["p_fwe"], p_text)
+    score = Cell(row["score"], write, (row["ci_low"], row["ci_high"]))
+    return site, score, Cell(row["chance"], write), Cell(row["p_fwe"], p_text)
 
 
-def score_cell(value: float | None, is_side: bool, limits: Limits | None = None) -> Cell:
-    """Return the accuracy of a side in percent, other scores as they are; a dash for none."""
-    return Cell(value, percent if is_side else _three_digits, limits)
-
-
-def _three_digits(value: float | None) -> str:
+def three_digits(value: float | None) -> str:
+    """Return a number with three digits; a dash for none."""
     return number(value, 3)
 
 
@@ -413,13 +420,13 @@ class ProbeResults:
             case "groups":
                 if self.curves[category, view].least_p >= 1:
                     return "take groups in which the label differs"
-                return "extract more items" if settings.is_side else "label more groups"
+                return "extract more items" if settings.balanced else "label more groups"
         return ""
 
     def __repr__(self) -> str:
         settings = self.settings
         random = ", RANDOM WEIGHTS" if settings.random_weights else ""
-        task = "" if settings.is_side else f" ({settings.task})"
+        task = "" if settings.balanced else f" ({settings.task})"
         return (
             f"<ProbeResults {settings.key} of {self.label}{random}: {', '.join(settings.categories)}; "
             f"views {', '.join(settings.views)}; target {settings.target}{task}; call {settings.call}; "
@@ -472,7 +479,7 @@ class ProbeResults:
             settings = self.settings
             hint = (
                 ""
-                if settings.is_side
+                if settings.balanced
                 else f"; probes of {settings.target!r} store no directions, those of a side do"
             )
             raise UnknownSiteError(
@@ -503,28 +510,28 @@ def best_sites_table(fitted: Sequence[ProbeResults], splits: bool = True) -> Tab
             listed only then.
     """
     first, several_calls = fitted[0].settings, len(fitted) > 1
-    several_views, metric = len(first.views) > 1, "accuracy %" if first.is_side else METRICS[first.task]
+    several_views, metric = len(first.views) > 1, "accuracy %" if first.balanced else METRICS[first.task]
     rows: list[tuple[Cell | str, ...]] = []
     for results in fitted:
         call = f"call {results.settings.call}" if several_calls else ""
-        for row in best_sites(results.scores, first.is_side):
+        for row in best_sites(results.scores):
             view = str(row["view"]) if several_views else ""
             name = " · ".join(filter(None, (_name(results, row["category"], row["stream"]), view, call)))
             met, missed = exceeded_controls(results, row)
             not_shown = f"not shown: {', '.join(missed)}" if missed else ""
-            begin = score_cell(row["first"], first.is_side)
+            begin = Cell(row["first"], first.write_score)
             exceeds = Cell("; ".join(filter(None, (", ".join(met), not_shown))) or None)
-            rows.append((name, *site_cells(row, first.is_side), exceeds, Cell(int(row["n"])), begin))
-        for control in results.controls.scores if splits or not first.is_side else ():
+            rows.append((name, *site_cells(row, first.write_score), exceeds, Cell(int(row["n"])), begin))
+        for control in results.controls.scores if splits or not first.balanced else ():
             view = control.view if several_views else ""
             where = _name(results, control.category, control.stream)
             name = " · ".join(filter(None, [f"control {control.name}", where, view, call]))
-            score = score_cell(control.score, first.is_side, control.ci)
-            chance = score_cell(control.chance, first.is_side)
+            score = Cell(control.score, first.write_score, control.ci)
+            chance = Cell(control.chance, first.write_score)
             p = Cell(control.p, p_text, after="" if control.p is None else " (this control alone)")
             rows.append((name, "", score, chance, p, "", Cell(control.n), ""))
     headings = (
-        "category" if first.is_side else "stream",
+        "category" if first.balanced else "stream",
         "best site",
         f"{metric} [95 %]",
         "chance",
@@ -533,7 +540,7 @@ def best_sites_table(fitted: Sequence[ProbeResults], splits: bool = True) -> Tab
         "n",
         "first iteration",
     )
-    notes = [_LEGEND + (_OF_SIDE if first.is_side else _OF_LABEL)]
+    notes = [_LEGEND + (_OF_SIDE if first.balanced else _OF_LABEL)]
     overflow = "split" if splits else "leave out"
     return Table.of(
         ", ".join(_title(fitted, several_views)),
@@ -547,8 +554,8 @@ def best_sites_table(fitted: Sequence[ProbeResults], splits: bool = True) -> Tab
 
 def _title(fitted: Sequence[ProbeResults], several_views: bool) -> Iterator[str]:
     settings = fitted[0].settings
-    yield f"{settings.target}: best site per stream" if not settings.is_side else "Best site per stream"
-    if not settings.is_side:
+    yield f"{settings.target}: best site per stream" if not settings.balanced else "Best site per stream"
+    if not settings.balanced:
         yield settings.task
     if not several_views:
         yield f"view {settings.views[0]}"
@@ -562,7 +569,7 @@ def _title(fitted: Sequence[ProbeResults], several_views: bool) -> Iterator[str]
 
 def _name(results: ProbeResults, category: str, stream: str) -> str:
     """Return the category, and for a target other than a side the stream."""
-    if results.settings.is_side:
+    if results.settings.balanced:
         return str(category)  # as --categories takes it
     pooled = results.settings.categories == (EVERYWHERE,)
     return " · ".join(filter(None, ["" if pooled else str(category), label_of(stream) if stream else ""]))

@@ -103,8 +103,10 @@ class SweepCheckpoint:
 
 SCORES, DECISIONS = "scores.csv", "decisions.npz"
 DIRECTIONS, CONTROLS = PROBE_DIRECTIONS, "controls.json"
-_TEXTS, _FACTS = ("parts", "classes"), ("task", "is_side", "smallest_p")
+_TEXTS, _FACTS = ("parts", "classes"), ("task", "balanced", "smallest_p")
 """Members of a curve that are tuples of texts, and those that are single values."""
+_STORED_AS = {"balanced": "is_side"}
+"""The names of members in files, where they differ: another name would not be read in results that are there."""
 
 
 def save_results(results: ProbeResults, run: Path | Location, *, requested: bool = True) -> None:
@@ -197,7 +199,7 @@ def newest_bundle(run: RunReader, stored: Mapping[str, Bundle], target: str) -> 
     of_target = [
         bundle
         for bundle, settings in _current(run, stored)
-        if settings.target == target and not (settings.is_side and settings.call)
+        if settings.target == target and not (settings.balanced and settings.call)
     ]
     return max(of_target, key=_rank, default=None)
 
@@ -222,7 +224,7 @@ def load_side_results(run: RunReader, key: str | None = None) -> ProbeResults:
         UsageError: For a key of another target.
     """
     results = load_results(run, key)
-    if not results.settings.is_side:
+    if not results.settings.balanced:
         raise UsageError(
             f"{run.location}: the probes {results.key} are of {results.settings.target!r}, not of a side. Add "
             f"--target {results.settings.target}, or give the key of other probes"
@@ -237,7 +239,7 @@ def stored_targets(run: RunReader) -> dict[str, int]:
     them was a test.
     """
     current = _current(run, read_probes(run.location))
-    versions = {(settings.target, settings.label) for _, settings in current if not settings.is_side}
+    versions = {(settings.target, settings.label) for _, settings in current if not settings.balanced}
     return dict(sorted(Counter(target for target, _ in versions).items()))
 
 
@@ -287,7 +289,7 @@ def _rank(bundle: Bundle) -> tuple[bool, str, str, str]:
     Probes of a side on all categories together rank below others: statements by category have no number from them.
     """
     settings = settings_of(bundle)
-    by_category = not settings.is_side or settings.categories != (EVERYWHERE,)
+    by_category = not settings.balanced or settings.categories != (EVERYWHERE,)
     return by_category, bundle.times.get("requested", ""), bundle.times.get("created", ""), bundle.key
 
 
@@ -298,7 +300,7 @@ def _now() -> str:
 def _pack(curves: Mapping[tuple[str, str], ProbeCurve]) -> dict[str, Any]:
     """Return arrays by `category/view/member`; views hold no slash."""
     return {
-        f"{category}/{view}/{member.name}": _as_array(value)
+        f"{category}/{view}/{_STORED_AS.get(member.name, member.name)}": _as_array(value)
         for (category, view), curve in curves.items()
         for member in fields(curve)
         if (value := getattr(curve, member.name)) is not None
@@ -311,9 +313,10 @@ def _as_array(value: Any) -> Any:
 
 def _unpack(arrays: Mapping[str, Any]) -> dict[tuple[str, str], ProbeCurve]:
     curves: dict[tuple[str, str], dict[str, Any]] = {}
+    members_of = {stored: member for member, stored in _STORED_AS.items()}
     for name, value in arrays.items():
         category, view, member = name.rsplit("/", 2)  # from the right: a category of one's own may hold a slash
-        curves.setdefault((category, view), {})[member] = value
+        curves.setdefault((category, view), {})[members_of.get(member, member)] = value
     for (category, view), members in curves.items():
         if problem := axes_problem(ProbeCurve.AXES, members):
             raise ValueError(f"{category}/{view} {problem}")

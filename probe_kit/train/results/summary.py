@@ -22,10 +22,10 @@ def best_sites_findings(results: ProbeResults) -> list[str]:
     settings = results.settings
     lines = []
     for view, category, rows in _places(results):
-        pixels = results.controls.of_category(category).get("pixels") if settings.is_side else None
+        pixels = results.controls.of_category(category).get("pixels") if settings.balanced else None
         by_pictures = ["the pictures alone decode it too"] * (pixels is not None and pixels.above_chance)
-        name = category_of(category).title if settings.is_side else settings.target
-        if not settings.is_side:
+        name = category_of(category).title if settings.balanced else settings.target
+        if not settings.balanced:
             name = ", ".join(
                 [name, *[category] * (settings.categories != (EVERYWHERE,)), *[view] * (len(settings.views) > 1)]
             )
@@ -36,8 +36,8 @@ def best_sites_findings(results: ProbeResults) -> list[str]:
 
 def _places(results: ProbeResults) -> "Iterator[tuple[str, str, list[pd.Series]]]":
     """Yield view, category and the best sites of each stream; of a side in the first view alone."""
-    rows, settings = best_sites(results.scores, results.settings.is_side), results.settings
-    for view in settings.views[:1] if settings.is_side else settings.views:
+    rows, settings = best_sites(results.scores), results.settings
+    for view in settings.views[:1] if settings.balanced else settings.views:
         for category in dict.fromkeys(str(row["category"]) for row in rows):
             yield view, category, [row for row in rows if (row["category"], row["view"]) == (category, view)]
 
@@ -55,7 +55,7 @@ def _findings(results: ProbeResults, rows: "Sequence[pd.Series]") -> Iterator[st
     open_: dict[str, list[str]] = {}
     for row in rows:
         stream, (_, missed) = f"the {label_of(row['stream'])}", exceeded_controls(results, row)
-        score = f"{100 * row['score']:.0f} %" if results.settings.is_side else f"{row['score']:.2f}"
+        score = f"{100 * row['score']:.0f} %" if results.settings.balanced else f"{row['score']:.2f}"
         if remedy := results.remedy(row["category"], row["view"]):
             # Without enough of them nothing can be shown, whatever the network holds.
             open_.setdefault(f"not testable in {{}}: {remedy}", []).append(stream)

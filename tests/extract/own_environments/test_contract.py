@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from probe_kit.errors import OwnEnvironmentError, UsageError
-from probe_kit.extract import EnvEpisode, EnvSource, Step, check_environment
+from probe_kit.extract import EnvEpisode, EnvironmentSettings, Step, check_environment
 from probe_kit.extract.sources.environment_source import (
     EnvironmentPlayer,
     checked_step,
@@ -117,7 +117,7 @@ class Listed(ReachEnv):
 )
 def test_episodes_that_cannot_be_told_apart_or_named_are_refused(listed: list[Any], message: str) -> None:
     with pytest.raises(OwnEnvironmentError, match=message):
-        listed_episodes(Listed(listed), EnvSource("x:Y"))
+        listed_episodes(Listed(listed), EnvironmentSettings("x:Y"))
 
 
 def test_chosen_episodes_are_those_of_their_indices_and_endless_lists_end() -> None:
@@ -127,16 +127,16 @@ def test_chosen_episodes_are_those_of_their_indices_and_endless_lists_end() -> N
         def episodes(self) -> Any:
             return (EnvEpisode(f"e{number}", number, "x") for number in count())
 
-    episodes = listed_episodes(Endless(), EnvSource("x:Y", episodes=(5, 2)))
+    episodes = listed_episodes(Endless(), EnvironmentSettings("x:Y", episodes=(5, 2)))
     assert [(number, episode.id) for number, episode in episodes] == [(2, "e2"), (5, "e5")]
     with pytest.raises(UsageError, match="has 12 episodes, counted from 0; asked for 12"):
-        listed_episodes(ReachEnv(), EnvSource("x:Y", episodes=(12,)))
+        listed_episodes(ReachEnv(), EnvironmentSettings("x:Y", episodes=(12,)))
 
 
 @pytest.mark.parametrize("wrong", [{"max_steps": 0}, {"episodes": ()}, {"episodes": (-1,)}, {"max_steps": 10**6}])
 def test_settings_that_no_environment_can_have_are_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(UsageError):
-        EnvSource("x:Y", **wrong)
+        EnvironmentSettings("x:Y", **wrong)
 
 
 # -- steps ----------------------------------------------------------------------------------------------------
@@ -162,7 +162,7 @@ def test_steps_that_break_the_contract_are_refused_with_their_place(answer: Any,
 
 
 def stage(name: str = "ReachEnv", **options: Any) -> EnvironmentPlayer:
-    return EnvironmentPlayer(EnvSource(HOME + name, **options), FACTS, Played("ends", 3))
+    return EnvironmentPlayer(EnvironmentSettings(HOME + name, **options), FACTS, Played("ends", 3))
 
 
 def planned(seed: int = 3) -> Row:
@@ -214,10 +214,10 @@ def test_an_error_of_the_environment_names_its_episode_and_method() -> None:
 
 
 def test_options_are_arguments_of_the_class() -> None:
-    source = EnvSource(HOME + "ReachEnv", options=["count=4"], episodes="0:4")
+    source = EnvironmentSettings(HOME + "ReachEnv", options=["count=4"], episodes="0:4")
     assert len(listed_episodes(open_environment(source), source)) == 4
     with pytest.raises(OwnEnvironmentError, match="its constructor: TypeError"):
-        open_environment(EnvSource(HOME + "ReachEnv", {"colour": "red"}))  # type: ignore[arg-type]
+        open_environment(EnvironmentSettings(HOME + "ReachEnv", {"colour": "red"}))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(("name", "code"), [("ReachEnv", 0), ("Forgetful", 1)])

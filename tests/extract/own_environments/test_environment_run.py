@@ -17,7 +17,7 @@ from probe_kit.errors import (
     UnitsError,
     UsageError,
 )
-from probe_kit.extract import EnvSource, ExtractSettings, Step, check_environment, prepare
+from probe_kit.extract import EnvironmentSettings, ExtractSettings, Step, check_environment, prepare
 from probe_kit.extract.commands import check_size
 from probe_kit.extract.sources.environment import SUCCESS
 from probe_kit.extract.sources.environment_source import EnvironmentPlayer, checked_step, open_environment
@@ -47,7 +47,7 @@ HOME = "reach_env:"
 def settings(name: str = "ReachEnv", **options: Any) -> ExtractSettings:
     source = {"max_steps": 6, **{key: options.pop(key) for key in ("episodes", "max_steps") if key in options}}
     all_options = {"captured_calls": 2, "execute": 3, "env_workers": 0, "batch": 6, **options}
-    return ExtractSettings("pi0-tiny", source=EnvSource(HOME + name, **source), **all_options)
+    return ExtractSettings("pi0-tiny", source=EnvironmentSettings(HOME + name, **source), **all_options)
 
 
 @pytest.fixture(scope="session")
@@ -88,7 +88,7 @@ class Stateless(ReachEnv):
 @pytest.mark.filterwarnings("ignore:the model put out tokens that name no action")
 def test_an_environment_without_a_state_is_stored_without_one(tmp_path: Path) -> None:
     """Zarr has no arrays of length 0."""
-    source = EnvSource(f"{__name__}:{Stateless.__name__}", max_steps=2, episodes="0:2")
+    source = EnvironmentSettings(f"{__name__}:{Stateless.__name__}", max_steps=2, episodes="0:2")
     checkpoint, options = WRITERS["openvla"][0](tmp_path / "openvla"), WRITERS["openvla"][1]
     stateless_settings = ExtractSettings(
         "openvla", checkpoint=str(checkpoint), options=options, source=source, env_workers=0
@@ -256,20 +256,20 @@ def test_options_of_scenes_and_recordings_are_refused_with_an_environment() -> N
     typed = ExtractSettings.of_command(
         {**options, "episodes": "0:2", "max_steps": 9, "no_pixels": False, "captured_calls": "all"}
     )
-    assert typed.source == EnvSource(HOME + "ReachEnv", episodes=(0, 1), max_steps=9, pixels=False)
+    assert typed.source == EnvironmentSettings(HOME + "ReachEnv", episodes=(0, 1), max_steps=9, pixels=False)
     assert typed.most_inferences(4) == 3
 
 
 @pytest.mark.slow
 def test_a_run_of_more_than_64_gb_begins_with_yes_only(tmp_path: Path) -> None:
     """30,000 episodes of the released pi0, planned without its weights."""
-    source = EnvSource(HOME + "ReachEnv", {"count": "30000"})  # type: ignore[arg-type]
+    source = EnvironmentSettings(HOME + "ReachEnv", {"count": "30000"})  # type: ignore[arg-type]
     planned = prepare(ExtractSettings("pi0", source=source, captured_calls=8), fetch=False)
     location = locate(tmp_path / "run")
     with pytest.raises(DiskSpaceError, match=r"would take up to .* TB; more than 64\.0 GB is written with --yes"):
         check_size(planned, location, agreed=False)
     check_size(planned, location, agreed=True)
-    few = EnvSource(HOME + "ReachEnv", {"count": "12"})  # type: ignore[arg-type]
+    few = EnvironmentSettings(HOME + "ReachEnv", {"count": "12"})  # type: ignore[arg-type]
     check_size(prepare(ExtractSettings("pi0", source=few), fetch=False), location, agreed=False)
 
 
@@ -277,7 +277,7 @@ FACTS = ("block", "left", "success")
 
 
 def settings_of(name: str, **options: Any) -> ExtractSettings:
-    return ExtractSettings("pi0-tiny", source=EnvSource(f"reach_env:{name}"), env_workers=0, **options)
+    return ExtractSettings("pi0-tiny", source=EnvironmentSettings(f"reach_env:{name}"), env_workers=0, **options)
 
 
 def outcome_of(monkeypatch: pytest.MonkeyPatch, successes: list[bool], steps: int) -> Mapping[str, Any]:
@@ -289,7 +289,7 @@ def outcome_of(monkeypatch: pytest.MonkeyPatch, successes: list[bool], steps: in
         plain_step = plain(self, np.zeros(7, np.float32))
         return Step(plain_step.observation, False, {**plain_step.facts, SUCCESS: next(after)})
 
-    stage = EnvironmentPlayer(EnvSource("reach_env:ReachEnv", max_steps=steps), FACTS, Played())
+    stage = EnvironmentPlayer(EnvironmentSettings("reach_env:ReachEnv", max_steps=steps), FACTS, Played())
     monkeypatch.setattr(type(stage._environment), "step", step)
     stage.begin(planned(), film=False)
     ending = stage.advance(np.zeros((steps, 7), np.float32))
@@ -350,9 +350,9 @@ def test_an_environment_may_write_into_the_arrays_that_it_gave() -> None:
 
 @pytest.mark.parametrize("name", ["ReachEnv", "Reusing"])
 def test_small_frames_are_the_first_and_the_last_picture(name: str) -> None:
-    environment = open_environment(EnvSource("reach_env:ReachEnv"))
+    environment = open_environment(EnvironmentSettings("reach_env:ReachEnv"))
     first = environment.reset(planned().content).observation.image  # type: ignore[union-attr]
-    stage = EnvironmentPlayer(EnvSource(f"reach_env:{name}", max_steps=3), FACTS, Played("ends"))
+    stage = EnvironmentPlayer(EnvironmentSettings(f"reach_env:{name}", max_steps=3), FACTS, Played("ends"))
     stage.begin(planned(), film=False)
     stage.advance(np.tile(np.float32([0, 0.02, 0, 0, 0, 0, 0]), (3, 1)))
     np.testing.assert_array_equal(stage._first[0][1:], first[1:])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from probe_kit.errors import MissingExtraError, OwnEnvironmentError, UsageError
-from probe_kit.extract import EnvSource, check_environment
+from probe_kit.extract import EnvironmentSettings, check_environment
 from probe_kit.extract.sources.environment_source import EnvironmentSource, open_environment
 from probe_kit.extract.sources.lerobot_env import LeRobotEnvironment
 from tests.support.reach_env import Reach
@@ -21,7 +21,7 @@ def _registered() -> None:
 
 
 def test_an_environment_of_lerobot_keeps_the_contract() -> None:
-    source = EnvSource("registered_reach:lerobot_reach", {"per_task": 2})  # type: ignore[arg-type]
+    source = EnvironmentSettings("registered_reach:lerobot_reach", {"per_task": 2})  # type: ignore[arg-type]
     assert [check.problem for check in check_environment(source) if check.problem] == []
 
 
@@ -78,7 +78,7 @@ def test_what_cannot_be_played_is_named(
     name: str, options: dict[str, Any], error: type[Exception], message: str
 ) -> None:
     with pytest.raises(error, match=message):
-        open_environment(EnvSource(name, options))
+        open_environment(EnvironmentSettings(name, options))
 
 
 @pytest.mark.parametrize("name", ["vlabench", "robotwin"])
@@ -89,7 +89,7 @@ def test_a_simulator_that_is_imported_late_is_named_at_the_first_reset(name: str
 
 
 def test_an_episode_ends_at_lerobots_limit_and_every_seed_is_a_group() -> None:
-    source = EnvSource(
+    source = EnvironmentSettings(
         "lerobot:probe_kit_reach", {"instruction": "x", "per_task": 6, "episode_length": 300}
     ).open()  # type: ignore[arg-type]
     assert source.settings.steps() == 300
@@ -99,7 +99,7 @@ def test_an_episode_ends_at_lerobots_limit_and_every_seed_is_a_group() -> None:
 
 
 def test_tasks_of_several_limits_end_at_their_own() -> None:
-    source = EnvSource("lerobot:probe_kit_suites", {"instruction": "x", "per_task": 1}).open()  # type: ignore[arg-type]
+    source = EnvironmentSettings("lerobot:probe_kit_suites", {"instruction": "x", "per_task": 1}).open()  # type: ignore[arg-type]
     assert {row.columns["episode_id"]: row.columns["max_steps"] for row in source.rows(0)} == {
         "short-0/0000": 280,
         "long-0/0000": 520,
@@ -148,7 +148,7 @@ def test_a_real_simulator_ends_where_its_benchmark_does_and_repeats(
 ) -> None:
     """Where its package is installed; the table of docs/own-environments.md has all that were run."""
     pytest.importorskip(package)
-    source = EnvSource(f"lerobot:{kind}", {**options, "per_task": 6}).open()  # type: ignore[arg-type]
+    source = EnvironmentSettings(f"lerobot:{kind}", {**options, "per_task": 6}).open()  # type: ignore[arg-type]
     assert isinstance(source, EnvironmentSource)
     source.rehearse(source.rows(0))
     assert source.settings.steps() == limit

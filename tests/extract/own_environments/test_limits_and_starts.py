@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from probe_kit.errors import OtherFramesError, OwnEnvironmentError, UsageError
-from probe_kit.extract import EnvEpisode, EnvSource, check_environment
+from probe_kit.extract import EnvEpisode, EnvironmentSettings, check_environment
 from probe_kit.extract.sources.environment import MAX_STEPS
 from probe_kit.extract.sources.environment_source import EnvironmentPlayer, EnvironmentSource, open_environment
 from probe_kit.extract.sources.environment_starts import start_digest
@@ -44,7 +44,7 @@ class PerEpisode(ReachEnv):
 
 
 def opened(name: str = HOME + "ReachEnv", **options: Any) -> EnvironmentSource:
-    source = EnvSource(name, **options).open()
+    source = EnvironmentSettings(name, **options).open()
     assert isinstance(source, EnvironmentSource)
     return source
 
@@ -250,7 +250,7 @@ def test_pictures_of_all_cameras_or_of_one_are_rotated_at_every_step(
     rotations: Any, first: int, wrist: int
 ) -> None:
     plain, turned = (
-        open_environment(EnvSource(HOME + "TwoCameras", rotations=chosen_rotations))
+        open_environment(EnvironmentSettings(HOME + "TwoCameras", rotations=chosen_rotations))
         for chosen_rotations in ((), rotations)
     )
     episode = next(iter(plain.episodes()))

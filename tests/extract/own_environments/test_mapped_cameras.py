@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from probe_kit.errors import OwnEnvironmentError
-from probe_kit.extract import EnvSource, Step
+from probe_kit.extract import EnvironmentSettings, Step
 from probe_kit.extract.sources.environment_source import (
     EnvironmentSource,
     arrange_pictures,
@@ -128,12 +128,12 @@ def test_a_rotation_of_a_camera_turns_the_picture_that_it_is_given(
     """Also where only the checkpoint's map says which picture that is."""
     renames = {f"{IMAGES}{picture}": f"{IMAGES}{camera}" for camera, picture in pairs.items()}
     typed = pairs if by == "option" else {}
-    source = EnvSource(NAMED, cameras=typed, rotations=rotations).open()
+    source = EnvironmentSettings(NAMED, cameras=typed, rotations=rotations).open()
     assert isinstance(source, EnvironmentSource)
     inputs = DeclaredInputs(tuple(pairs), renames={name: to for name, to in renames.items() if name != to})
     decided = source._begun(inputs, True)
     assert decided.seen is not None
-    plain = open_environment(EnvSource(NAMED))
+    plain = open_environment(EnvironmentSettings(NAMED))
     observation = plain.reset(next(iter(plain.episodes()))).observation  # type: ignore[union-attr]
     pictures = {"front": observation.image, **observation.cameras}
     by_camera = {**dict(zip(pairs, [decided.seen.image], strict=False)), **decided.seen.cameras}

@@ -37,6 +37,7 @@ from probe_kit.hooks import Observation
 from probe_kit.hooks.checkpoints.third_party import contain_policy, while_acting
 from probe_kit.hooks.families.pi0.adapter import Pi0, load_pi0_tiny
 from probe_kit.hooks.family import Family
+from probe_kit.hooks.family_parts import Requirements
 from probe_kit.runs import Run, open_run
 from probe_kit.suite import Suite
 from tests.support.episode_tables import without_seconds
@@ -501,7 +502,13 @@ def test_a_family_that_is_wrong_about_itself_breaks_no_page(monkeypatch: pytest.
     from probe_kit.extract.inspect_commands import _model_rows
     from probe_kit.hooks import registry
 
-    broken = Family("mine", "theirs", None, "x:y", packages=(("nowhere.at.all", "extra"),))
+    broken = Family(
+        "mine",
+        "theirs",
+        None,
+        "x:y",
+        requirements=Requirements(packages=(("nowhere.at.all", "extra"),)),
+    )
     entry = SimpleNamespace(name="mine", value="x:y", load=lambda: broken, dist=None)
     monkeypatch.setattr(registry, "family_entries", lambda: [entry])
     (row,) = _model_rows("mine")

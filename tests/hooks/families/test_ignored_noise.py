@@ -25,7 +25,7 @@ from tests.support.every_checkpoint import WRITERS
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore:the model put out tokens")]
 NOISY = {"pi0", "pi05", "smolvla", "molmoact2", "groot", "xvla", "eo1", "xiaomi-r0", "internvla-m1"}
-ACTING = [name for name in WRITERS if own_families()[name].acts]
+ACTING = [name for name in WRITERS if own_families()[name].abilities.acts]
 DRAWN, CONSTANT = (
     actions_have_the_contracts_shape_and_come_from_the_seed_alone,
     another_seed_gives_another_chunk_where_noise_is_drawn,

@@ -24,6 +24,7 @@ from probe_kit.hooks.families.molmoact2.packing import FramedUnits, JointFrame
 from probe_kit.hooks.families.pi0.adapter import Pi05
 from probe_kit.hooks.families.pi0_fast.adapter import Pi0Fast
 from probe_kit.hooks.families.shared.lerobot.normaliser import Bounds, Normaliser
+from probe_kit.hooks.families.shared.lerobot.packing import TEXT_FILES
 from probe_kit.hooks.families.shared.lerobot.pipelines import (
     CROP,
     POSTPROCESSOR,
@@ -33,7 +34,6 @@ from probe_kit.hooks.families.shared.lerobot.pipelines import (
     known_values,
     tokenizer_folder,
 )
-from probe_kit.hooks.families.shared.lerobot.policy import TEXT_FILES
 from probe_kit.hooks.families.shared.lerobot.window import PictureWindow, read_window
 from probe_kit.hooks.registry import find_family
 from probe_kit.models.pi0 import PaliGemmaSize, Pi0Size, resize_network

@@ -29,7 +29,7 @@ from probe_kit.hooks.families.shared.taps import (
     returned_weights,
     shares,
 )
-from probe_kit.hooks.families.shared.text import Frame, FramedText
+from probe_kit.hooks.families.shared.text import FramedText, QuestionFrame
 from probe_kit.hooks.families.shared.token_decoder import ALL, CHECKPOINT, TOP, chooser, top_of
 from probe_kit.hooks.registry import find_family
 from probe_kit.hooks.testing import example_observations
@@ -325,7 +325,9 @@ def test_towers_that_no_released_ovis_has_are_refused(vision: dict[str, object],
         load_model("ovis2.5", str(folder))
 
 
-FRAME = Frame("<|im_start|>user\n<|vision_start|>", "<|vision_end|>", "<|im_start|>user\n", "<|im_end|>\nSay: ")
+FRAME = QuestionFrame(
+    "<|im_start|>user\n<|vision_start|>", "<|vision_end|>", "<|im_start|>user\n", "<|im_end|>\nSay: "
+)
 PAD = ID["<|image_pad|>"]
 
 

@@ -95,7 +95,7 @@ def test_statistics_of_an_adapters_folder_count_over_those_of_its_base(tmp_path:
 @pytest.mark.parametrize("family", list(DEFAULTS))
 def test_the_default_checkpoint_alone_has_default_units(family: str) -> None:
     entry = find_family(family)
-    assert entry.of_default == DEFAULTS[family]
+    assert entry.checkpoints.of_default == DEFAULTS[family]
     released = entry.check(random_weights=True, fetch=False, device="cpu")
     assert released.items() >= DEFAULTS[family].items()
     assert not entry.check("someone/fine-tune", random_weights=True, fetch=False).keys() & DEFAULTS[family].keys()
@@ -118,7 +118,7 @@ def test_the_plan_prints_whose_units_are_used(tmp_path: Path) -> None:
     assert "my_arm, from" in " ".join(result.output.split())
 
 
-ACTING = {name: writer for name, writer in WRITERS.items() if own_families()[name].acts}
+ACTING = {name: writer for name, writer in WRITERS.items() if own_families()[name].abilities.acts}
 MADE: dict[str, tuple[str, Callable[[Path], Path], dict[str, Any]]] = {
     **{name: (name, *arguments) for name, arguments in ACTING.items()},
     "groot of NVIDIA": ("groot", write_nvidias, {"embodiment": "libero_sim"}),

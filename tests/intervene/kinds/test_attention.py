@@ -24,7 +24,7 @@ from probe_kit.intervene import (
     AttentionReadout,
     AttentionShares,
     InterventionResult,
-    ReplaySource,
+    ReplayFiles,
     load_effects,
     run_intervention,
     stored_attention,
@@ -56,7 +56,7 @@ STEPS = 4
 
 
 @pytest.fixture(scope="module")
-def attention_records(copy: Run, source: ReplaySource, twin: "Policy") -> InterventionResult:
+def attention_records(copy: Run, source: ReplayFiles, twin: "Policy") -> InterventionResult:
     return run_intervention(copy, AttentionReadout(categories=("color",), items=2), source, load=lambda *_: twin)
 
 
@@ -268,7 +268,7 @@ def test_the_command_shows_a_table_json_and_csv(copy: Run, attention_records: In
 
 
 @pytest.mark.slow
-def test_along_the_whole_episode_every_call_is_noted(copy: Run, source: ReplaySource, twin: "Policy") -> None:
+def test_along_the_whole_episode_every_call_is_noted(copy: Run, source: ReplayFiles, twin: "Policy") -> None:
     intervention = AttentionReadout(categories=("shape",), items=1, roles=("language",), readout="per-step")
     effects = run_intervention(copy, intervention, source, load=lambda *_: twin)
     attended = AttentionShares.from_bytes(effects.read(ATTENTION_FILE))
@@ -281,7 +281,7 @@ def test_along_the_whole_episode_every_call_is_noted(copy: Run, source: ReplaySo
 
 @pytest.mark.slow
 def test_killed_and_resumed_gives_the_same_bytes_and_damage_is_found(
-    copy: Run, attention_records: InterventionResult, source: ReplaySource, twin: "Policy", tmp_path: Path
+    copy: Run, attention_records: InterventionResult, source: ReplayFiles, twin: "Policy", tmp_path: Path
 ) -> None:
     mine = open_run(shutil.copytree(copy.path, tmp_path / "run"))
     folder = mine.path / "interventions" / attention_records.key

@@ -13,7 +13,7 @@ from probe_kit.hooks import Policy, Site, gradients_at
 from probe_kit.intervene import (
     AttributionEffect,
     AttributionPatching,
-    ReplaySource,
+    ReplayFiles,
     load_effects,
     run_intervention,
 )
@@ -138,7 +138,7 @@ def test_what_cannot_be_screened_is_refused_with_what_to_do() -> None:
 
 
 def test_a_screen_is_stored_with_the_run_and_enters_no_verdict(
-    copy: Run, source: ReplaySource, twin: Policy
+    copy: Run, source: ReplayFiles, twin: Policy
 ) -> None:
     before = verdicts_of(copy)
     intervention = AttributionPatching(categories=("color",), items=1, sites=("kv.*", "backbone.01"))

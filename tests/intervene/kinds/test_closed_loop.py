@@ -16,7 +16,7 @@ from probe_kit.intervene import (
     ClosedLoopEffect,
     ConditionOutcomes,
     InterventionResult,
-    ReplaySource,
+    ReplayFiles,
     best_patch_targets,
     load_effects,
     run_intervention,
@@ -193,7 +193,7 @@ def run(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 
 @pytest.fixture(scope="module")
-def effects(run: Run, source: ReplaySource, twin: "Policy") -> InterventionResult:
+def effects(run: Run, source: ReplayFiles, twin: "Policy") -> InterventionResult:
     return run_intervention(run, ASKED, source, load=lambda *_: twin)
 
 
@@ -248,7 +248,7 @@ def test_it_is_stored_apart_from_other_kinds_and_read_back(run: Run, effects: In
 
 @pytest.mark.slow
 def test_another_outcome_stops_before_anything_is_stored(
-    run: Run, effects: InterventionResult, source: ReplaySource, twin: "Policy", tmp_path: Path
+    run: Run, effects: InterventionResult, source: ReplayFiles, twin: "Policy", tmp_path: Path
 ) -> None:
     assert effects
     other = open_run(shutil.copytree(run.path, tmp_path / "run"))
@@ -261,7 +261,7 @@ def test_another_outcome_stops_before_anything_is_stored(
 
 @pytest.mark.slow
 def test_killed_and_resumed_gives_the_same_bytes(
-    recorded_run: Run, source: ReplaySource, twin: "Policy", tmp_path: Path
+    recorded_run: Run, source: ReplayFiles, twin: "Policy", tmp_path: Path
 ) -> None:
     intervention = ClosedLoop(categories=("color",), items=2, targets=("backbone.02|image",))
     copies = [open_run(shutil.copytree(recorded_run.path, tmp_path / name)) for name in ("whole", "killed")]
@@ -283,7 +283,7 @@ def test_killed_and_resumed_gives_the_same_bytes(
 
 @pytest.mark.slow
 def test_every_inference_has_its_own_state_and_the_pictures_exchanged(
-    run: Run, source: ReplaySource, twin: "Policy"
+    run: Run, source: ReplayFiles, twin: "Policy"
 ) -> None:
     observations: list[tuple[Observation, Observation]] = []
 

@@ -17,7 +17,7 @@ from probe_kit.intervene import (
     ConceptErasure,
     ConditionOutcomes,
     InterventionResult,
-    ReplaySource,
+    ReplayFiles,
     load_effects,
     run_intervention,
     stored_image_swaps,
@@ -44,7 +44,7 @@ EPISODES = 12
 
 
 @pytest.fixture(scope="module")
-def effects(copy: Run, source: ReplaySource, twin: "Policy") -> InterventionResult:
+def effects(copy: Run, source: ReplayFiles, twin: "Policy") -> InterventionResult:
     return run_intervention(copy, ASKED, source, load=lambda *_: twin)
 
 
@@ -103,7 +103,7 @@ def test_it_is_stored_apart_from_other_kinds_and_read_back(copy: Run, effects: I
 
 @pytest.mark.slow
 def test_killed_and_resumed_gives_the_same_bytes(
-    copy: Run, effects: InterventionResult, source: ReplaySource, twin: "Policy", tmp_path: Path
+    copy: Run, effects: InterventionResult, source: ReplayFiles, twin: "Policy", tmp_path: Path
 ) -> None:
     mine = open_run(shutil.copytree(copy.path, tmp_path / "run"))
     folder = mine.path / "interventions" / effects.key

@@ -14,7 +14,7 @@ from probe_kit.intervene import (
     InstructionSwap,
     Interchange,
     InterventionResult,
-    ReplaySource,
+    ReplayFiles,
     load_effects,
     run_intervention,
 )
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 @pytest.fixture(scope="module")
-def worded(copy: Run, source: ReplaySource, twin: "Policy") -> InterventionResult:
+def worded(copy: Run, source: ReplayFiles, twin: "Policy") -> InterventionResult:
     return run_intervention(copy, InstructionSwap(categories=("color",), items=2), source, load=lambda *_: twin)
 
 
@@ -101,7 +101,7 @@ def test_a_family_whose_inference_is_one_action_is_marked(worded: InterventionRe
 
 @pytest.mark.slow
 def test_what_every_block_hands_over_is_a_place_and_all_of_it_is_the_exchange(
-    copy: Run, source: ReplaySource, twin: "Policy"
+    copy: Run, source: ReplayFiles, twin: "Policy"
 ) -> None:
     intervention = Interchange(categories=("color",), items=1, sites=("kv.*",), roles=("all", "image", "language"))
     effects = run_intervention(copy, intervention, source, load=lambda *_: twin)
@@ -134,7 +134,7 @@ def test_a_memory_has_the_backbones_roles_and_no_layer_behind_its_last_block(
 
 
 def test_a_family_without_a_memory_is_refused_before_anything_is_loaded(
-    copy: Run, source: ReplaySource, monkeypatch: pytest.MonkeyPatch
+    copy: Run, source: ReplayFiles, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(type(copy), "model", "internvla-m1")
 

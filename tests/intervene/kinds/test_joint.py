@@ -9,7 +9,7 @@ import pytest
 from probe_kit._terminal.console import out
 from probe_kit.errors import UnsupportedInterventionError, UsageError
 from probe_kit.hooks.contract.declared import Interventions
-from probe_kit.intervene import Interchange, InterventionResult, ReplaySource, run_intervention
+from probe_kit.intervene import Interchange, InterventionResult, ReplayFiles, run_intervention
 from probe_kit.intervene.inventory import listed_interventions
 from probe_kit.intervene.kinds.interchange import localised_by_category, stored_site_effects
 from probe_kit.intervene.kinds.joint import JointPlaces, stored_joint_places
@@ -83,14 +83,14 @@ SITES, ROLES = ("kv.00", "kv.01"), ("image", "language")
 
 
 @pytest.fixture(scope="module")
-def result(copy: Run, source: ReplaySource, twin: "Policy") -> InterventionResult:
+def result(copy: Run, source: ReplayFiles, twin: "Policy") -> InterventionResult:
     intervention = JointPlaces(categories=("color",), items=2, sites=SITES, roles=ROLES)
     return run_intervention(copy, intervention, source, load=lambda *_: twin)
 
 
 @pytest.mark.slow
 def test_one_cell_alone_is_the_interchange_at_its_place_bit_for_bit(
-    copy: Run, source: ReplaySource, twin: "Policy", result: InterventionResult
+    copy: Run, source: ReplayFiles, twin: "Policy", result: InterventionResult
 ) -> None:
     intervention = Interchange(categories=("color",), items=2, sites=SITES, roles=ROLES)
     singly = run_intervention(copy, intervention, source, load=lambda *_: twin).outcomes
@@ -127,7 +127,7 @@ def test_it_is_stored_listed_and_shown(copy: Run, result: InterventionResult) ->
 
 @pytest.mark.slow
 def test_heads_of_one_block_are_cells_and_no_search_of_the_backbone(
-    copy: Run, source: ReplaySource, twin: "Policy"
+    copy: Run, source: ReplayFiles, twin: "Policy"
 ) -> None:
     selection = {"categories": ("color",), "items": 1, "roles": ("image",)}
     heads = ("backbone.01.heads.2", "backbone.01.heads.3")
@@ -149,7 +149,7 @@ def test_heads_of_one_block_are_cells_and_no_search_of_the_backbone(
     )
 
 
-def test_heads_of_two_blocks_come_one_after_the_other(copy: Run, source: ReplaySource, twin: "Policy") -> None:
+def test_heads_of_two_blocks_come_one_after_the_other(copy: Run, source: ReplayFiles, twin: "Policy") -> None:
     intervention = JointPlaces(categories=("color",), items=1, sites=("backbone.*.heads.*",), roles=("image",))
     with pytest.raises(UsageError, match=r"come one after the other.*backbone\.02\.heads\.\*"):
         run_intervention(copy, intervention, source, load=lambda *_: twin)

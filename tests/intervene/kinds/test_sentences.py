@@ -15,7 +15,7 @@ from probe_kit.intervene.kinds.attribution import AttributionPatching
 from probe_kit.intervene.kinds.base import Intervention
 from probe_kit.intervene.kinds.closed_loop import ClosedLoop, ClosedLoopEffect
 from probe_kit.intervene.kinds.erase import ConceptErasure, ErasureEffect
-from probe_kit.intervene.kinds.image_swap import Finding, ImageSwap, ImageSwapEffect, InputEffect, input_effect
+from probe_kit.intervene.kinds.image_swap import ImageSwap, ImageSwapEffect, InputEffect, SwapFinding, input_effect
 from probe_kit.intervene.kinds.instruction_swap import InstructionSwap
 from probe_kit.intervene.kinds.interchange import Interchange, PatchEffect, unit_of_doses
 from probe_kit.intervene.kinds.joint import EVERY, MINIMAL, JointEffect, JointPlaces
@@ -209,7 +209,7 @@ def test_joint_places_say_where_the_answer_is_read_or_that_this_is_open() -> Non
     assert JointPlaces.sentences([every], context(None)) == ["Color: where the answer is read remains open."]
 
 
-def input_row(changed: float, share: float | None, finding: Finding) -> InputEffect:
+def input_row(changed: float, share: float | None, finding: SwapFinding) -> InputEffect:
     return InputEffect(
         category="public-info", vary="picture.wrist", n_episodes=12, n_items=6, n_groups=6, changed=changed,
         size=1.0, control_size=0.1, full_size=1.0, share=share, share_ci=None, p=0.01, finding=finding,

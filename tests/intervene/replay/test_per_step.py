@@ -14,7 +14,7 @@ from probe_kit.intervene import (
     ImageSwap,
     Interchange,
     InterventionResult,
-    ReplaySource,
+    ReplayFiles,
     run_intervention,
 )
 from probe_kit.intervene.open_session import open_session
@@ -33,7 +33,7 @@ EPISODES, STEPS = 2, 4
 
 @pytest.fixture(scope="module")
 def effects(copy: Run, small_suite: Suite, twin: "Policy") -> InterventionResult:
-    return run_intervention(copy, ASKED, ReplaySource(small_suite.folder), load=lambda *_: twin)
+    return run_intervention(copy, ASKED, ReplayFiles(small_suite.folder), load=lambda *_: twin)
 
 
 @pytest.mark.slow
@@ -42,7 +42,7 @@ def test_the_plain_condition_is_the_sum_of_what_the_run_commanded(
 ) -> None:
     assert effects.certificate["replay"]["equal"] == EPISODES
     clean_by_episode = dict(zip(effects.outcomes.episodes, effects.outcomes.of("clean"), strict=True))
-    with open_session(copy, ReplaySource(small_suite.folder), lambda *_: twin) as session:
+    with open_session(copy, ReplayFiles(small_suite.folder), lambda *_: twin) as session:
         for row, name in enumerate(copy.episodes["episode_id"]):
             if name not in clean_by_episode:
                 continue

@@ -7,7 +7,7 @@ import pytest
 
 from probe_kit.errors import UsageError
 from probe_kit.hooks import Site, capture
-from probe_kit.intervene import ClosedLoop, Interchange, ReplaySource, Steering, run_intervention
+from probe_kit.intervene import ClosedLoop, Interchange, ReplayFiles, Steering, run_intervention
 from probe_kit.intervene.directions import (
     Directions,
     TokenFeatures,
@@ -133,7 +133,7 @@ def test_they_are_the_leading_differences_of_class_means_of_the_other_folds(
 
 
 def test_tokens_are_taken_over_along_them_and_along_controls(
-    copy: Run, source: ReplaySource, twin: "Policy"
+    copy: Run, source: ReplayFiles, twin: "Policy"
 ) -> None:
     intervention = Interchange(
         categories=("color",), items=2, sites=("backbone.02",), roles=("image",), direction="mean-difference:2",
@@ -184,7 +184,7 @@ def test_a_dose_of_two_takes_the_marks_from_one_half_of_the_tokens_to_the_other(
 
 
 def test_steering_along_directions_of_tokens_moves_them_as_far_as_its_control(
-    copy: Run, source: ReplaySource, twin: "Policy"
+    copy: Run, source: ReplayFiles, twin: "Policy"
 ) -> None:
     intervention = Steering(
         categories=("color",), items=2, sites=("backbone.02",), role="image", direction="mean-difference:1",

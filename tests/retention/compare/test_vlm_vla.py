@@ -213,7 +213,7 @@ def test_every_format_shows_answers_sizes_and_gaps(runs: list[SaidRun], tmp_path
     assert [cells[:2] for cells in sizes.texts] == [("qwen3-vl", "p1"), ("qwen3-vl", "seen")]
 
 
-GROWN = {name: family for name, family in own_families().items() if family.source_weights is not None}
+GROWN = {name: family for name, family in own_families().items() if family.checkpoints.source_weights is not None}
 RIGHT = {"color": np.random.default_rng(0).random((12, 2)) < 0.7}
 
 
@@ -302,13 +302,15 @@ def test_the_early_policy_holds_the_weights_that_its_family_declares() -> None:
 @pytest.mark.parametrize("name", GROWN)
 def test_the_declared_source_is_a_released_size_of_its_family(name: str) -> None:
     family = GROWN[name]
-    source, declared = find_family(str(family.source)), family.source_weights
+    source, declared = find_family(str(family.checkpoints.source)), family.checkpoints.source_weights
     assert declared is not None
-    if source.full_size is None:
+    if source.checkpoints.full_size is None:
         assert asdict(declared)["sha256"] == load_model(source.name).card.weights_sha256
         assert declared.parameters == load_model(source.name).card.parameters
         return
-    sizes = {checkpoint: size for size, checkpoint in source.sizes} or {source.default_checkpoint: None}
+    sizes = {checkpoint: size for size, checkpoint in source.checkpoints.sizes} or {
+        source.default_checkpoint: None
+    }
     size = sizes[declared.checkpoint]
     network = source.function("full_size")(*([] if size is None else [size]))
     assert sum(parameter.numel() for parameter in network.parameters()) == declared.parameters

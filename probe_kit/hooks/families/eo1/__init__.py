@@ -3,6 +3,7 @@
 from probe_kit.hooks.contract.declared import Interventions, backbone, expert
 from probe_kit.hooks.contract.sites import QUANTITIES
 from probe_kit.hooks.families.shared.kinds import MERGED, lerobot_family
+from probe_kit.hooks.family_parts import Abilities, Checkpoints, Requirements
 
 INTERVENTIONS = Interventions(
     edits={"backbone": QUANTITIES, "expert": QUANTITIES},
@@ -31,14 +32,16 @@ FAMILIES = (
             "A checkpoint in lerobot's layout, with the configuration of its Qwen2.5-VL in config.json; the "
             "processor's files lie beside it or come from the repository that policy_preprocessor.json names"
         ),
-        needs_checkpoint=True,
-        parameters={"": 3_771_607_072},
-        declared={
-            "": (
-                backbone(37, 2048, 160, "state", camera="image"),
-                expert(37, 2048, 10, 8, ("action",)),
-            )
-        },
-        interventions=INTERVENTIONS,
+        requirements=Requirements(needs_checkpoint=True),
+        checkpoints=Checkpoints(
+            parameters={"": 3_771_607_072},
+            declared={
+                "": (
+                    backbone(37, 2048, 160, "state", camera="image"),
+                    expert(37, 2048, 10, 8, ("action",)),
+                )
+            },
+        ),
+        abilities=Abilities(interventions=INTERVENTIONS),
     ),
 )

@@ -20,7 +20,7 @@ from probe_kit.errors import UsageError
 from probe_kit.hooks.families.groot import BRIDGE, INTERVENTIONS
 from probe_kit.hooks.families.groot.network import (
     GrootChoice,
-    Places,
+    PartFolders,
     build_groot,
     check_version,
     flow_actions,
@@ -28,7 +28,7 @@ from probe_kit.hooks.families.groot.network import (
     network_config,
     nvidias_config,
 )
-from probe_kit.hooks.families.groot.packing import NvidiasPictures, Packing, Steps, lerobots_rule, read_steps
+from probe_kit.hooks.families.groot.packing import GrootPacking, NvidiasPictures, Steps, lerobots_rule, read_steps
 from probe_kit.hooks.families.groot.units import action_units, state_units
 from probe_kit.hooks.families.shared.kinds import IMAGES
 from probe_kit.hooks.families.shared.lerobot.flow import PackedPolicy
@@ -117,7 +117,7 @@ class Groot(PackedPolicy):
             config = super().parse_config(folder, evaluation)
             config.unread_pictures = _without_unread_views(config, folder)
         config.resize, config.letterbox = evaluation.resize, evaluation.letterbox
-        config.places = Places.of(folder, config.base_model_path, evaluation.vlm)
+        config.places = PartFolders.of(folder, config.base_model_path, evaluation.vlm)
         return config
 
     @classmethod
@@ -215,9 +215,9 @@ class Groot(PackedPolicy):
     # -- the prompt --------------------------------------------------------------------------------------
 
     @cached_property
-    def packing(self) -> Packing:
+    def packing(self) -> GrootPacking:
         """The packing of lerobot."""
-        return Packing(self._steps, self.config.places.vlm)
+        return GrootPacking(self._steps, self.config.places.vlm)
 
     def suffix_labels(self) -> list[str]:
         """Return the labels of the state, then of the network's whole horizon."""

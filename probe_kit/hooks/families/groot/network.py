@@ -155,7 +155,7 @@ class GrootChoice(Evaluation):
 
 
 @dataclass(frozen=True)
-class Places:
+class PartFolders:
     """The folders of a checkpoint's parts.
 
     Attributes:
@@ -171,7 +171,7 @@ class Places:
     model_name: str
 
     @classmethod
-    def of(cls, folder: Path, base: str, vlm: str | None) -> "Places":
+    def of(cls, folder: Path, base: str, vlm: str | None) -> "PartFolders":
         """Find the parts of a checkpoint.
 
         Args:

@@ -411,7 +411,7 @@ def _select_steps(steps: Sequence[Any], source: str) -> Steps:
     return Steps(pack, encode, decode, source)
 
 
-class Packing:
+class GrootPacking:
     """The packing of lerobot: pictures, words and state become the inputs of the network."""
 
     def __init__(self, steps: Steps, vlm: Path) -> None:

@@ -10,7 +10,7 @@ from probe_kit.errors import UsageError
 from probe_kit.hooks.families.shared.loading import Loaded, Recipe
 from probe_kit.hooks.families.shared.qwen import ASSISTANT, USER
 from probe_kit.hooks.families.shared.taps import TOWER, Stack
-from probe_kit.hooks.families.shared.text import Frame
+from probe_kit.hooks.families.shared.text import QuestionFrame
 from probe_kit.hooks.families.shared.vlm import Pictures, VisionLanguageModel
 from probe_kit.models.internvl import FILE_NAMES, TiledPictures, build_internvl
 
@@ -21,7 +21,7 @@ class InternVL(VisionLanguageModel):
     """A loaded InternVL; its option `tiles` is `auto`, which cuts pictures as released, or `1`, one for each."""
 
     family: ClassVar[str] = "internvl"
-    frame: ClassVar[Frame] = Frame(f"{USER}<img>", "</img>\n", USER, ASSISTANT)
+    frame: ClassVar[QuestionFrame] = QuestionFrame(f"{USER}<img>", "</img>\n", USER, ASSISTANT)
     recipe: ClassVar[Recipe] = Recipe(InternVLConfig.from_dict, build_internvl, FILE_NAMES)
     picture_token: ClassVar[str | None] = "<IMG_CONTEXT>"
 

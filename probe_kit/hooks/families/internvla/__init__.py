@@ -20,6 +20,7 @@ from probe_kit.hooks.contract.sites import QUANTITIES, Stream
 from probe_kit.hooks.families.shared.action_statistics import ActionStatistics
 from probe_kit.hooks.families.shared.kinds import MERGED
 from probe_kit.hooks.family import Family
+from probe_kit.hooks.family_parts import Abilities, Checkpoints
 
 _UNCONDITIONAL = "action expert without condition"
 _HEAD = ("condition", "action")
@@ -48,25 +49,6 @@ FAMILIES = (
         "probe_kit.hooks.families.internvla.adapter:load_internvla",
         embodiment="as the data set of -M unnorm_key; bridge_dataset: WidowX end-effector delta at 5 Hz",
         notes="MIT, Qwen research licence; a .pt file; tokenizer and configuration of Qwen/Qwen2.5-VL-3B-Instruct",
-        outputs="probe_kit.hooks.families.internvla.adapter:internvla_outputs",
-        source="qwen2.5-vl",
-        source_weights=SourceWeights("Qwen/Qwen2.5-VL-3B-Instruct", parameters=3_754_622_976),
-        units="probe_kit.hooks.families.internvla.adapter:internvla_units",
-        of_default={"unnorm_key": "bridge_dataset"},
-        declared={
-            "": (
-                backbone(37, 2048, 130),
-                DeclaredStream(Stream("bridge", 2, 768, part="bridge", quantities=_BLOCK), 64, ("query",)),
-                expert(13, 768, 10, 80, _HEAD),
-                expert(13, 768, 10, 80, _HEAD, name="expert_unconditional", label=_UNCONDITIONAL, probed=False),
-            )
-        },
-        full_size="probe_kit.models.internvla:full_size_internvla",
-        parameters={"": 3_872_703_111},
-        hub=(
-            ("InternRobotics/InternVLA-M1-Pretrain-RT-1-Bridge", "config.yaml"),
-            ("Qwen/Qwen2.5-VL-3B-Instruct", "tokenizer.json"),
-        ),
         options=(
             Option("unnorm_key", str, "Data set whose units the actions get.", "the only one"),
             Option("steps", int, "DDIM steps; as many as divide the training's evenly.", "10"),
@@ -92,7 +74,32 @@ FAMILIES = (
                 unmatched=(OWN_SEEDS,),
             )
         },
-        interventions=INTERVENTIONS,
+        abilities=Abilities(
+            outputs="probe_kit.hooks.families.internvla.adapter:internvla_outputs",
+            units="probe_kit.hooks.families.internvla.adapter:internvla_units",
+            interventions=INTERVENTIONS,
+        ),
+        checkpoints=Checkpoints(
+            source="qwen2.5-vl",
+            source_weights=SourceWeights("Qwen/Qwen2.5-VL-3B-Instruct", parameters=3_754_622_976),
+            of_default={"unnorm_key": "bridge_dataset"},
+            declared={
+                "": (
+                    backbone(37, 2048, 130),
+                    DeclaredStream(Stream("bridge", 2, 768, part="bridge", quantities=_BLOCK), 64, ("query",)),
+                    expert(13, 768, 10, 80, _HEAD),
+                    expert(
+                        13, 768, 10, 80, _HEAD, name="expert_unconditional", label=_UNCONDITIONAL, probed=False
+                    ),
+                )
+            },
+            full_size="probe_kit.models.internvla:full_size_internvla",
+            parameters={"": 3_872_703_111},
+            hub=(
+                ("InternRobotics/InternVLA-M1-Pretrain-RT-1-Bridge", "config.yaml"),
+                ("Qwen/Qwen2.5-VL-3B-Instruct", "tokenizer.json"),
+            ),
+        ),
     ),
 )
 

@@ -3,6 +3,7 @@
 from probe_kit.hooks.contract.declared import ACT2ANSWER, OWN_SEEDS, Option, ProtocolRow, backbone, chosen_tokens
 from probe_kit.hooks.families.shared.kinds import MAPS
 from probe_kit.hooks.family import Family
+from probe_kit.hooks.family_parts import Abilities, Checkpoints, Requirements
 
 FAMILIES = (
     Family(
@@ -11,15 +12,7 @@ FAMILIES = (
         "microsoft/Magma-8B",
         "probe_kit.hooks.families.magma.adapter:load_magma",
         embodiment="as the data set of -M unnorm_key; bridge_orig: WidowX end-effector delta at 5 Hz",
-        packages=(("timm", "magma"),),
         notes="MIT, Llama 3 licence; extra magma; about 18 GB in bfloat16",
-        outputs="probe_kit.hooks.families.magma.adapter:magma_outputs",
-        words="probe_kit.hooks.families.magma.adapter:check_magma_words",
-        units="probe_kit.hooks.families.magma.adapter:magma_units",
-        of_default={"unnorm_key": "bridge_orig"},
-        declared={"": (backbone(33, 4096, 320, "separator"), chosen_tokens("action", 33, 4096, 7))},
-        full_size="probe_kit.models.magma:full_size_magma",
-        parameters={"": 8_903_549_824},
         options=(
             Option("unnorm_key", str, "Data set whose units the actions get.", "the only one"),
             Option(
@@ -59,11 +52,23 @@ FAMILIES = (
                 ),
             )
         },
-        reads=True,
-        unstored=(
-            "vision_tower.clip_vision_model.head.",
-            "vision_tower.clip_vision_model.trunk.head.",
+        requirements=Requirements(packages=(("timm", "magma"),)),
+        abilities=Abilities(
+            outputs="probe_kit.hooks.families.magma.adapter:magma_outputs",
+            words="probe_kit.hooks.families.magma.adapter:check_magma_words",
+            units="probe_kit.hooks.families.magma.adapter:magma_units",
+            reads=True,
+            interventions=MAPS,
         ),
-        interventions=MAPS,
+        checkpoints=Checkpoints(
+            of_default={"unnorm_key": "bridge_orig"},
+            declared={"": (backbone(33, 4096, 320, "separator"), chosen_tokens("action", 33, 4096, 7))},
+            full_size="probe_kit.models.magma:full_size_magma",
+            parameters={"": 8_903_549_824},
+            unstored=(
+                "vision_tower.clip_vision_model.head.",
+                "vision_tower.clip_vision_model.trunk.head.",
+            ),
+        ),
     ),
 )

@@ -58,7 +58,7 @@ from probe_kit.models.magma import (
     Grid,
     MagmaConfig,
     MagmaNetwork,
-    Picture,
+    MagmaPicture,
     PictureSettings,
     PictureSpan,
     choose_grid,
@@ -173,7 +173,7 @@ class Magma(TokenDecoder, Policy, SpeakingModel):
         """The question with which the model acts on an instruction."""
         return self.text.prompt(ACTION_QUESTION.format(instruction=instruction))
 
-    def picture(self, image: NDArray[np.uint8]) -> Picture:
+    def picture(self, image: NDArray[np.uint8]) -> MagmaPicture:
         """Return the crops of a (H, W, 3) uint8 picture.
 
         Raises:
@@ -190,7 +190,7 @@ class Magma(TokenDecoder, Policy, SpeakingModel):
     # -- running -----------------------------------------------------------------------------------------
 
     def generate(
-        self, prompts: Sequence[Sequence[int]], pictures: Sequence[Picture] | None, choose: Choose = greedy
+        self, prompts: Sequence[Sequence[int]], pictures: Sequence[MagmaPicture] | None, choose: Choose = greedy
     ) -> Decoded:
         """Return seven tokens behind every prompt; one inference, as `capture` counts it.
 
@@ -483,11 +483,11 @@ class _Reference:
         self.prompt: list[int] = recorded["input_ids"].ravel().tolist()
 
     @cached_property
-    def first(self) -> tuple[Picture, Decoded, ActivationCache]:
+    def first(self) -> tuple[MagmaPicture, Decoded, ActivationCache]:
         """The first picture and the recorded prompt, through the adapter."""
         return self._run(self.recorded["image1_uint8"])
 
-    def _run(self, image: NDArray[np.uint8]) -> tuple[Picture, Decoded, ActivationCache]:
+    def _run(self, image: NDArray[np.uint8]) -> tuple[MagmaPicture, Decoded, ActivationCache]:
         picture = self.model.picture(image)
         decoded, activations, _ = watch(
             self.model, lambda: self.model.generate([self.prompt], [picture], self._choose)
@@ -495,7 +495,7 @@ class _Reference:
         return picture, decoded, activations
 
     @cached_property
-    def second(self) -> tuple[Picture, dict[str, Produce]]:
+    def second(self) -> tuple[MagmaPicture, dict[str, Produce]]:
         """The second picture, and what comes of it and the prompt."""
         picture, decoded, activations = self._run(self.recorded["image2_uint8"])
         return picture, generation_outputs(self.model, "action", activations, decoded)
@@ -592,13 +592,13 @@ class _Reference:
         return [row[is_token].tolist() for row, is_token in zip(ids, mask, strict=True)]
 
     @cached_property
-    def _batch_pictures(self) -> list[Picture]:
+    def _batch_pictures(self) -> list[MagmaPicture]:
         pictures = []
         for crops, size in zip(
             self.recorded["batch_pixel_values"], self.recorded["batch_image_sizes"][:, 0].tolist(), strict=True
         ):
             grid = Grid(*size)
-            pictures.append(Picture(torch.from_numpy(crops[: grid.rows * grid.columns]), grid))
+            pictures.append(MagmaPicture(torch.from_numpy(crops[: grid.rows * grid.columns]), grid))
         return pictures
 
     @property
@@ -631,5 +631,5 @@ class _Reference:
         }
 
 
-def _sizes(picture: Picture) -> NDArray[np.int64]:
+def _sizes(picture: MagmaPicture) -> NDArray[np.int64]:
     return np.array([[[picture.grid.rows, picture.grid.columns]]])

@@ -5,6 +5,7 @@ from dataclasses import replace
 from probe_kit.hooks.contract.declared import backbone, expert
 from probe_kit.hooks.contract.sites import QUANTITIES
 from probe_kit.hooks.families.shared.kinds import FLOW, MERGED, lerobot_family
+from probe_kit.hooks.family_parts import Abilities, Checkpoints
 
 EXPERT = ("residual", "attention", "cross_attention", "mlp", "final_norm")
 LAYERWISE = replace(
@@ -28,19 +29,21 @@ FAMILIES = (
         "allenai/MolmoAct2-LIBERO-LeRobot",
         "molmoact2.adapter:MolmoAct2",
         embodiment="LIBERO end-effector delta; other fine-tunes in lerobot's layout as --checkpoint",
-        hub=(("allenai/MolmoAct2-LIBERO", "tokenizer.json"),),
         notes=(
             "A checkpoint names a second one, whose configuration and tokenizer are fetched, not its weights. 5.4 "
             "billion parameters, 11 GB in bfloat16; lerobot measured 12 GiB. Acts by its flow expert; discrete "
             "actions are refused. CUDA graphs are off"
         ),
-        parameters={"": 5_442_196_208},
-        declared={
-            "": (
-                backbone(37, 2560, 310, "state", camera="image"),
-                expert(37, 768, 10, 30, ("action",), quantities=EXPERT, sums=False),
-            )
-        },
-        interventions=LAYERWISE,
+        checkpoints=Checkpoints(
+            hub=(("allenai/MolmoAct2-LIBERO", "tokenizer.json"),),
+            parameters={"": 5_442_196_208},
+            declared={
+                "": (
+                    backbone(37, 2560, 310, "state", camera="image"),
+                    expert(37, 768, 10, 30, ("action",), quantities=EXPERT, sums=False),
+                )
+            },
+        ),
+        abilities=Abilities(interventions=LAYERWISE),
     ),
 )

@@ -37,7 +37,13 @@ from probe_kit.hooks.checkpoints.folders import inside_or_hub
 from probe_kit.hooks.contract.model import Tap
 from probe_kit.hooks.contract.sites import Site, kv_stream
 from probe_kit.hooks.families.molmoact2 import EXPERT, LAYERWISE
-from probe_kit.hooks.families.molmoact2.packing import STEPS, FramedUnits, Packing, in_packed_order, read_steps
+from probe_kit.hooks.families.molmoact2.packing import (
+    STEPS,
+    FramedUnits,
+    MolmoActPacking,
+    in_packed_order,
+    read_steps,
+)
 from probe_kit.hooks.families.shared.lerobot.flow import PackedPolicy
 from probe_kit.hooks.families.shared.lerobot.pipelines import Inert
 from probe_kit.hooks.families.shared.lerobot.policy import checked_steps
@@ -370,9 +376,9 @@ class MolmoAct2(PackedPolicy):
     # -- the prompt --------------------------------------------------------------------------------------
 
     @cached_property
-    def packing(self) -> Packing:
+    def packing(self) -> MolmoActPacking:
         """The packing of lerobot."""
-        return Packing(self.config, self._action_numbers)
+        return MolmoActPacking(self.config, self._action_numbers)
 
     # -- capture -----------------------------------------------------------------------------------------
 

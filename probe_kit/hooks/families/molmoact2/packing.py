@@ -179,7 +179,7 @@ _TEXT = ("input_ids", "attention_mask", "token_type_ids")
 _PICTURES = ("pixel_values", "image_token_pooling", "image_grids", "image_num_crops")
 
 
-class Packing:
+class MolmoActPacking:
     """The packing of lerobot: pictures, words and state become the inputs of the network."""
 
     def __init__(self, config: Any, actions: int) -> None:

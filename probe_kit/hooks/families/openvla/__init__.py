@@ -4,6 +4,7 @@ from probe_kit.hooks.contract.declared import ACT2ANSWER, OWN_SEEDS, Option, Pro
 from probe_kit.hooks.families.prismatic import BITS, TOKENIZER
 from probe_kit.hooks.families.shared.kinds import TOKENS
 from probe_kit.hooks.family import Family
+from probe_kit.hooks.family_parts import Abilities, Checkpoints, Requirements
 
 BRIDGE = "bridge_orig"
 """The data set of the WidowX arm that Act2Answer imitates."""
@@ -30,17 +31,7 @@ FAMILIES = (
         "openvla/openvla-7b",
         "probe_kit.hooks.families.openvla.adapter:load_openvla",
         embodiment="as the data set of -M unnorm_key; bridge_orig: WidowX end-effector delta at 5 Hz",
-        packages=(("timm", "openvla"),),
         notes="MIT, Llama 2 licence; extra openvla; about 16 GB in bfloat16",
-        outputs="probe_kit.hooks.families.openvla.adapter:openvla_outputs",
-        config_types=("openvla", "prismatic"),
-        source="prismatic",
-        words="probe_kit.hooks.families.openvla.adapter:check_openvla_words",
-        units="probe_kit.hooks.families.openvla.adapter:openvla_units",
-        of_default={"unnorm_key": BRIDGE},
-        declared={"": (backbone(33, 4096, 275), chosen_tokens("action", 33, 4096, 7))},
-        full_size="probe_kit.models.prismatic:full_size_openvla",
-        parameters={"": 7_541_237_184},
         options=(
             Option("unnorm_key", str, "Data set whose units the actions get.", "the only one"),
             Option(
@@ -76,6 +67,20 @@ FAMILIES = (
                 _row("base", "openvla/openvla-7b", BRIDGE),
             )
         },
-        interventions=TOKENS,
+        requirements=Requirements(packages=(("timm", "openvla"),)),
+        abilities=Abilities(
+            outputs="probe_kit.hooks.families.openvla.adapter:openvla_outputs",
+            words="probe_kit.hooks.families.openvla.adapter:check_openvla_words",
+            units="probe_kit.hooks.families.openvla.adapter:openvla_units",
+            interventions=TOKENS,
+        ),
+        checkpoints=Checkpoints(
+            config_types=("openvla", "prismatic"),
+            source="prismatic",
+            of_default={"unnorm_key": BRIDGE},
+            declared={"": (backbone(33, 4096, 275), chosen_tokens("action", 33, 4096, 7))},
+            full_size="probe_kit.models.prismatic:full_size_openvla",
+            parameters={"": 7_541_237_184},
+        ),
     ),
 )

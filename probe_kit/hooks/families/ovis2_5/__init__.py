@@ -2,6 +2,7 @@
 
 from probe_kit.hooks.contract.declared import answering
 from probe_kit.hooks.families.shared.kinds import TOKENIZER_FOLDER, answering_family
+from probe_kit.hooks.family_parts import Checkpoints
 
 FAMILIES = (
     answering_family(
@@ -10,10 +11,12 @@ FAMILIES = (
         "AIDC-AI/Ovis2.5-9B",
         "ovis2_5.adapter:Ovis25.load",
         notes="asked without its thought; 18 GB in bfloat16",
-        config_types=("ovis2_5",),
-        declared={"": answering(37, 4096, 240)},
-        full_size="probe_kit.models.ovis2_5:full_size_ovis2_5",
-        parameters={"": 9_174_807_784},
         options=(TOKENIZER_FOLDER,),
+        checkpoints=Checkpoints(
+            config_types=("ovis2_5",),
+            declared={"": answering(37, 4096, 240)},
+            full_size="probe_kit.models.ovis2_5:full_size_ovis2_5",
+            parameters={"": 9_174_807_784},
+        ),
     ),
 )

@@ -13,7 +13,7 @@ from probe_kit.hooks.contract.model import Prompt
 from probe_kit.hooks.families.shared.loading import Recipe
 from probe_kit.hooks.families.shared.qwen import ASSISTANT, USER, ByPicture
 from probe_kit.hooks.families.shared.taps import NOTHING, TOWER, Stack
-from probe_kit.hooks.families.shared.text import Frame
+from probe_kit.hooks.families.shared.text import QuestionFrame
 from probe_kit.hooks.families.shared.vlm import Pictures, VisionLanguageModel
 from probe_kit.hooks.outputs import Produce, numpy_of
 from probe_kit.models.ovis2_5 import (
@@ -30,7 +30,7 @@ class Ovis25(ByPicture, VisionLanguageModel):
     """A loaded Ovis2.5."""
 
     family: ClassVar[str] = "ovis2.5"
-    frame: ClassVar[Frame] = Frame(USER, "\n", USER, f"{ASSISTANT}<think>\n\n</think>\n\n")
+    frame: ClassVar[QuestionFrame] = QuestionFrame(USER, "\n", USER, f"{ASSISTANT}<think>\n\n</think>\n\n")
     recipe: ClassVar[Recipe] = Recipe(OvisConfig.from_values, build_ovis2_5)
     marks: ClassVar[int] = 1
     stream_tolerance: ClassVar[float] = 1e-4  # pictures enter through a softmax over visual words

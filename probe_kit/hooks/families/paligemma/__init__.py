@@ -2,6 +2,7 @@
 
 from probe_kit.hooks.contract.declared import EMBEDDED, answering
 from probe_kit.hooks.families.shared.kinds import TOKENIZER_FOLDER, answering_family
+from probe_kit.hooks.family_parts import Abilities, Checkpoints
 
 FAMILIES = (
     answering_family(
@@ -11,9 +12,9 @@ FAMILIES = (
         "paligemma.adapter:load_vlm_tiny",
         streams="backbone 4 layers, answer 4 layers",
         notes="its words are those of the embedded suite and of the prompts of `probe-kit ask`; no others",
-        config_types=("paligemma",),
         home=EMBEDDED,
-        vocabulary="probe_kit.models.embedded.words",
+        checkpoints=Checkpoints(config_types=("paligemma",)),
+        abilities=Abilities(vocabulary="probe_kit.models.embedded.words"),
     ),
     answering_family(
         "paligemma",
@@ -21,11 +22,13 @@ FAMILIES = (
         "google/paligemma-3b-pt-224",
         "paligemma.adapter:PaliGemma.load",
         notes="Gemma licence, gated; pt, not mix: it was not trained to follow instructions; 5.9 GB in bfloat16",
-        config_types=("paligemma",),
-        declared={"": answering(19, 2048, 290)},
-        full_size="probe_kit.models.paligemma:full_size_paligemma",
-        parameters={"": 2_923_466_480},
-        stored_names="probe_kit.models.paligemma:FILE_NAMES",
         options=(TOKENIZER_FOLDER,),
+        checkpoints=Checkpoints(
+            config_types=("paligemma",),
+            declared={"": answering(19, 2048, 290)},
+            full_size="probe_kit.models.paligemma:full_size_paligemma",
+            parameters={"": 2_923_466_480},
+            stored_names="probe_kit.models.paligemma:FILE_NAMES",
+        ),
     ),
 )

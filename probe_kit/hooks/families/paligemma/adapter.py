@@ -11,7 +11,7 @@ from transformers import PaliGemmaConfig
 from probe_kit.hooks.contract.card import EMBEDDED
 from probe_kit.hooks.families.shared.loading import Recipe
 from probe_kit.hooks.families.shared.taps import TOWER, Stack
-from probe_kit.hooks.families.shared.text import Frame
+from probe_kit.hooks.families.shared.text import QuestionFrame
 from probe_kit.hooks.families.shared.vlm import Pictures, VisionLanguageModel
 from probe_kit.models.decoding import LeftPacked
 from probe_kit.models.embedded import embedded_checkpoint
@@ -24,7 +24,7 @@ class PaliGemma(VisionLanguageModel):
     """A loaded PaliGemma."""
 
     family: ClassVar[str] = "paligemma"
-    frame: ClassVar[Frame] = Frame("", "<bos>", "<bos>", "\n")
+    frame: ClassVar[QuestionFrame] = QuestionFrame("", "<bos>", "<bos>", "\n")
     recipe: ClassVar[Recipe] = Recipe(PaliGemmaConfig.from_dict, build_paligemma, FILE_NAMES)
     picture_token: ClassVar[str | None] = "<image>"
 

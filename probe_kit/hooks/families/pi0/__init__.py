@@ -12,6 +12,7 @@ from probe_kit.hooks.contract.declared import (
 )
 from probe_kit.hooks.families.shared.kinds import EVALUATION_OPTIONS, FLOW, lerobot_family
 from probe_kit.hooks.family import Family
+from probe_kit.hooks.family_parts import Abilities, Checkpoints
 
 _VLM_TINY = SourceWeights(
     sha256="77a4486bf2d356c1e11cfd2a7a0f835683dacf1a7864f714feef92cb19fa0650", parameters=658_944
@@ -27,13 +28,13 @@ def _embedded_family(name: str, summary: str, notes: str) -> Family:
         f"probe_kit.hooks.families.pi0.adapter:load_{name.replace('-', '_')}",
         streams="backbone 4 layers, expert 4 layers x 10 iterations",
         notes=notes,
-        outputs="probe_kit.hooks.families.shared.lerobot.outputs:lerobot_outputs",
-        config_types=("pi0",),
-        source="vlm-tiny",
-        source_weights=_VLM_TINY,
-        interventions=FLOW,
         home=EMBEDDED,
-        vocabulary="probe_kit.models.embedded.words",
+        abilities=Abilities(
+            outputs="probe_kit.hooks.families.shared.lerobot.outputs:lerobot_outputs",
+            interventions=FLOW,
+            vocabulary="probe_kit.models.embedded.words",
+        ),
+        checkpoints=Checkpoints(config_types=("pi0",), source="vlm-tiny", source_weights=_VLM_TINY),
     )
 
 
@@ -58,23 +59,11 @@ FAMILIES = (
         "pi0 (PaliGemma 3B + 300M flow-matching expert) through lerobot",
         "juexzz/INTACT-pi0-finetune-bridge",
         "pi0.adapter:Pi0",
-        full_size="probe_kit.models.pi0:full_size_pi0",
         embodiment="WidowX end-effector delta at 5 Hz; other fine-tunes as --checkpoint",
-        hub=(("google/paligemma-3b-pt-224", "tokenizer.json"),),
         notes=(
             "Gemma licence; tokenizer google/paligemma-3b-pt-224 is gated. lerobot/pi0_base acts in 32 unnamed "
             "dimensions: --checkpoint lerobot/pi0_base --no-act"
         ),
-        source="paligemma",
-        source_weights=SourceWeights("google/paligemma-3b-pt-224", parameters=2_923_466_480),
-        declared={
-            "": (
-                backbone(19, 2048, 304, camera="top"),
-                expert(19, 1024, 10, 5, ("state", "action")),
-            )
-        },
-        parameters={"": 4_028_019_472},
-        not_acting=("lerobot/pi0_base",),
         options=(
             *EVALUATION_OPTIONS,
             Option("unread", str, "Settings of config.json that change nothing, comma-separated.", "none"),
@@ -95,33 +84,49 @@ FAMILIES = (
                 ),
             )
         },
-        interventions=FLOW,
+        checkpoints=Checkpoints(
+            full_size="probe_kit.models.pi0:full_size_pi0",
+            hub=(("google/paligemma-3b-pt-224", "tokenizer.json"),),
+            source="paligemma",
+            source_weights=SourceWeights("google/paligemma-3b-pt-224", parameters=2_923_466_480),
+            declared={
+                "": (
+                    backbone(19, 2048, 304, camera="top"),
+                    expert(19, 1024, 10, 5, ("state", "action")),
+                )
+            },
+            parameters={"": 4_028_019_472},
+            not_acting=("lerobot/pi0_base",),
+        ),
+        abilities=Abilities(interventions=FLOW),
     ),
     lerobot_family(
         "pi05",
         "pi0.5 (PaliGemma 3B + 300M flow-matching expert with adaptive norms) through lerobot",
         "lerobot/pi05_base",
         "pi0.adapter:Pi05",
-        config_types=("pi05",),
-        full_size="probe_kit.models.pi0:full_size_pi05",
         embodiment="as fine-tuned; the base model acts in 32 unnamed dimensions",
-        hub=(("google/paligemma-3b-pt-224", "tokenizer.json"),),
         notes=(
             "Gemma licence; tokenizer google/paligemma-3b-pt-224 is gated. The base can be captured without "
             "acting (--no-act); to act it needs a fine-tune for end-effector deltas. The prompt holds the state "
             "as digits"
         ),
-        source="paligemma",
-        source_weights=SourceWeights("google/paligemma-3b-pt-224", parameters=2_923_466_480),
-        declared={
-            "": (
-                backbone(19, 2048, 968, "state", camera="base_0_rgb"),
-                expert(19, 1024, 10, 50, ("action",)),
-            )
-        },
-        parameters={"": 4_143_404_816},
-        not_acting=("lerobot/pi05_base",),
         options=EVALUATION_OPTIONS,
-        interventions=FLOW,
+        checkpoints=Checkpoints(
+            config_types=("pi05",),
+            full_size="probe_kit.models.pi0:full_size_pi05",
+            hub=(("google/paligemma-3b-pt-224", "tokenizer.json"),),
+            source="paligemma",
+            source_weights=SourceWeights("google/paligemma-3b-pt-224", parameters=2_923_466_480),
+            declared={
+                "": (
+                    backbone(19, 2048, 968, "state", camera="base_0_rgb"),
+                    expert(19, 1024, 10, 50, ("action",)),
+                )
+            },
+            parameters={"": 4_143_404_816},
+            not_acting=("lerobot/pi05_base",),
+        ),
+        abilities=Abilities(interventions=FLOW),
     ),
 )

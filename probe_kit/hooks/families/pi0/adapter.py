@@ -27,7 +27,7 @@ from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE, without_revision
 from probe_kit.hooks.contract.card import EMBEDDED
 from probe_kit.hooks.contract.model import Unembedding
 from probe_kit.hooks.contract.observation import ARM_NUMBERS, laid_out
-from probe_kit.hooks.families.shared.kinds import STATE, Picture
+from probe_kit.hooks.families.shared.kinds import STATE, PictureFit
 from probe_kit.hooks.families.shared.lerobot.flow import (
     GatelessNorm,
     LerobotFlow,
@@ -169,7 +169,7 @@ class Pi0(PaliGemmaPolicy, LerobotFlow):
         return None if source in (None, NO_STATISTICS) else StatisticsFile.read(str(source))
 
     @cached_property
-    def picture(self) -> Picture:
+    def picture(self) -> PictureFit:
         """The way pictures get their size: as requested, or as the checkpoint's layout implies."""
         if self.evaluation.picture is not None:
             return self.evaluation.picture

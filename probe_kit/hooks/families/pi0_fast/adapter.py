@@ -44,8 +44,8 @@ from probe_kit.hooks.contract.sites import Stream
 from probe_kit.hooks.families.pi0_fast import CAPTURED, FAST
 from probe_kit.hooks.families.shared.kinds import Evaluation
 from probe_kit.hooks.families.shared.lerobot.flow import GatelessNorm, PaliGemmaPolicy, StatePrompt, sizes_file
+from probe_kit.hooks.families.shared.lerobot.packing import MASK, TOKENS
 from probe_kit.hooks.families.shared.lerobot.pipelines import CROP
-from probe_kit.hooks.families.shared.lerobot.policy import MASK, TOKENS
 from probe_kit.hooks.families.shared.taps import (
     ALL_BUT_LAST,
     LAST,

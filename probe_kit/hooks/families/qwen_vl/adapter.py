@@ -6,7 +6,7 @@ from transformers import Qwen2_5_VLConfig, Qwen3VLConfig
 
 from probe_kit.hooks.families.shared.loading import Recipe
 from probe_kit.hooks.families.shared.qwen import SYSTEM, QwenVLM, qwen_frame
-from probe_kit.hooks.families.shared.text import Frame
+from probe_kit.hooks.families.shared.text import QuestionFrame
 from probe_kit.models.qwen import QWEN2_5_NAMES, build_qwen2_5_vl, build_qwen3_vl
 
 
@@ -14,7 +14,7 @@ class Qwen25VL(QwenVLM):
     """A loaded Qwen2.5-VL."""
 
     family: ClassVar[str] = "qwen2.5-vl"
-    frame: ClassVar[Frame] = qwen_frame(SYSTEM)
+    frame: ClassVar[QuestionFrame] = qwen_frame(SYSTEM)
     recipe: ClassVar[Recipe] = Recipe(Qwen2_5_VLConfig.from_dict, build_qwen2_5_vl, QWEN2_5_NAMES)
 
 
@@ -22,6 +22,6 @@ class Qwen3VL(QwenVLM):
     """A loaded Qwen3-VL."""
 
     family: ClassVar[str] = "qwen3-vl"
-    frame: ClassVar[Frame] = qwen_frame()
+    frame: ClassVar[QuestionFrame] = qwen_frame()
     recipe: ClassVar[Recipe] = Recipe(Qwen3VLConfig.from_dict, build_qwen3_vl)
     sums: ClassVar[bool] = False

@@ -9,6 +9,7 @@ from probe_kit.hooks.contract.declared import Interventions, Option
 from probe_kit.hooks.contract.observation import OPENNESS
 from probe_kit.hooks.contract.sites import QUANTITIES
 from probe_kit.hooks.family import Family
+from probe_kit.hooks.family_parts import Abilities, Checkpoints
 
 FLOW = Interventions(
     edits={"backbone": QUANTITIES, "expert": QUANTITIES},
@@ -47,10 +48,21 @@ MAPS = replace(
 """The interventions `TOKENS` without tiles, where a picture becomes maps of several crops."""
 
 _FAMILIES = "probe_kit.hooks.families"
+NO_CHECKPOINTS, NO_ABILITIES = Checkpoints(), Abilities()
+"""Declarations of a family that adds nothing to what its kind has."""
 TOKENIZER_FOLDER = Option("tokenizer", str, "Folder of another tokenizer.json.", "the checkpoint's", is_path=True)
 
 
-def lerobot_family(name: str, description: str, checkpoint: str | None, adapter: str, **fields: Any) -> Family:
+def lerobot_family(
+    name: str,
+    description: str,
+    checkpoint: str | None,
+    adapter: str,
+    *,
+    checkpoints: Checkpoints = NO_CHECKPOINTS,
+    abilities: Abilities = NO_ABILITIES,
+    **fields: Any,
+) -> Family:
     """Return the family of a policy of lerobot.
 
     Args:
@@ -58,19 +70,28 @@ def lerobot_family(name: str, description: str, checkpoint: str | None, adapter:
         description: One line about the family.
         checkpoint: Hub id of the default checkpoint; None for none.
         adapter: `folder.adapter:Class`; the folder is named as lerobot names the policy.
+        checkpoints: Its checkpoints; types of the configuration and `full_size` follow from the folder.
+        abilities: Its abilities; `outputs` and `words` are those of lerobot's policies.
         **fields: Further fields of `Family`.
     """
     kind, path = adapter.partition(".")[0], f"{_FAMILIES}.{adapter}"
-    shared = {
-        "outputs": f"{_FAMILIES}.shared.lerobot.outputs:lerobot_outputs",
-        "config_types": (kind,),
-        "words": f"{path}.check_words",
-        "full_size": f"{path.partition(':')[0]}:full_size_{kind}",
-    }
-    return Family(name, description, checkpoint, f"{path}.load", **{**shared, **fields})
+    full_size = checkpoints.full_size or f"{path.partition(':')[0]}:full_size_{kind}"
+    checkpoints = replace(checkpoints, config_types=checkpoints.config_types or (kind,), full_size=full_size)
+    outputs = abilities.outputs or f"{_FAMILIES}.shared.lerobot.outputs:lerobot_outputs"
+    abilities = replace(abilities, outputs=outputs, words=abilities.words or f"{path}.check_words")
+    fields = {"checkpoints": checkpoints, "abilities": abilities, **fields}
+    return Family(name, description, checkpoint, f"{path}.load", **fields)
 
 
-def answering_family(name: str, description: str, checkpoint: str | None, loader: str, **fields: Any) -> Family:
+def answering_family(
+    name: str,
+    description: str,
+    checkpoint: str | None,
+    loader: str,
+    *,
+    abilities: Abilities = NO_ABILITIES,
+    **fields: Any,
+) -> Family:
     """Return the family of a VLM that answers and does not act.
 
     Args:
@@ -78,15 +99,14 @@ def answering_family(name: str, description: str, checkpoint: str | None, loader
         description: One line about the family.
         checkpoint: Hub id of the default checkpoint; None for none.
         loader: `folder.adapter:function`, which loads the model.
+        abilities: Its abilities; it answers and does not act.
         **fields: Further fields of `Family`.
     """
-    shared = {
-        "embodiment": "none: answers, does not act",
-        "outputs": f"{_FAMILIES}.shared.vlm:vlm_outputs",
-        "acts": False,
-        "reads": True,
-    }
-    return Family(name, description, checkpoint, f"{_FAMILIES}.{loader}", **{**shared, **fields})
+    abilities = replace(
+        abilities, outputs=abilities.outputs or f"{_FAMILIES}.shared.vlm:vlm_outputs", acts=False, reads=True
+    )
+    fields = {"embodiment": "none: answers, does not act", "abilities": abilities, **fields}
+    return Family(name, description, checkpoint, f"{_FAMILIES}.{loader}", **fields)
 
 
 # -- names and evaluations of lerobot's policies --------------------------------------------------------------
@@ -125,8 +145,8 @@ def renamed_features(features: Iterable[str], renames: Mapping[str, str]) -> dic
     return by_name
 
 
-Picture = Literal["padded", "padded-top-left", "squashed"]
-PICTURES: tuple[Picture, ...] = ("padded", "padded-top-left", "squashed")
+PictureFit = Literal["padded", "padded-top-left", "squashed"]
+PICTURES: tuple[PictureFit, ...] = ("padded", "padded-top-left", "squashed")
 EVALUATION_OPTIONS = (
     Option(
         "statistics",
@@ -162,6 +182,6 @@ class Evaluation:
     """
 
     statistics: str | None = None
-    picture: Picture | None = None
+    picture: PictureFit | None = None
     openness: str = "measured"
     unread: str = ""

@@ -16,7 +16,7 @@ from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import IMAGE_ROLE, PADDING, Site, Stream
 from probe_kit.hooks.families.shared.loading import Loaded
 from probe_kit.hooks.families.shared.taps import TOWER, Stack, decoder_tap, kept_prompt
-from probe_kit.hooks.families.shared.text import Frame, TokenizerFile
+from probe_kit.hooks.families.shared.text import QuestionFrame, TokenizerFile
 from probe_kit.hooks.families.shared.vlm import Pictures, VisionLanguageModel
 from probe_kit.hooks.outputs import Arrays
 from probe_kit.models.decoding import LeftPacked
@@ -86,9 +86,9 @@ SYSTEM = "<|im_start|>system\nYou are a helpful assistant.<|im_end|>\n"
 USER, ASSISTANT = "<|im_start|>user\n", "<|im_end|>\n<|im_start|>assistant\n"
 
 
-def qwen_frame(system: str = "") -> Frame:
+def qwen_frame(system: str = "") -> QuestionFrame:
     """Return Qwen's chat of one turn, behind the `system` turn."""
-    return Frame(f"{system}{USER}<|vision_start|>", "<|vision_end|>", f"{system}{USER}", ASSISTANT)
+    return QuestionFrame(f"{system}{USER}<|vision_start|>", "<|vision_end|>", f"{system}{USER}", ASSISTANT)
 
 
 class QwenVLM(QwenVision, VisionLanguageModel):

@@ -177,7 +177,7 @@ def values_of(file: Path) -> dict[str, Any]:
 
 
 @dataclass(frozen=True)
-class Frame:
+class QuestionFrame:
     """The fixed strings around a question.
 
     Attributes:
@@ -223,12 +223,12 @@ class FramedText(TokenizerFile):
         ends: End tokens of an answer.
     """
 
-    frame: Frame
+    frame: QuestionFrame
     vocabulary: int
     ends: frozenset[int]
 
     @classmethod
-    def of(cls, folder: Path, frame: Frame, config: Any, generation: Path) -> "FramedText":
+    def of(cls, folder: Path, frame: QuestionFrame, config: Any, generation: Path) -> "FramedText":
         """Read the files in `folder`.
 
         Args:

@@ -29,7 +29,7 @@ from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import IMAGE_ROLE, PADDING, Site, Stream
 from probe_kit.hooks.families.shared.loading import Loaded, Recipe, load_vlm
 from probe_kit.hooks.families.shared.taps import ALL_BUT_LAST, ALL_TOKENS, LAST, Stack, decoder_tap
-from probe_kit.hooks.families.shared.text import Frame, FramedText, TokenPrompt
+from probe_kit.hooks.families.shared.text import FramedText, QuestionFrame, TokenPrompt
 from probe_kit.hooks.outputs import Arrays, Outputs, Produce, numpy_of, watch
 from probe_kit.models.decoding import Decoded, LeftPacked, positions
 
@@ -183,7 +183,7 @@ class VisionLanguageModel(SpeakingModel):
     family: ClassVar[str]
     recipe: ClassVar[Recipe]
     stream_tolerance: ClassVar[float] = 3e-5
-    frame: ClassVar[Frame]
+    frame: ClassVar[QuestionFrame]
     picture_token: ClassVar[str | None] = None
     """The token at the positions of a picture, if it is one of the tokenizer."""
     marks: ClassVar[int] = 0
@@ -436,7 +436,7 @@ def vlm_outputs(load: Callable[..., VisionLanguageModel], folder: Path, recorded
     """Ask the recorded questions; see `VisionLanguageModel.further_outputs` for quantities of a family."""
     model = load(str(folder / "checkpoint"), dtype="float32")
     questions = questions_of(folder, recorded, model)
-    produced = Reference(model, questions, recorded).produced()
+    produced = AnswerReference(model, questions, recorded).produced()
     produced = {**produced, **model.further_outputs(questions[0], produced)}
     return answer_outputs(produced, recorded, model.stream_tolerance)
 
@@ -494,7 +494,7 @@ def _question_between(text: str, model: VisionLanguageModel) -> str:
     return _PLACEHOLDER.split(body)[-1].lstrip("\n")
 
 
-class Reference:
+class AnswerReference:
     """The recorded questions, run through the adapter at the first request for a result of them."""
 
     def __init__(self, model: VisionLanguageModel, questions: Sequence[Prompt], recorded: Arrays) -> None:

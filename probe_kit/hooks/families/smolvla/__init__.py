@@ -2,6 +2,7 @@
 
 from probe_kit.hooks.contract.declared import backbone, expert
 from probe_kit.hooks.families.shared.kinds import FLOW, lerobot_family
+from probe_kit.hooks.family_parts import Abilities, Checkpoints, Requirements
 
 FAMILIES = (
     lerobot_family(
@@ -10,17 +11,19 @@ FAMILIES = (
         "lerobot/smolvla_base",
         "smolvla.adapter:SmolVLA",
         embodiment="as fine-tuned; the base model acts in SO-100 joint positions",
-        hub=(("HuggingFaceTB/SmolVLM2-500M-Video-Instruct", "tokenizer.json"),),
         notes=(
             "Apache-2.0; configuration and tokenizer of HuggingFaceTB/SmolVLM2-500M-Video-Instruct. The base can "
             "be captured without acting (--no-act); to act it needs a fine-tune for end-effector deltas"
         ),
-        declared={
-            "": (backbone(17, 960, 113, "state", camera="top"), expert(17, 720, 10, 50, ("action",))),
-        },
-        always_float32=True,
-        parameters={"": 450_046_176},
-        not_acting=("lerobot/smolvla_base",),
-        interventions=FLOW,
+        checkpoints=Checkpoints(
+            hub=(("HuggingFaceTB/SmolVLM2-500M-Video-Instruct", "tokenizer.json"),),
+            declared={
+                "": (backbone(17, 960, 113, "state", camera="top"), expert(17, 720, 10, 50, ("action",))),
+            },
+            parameters={"": 450_046_176},
+            not_acting=("lerobot/smolvla_base",),
+        ),
+        requirements=Requirements(always_float32=True),
+        abilities=Abilities(interventions=FLOW),
     ),
 )

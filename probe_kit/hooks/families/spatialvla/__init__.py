@@ -4,6 +4,7 @@ from probe_kit.hooks.contract.declared import ACT2ANSWER, Option, ProtocolRow, b
 from probe_kit.hooks.families.prismatic import TOKENIZER
 from probe_kit.hooks.families.shared.kinds import TOKENS
 from probe_kit.hooks.family import Family
+from probe_kit.hooks.family_parts import Abilities, Checkpoints
 
 FAMILIES = (
     Family(
@@ -13,13 +14,6 @@ FAMILIES = (
         "probe_kit.hooks.families.spatialvla.adapter:load_spatialvla",
         embodiment="as the data set of -M unnorm_key; bridge_orig/1.0.0: WidowX end-effector delta at 5 Hz",
         notes="MIT, Gemma licence; weights 8.1 GB in bfloat16; also …-mix-224-pt, …-sft-bridge, …-sft-fractal",
-        outputs="probe_kit.hooks.families.spatialvla.outputs:spatialvla_outputs",
-        words="probe_kit.hooks.families.spatialvla.adapter:check_spatialvla_words",
-        units="probe_kit.hooks.families.spatialvla.adapter:spatialvla_units",
-        of_default={"unnorm_key": "bridge_orig/1.0.0"},
-        declared={"": (backbone(27, 2304, 269), chosen_tokens("action", 27, 2304, 3))},
-        full_size="probe_kit.models.spatialvla:full_size_spatialvla",
-        parameters={"": 4_027_854_731},
         options=(
             Option("unnorm_key", str, "Data set whose units the actions get.", "the only one"),
             Option("prompt", str, "bare, question or a template with {instruction}.", "bare"),
@@ -42,6 +36,17 @@ FAMILIES = (
                 unmatched=("pictures are resized from bytes, not from floats of 0 to 255",),
             )
         },
-        interventions=TOKENS,
+        abilities=Abilities(
+            outputs="probe_kit.hooks.families.spatialvla.outputs:spatialvla_outputs",
+            words="probe_kit.hooks.families.spatialvla.adapter:check_spatialvla_words",
+            units="probe_kit.hooks.families.spatialvla.adapter:spatialvla_units",
+            interventions=TOKENS,
+        ),
+        checkpoints=Checkpoints(
+            of_default={"unnorm_key": "bridge_orig/1.0.0"},
+            declared={"": (backbone(27, 2304, 269), chosen_tokens("action", 27, 2304, 3))},
+            full_size="probe_kit.models.spatialvla:full_size_spatialvla",
+            parameters={"": 4_027_854_731},
+        ),
     ),
 )

@@ -6,6 +6,7 @@ from probe_kit.hooks.contract.observation import OPENNESS
 from probe_kit.hooks.contract.sites import QUANTITIES
 from probe_kit.hooks.families.shared.kinds import MERGED, TOKENIZER_FOLDER
 from probe_kit.hooks.family import Family
+from probe_kit.hooks.family_parts import Abilities, Checkpoints
 
 _EXPERT = ("residual", "attention", "middle", "mlp")
 INTERVENTIONS = Interventions(
@@ -28,19 +29,6 @@ FAMILIES = (
         "probe_kit.hooks.families.xiaomi.adapter:load_xiaomi",
         embodiment="as the robot of -M robot; bridge: WidowX end-effector delta at 5 Hz",
         notes="Apache-2.0; 9.4 GB in bfloat16; the expert's layers renormalise their stream inside",
-        outputs="probe_kit.hooks.families.xiaomi.adapter:xiaomi_outputs",
-        source="qwen3-vl",
-        source_weights=SourceWeights("Qwen/Qwen3-VL-4B-Instruct", parameters=4_437_815_808),
-        units="probe_kit.hooks.families.xiaomi.adapter:xiaomi_units",
-        of_default={"robot": "bridge_delta"},
-        declared={
-            "": (
-                backbone(37, 2560, 125, sums=False),
-                expert(17, 1024, 5, 32, ("special", "state", "action"), quantities=_EXPERT, sums=False),
-            )
-        },
-        full_size="probe_kit.models.xiaomi:full_size_xiaomi",
-        parameters={"": 4_716_274_176},
         options=(
             Option("robot", str, "Robot whose statistics, picture and state are used.", "the only one"),
             Option("steps", int, "Euler steps of the flow.", "5"),
@@ -58,6 +46,23 @@ FAMILIES = (
                 unmatched=("noise comes from the episode's seed, not from a hash of the inputs",),
             )
         },
-        interventions=INTERVENTIONS,
+        abilities=Abilities(
+            outputs="probe_kit.hooks.families.xiaomi.adapter:xiaomi_outputs",
+            units="probe_kit.hooks.families.xiaomi.adapter:xiaomi_units",
+            interventions=INTERVENTIONS,
+        ),
+        checkpoints=Checkpoints(
+            source="qwen3-vl",
+            source_weights=SourceWeights("Qwen/Qwen3-VL-4B-Instruct", parameters=4_437_815_808),
+            of_default={"robot": "bridge_delta"},
+            declared={
+                "": (
+                    backbone(37, 2560, 125, sums=False),
+                    expert(17, 1024, 5, 32, ("special", "state", "action"), quantities=_EXPERT, sums=False),
+                )
+            },
+            full_size="probe_kit.models.xiaomi:full_size_xiaomi",
+            parameters={"": 4_716_274_176},
+        ),
     ),
 )

@@ -41,8 +41,8 @@ from probe_kit.models.xiaomi import (
     DEFAULT_ROBOT,
     STATISTICS_FILE,
     STEPS,
-    ActionUnits,
     Robot,
+    RobotUnits,
     XiaomiConfig,
     XiaomiNetwork,
     build_xiaomi,
@@ -118,12 +118,12 @@ class Xiaomi(QwenVLA):
 
     # -- the robot ---------------------------------------------------------------------------------------
 
-    def units_or_reason(self) -> ActionUnits | str:
+    def units_or_reason(self) -> RobotUnits | str:
         """Return the statistics, or why there are none; a robot that was named has to have them."""
         return self.units if self._robot is not None else super().units_or_reason()
 
     @cached_property
-    def units(self) -> ActionUnits:
+    def units(self) -> RobotUnits:
         """The statistics that give actions units and the chunk its length.
 
         Raises:
@@ -375,4 +375,4 @@ def _restore_actions(policy: Xiaomi, actions: NDArray[Any], recorded: Arrays) ->
         return policy.units.restore(actions)
     mean, deviation = (np.asarray(recorded[name], np.float64) for name in _NORMS)
     mean, deviation = (part.reshape(part.shape[-2:]) for part in (mean, deviation))
-    return ActionUnits("recorded", mean, deviation).restore(actions)
+    return RobotUnits("recorded", mean, deviation).restore(actions)

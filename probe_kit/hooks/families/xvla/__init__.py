@@ -3,6 +3,7 @@
 from probe_kit.hooks.contract.declared import TEXT, DeclaredStream, Interventions, Option, expert
 from probe_kit.hooks.contract.sites import Stream
 from probe_kit.hooks.families.shared.kinds import MERGED, lerobot_family
+from probe_kit.hooks.family_parts import Abilities, Checkpoints
 
 PICTURES = ("padded", "squashed")
 """The ways in which pictures come to the network's resolution: of lerobot, and of the authors."""
@@ -27,23 +28,12 @@ FAMILIES = (
         "lerobot/xvla-base",
         "xvla.adapter:Xvla",
         embodiment="as the checkpoint's action space; the released ones are absolute poses",
-        hub=(("facebook/bart-large", "tokenizer.json"),),
         notes=(
             "A checkpoint in lerobot's layout. Its configuration holds Florence-2's; the tokenizer "
             "facebook/bart-large is fetched where no tokenizer.json lies beside it. -M domain=N chooses the soft "
             "prompts of another robot. Pictures are padded as config.json says; the authors squash them to 224 x "
             "224, bicubic (-M picture=squashed). Absolute poses cannot act here: --no-act"
         ),
-        parameters={"": 879_851_096},
-        not_acting=("lerobot/xvla-base", "2toINF/X-VLA-WidowX"),
-        declared={
-            "": (
-                DeclaredStream(
-                    Stream("backbone", 13, 1024, quantities=BLOCK, sums=False), 114, ("image.image", *TEXT)
-                ),
-                expert(25, 1024, 10, 276, ("action", "image.image", *TEXT, "soft_prompt"), quantities=BLOCK),
-            )
-        },
         options=(
             Option(
                 "picture",
@@ -54,6 +44,19 @@ FAMILIES = (
             ),
             Option("domain", int, "Number of the robot's soft prompts.", "as policy_preprocessor.json says"),
         ),
-        interventions=INTERVENTIONS,
+        checkpoints=Checkpoints(
+            hub=(("facebook/bart-large", "tokenizer.json"),),
+            parameters={"": 879_851_096},
+            not_acting=("lerobot/xvla-base", "2toINF/X-VLA-WidowX"),
+            declared={
+                "": (
+                    DeclaredStream(
+                        Stream("backbone", 13, 1024, quantities=BLOCK, sums=False), 114, ("image.image", *TEXT)
+                    ),
+                    expert(25, 1024, 10, 276, ("action", "image.image", *TEXT, "soft_prompt"), quantities=BLOCK),
+                )
+            },
+        ),
+        abilities=Abilities(interventions=INTERVENTIONS),
     ),
 )

@@ -14,7 +14,8 @@ from torch import Tensor
 
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.families.shared.kinds import IMAGES, STATE
-from probe_kit.hooks.families.shared.lerobot.policy import MASK, TOKENS, LerobotPolicy
+from probe_kit.hooks.families.shared.lerobot.packing import MASK, TOKENS
+from probe_kit.hooks.families.shared.lerobot.policy import LerobotPolicy
 from probe_kit.hooks.outputs import (
     Arrays,
     Outputs,

@@ -1,22 +1,18 @@
-"""Figures of a whole table: numbers on heat colours, and success against probe accuracy."""
+"""A figure of a whole table: success against probe accuracy."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
-from textwrap import fill
-from typing import TYPE_CHECKING, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Literal, Self
 
-from probe_kit._tables.content import HEAT, heat_colour
+from probe_kit._tables.numbers import Limits
 from probe_kit.errors import UsageError
-from probe_kit.retention.behaviour import Regime
-from probe_kit.retention.columns.tables import once_per_category
 from probe_kit.retention.columns.text import RATE, Modes, model_name, modes_of, title_of
 from probe_kit.retention.displays.display import (
     Display,
     ProvenanceLine,
     darker,
-    legend_above,
     series,
     significance_handles,
 )
@@ -28,219 +24,7 @@ if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from matplotlib.patches import Patch
 
-
-_CELL_WIDTH, _ROW_HEIGHT = 0.66, 0.36  # inches
-_NAME_WIDTH = 0.085  # inches per character of a model's name
-_EMPTY = "#F4F4F4"
-
-
-@dataclass(frozen=True)
-class Cell:
-    """Values side by side, None where there is none, and whether they are printed bold."""
-
-    values: tuple[float | None, ...]
-    bold: bool = False
-
-
-@dataclass(kw_only=True)
-class HeatTableDisplay(Display):
-    """A table drawn as a figure; the numbers are `cells[row][column].values`.
-
-    The display has one certificate per row.
-
-    Attributes:
-        rows: Names of the rows.
-        columns: Names of the columns.
-        parts: Names of the values side by side in a cell.
-    """
-
-    rows: tuple[str, ...]
-    columns: tuple[str, ...]
-    cells: tuple[tuple[Cell, ...], ...]
-    parts: ClassVar[tuple[str, ...]] = ("",)
-    heading = ""
-    note = ""
-    is_framed: ClassVar = True
-    title_size: ClassVar = 10
-    notes: ClassVar[Mapping[Modes, str]] = {}
-    scale: ClassVar[float] = 100.0
-    digits: ClassVar[int] = 1
-
-    @classmethod
-    def _of_behaviour(cls, table: RetentionTable, cell: Callable[[RetentionRow], Cell]) -> Self:
-        """Return a display of success rates, which belong to an outcome rule."""
-        rows = once_per_category(table.all_rows)
-        display = cls._of(rows, cell)
-        modes, acted = modes_of(rows), [row for row in rows if row.run.mode == "acts"]
-        display.note = cls.notes.get(modes, cls.note)
-        rules = ", ".join(dict.fromkeys(row.rules.rule for row in acted))
-        display.title = cls.heading.replace(RATE["acts"], RATE[modes]) + f", outcome rule {rules}" * bool(acted)
-        return display
-
-    @classmethod
-    def _of(cls, rows: Sequence[RetentionRow], cell: Callable[[RetentionRow], Cell]) -> Self:
-        """Return a display with one line per run and view, one column per category of any of them."""
-        if not rows:
-            raise UsageError(f"{cls.heading}: the table has no rows to show")
-        lines: dict[tuple[str | None, str, str | None], dict[str, RetentionRow]] = {}
-        for row in rows:
-            lines.setdefault((row.group, row.run.location, row.view), {})[row.category] = row
-        columns = tuple(dict.fromkeys(row.category for row in rows))
-        columns = (*(name for name in columns if name != "mean"), *(["mean"] if "mean" in columns else []))
-        blank = Cell((None,) * len(cls.parts))
-        names = tuple(_line_name(line, rows) for line in lines.values())
-        width = _CELL_WIDTH * len(columns) + _NAME_WIDTH * max(map(len, names)) + 0.3
-        return cls(
-            title=cls.heading,
-            figure_size=(max(6.2, width), _ROW_HEIGHT * (len(names) + 1.5) - 0.2),
-            rows=names,
-            columns=columns,
-            cells=tuple(
-                tuple(cell(line[name]) if name in line else blank for name in columns) for line in lines.values()
-            ),
-            certificates=tuple(ProvenanceLine.of_row(list(line.values())[-1]) for line in lines.values()),
-        )
-
-    def draw(self, axes: "Axes") -> None:
-        """Draw the cells and the names of rows and columns."""
-        for number, line in enumerate(self.cells):
-            for column, cell in enumerate(line):
-                self._draw_cell(axes, column, number, cell)
-        self._draw_names(axes)
-
-    def finish(self, figure: "Figure", grid: "Sequence[Axes]") -> None:
-        """Add the key of colours below the title, which may be wider than the table."""
-        grid[0].set_title("", loc="left")
-        legend_above(figure, self._key(), f"{self.title}\n{self.note}")
-
-    def _draw_cell(self, axes: "Axes", column: int, number: int, cell: Cell) -> None:
-        from matplotlib.patches import Rectangle
-
-        share = 1 / len(cell.values)
-        for part, value in enumerate(cell.values):
-            start = column + part * share
-            fill_with = _EMPTY if value is None else heat_colour(value)
-            axes.add_patch(Rectangle((start, number), share, 1, fc=fill_with, ec="white", lw=0.6))
-            text = "–" if value is None else f"{self.scale * value:.{self.digits}f}"
-            weight = "bold" if cell.bold else "normal"
-            axes.text(start + share / 2, number + 0.52, text, ha="center", va="center", fontsize=8, weight=weight)
-        axes.add_patch(Rectangle((column, number), 1, 1, fill=False, ec="white", lw=2.2))
-
-    def _draw_names(self, axes: "Axes") -> None:
-        axes.set_xlim(0, len(self.columns))
-        axes.set_ylim(len(self.rows), 0)
-        names = [fill(title_of(name), 9, break_long_words=False) for name in self.columns]
-        axes.set_xticks([column + 0.5 for column in range(len(names))], names, fontsize=8)
-        axes.set_yticks([number + 0.5 for number in range(len(self.rows))], list(self.rows), fontsize=8)
-        axes.xaxis.tick_top()
-        axes.tick_params(length=0)
-        axes.spines[:].set_visible(False)
-        if self.columns[-1] == "mean" and len(self.columns) > 1:
-            axes.axvline(len(self.columns) - 1, color="0.35", lw=0.9)
-
-    def _key(self) -> "list[Patch]":
-        """Return the colours and the numbers that they stand for."""
-        from matplotlib.patches import Patch
-
-        bounds = [0.0, *(bound for bound, _, _ in HEAT[:-1])]
-        labels = [f"{self.scale * bound:g}–{self.scale * (bound + 0.2):g}" for bound in bounds]
-        labels[0], labels[-1] = f"< {self.scale * 0.2:g}", f"≥ {self.scale * 0.8:g}"
-        return [Patch(fc=f"#{rgb}", label=label) for (_, _, rgb), label in zip(HEAT, labels, strict=True)]
-
-
-class SuccessTableDisplay(HeatTableDisplay):
-    """Success rate in percent by model and category; bold above 0.5 + Δ."""
-
-    heading = "Success rate (%)"
-    note = "bold: more than guessing explains, items as the unit"
-
-    @classmethod
-    def from_table(cls, table: RetentionTable) -> Self:
-        """Read the retention table of any runs.
-
-        Raises:
-            UsageError: If it is empty.
-        """
-        return cls._of_behaviour(
-            table, lambda row: Cell((row.success.sr,), row.success.regime == Regime.KNOWLEDGE)
-        )
-
-
-class SideTableDisplay(HeatTableDisplay):
-    """Success rate in percent where the correct picture lay left | right (the paper's L/R table)."""
-
-    heading = "Success rate (%) where the correct picture is left | right"
-    digits = 0
-    note = "equal halves: no side is favoured; one blue, one pale: the policy goes to a side, not to an answer"
-    notes: ClassVar[Mapping[Modes, str]] = {
-        "answers": "equal halves: no side is favoured; one blue, one pale: a side is named, whatever the question",
-        "both": "equal halves: no side is favoured; one blue, one pale: a side is chosen, whatever the question",
-    }
-    parts = ("left", "right")
-
-    @classmethod
-    def from_table(cls, table: RetentionTable) -> Self:
-        """Read the retention table of any runs.
-
-        Raises:
-            UsageError: If it is empty.
-        """
-        return cls._of_behaviour(table, lambda row: Cell((row.success.sr_left, row.success.sr_right)))
-
-
-class RetentionTableDisplay(HeatTableDisplay):
-    """Bounded retention and the published ratio by model and category; empty where the backbone knows nothing."""
-
-    heading = "Retention | published ratio"
-    note = "dash: the backbone's signal is not shown, so the ratio has no meaning"
-    parts = ("retention", "published")
-    scale, digits = 1.0, 2
-
-    @classmethod
-    def from_table(cls, table: RetentionTable) -> Self:
-        """Read a retention table with probes.
-
-        Raises:
-            UsageError: If no run was probed.
-        """
-
-        def cell(row: RetentionRow) -> Cell:
-            values = (row.retention.value, row.retention.published) if row.retention.defined else (None, None)
-            return Cell(values)
-
-        return cls._of([row for row in table.all_rows if row.view is not None], cell)
-
-
-def _line_name(line: dict[str, RetentionRow], rows: Sequence[RetentionRow]) -> str:
-    row = next(iter(line.values()))
-    views = {other.view for other in rows if other.view is not None}
-    return f"{model_name(row)}, {row.view}" if len(views) > 1 and row.view else model_name(row)
-
-
-@in_report(1)
-def table_figures(source: FigureSource) -> Iterator[ReportFigure]:
-    """Yield the tables of success, sides and retention, as far as the rows have such numbers."""
-    table = source.table
-    acted = [row for row in table.rows if row.success.sr is not None]
-    modes = modes_of(acted)
-    displays: list[tuple[type[HeatTableDisplay], Callable[[RetentionTable], HeatTableDisplay], str, str, str]] = []
-    if acted:
-        sides, by_side = SideTableDisplay, f"{RATE[modes]} by side"
-        displays.append((SuccessTableDisplay, SuccessTableDisplay.from_table, "success", RATE[modes], "behaviour"))
-        displays.append((sides, sides.from_table, "sides", by_side, "behaviour"))
-    if any(row.retention.published is not None for row in table.rows):
-        ratios = RetentionTableDisplay
-        displays.append((ratios, ratios.from_table, "retention", "Retention", "retention"))
-    for display, read, name, title, subject in displays:
-        yield ReportFigure(
-            name, title, subject, display.notes.get(modes, display.note), None, partial(figure_of, read, table),
-            is_table=True, is_detail=display is SideTableDisplay,
-        )  # fmt: skip
-
-
-# -- success against what probes read ----------------------------------------------------------------------------
 
 Point = tuple[float, float]
 Box = tuple[float, float, float, float]
@@ -319,9 +103,6 @@ def _covered(box: Box, boxes: Sequence[Box]) -> float:
     )
 
 
-Limits = tuple[float | None, float | None] | None
-
-
 @dataclass(frozen=True)
 class GapPoint:
     """One category of one run: probe accuracy and success rate, as shares, with 95 % intervals if known."""
@@ -329,9 +110,9 @@ class GapPoint:
     model: str
     category: str
     accuracy: float
-    accuracy_ci: Limits
+    accuracy_ci: Limits | None
     sr: float
-    sr_ci: Limits
+    sr_ci: Limits | None
     significant: bool
 
 
@@ -477,7 +258,7 @@ def _bars(point: GapPoint) -> "list[tuple[tuple[float, float], tuple[float, floa
     return level + upright
 
 
-def _arms(value: float, limits: Limits) -> list[list[float]] | None:
+def _arms(value: float, limits: Limits | None) -> list[list[float]] | None:
     if limits is None or limits[0] is None or limits[1] is None:
         return None
     return [[max(0.0, 100 * (value - limits[0]))], [max(0.0, 100 * (limits[1] - value))]]
