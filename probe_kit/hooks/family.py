@@ -105,6 +105,8 @@ class Family:
         not_acting: Released checkpoints whose actions no arm here can execute, for plans without their
             configuration.
         home: The scene it acts in, or is asked about, when none is named.
+        no_words: The reason why feed-forward units of its backbone cannot be read as tokens, which is said before
+            anything is loaded; empty where they can be, and where only a loaded model tells.
         vocabulary: Module with `known_words` and `words_in`, of a family whose default checkpoint knows few words;
             empty for one that reads any text.
 
@@ -145,6 +147,7 @@ class Family:
     always_float32: bool = False
     not_acting: tuple[str, ...] = ()
     home: DefaultScene = RELEASED
+    no_words: str = ""
     vocabulary: str = ""
 
     def __post_init__(self) -> None:

@@ -73,6 +73,7 @@ def words(
     """
     from probe_kit.hooks.contract.declared import read_pairs
     from probe_kit.hooks.registry import find_family
+    from probe_kit.intervene.vocabulary import check_family, value_words
     from probe_kit.runs.direction_files import check_direction_file
 
     blocks = None if layers is None else [_block(text) for text in layers]
@@ -81,12 +82,11 @@ def words(
         if out_file.exists():
             raise UsageError(f"{out_file} exists; choose another --out or remove it")
     family = find_family(model)
+    check_family(family)
     options = read_pairs(model_options or [])
     family.check(checkpoint, device, None, random_weights, options, weights_seed)  # before it loads for minutes
     with err.status("loading the model"):
         loaded = family.load(checkpoint, device, None, random_weights, options, weights_seed)
-    from probe_kit.intervene.vocabulary import value_words
-
     with progress() as bar:
         value = value_words(loaded, blocks, tokens, counter(bar, "units"))
     match = None if like is None else value.match(like, shuffles, seed)

@@ -2,7 +2,7 @@
 
 from probe_kit.hooks.contract.declared import Interventions, backbone, expert
 from probe_kit.hooks.contract.sites import QUANTITIES
-from probe_kit.hooks.families.shared.kinds import MERGED, lerobot_family
+from probe_kit.hooks.families.shared.kinds import MERGED, NO_HEAD, lerobot_family
 
 INTERVENTIONS = Interventions(
     edits={"backbone": QUANTITIES, "expert": QUANTITIES},
@@ -40,5 +40,6 @@ FAMILIES = (
             )
         },
         interventions=INTERVENTIONS,
+        no_words=NO_HEAD,
     ),
 )

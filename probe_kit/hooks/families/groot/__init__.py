@@ -2,7 +2,7 @@
 
 from probe_kit.hooks.contract.declared import TEXT, DeclaredStream, Interventions, Option, backbone, expert
 from probe_kit.hooks.contract.sites import QUANTITIES, Stream
-from probe_kit.hooks.families.shared.kinds import MERGED, lerobot_family
+from probe_kit.hooks.families.shared.kinds import MERGED, NO_HEAD, lerobot_family
 
 RESIZES = ("nvidia", "lerobot")
 """The code that brings pictures to their size, in two ways."""
@@ -65,5 +65,6 @@ FAMILIES = (
             ),
         ),
         interventions=INTERVENTIONS,
+        no_words=NO_HEAD,
     ),
 )

@@ -18,7 +18,7 @@ from probe_kit.hooks.contract.declared import (
 )
 from probe_kit.hooks.contract.sites import QUANTITIES, Stream
 from probe_kit.hooks.families.shared.action_statistics import ActionStatistics
-from probe_kit.hooks.families.shared.kinds import MERGED
+from probe_kit.hooks.families.shared.kinds import MERGED, NO_HEAD
 from probe_kit.hooks.family import Family
 
 _UNCONDITIONAL = "action expert without condition"
@@ -93,6 +93,7 @@ FAMILIES = (
             )
         },
         interventions=INTERVENTIONS,
+        no_words=NO_HEAD,
     ),
 )
 

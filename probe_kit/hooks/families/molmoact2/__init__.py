@@ -4,7 +4,7 @@ from dataclasses import replace
 
 from probe_kit.hooks.contract.declared import backbone, expert
 from probe_kit.hooks.contract.sites import QUANTITIES
-from probe_kit.hooks.families.shared.kinds import FLOW, MERGED, lerobot_family
+from probe_kit.hooks.families.shared.kinds import FLOW, MERGED, NO_HEAD, lerobot_family
 
 EXPERT = ("residual", "attention", "cross_attention", "mlp", "final_norm")
 LAYERWISE = replace(
@@ -42,5 +42,6 @@ FAMILIES = (
             )
         },
         interventions=LAYERWISE,
+        no_words=NO_HEAD,
     ),
 )

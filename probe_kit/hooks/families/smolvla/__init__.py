@@ -1,7 +1,7 @@
 """SmolVLA through lerobot."""
 
 from probe_kit.hooks.contract.declared import backbone, expert
-from probe_kit.hooks.families.shared.kinds import FLOW, lerobot_family
+from probe_kit.hooks.families.shared.kinds import FLOW, NO_HEAD, lerobot_family
 
 FAMILIES = (
     lerobot_family(
@@ -22,5 +22,6 @@ FAMILIES = (
         parameters={"": 450_046_176},
         not_acting=("lerobot/smolvla_base",),
         interventions=FLOW,
+        no_words=NO_HEAD,
     ),
 )

@@ -43,5 +43,6 @@ FAMILIES = (
             )
         },
         interventions=TOKENS,
+        no_words="a feed-forward block of Gemma 2 ends in a norm, so that a unit adds no vector of its own",
     ),
 )

@@ -4,7 +4,7 @@ from probe_kit.hooks.contract.card import SourceWeights
 from probe_kit.hooks.contract.declared import ACT2ANSWER, Interventions, Option, ProtocolRow, backbone, expert
 from probe_kit.hooks.contract.observation import OPENNESS
 from probe_kit.hooks.contract.sites import QUANTITIES
-from probe_kit.hooks.families.shared.kinds import MERGED, TOKENIZER_FOLDER
+from probe_kit.hooks.families.shared.kinds import MERGED, NO_HEAD, TOKENIZER_FOLDER
 from probe_kit.hooks.family import Family
 
 _EXPERT = ("residual", "attention", "middle", "mlp")
@@ -59,5 +59,6 @@ FAMILIES = (
             )
         },
         interventions=INTERVENTIONS,
+        no_words=NO_HEAD,
     ),
 )

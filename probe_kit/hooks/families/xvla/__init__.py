@@ -2,7 +2,7 @@
 
 from probe_kit.hooks.contract.declared import TEXT, DeclaredStream, Interventions, Option, expert
 from probe_kit.hooks.contract.sites import Stream
-from probe_kit.hooks.families.shared.kinds import MERGED, lerobot_family
+from probe_kit.hooks.families.shared.kinds import MERGED, NO_HEAD, lerobot_family
 
 PICTURES = ("padded", "squashed")
 """The ways in which pictures come to the network's resolution: of lerobot, and of the authors."""
@@ -55,5 +55,6 @@ FAMILIES = (
             Option("domain", int, "Number of the robot's soft prompts.", "as policy_preprocessor.json says"),
         ),
         interventions=INTERVENTIONS,
+        no_words=NO_HEAD,
     ),
 )
