@@ -42,7 +42,8 @@ from probe_kit.hooks import (
 )
 from probe_kit.hooks.capturing.edits import ReplaceWith, TokenSelection, apply_patch, apply_patches
 from probe_kit.hooks.contract.sites import HEADS, KV
-from probe_kit.intervene import Interchange, Intervention, Knockout, run_intervention
+from probe_kit.intervene import Interchange, Knockout, run_intervention
+from probe_kit.intervene.kinds.base import Intervention
 from probe_kit.runs import open_run
 
 EMBEDDED = "pi0-tiny"
