@@ -32,9 +32,9 @@ from torch.overrides import TorchFunctionMode
 from probe_kit.errors import CaptureError, RolesMismatchError, UnknownSiteError, UsageError
 from probe_kit.hooks.capturing.capture_context import ActivationCache, capture, edit
 from probe_kit.hooks.capturing.edits import ActiveEdits, EditLog
-from probe_kit.hooks.contract.model import Model, Policy
+from probe_kit.hooks.contract.model import Model, Policy, Tap
 from probe_kit.hooks.contract.roles import Roles
-from probe_kit.hooks.contract.sites import HEADS, Site, Stream, first_of
+from probe_kit.hooks.contract.sites import HEADS, Site, first_of
 
 Read = tuple[int, int]
 """A block of the backbone whose keys and values are read, and the iteration in which it is."""
@@ -393,7 +393,15 @@ class _AttentionCalls(TorchFunctionMode):
     def __init__(self, model: Model, sites: Iterable[Site]) -> None:
         super().__init__()
         self.model = model
-        self.taps = {site: model.tap(site) for site in sites}
+        # Sites that differ only in the iteration have one tap.
+        taps: dict[tuple[str, int], Tap] = {}
+        self.taps: dict[Site, Tap] = {}
+        for site in sites:
+            if (site.stream, site.layer) not in taps:
+                taps[site.stream, site.layer] = model.tap(site)
+            self.taps[site] = taps[site.stream, site.layer]
+        self._unchecked: list[tuple[Site, Tensor, Tensor]] = []
+        self._unchecked_bytes = 0
         self.last: _Attention | None = None
         self.is_inside = False
         self.projections: dict[nn.Module, bool] = {}
@@ -427,6 +435,7 @@ class _AttentionCalls(TorchFunctionMode):
             if not is_known:
                 stack.enter_context(self)
             yield
+        self._check_readings()
         for module, is_inside in self.projections.items():
             if is_inside and module in owners and not is_known:
                 begins = self._begins.get(owners[module], set())
@@ -472,10 +481,41 @@ class _AttentionCalls(TorchFunctionMode):
         with torch._C.DisableTorchFunction():
             weights = last.weights()
             values = _repeat_for_heads(last.values, weights.shape[1]).float().to(weights.device)
-            computed = tap.rows.of((weights @ values).transpose(1, 2).flatten(2))[:, tap.tokens]
-        _check_reading(site, self.model.stream_of(site), weights.shape[1], computed, read)
+            computed = tap.rows.of((weights @ values).transpose(1, 2))[:, tap.tokens]
+            self._compare(site, computed, read)
         self.projections[tap.module] = self.projections.get(tap.module, True) and self.is_inside
         return tap.rows.of(weights)[:, :, tap.tokens], tap.rows.of(values)
+
+    def _compare(self, site: Site, computed: Tensor, read: Tensor) -> None:
+        """Keep by how much (B, S, H, E) differs from what the heads read (B, S, H · E), for `_check_readings`.
+
+        Raises:
+            CaptureError: For other shapes.
+        """
+        stream, shape = self.model.stream_of(site), computed.shape
+        if shape[2] != stream.heads or (*shape[:2], shape[2] * shape[3]) != tuple(read.shape):
+            raise _unlike_reading(
+                site, f"has {shape[2]} heads and {tuple(shape)}", f"{stream.heads} and {tuple(read.shape)}"
+            )
+        self._unchecked.append((site, computed - read.reshape(shape), read))
+        self._unchecked_bytes += read.numel() * 8
+        if self._unchecked_bytes > _UNCHECKED_BYTES:
+            self._check_readings()
+
+    def _check_readings(self) -> None:
+        """Raise CaptureError unless every pattern gives what the heads read: all together, as that costs less."""
+        if not self._unchecked:
+            return
+        sites, differences, readings = zip(*self._unchecked, strict=True)
+        self._unchecked, self._unchecked_bytes = [], 0
+        norms = [
+            torch.stack(torch._foreach_norm(list(tensors), ord=torch.inf)).tolist()
+            for tensors in (differences, readings)
+        ]
+        for site, apart, largest, read in zip(sites, *norms, readings, strict=True):
+            limit = TOLERANCE.get(read.dtype, TOLERANCE[torch.float32]) * largest
+            if not apart <= limit:  # negated, so that NaN is refused too
+                raise _unlike_reading(site, f"is off by {apart:.3g}", f"at most {limit:.3g}")
 
     def _enter(self, watches: bool, owner: nn.Module, *_: Any) -> None:
         self._depth += 1
@@ -576,21 +616,13 @@ def _repeat_for_heads(heads: Tensor, count: int) -> Tensor:
     return heads[:, :, None].expand(batch, groups, count // groups, *shape).flatten(1, 2)
 
 
-def _check_reading(site: Site, stream: Stream, heads: int, computed: Tensor, read: Tensor) -> None:
-    """Raise CaptureError unless what a pattern gives is what the heads read."""
-    if heads == stream.heads and computed.shape == read.shape:
-        largest = partial(torch.linalg.vector_norm, ord=torch.inf)
-        limit = TOLERANCE.get(read.dtype, TOLERANCE[torch.float32]) * float(largest(read))
-        apart = float(largest(computed - read))  # float32 of both
-        if apart <= limit:
-            return
-        actual, expected = f"is off by {apart:.3g}", f"at most {limit:.3g}"
-    else:
-        actual, expected = (
-            f"has {heads} heads and {tuple(computed.shape)}",
-            f"{stream.heads} and {tuple(read.shape)}",
-        )
-    raise CaptureError(
+_UNCHECKED_BYTES = 64_000_000
+"""Size of readings that are kept to be compared together."""
+
+
+def _unlike_reading(site: Site, actual: str, expected: str) -> CaptureError:
+    """Return the error of a pattern that does not give what the heads read."""
+    return CaptureError(
         f"the attention in front of {site} does not give what its heads read: it {actual}; expected {expected}. "
         "The block computes something between its attention and its output projection; correct the tap of `heads`"
     )
