@@ -1,6 +1,7 @@
 """What changing streams costs: a clean inference, with one site changed, with joint places, and with gradients.
 
     python benchmarks/intervention_cost.py [--family pi0-tiny] [--pairs 200] [--device cpu]
+    python benchmarks/intervention_cost.py --sweep FOLDER [--repeats 2]
 
 The embedded policy, or another family at the size of `capture_subjects`; one observation, one process. Every pair
 is a clean inference and a changed one, in drawn order, one directly behind the other, so that neighbours on the
@@ -10,11 +11,15 @@ what the measurement itself adds. Changes take tokens over from an inference bef
 A joint condition patches the picture and the words of every block of `kv`. A knockout cuts the attention of the
 expert to the picture, in one layer and in all, at every iteration. Gradients are of one number at all
 sites of backbone and `kv`: an inference with a graph, and a backward pass. The machine's load is printed first.
+
+`--sweep` times whole interventions on 12 items of Color instead, in turns: a knockout of image and language in all
+windows with its controls, and an interchange of as many cells. It prints processor time of both and their ratio.
 """
 
 import argparse
 import os
 import random
+import shutil
 import statistics
 import tempfile
 import time
@@ -24,6 +29,7 @@ from pathlib import Path
 import numpy as np
 from capture_subjects import LARGER, subject
 
+from probe_kit.extract import ExtractSettings, extract_run
 from probe_kit.hooks import (
     AttentionCut,
     Observation,
@@ -36,6 +42,9 @@ from probe_kit.hooks import (
 )
 from probe_kit.hooks.capturing.edits import ReplaceWith, TokenSelection, apply_patch, apply_patches
 from probe_kit.hooks.contract.sites import HEADS, KV
+from probe_kit.intervene import Interchange, Knockout, run_intervention
+from probe_kit.intervene.kinds.base import Intervention
+from probe_kit.runs import open_run
 
 EMBEDDED = "pi0-tiny"
 INSTRUCTION = "Put the cube on the red shape"
@@ -129,7 +138,12 @@ def main() -> None:
     parser.add_argument("--family", default=EMBEDDED, help=f"{EMBEDDED} or one of {', '.join(LARGER)}")
     parser.add_argument("--pairs", type=int, default=200)
     parser.add_argument("--device", default="cpu")
+    parser.add_argument("--sweep", type=Path, default=None)
+    parser.add_argument("--repeats", type=int, default=2)
     arguments = parser.parse_args()
+    if arguments.sweep is not None:
+        time_sweeps(arguments.sweep, arguments.repeats)
+        return
     policy = policy_of(arguments.family, arguments.device)
     every, draw = ways(policy), random.Random(0)
     print(f"load of the last minute: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
@@ -153,6 +167,33 @@ def main() -> None:
             f"{statistics.median(baseline) / statistics.median(other):6.3f} medians, "
             f"{fifth(baseline) / fifth(other):6.3f} lower fifths"
         )
+
+
+SITES = ("backbone.*", "kv.*", "kv.00.values", "kv.01.values", "kv.02.values")
+"""Ten places, each with three roles: as many cells as a knockout of two roles has cuts and controls."""
+
+
+def time_sweeps(folder: Path, repeats: int) -> None:
+    """Time a knockout of all windows and an interchange of as many cells, in turns; the run is made once."""
+    if not (folder / "run").exists():
+        settings = ExtractSettings(EMBEDDED, categories=("color",), items=12, max_steps=4, env_workers=0)
+        extract_run(settings, folder / "run")
+    seconds: dict[str, list[float]] = {"knockout": [], "interchange": []}
+    for repeat in range(repeats):
+        for name, times in seconds.items():
+            copy = folder / f"{name}-{repeat}"
+            shutil.rmtree(copy, ignore_errors=True)
+            shutil.copytree(folder / "run", copy)
+            kind: Intervention = Knockout(roles=("image", "language"))
+            if name == "interchange":
+                kind = Interchange(sites=SITES, roles=("all", "image", "language"))
+            start = time.process_time()
+            result = run_intervention(open_run(copy), kind)
+            times.append(time.process_time() - start)
+            cells = sum(bool(cell.site) for cell in result.outcomes.cells)
+            print(f"{name}: {cells} cells, {times[-1]:.1f} s of processor time", flush=True)
+    ratios = [first / second for first, second in zip(*seconds.values(), strict=True)]
+    print(f"knockout of interchange: {', '.join(f'{ratio:.2f}' for ratio in ratios)}")
 
 
 def timed(run: Callable[[], object]) -> float:

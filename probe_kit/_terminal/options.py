@@ -160,7 +160,8 @@ EnvWorkers = Annotated[
     speed_option("--env-workers", help="Number of simulation processes. Default: two per observation of a batch."),
 ]
 Workers = Annotated[
-    int, speed_option("--workers", help="Number of model processes, one per GPU. 0: use this process.")
+    int,
+    speed_option("--workers", help="Number of model processes, one per GPU. 0: the model runs in this process."),
 ]
 RayAddress = Annotated[
     str | None,
@@ -172,7 +173,8 @@ InferenceLimit = Annotated[
     float | None,
     speed_option(
         "--inference-limit",
-        help="Stop a worker whose model call takes longer, in seconds. Requires --workers or --ray.",
+        help="Stop a worker if one call of the model takes longer than this, in seconds. Requires --workers "
+        "or --ray.",
     ),
 ]
 

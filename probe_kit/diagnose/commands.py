@@ -43,7 +43,16 @@ _ACTING = frozenset(
 ModelOrRun = Annotated[str, typer.Argument(metavar="MODEL|RUN", help="Model to diagnose, or folder of a run.")]
 _OF_A_REPLAY = frozenset({"suite", "checkpoint", "model_option", "weights_seed", "device"})
 """Options of a new run that also name the present place of a stored run's model and suite."""
-Frames = Annotated[int, typer.Option("--frames", min=6, max=1000, metavar="N", help="Number of frames.")]
+Frames = Annotated[
+    int,
+    typer.Option(
+        "--frames",
+        min=6,
+        max=1000,
+        metavar="N",
+        help="Number of frames.",
+    ),
+]
 Require = Annotated[
     common.Names | None,
     typer.Option(
@@ -73,13 +82,17 @@ Labels = Annotated[
 ]
 Base = Annotated[
     str | None,
-    typer.Option("--base", metavar="CHECKPOINT", help="Checkpoint before fine-tuning, to compare."),
+    typer.Option(
+        "--base",
+        metavar="CHECKPOINT",
+        help="Checkpoint before fine-tuning, to compare.",
+    ),
 ]
 Inside = Annotated[
     bool,
     further_option("--inside/--no-inside", help="Patch every site, to find the layer at which an input is lost."),
 ]
-Html = Annotated[Path | None, typer.Option("--html", help="Also write a page with a figure.")]
+Html = Annotated[Path | None, typer.Option("--html", help="Also write an HTML page with a figure.")]
 
 
 @command_with(*ExtractSettings.option_models(), offers=lambda name: name not in _ACTING)

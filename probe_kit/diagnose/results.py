@@ -246,14 +246,17 @@ class Knowledge:
         best = [site for site in (self.best(True), self.best(False)) if site is not None]
         carriers = [site for site in best if site.signal]
         if not carriers:
-            return f"{self.target} is never known: {self._words(best[0])} is no signal."
+            return f"{self.target} cannot be read anywhere: {self._words(best[0])} is no signal."
         where = " and ".join(self._words(site) for site in carriers)
         if best[-1].part == "backbone":
-            return f"{self.target} is known: {where}."
+            return f"{self.target} can be read at {where}."
         if not best[-1].signal:
-            return f"{self.target} is known by {where}; {self._words(best[-1])} is no signal: it is not used."
+            return (
+                f"{self.target} can be read at {where}; {self._words(best[-1])} is no signal: not shown in the "
+                "action part."
+            )
         used = "" if decided else ", and not shown to be used: no input decides the action"
-        return f"{self.target} is known up to the action by {where}{self._retained()}{used}."
+        return f"{self.target} can be read up to the action, at {where}{self._retained()}{used}."
 
     def _words(self, site: SiteKnowledge) -> str:
         return f"{site.name} ({self.metric} {site.score:z.2f}, chance {site.chance:z.2f})"
@@ -346,9 +349,9 @@ _HEADINGS = (
     Heading("arrives", "whether any number of any action changed under another value"),
     Heading("effect", "decides, moves, no effect, open, does not arrive, not varied, not an input"),
     Heading("decides %", "share of the action's variance that is due to it: total-effect index, 95 % by groups"),
-    Heading("control %", "the same of a change that should not matter"),
+    Heading("control %", "the same of a change that should not matter, such as a full stop more or less"),
     Heading("all inputs %", "the same of all inputs together; the seed decides the rest"),
-    Heading("p", "that it changes more than its control, by permutation in whole groups"),
+    Heading("p", "one-sided, of a larger change than by its control; labels of whole groups are permuted"),
 )
 _FINDINGS = {
     "decides": "decides the action",

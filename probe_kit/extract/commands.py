@@ -77,8 +77,8 @@ Prompts = Annotated[
         parser=_prompts,
         metavar="A,B,…",
         show_default="p1,p2,seen; instruction where there are no objects",
-        help="Prompts, comma-separated: seen, p1, p2 (from the paper), instruction (the words of the policies) "
-        "or text files. A file contains {object}, and {A} and {B} for the sides.",
+        help="Prompts, comma-separated: seen, p1, p2 (from the paper), instruction (the words that policies "
+        "get) or text files. In a file, {object} stands for the object, {A} and {B} for the sides.",
     ),
 ]
 PictureSizes = Annotated[
@@ -93,7 +93,7 @@ PictureSizes = Annotated[
 ]
 
 Large = Annotated[
-    bool, stored_option("--yes", help="Begin a run that would take more than 64 GB before compression.")
+    bool, stored_option("--yes", help="Start although the run would take more than 64 GB before compression.")
 ]
 
 ConfigFile = Annotated[
@@ -101,10 +101,13 @@ ConfigFile = Annotated[
     typer.Option(
         "--config",
         metavar="FILE",
-        help="Settings of --print-config, or a run whose settings are repeated. Typed options take precedence.",
+        help="Take all settings from a file of --print-config, or from a run. Options that you type take "
+        "precedence.",
     ),
 ]
-PrintConfig = Annotated[bool, typer.Option("--print-config", help="Print the settings for --config, and stop.")]
+PrintConfig = Annotated[
+    bool, typer.Option("--print-config", help="Print all settings as a file for --config, and stop.")
+]
 
 
 LARGE = 64 * 10**9

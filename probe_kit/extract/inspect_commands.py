@@ -29,7 +29,12 @@ if TYPE_CHECKING:
 
 def models(
     name: Annotated[str | None, typer.Argument(help="Model to show. Default: all.")] = None,
-    run: Annotated[str | None, typer.Option(metavar="RUN", help="Show the certificate of this run.")] = None,
+    run: Annotated[
+        str | None,
+        typer.Option(
+            metavar="RUN", help="Show what this run recorded of its model: weights, code, machine and checks."
+        ),
+    ] = None,
     words: Annotated[
         bool,
         typer.Option(
@@ -196,10 +201,12 @@ DAMAGED = 1
 @run_app.command("verify")
 def verify(
     run: RunFolder,
-    deep: Annotated[bool, typer.Option("--deep", help="Read every byte.")] = False,
+    deep: Annotated[
+        bool, typer.Option("--deep", help="Read every stored byte and compare it with its hash.")
+    ] = False,
     build: Annotated[
         bool,
-        typer.Option("--seal", help="First build the columns that make probing fast."),
+        typer.Option("--seal", help="First write the columns from which probes read the activations fast."),
     ] = False,
     as_json: AsJson = False,
 ) -> None:

@@ -147,8 +147,8 @@ class Capture(Part):
         LaterViews,
         stored_option(
             "--later-views",
-            help="What to store of the inferences after the first. mean: only the mean over tokens, in bfloat16 "
-            "(small).",
+            help="What to store of each inference after the first. all: the same as of the first. mean: only "
+            "the mean over tokens, in bfloat16 (small).",
         ),
     ] = "all"
     codec: Annotated[Codec, stored_option("--codec", help="Compression of stored activations.")] = "zstd"
@@ -239,8 +239,9 @@ class ActTask(Part):
         Rotation | None,
         further_option(
             "--rotation",
-            help="roll-pitch-yaw: pass the angles of an action on. axis-angle: convert them, as the release does "
-            "for some models. Default: set by protocol, else roll-pitch-yaw.",
+            help="How the rotation of an action reaches the arm. roll-pitch-yaw: as it is. axis-angle: "
+            "converted, as the released evaluation does for some models. Default: set by protocol, else "
+            "roll-pitch-yaw.",
         ),
     ] = None
     capture_only: Annotated[
@@ -358,8 +359,8 @@ class Machine(Part):
         further_option(
             "--capture-memory",
             metavar="MB",
-            help="Most megabytes of the device for activations that wait to be pooled; fewer layers are then "
-            "pooled at once. Default: all layers of one iteration of a stream.",
+            help="Device memory, in megabytes, for activations before they are pooled. With less, fewer "
+            "layers are pooled at once. Default: enough for all layers of one iteration.",
         ),
     ] = None
     allow_mixed: common.AllowMixed = False
@@ -426,7 +427,8 @@ class ActMachine(Machine):
         bool,
         further_option(
             "--accept-units",
-            help="Accept states that lie far outside the statistics of the checkpoint.",
+            help="Accept robot states far outside the checkpoint's statistics. Such states often have other "
+            "units, such as degrees in place of radians.",
         ),
     ] = False
 

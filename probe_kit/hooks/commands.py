@@ -17,7 +17,8 @@ def verify(
     family: Annotated[str, typer.Argument(help="Model family; `probe-kit models` lists them.")],
     folder: Annotated[Path | None, typer.Argument(help="Folder with checkpoint/ and reference.npz.")] = None,
     keys: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Recorded tensor names of the full-size model.")
+        Path | None,
+        typer.Option(metavar="FILE", help="File of the full-size model's tensor names, to compare with."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:

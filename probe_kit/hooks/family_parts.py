@@ -73,6 +73,8 @@ class Abilities:
             stand, from the small files. It raises UsageError where that has to be chosen.
         vocabulary: Module with `known_words` and `words_in`, of a family whose default checkpoint knows few words;
             empty for one that reads any text.
+        no_words: The reason why feed-forward units of its backbone cannot be read as tokens, which is said before
+            anything is loaded; empty where they can be, and where only a loaded model tells.
         outputs: `outputs(loader, folder, recorded arrays)` gives the `Outputs` that a golden reference is compared
             with; None for a family that compares nothing.
     """
@@ -83,6 +85,7 @@ class Abilities:
     words: str | None = None
     units: str | None = None
     vocabulary: str = ""
+    no_words: str = ""
     outputs: str | None = None
 
 

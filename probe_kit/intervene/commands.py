@@ -91,20 +91,26 @@ Roles = Annotated[
     _inside_option(
         "--roles",
         **LISTED,
-        help="Token roles, comma-separated: all, image, image.left, image.right, language, state, action.",
+        help="Token roles, comma-separated: all, image, image.left, image.right, language, state, action. Of "
+        "a knockout also kv.02.",
     ),
 ]
 Direction = Annotated[
     str | None,
     _inside_option(
         "--direction",
-        help="Direction or subspace: none, mean-difference, probe, mean-difference:K, leace, inlp:K, or FILE#NAME "
-        "of a safetensors or npz file.",
+        help="Direction or subspace that is changed: none, mean-difference, probe, mean-difference:K, leace, "
+        "inlp:K, or FILE#NAME of a safetensors or npz file.",
     ),
 ]
 Controls = Annotated[
     int | None,
-    _inside_option("--controls", help="Number of random directions of equal size, as controls.", min=0, max=100),
+    _inside_option(
+        "--controls",
+        help="Number of controls: random directions of equal size. Of a knockout: cuts of random tokens.",
+        min=0,
+        max=100,
+    ),
 ]
 Coefficients = Annotated[
     Numbers | None,
@@ -131,12 +137,19 @@ Window = Annotated[
 Readers = Annotated[
     str | None,
     _inside_option(
-        "--readers", metavar="ROLE", help="Tokens of the backbone that no longer read. Default: the acting stream."
+        "--readers",
+        metavar="ROLE",
+        help="Of a knockout: role of backbone tokens that can no longer read. "
+        "Default: the action stream can no longer read.",
     ),
 ]
 Heads = Annotated[
     Names | None,
-    _inside_option("--heads", **LISTED, help="Heads that no longer read, counted from 0. Default: all."),
+    _inside_option(
+        "--heads",
+        **LISTED,
+        help="Of a knockout: attention heads that are cut, counted from 0, such as 0,3. Default: all.",
+    ),
 ]
 ClosedLoopCut = Annotated[
     bool,
@@ -150,8 +163,8 @@ Untrained = Annotated[
     _inside_option(
         "--untrained",
         metavar="RUN",
-        help="Run of the same episodes with random weights. The same knockout, stored there, is shown beside this "
-        "one.",
+        help="Of a knockout: run of the same episodes with random weights. The same knockout must be stored "
+        "there; it is shown beside this one.",
     ),
 ]
 _pairs_option = partial(typer.Option, rich_help_panel="Recordings and your own environment")

@@ -34,15 +34,17 @@ from probe_kit.hooks.contract.observation import Observation
 from probe_kit.intervene.outcomes import directions_of, spread_of
 from probe_kit.intervene.pairs import Chunk, Given, Pair, PairRow
 from probe_kit.intervene.settings import Choice
-from probe_kit.runs.layout import source_settings_of
+from probe_kit.runs.layout import AT_END, source_settings_of
 from probe_kit.runs.run import Run
 
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from probe_kit.extract.sources.player import Ending, Player
     from probe_kit.hooks import Policy
+    from probe_kit.runs.plan import Row
 
-from probe_kit.intervene.sessions import ReplayFiles, ReplaySession
+from probe_kit.intervene.sessions import ReplayFiles, ReplaySession, largest_difference
 
 CACHED = 256
 """Number of observations that are kept: those of the nearest frames are compared again and again."""
@@ -71,7 +73,7 @@ class Frames:
         opened.check_same(run.settings)
         opened.columns = tuple(inputs["columns"])
         self._name, self._rows = opened.name, {row.episode_id: row for row in opened.rows(run.settings["seed"])}
-        self._player = opened.play(Played())()
+        self.player = opened.play(Played())()
         self.cameras = tuple(camera if isinstance(camera, str) else camera[0] for camera in inputs["cameras"])
         self._cached = lru_cache(maxsize=CACHED)(self.observe)
         self.index = list(self._listed())
@@ -116,7 +118,7 @@ class Frames:
                 "differs. Give the files of the run"
             )
         single = row if row.frames is None else replace(row, frames=(frame.number,))
-        observation = self._player.answer("begin", (single, False))
+        observation = self.player.answer("begin", (single, False))
         assert isinstance(observation, Observation)
         if frame.state.size and not np.array_equal(observation.state.astype(np.float64), frame.state):
             raise OtherFramesError(
@@ -128,9 +130,13 @@ class Frames:
             observation, image=np.array(observation.image), state=np.array(observation.state), cameras=pictures
         )
 
+    def planned(self, row: int) -> "Row":
+        """Return a row of the run as its source plans it."""
+        return self._rows[str(self.run.episodes["episode_id"].iloc[row])]
+
     def close(self) -> None:
         """Free the player's resources."""
-        self._player.close()
+        self.player.close()
 
     def _listed(self) -> Iterator[Frame]:
         inputs = self.run.inputs
@@ -326,6 +332,40 @@ class FrameSession(ReplaySession):
         """The weights (N,), 1 / spread² of every number of the clean actions, over all pairs of the items."""
         clean = [self.act(pair.clean, pair.seed).ravel() for item in self.items for pair in self.pairs(item)]
         return spread_of(np.array(clean))
+
+    # -- whole episodes ----------------------------------------------------------------------------------
+
+    @property
+    def player(self) -> "Player":
+        """The player of the environment or the recordings."""
+        return self.frames.player
+
+    def planned(self, pair: Pair) -> "Row":
+        """Return a pair's episode as the run planned it."""
+        return self.frames.planned(pair.row)
+
+    def pair_at(self, pair: Pair, observation: Observation, call: int, swapping: bool) -> Pair:
+        """Return the pair of an inference of the episode that is played; without a source of its own."""
+        del swapping
+        planned = self.player.row
+        seed = derive_seed(planned.policy_seed, "inference", planned.noise_of(call))
+        return replace(pair, clean=observation, source=observation, seed=seed, step=call, stored=None)
+
+    def end_position(self, ending: "Ending") -> float:
+        """Return 1 for success after the last action, else 0."""
+        return float(ending.outcome[AT_END])
+
+    def trajectory_difference(self, pair: Pair, ending: "Ending", actions: Sequence[Chunk]) -> float:
+        """Return the largest difference of a stored action; the smallest number if only pictures differ.
+
+        The run keeps the hash of all pictures of an episode, and the actions of its captured inferences.
+        """
+        if str(self.run.episodes["frames_blake2b"].iloc[pair.row]) == ending.outcome["frames_blake2b"]:
+            return 0.0
+        assert self.run.inputs is not None
+        stored = self.run.inputs.row("action", pair.row)
+        apart = [largest_difference(*both) for both in zip(actions, stored, strict=False)]
+        return max([*apart, float(np.finfo(np.float32).tiny)])
 
     # -- words -------------------------------------------------------------------------------------------
 

@@ -97,7 +97,10 @@ def sizes(chunks: NDArray[np.float32]) -> Matrix:
     return np.asarray(np.sqrt(((values - values[0]) ** 2 * weights).sum(axis=2) / count))
 
 
-BY_CONDITION = ("displacement", "max_action_change", "edit_log", "episode_outcomes", "toward", "size", "chunks")
+BY_CONDITION = (
+    "displacement", "max_action_change", "edit_log", "episode_outcomes", "toward", "size", "chunks",
+    "token_counts",
+)  # fmt: skip
 """Arrays with conditions along their first axis."""
 UNSTORED = ("seed_text", "chunks", "mass", "inferences", "patches")
 """Fields that a stored intervention does not have, or has in a file of its kind's own."""
@@ -121,11 +124,14 @@ class ConditionOutcomes:
         edit_log: (K, E, 5) logs of the edits, see `LOG_FIELDS`.
         replay_error: (E,) difference of the clean inference from the stored one; NaN where the run has none.
         episode_outcomes: (K, E) zone where the cube ended, correct, wrong or oob, for episodes that were played to
-            their end; None where nothing was executed. With it, `displacement` is the cube's, and
-            `max_action_change` and `replay_error` are of the trajectory.
+            their end; in an environment success or failure. None where nothing was executed. With it,
+            `displacement` is the cube's, or 1 for success and 0 without, and `max_action_change` and
+            `replay_error` are of the trajectory.
         toward: (K, E) displacement toward the source's action, in spreads of clean actions; None where whole
             episodes were played.
         size: (K, E) size of the change, in spreads of clean actions; None where whole episodes were played.
+        token_counts: (K, E, 2) numbers of tokens that are cut, and of the others, of cuts of attention; 0 where
+            nothing is cut. None for other kinds, and in outcomes of earlier versions.
         seed_text: Text of the run by which random draws are made.
         chunks: (K, E, N) all numbers of the actions of first inferences; None where whole episodes were played,
             and in stored outcomes.
@@ -147,6 +153,7 @@ class ConditionOutcomes:
         "edit_log": "f KEL",
         "replay_error": "f E",
         "episode_outcomes": "U KE",
+        "token_counts": "iu KE2",
     }
 
     conditions: tuple[str, ...]
@@ -162,6 +169,7 @@ class ConditionOutcomes:
     episode_outcomes: NDArray[np.str_] | None = None
     toward: NDArray[np.float64] | None = None
     size: NDArray[np.float64] | None = None
+    token_counts: NDArray[np.int64] | None = None
     seed_text: str = ""
     chunks: NDArray[np.float32] | None = None
     mass: NDArray[np.float32] | None = None

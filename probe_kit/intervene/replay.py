@@ -65,6 +65,7 @@ class ConditionResult:
         mass: (B, I, H, R) shares of its attention; None if not recorded; see `AttentionShares`.
         patches: (B, P) shares on the patches of the cameras' pictures, means over iterations and heads; None if
             not recorded.
+        token_counts: Numbers of tokens that are cut, and of the others; None where no attention is cut.
         estimated: Displacement that an estimate adds to the chunk's, without an inference that makes it.
     """
 
@@ -72,6 +73,7 @@ class ConditionResult:
     edit_log: EditLog | None = None
     mass: NDArray[np.float32] | None = None
     patches: NDArray[np.float32] | None = None
+    token_counts: tuple[int, int] | None = None
     estimated: float = 0.0
 
 
@@ -184,6 +186,18 @@ def room_for(pairs: Sequence[Pair], conditions: Sequence[Condition]) -> Conditio
     )
 
 
+def count_tokens(
+    outcomes: ConditionOutcomes, counted: Mapping[tuple[int, int], tuple[int, int]]
+) -> ConditionOutcomes:
+    """Return outcomes with the numbers of cut and of other tokens, by condition and pair, if any were counted."""
+    if not counted:
+        return outcomes
+    counts = np.zeros((*outcomes.displacement.shape, 2), np.int64)
+    for cell, numbers in counted.items():
+        counts[cell] = numbers
+    return replace(outcomes, token_counts=counts)
+
+
 def with_attention(outcomes: ConditionOutcomes, records: Sequence[AttentionRecord]) -> ConditionOutcomes:
     """Return outcomes with the attention of their inferences, if any was recorded."""
     if not records:
@@ -201,6 +215,7 @@ def replay(session: "ReplaySession", pairs: Sequence[Pair], conditions: Sequence
     """Play every condition on every pair; the first one is the clean one."""
     outcomes = room_for(pairs, conditions)
     attention_records: list[AttentionRecord] = []
+    counted: dict[tuple[int, int], tuple[int, int]] = {}
     chunks: list[list[Chunk]] = []
     for column, pair in enumerate(pairs):
         context = ConditionContext(session, pair)
@@ -215,7 +230,9 @@ def replay(session: "ReplaySession", pairs: Sequence[Pair], conditions: Sequence
             chunks[-1].append(played.chunk.ravel())
             if played.edit_log is not None:
                 outcomes.edit_log[number, column] = played.edit_log.row()
+            if played.token_counts is not None:
+                counted[number, column] = played.token_counts
             if played.mass is not None:
                 attention_records.append((pair.row, pair.step, played.mass, played.patches))
     by_condition = np.array(chunks, np.float32).swapaxes(0, 1) if chunks else None
-    return replace(with_attention(outcomes, attention_records), chunks=by_condition)
+    return replace(with_attention(count_tokens(outcomes, counted), attention_records), chunks=by_condition)

@@ -8,23 +8,28 @@ episode, and the lateral displacements of its actions are summed.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import count
-from math import nan
 
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.errors import CaptureChangedActionError, NoTrajectoryError
+from probe_kit.errors import CaptureChangedActionError
 from probe_kit.extract.rollout.controllers import executed_actions
 from probe_kit.extract.sources.player import Answer, Ending
-from probe_kit.hashing import derive_seed
 from probe_kit.hooks.capturing.edits import EditLog
 from probe_kit.hooks.contract.declared import PLAIN
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.intervene.outcomes import ConditionOutcomes
 from probe_kit.intervene.pairs import Chunk, Pair
-from probe_kit.intervene.replay import AttentionRecord, Condition, ConditionContext, room_for, with_attention
+from probe_kit.intervene.replay import (
+    AttentionRecord,
+    Condition,
+    ConditionContext,
+    count_tokens,
+    room_for,
+    with_attention,
+)
 from probe_kit.intervene.scene_session import SceneSession
-from probe_kit.intervene.sessions import ReplaySession
+from probe_kit.intervene.sessions import ReplaySession, largest_difference
 
 
 @dataclass(frozen=True)
@@ -32,16 +37,26 @@ class RolloutResult:
     """One episode that was played to its end.
 
     Attributes:
-        outcome: Zone where the cube ended: correct, wrong or oob.
-        cube: End of the cube in the plane, in metres.
-        frames: (T + 1, C) frames of the trajectory, as in `env.trajectory`.
+        ending: End of the episode.
+        actions: Executed actions (n, D) of every inference.
         edit_log: Log of all edits.
+        token_counts: Numbers of cut and of other tokens at the first inference; None where no attention is cut.
     """
 
-    outcome: str
-    cube: tuple[float, float]
-    frames: NDArray[np.float32]
+    ending: Ending
+    actions: tuple[Chunk, ...]
     edit_log: EditLog
+    token_counts: tuple[int, int] | None = None
+
+    @property
+    def outcome(self) -> str:
+        """The zone where the cube ended, correct, wrong or oob; in an environment success or failure."""
+        return str(self.ending.outcome["outcome"])
+
+    @property
+    def frames(self) -> NDArray[np.float32]:
+        """The frames (T + 1, C) of the trajectory, as in `env.trajectory`; in an environment actions (T, D)."""
+        return np.concatenate(self.actions) if self.ending.trajectory is None else self.ending.trajectory
 
 
 def play_episodes(
@@ -49,28 +64,31 @@ def play_episodes(
 ) -> ConditionOutcomes:
     """Play every episode under every condition; the first one changes nothing and repeats the run.
 
-    `max_action_change` is the largest difference of any number of the trajectory from the first condition's.
+    `displacement` is where the cube ends, in an environment 1 for success and 0 without. `max_action_change` is
+    the largest difference of any number of the trajectory, or of the actions, from the first condition's.
     `replay_error` is that of the first condition's from the stored one's.
 
     Raises:
         CaptureChangedActionError: If an outcome is not the stored one.
     """
-    assert isinstance(session, SceneSession), "only the scene is played again; other runs are refused before"
     ends = np.zeros((len(conditions), len(pairs)), "U7")
     outcomes = replace(room_for(pairs, conditions), episode_outcomes=ends)
+    counted: dict[tuple[int, int], tuple[int, int]] = {}
     for column, pair in enumerate(pairs):
         clean = roll_out(session, pair, conditions[0], swapping=False)
         outcomes.replay_error[column] = apart_from_stored(session, pair, clean)
         for number, condition in enumerate(conditions):
             played = roll_out(session, pair, condition) if number else clean
-            outcomes.displacement[number, column] = session.lateral_offset(np.array(played.cube))
-            outcomes.max_action_change[number, column] = _largest(played.frames, clean.frames)
+            outcomes.displacement[number, column] = session.end_position(played.ending)
+            outcomes.max_action_change[number, column] = largest_difference(played.frames, clean.frames)
             outcomes.edit_log[number, column] = played.edit_log.row()
             ends[number, column] = played.outcome
-    return outcomes
+            if played.token_counts is not None:
+                counted[number, column] = played.token_counts
+    return count_tokens(outcomes, counted)
 
 
-def roll_out(session: SceneSession, pair: Pair, condition: Condition, swapping: bool = True) -> RolloutResult:
+def roll_out(session: ReplaySession, pair: Pair, condition: Condition, swapping: bool = True) -> RolloutResult:
     """Play one episode under a condition that applies at every inference.
 
     Args:
@@ -80,14 +98,17 @@ def roll_out(session: SceneSession, pair: Pair, condition: Condition, swapping: 
         swapping: Whether the condition needs swapped images; they are then drawn at every inference.
     """
     edit_logs: list[EditLog] = []
+    counts: list[tuple[int, int]] = []
 
     def act(current: Pair, past: Sequence[Chunk]) -> Chunk:
         del past
         played = condition.play(ConditionContext(session, current))
         edit_logs.extend([] if played.edit_log is None else [played.edit_log])
+        counts.extend([] if played.token_counts is None else [played.token_counts])
         return played.chunk
 
-    return replace(_step_through(session, pair, act, swapping), edit_log=EditLog.sum(edit_logs))
+    stepped = _step_through(session, pair, act, swapping)
+    return replace(stepped, edit_log=EditLog.sum(edit_logs), token_counts=next(iter(counts), None))
 
 
 def evaluate_per_step(
@@ -140,26 +161,22 @@ def _evaluate(
 
 
 def _step_through(
-    session: SceneSession, pair: Pair, act: Callable[[Pair, Sequence[Chunk]], Chunk], swapping: bool
+    session: ReplaySession, pair: Pair, act: Callable[[Pair, Sequence[Chunk]], Chunk], swapping: bool
 ) -> RolloutResult:
     """Play one episode with the chunks that `act` gives for every inference's pair and the chunks before."""
-    stage, planned = session.stage, session.planned(pair)
-    answer: Answer = stage.begin(planned, False)
+    player = session.player
+    answer: Answer = player.answer("begin", (session.planned(pair), False))
     past: list[Chunk] = []
+    actions: list[Chunk] = []
     for call in count():
         assert isinstance(answer, Observation)
-        other = stage.look_swapped()[0] if swapping else answer
-        seed = derive_seed(planned.policy_seed, "inference", call)
-        current = replace(pair, clean=answer, source=other, seed=seed, tiles=stage.tile_masks(), step=call)
-        past.append(act(current, past))
-        answer = stage.advance(executed_chunk(session, past))
+        past.append(act(session.pair_at(pair, answer, call, swapping), past))
+        actions.append(executed_chunk(session, past))
+        answer = player.answer("advance", (actions[-1],))
         if isinstance(answer, Ending):
             break
     assert isinstance(answer, Ending)
-    assert answer.trajectory is not None
-    outcome = answer.outcome
-    cube = float(outcome["cube_x"]), float(outcome["cube_y"])
-    return RolloutResult(str(outcome["outcome"]), cube, answer.trajectory, EditLog())
+    return RolloutResult(answer, tuple(actions), EditLog())
 
 
 def _offset(session: SceneSession, observation: object) -> float:
@@ -167,13 +184,13 @@ def _offset(session: SceneSession, observation: object) -> float:
     return session.lateral_offset(observation.state[:2].astype(np.float64))
 
 
-def executed_chunk(session: SceneSession, past: Sequence[Chunk]) -> Chunk:
+def executed_chunk(session: ReplaySession, past: Sequence[Chunk]) -> Chunk:
     """Return the executed actions: the head of the newest chunk, or one averaged over all chunks."""
     settings, exponent = session.run.settings, session.policy.card.ensemble
     return executed_actions(past, int(settings["execute"]), exponent, settings.get("rotation", PLAIN))
 
 
-def apart_from_stored(session: SceneSession, pair: Pair, clean: RolloutResult) -> float:
+def apart_from_stored(session: ReplaySession, pair: Pair, clean: RolloutResult) -> float:
     """Return by how much the episode differs from the stored one; NaN where the run keeps no trajectory.
 
     Raises:
@@ -187,17 +204,4 @@ def apart_from_stored(session: SceneSession, pair: Pair, clean: RolloutResult) -
             "with --batch 1 on this machine (larger batches and other devices round otherwise), then intervene on "
             "that run"
         )
-    try:
-        frames = session.run.trajectory(pair.row).frames
-    except NoTrajectoryError:
-        return nan
-    return _largest(clean.frames, frames)
-
-
-def _largest(first: NDArray[np.float32], second: NDArray[np.float32]) -> float:
-    """Return the largest difference over the frames that both have; 0 only if they are bit for bit the same."""
-    if np.array_equal(first, second, equal_nan=True):
-        return 0.0
-    both = min(len(first), len(second))
-    apart = np.abs(first[:both].astype(np.float64) - second[:both])
-    return max(float(np.nanmax(apart)), float(np.finfo(np.float32).tiny))
+    return session.trajectory_difference(pair, clean.ending, clean.actions)

@@ -1,7 +1,8 @@
 """The session of a run in the scene: both layouts of an item, drawn again from the same state."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from math import nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,7 @@ from probe_kit.errors import (
     NoTrajectoryError,
     OtherFramesError,
 )
+from probe_kit.extract.sources.player import Ending
 from probe_kit.extract.sources.scene_source import ScenePlayer, scene_row
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.observation import Observation
@@ -30,7 +32,7 @@ if TYPE_CHECKING:
 
     from probe_kit.hooks import Policy
 
-from probe_kit.intervene.sessions import ReplayFiles, ReplaySession
+from probe_kit.intervene.sessions import ReplayFiles, ReplaySession, largest_difference
 
 _OTHER: Mapping[Layout, Layout] = {"original": "swapped", "swapped": "original"}
 
@@ -127,6 +129,34 @@ class SceneSession(ReplaySession):
         item = replace(self.items[pair.item], instruction=pair.clean.instruction)
         seeds = int(record["scene_seed"]), int(record["policy_seed"])
         return scene_row(0, Episode(item, _layout_of(record)), *seeds)
+
+    # -- whole episodes ----------------------------------------------------------------------------------
+
+    @property
+    def player(self) -> ScenePlayer:
+        """The player of the scene."""
+        return self.stage
+
+    def pair_at(self, pair: Pair, observation: Observation, call: int, swapping: bool) -> Pair:
+        """Return the pair of an inference of the episode that is played; its source has the pictures swapped."""
+        source = self.stage.look_swapped()[0] if swapping else observation
+        seed = derive_seed(self.stage.row.policy_seed, "inference", call)
+        tiles = self.stage.tile_masks()
+        return replace(pair, clean=observation, source=source, seed=seed, tiles=tiles, step=call)
+
+    def end_position(self, ending: Ending) -> float:
+        """Return the lateral offset of the cube in metres, see `lateral_offset`."""
+        return self.lateral_offset(np.array([float(ending.outcome["cube_x"]), float(ending.outcome["cube_y"])]))
+
+    def trajectory_difference(self, pair: Pair, ending: Ending, actions: Sequence[Chunk]) -> float:
+        """Return the largest difference of any number of the trajectory; NaN where the run keeps none."""
+        del actions
+        try:
+            frames = self.run.trajectory(pair.row).frames
+        except NoTrajectoryError:
+            return nan
+        assert ending.trajectory is not None
+        return largest_difference(ending.trajectory, frames)
 
     def _stored(self, row: int) -> Chunk | None:
         try:

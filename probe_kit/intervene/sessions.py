@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from probe_kit._system.machine import AUTO
 from probe_kit._system.types import Progress
@@ -29,7 +30,9 @@ from probe_kit.runs.run import Run
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from probe_kit.extract.sources.player import Ending, Player
     from probe_kit.hooks import Policy
+    from probe_kit.runs.plan import Row
 
 
 FAR = 0.01
@@ -61,6 +64,15 @@ class ReplayFiles:
     weights_seed: int | None = None
     device: str = AUTO
     moved: Mapping[str, Any] = field(default_factory=dict)
+
+
+def largest_difference(first: NDArray[np.float32], second: NDArray[np.float32]) -> float:
+    """Return the largest difference over the rows that both have; 0 only if they are bit for bit the same."""
+    if np.array_equal(first, second, equal_nan=True):
+        return 0.0
+    both = min(len(first), len(second))
+    apart = np.abs(first[:both].astype(np.float64) - second[:both])
+    return max(float(np.nanmax(apart)), float(np.finfo(np.float32).tiny))
 
 
 LoadPolicy = Callable[[Run, ReplayFiles], "Policy"]
@@ -105,6 +117,44 @@ class ReplaySession(ABC):
     @abstractmethod
     def slope(self, pair: Pair) -> "Callable[[Tensor], Tensor]":
         """Return `displacement` up to a constant, as a function of actions (chunk, D) that keeps their graph."""
+
+    @property
+    @abstractmethod
+    def player(self) -> "Player":
+        """The player of the run's episodes."""
+
+    @abstractmethod
+    def planned(self, pair: Pair) -> "Row":
+        """Return a pair's episode as the run planned it."""
+
+    @abstractmethod
+    def pair_at(self, pair: Pair, observation: Observation, call: int, swapping: bool) -> Pair:
+        """Return the pair of an inference of the episode that `player` plays.
+
+        Args:
+            pair: First pair of the episode.
+            observation: Observation that is inferred now.
+            call: Number of the inference in the episode.
+            swapping: Whether the source is needed.
+        """
+
+    @abstractmethod
+    def end_position(self, ending: "Ending") -> float:
+        """Return where an episode ended: the cube's lateral offset in metres, or success as 1 or 0."""
+
+    @abstractmethod
+    def trajectory_difference(self, pair: Pair, ending: "Ending", actions: Sequence[Chunk]) -> float:
+        """Return by how much an episode that was played again differs from the stored one.
+
+        Args:
+            pair: First pair of the episode.
+            ending: End of the episode.
+            actions: Executed actions (n, D) of every inference.
+
+        Returns:
+            The largest difference of any number, 0 only if all are bit for bit the same; NaN where the run keeps
+            nothing to compare with.
+        """
 
     @abstractmethod
     def with_other_instruction(self, pair: Pair) -> Observation | None:

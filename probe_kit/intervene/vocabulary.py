@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from torch import Tensor, nn
 
     from probe_kit.hooks.contract.model import Model, Unembedding
+    from probe_kit.hooks.family import Family
 
 STREAM = "backbone"
 """The stream whose blocks are read: the decoder of the prompt."""
@@ -243,6 +244,21 @@ def value_words(
     )
 
 
+def check_family(family: "Family") -> None:
+    """Refuse, before anything is loaded, a family whose units cannot be read in words.
+
+    Raises:
+        UnsupportedInterventionError: For such a family.
+    """
+    if family.abilities.no_words:
+        raise UnsupportedInterventionError(
+            f"probe-kit words cannot read {family.name}: {family.abilities.no_words}. {_ELSEWHERE}"
+        )
+
+
+_ELSEWHERE = "Take a family with words, such as pi0, openvla or its VLM (docs/capture.md lists them)"
+
+
 def _vocabulary_of(model: "Model") -> "tuple[Unembedding, tuple[str, ...]]":
     """Return the head that reads the backbone in tokens, and the text of each token that it scores.
 
@@ -253,8 +269,8 @@ def _vocabulary_of(model: "Model") -> "tuple[Unembedding, tuple[str, ...]]":
     if head is None or STREAM not in head.streams:
         raise UnsupportedInterventionError(
             f"{model.card.family} has no vocabulary in its backbone: its checkpoint holds no head of a language "
-            "model that turns the backbone's residuals into tokens, and no embedding that is shared with one. "
-            "Take a family with words, such as pi0, openvla or its VLM (docs/capture.md lists them)"
+            f"model that turns the backbone's residuals into tokens, and no embedding that is shared with one. "
+            f"{_ELSEWHERE}"
         )
     texts = model.token_texts()
     if texts is None:

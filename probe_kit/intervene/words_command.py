@@ -37,12 +37,18 @@ def words(
         common.Names | None,
         typer.Option(**common.LISTED, help="Blocks to read, counted from 0, such as 4,5. Default: all."),
     ] = None,
-    tokens: Annotated[int, typer.Option(help="Number of first tokens of a unit.", min=1, max=1000)] = 10,
+    tokens: Annotated[
+        int,
+        typer.Option(help="Number of a unit's first tokens: the best scores.", min=1, max=1000),
+    ] = 10,
     units: Annotated[
-        int, typer.Option(help="Most units to list: those with the highest scores.", min=1, max=1_000_000)
+        int, typer.Option(help="Most units to list: those with the best scores.", min=1, max=1_000_000)
     ] = 20,
     shuffles: Annotated[
-        int, common.further_option("--shuffles", help="Number of shuffles of the embedding, with --like.", min=1)
+        int,
+        common.further_option(
+            "--shuffles", help="With --like: number of shuffled embeddings to compare with.", min=1
+        ),
     ] = 1000,
     seed: common.Seed = 0,
     out_file: Annotated[
@@ -50,8 +56,8 @@ def words(
         typer.Option(
             "--out",
             metavar="FILE",
-            help="Write the value vectors of the listed units as directions (.safetensors or .npz), which "
-            "`probe-kit intervene --kind steer --direction FILE#NAME` reads.",
+            help="Write the listed units' value vectors as directions (.safetensors or .npz) for `probe-kit "
+            "intervene --kind steer --direction FILE#NAME`.",
         ),
     ] = None,
     checkpoint: common.Checkpoint = None,
@@ -73,6 +79,7 @@ def words(
     """
     from probe_kit.hooks.contract.declared import read_pairs
     from probe_kit.hooks.registry import find_family
+    from probe_kit.intervene.vocabulary import check_family, value_words
     from probe_kit.runs.direction_files import check_direction_file
 
     blocks = None if layers is None else [_block(text) for text in layers]
@@ -81,12 +88,11 @@ def words(
         if out_file.exists():
             raise UsageError(f"{out_file} exists; choose another --out or remove it")
     family = find_family(model)
+    check_family(family)
     options = read_pairs(model_options or [])
     family.check(checkpoint, device, None, random_weights, options, weights_seed)  # before it loads for minutes
     with err.status("loading the model"):
         loaded = family.load(checkpoint, device, None, random_weights, options, weights_seed)
-    from probe_kit.intervene.vocabulary import value_words
-
     with progress() as bar:
         value = value_words(loaded, blocks, tokens, counter(bar, "units"))
     match = None if like is None else value.match(like, shuffles, seed)

@@ -130,7 +130,8 @@ LabelFamily = Annotated[
     Family,
     typer.Option(
         "--family",
-        help="With several --target. table: correct p for all targets of the table (Holm).",
+        help="What p is corrected for. label: the sites of one target. table: also all other targets of the "
+        "table (Holm).",
         rich_help_panel=RUNS,
     ),
 ]
@@ -168,7 +169,8 @@ AbsentBelow = Annotated[
         "--absent-below",
         min=0.5,
         max=1.0,
-        help="Accuracy below which a stream without signal is called absent.",
+        help="A stream without signal is called absent if its accuracy is below this in all likelihood: its "
+        "upper 95 % limit.",
         rich_help_panel=RUNS,
     ),
 ]
@@ -199,7 +201,8 @@ Epsilons = Annotated[
         "--epsilons",
         parser=Radii.parse,
         metavar="A,B,…",
-        help="Radii of the target zone in metres: the rule disc is scored again at each, from stored positions.",
+        help="Radii of the target zone in metres, comma-separated. Success by the rule disc is counted again "
+        "with each, from stored positions.",
         rich_help_panel=RULES,
     ),
 ]
@@ -208,12 +211,19 @@ Epsilons = Annotated[
 
 Score = Annotated[
     AnswerScore,
-    typer.Option("--score", help="How the answers of VLM runs are read.", rich_help_panel=VLM_RUNS),
+    typer.Option(
+        "--score",
+        help="How answers of VLM runs are read. text: from the words. logits: the larger "
+        "logit. order-balanced: the same over both orders of the options.",
+        rich_help_panel=VLM_RUNS,
+    ),
 ]
 SideWords = Annotated[
     bool,
     typer.Option(
-        "--with-side-words", help="Count items such as 'no left turn sign' too.", rich_help_panel=VLM_RUNS
+        "--with-side-words",
+        help="Also count items that name a side in their words, such as 'no left turn sign'.",
+        rich_help_panel=VLM_RUNS,
     ),
 ]
 
@@ -240,7 +250,9 @@ AsPaper = Annotated[
 ]
 Html = Annotated[
     Path | None,
-    typer.Option("--html", metavar="FILE", help="Write a report that needs no network."),
+    typer.Option(
+        "--html", metavar="FILE", help="Write all results as one HTML file that opens without a network."
+    ),
 ]
 Figures = Annotated[
     Path | None,

@@ -65,9 +65,14 @@ Metadata = Annotated[
 ]
 StopAfter = Annotated[
     int | None,
-    common.further_option("--stop-after", min=1, metavar="N", help="End after so many stored episodes."),
+    common.further_option(
+        "--stop-after", min=1, metavar="N", help="Stop the server after this many stored episodes."
+    ),
 ]
-Out = Annotated[str, typer.Option("--out", metavar="FOLDER", help="Folder or s3://BUCKET/PREFIX/RUN of the run.")]
+Out = Annotated[
+    str,
+    typer.Option("--out", metavar="FOLDER", help="Where to store the run: a folder or s3://BUCKET/PREFIX/RUN."),
+]
 
 
 @command_with(

@@ -81,7 +81,8 @@ def run(
             "--slots",
             min=0,
             max=1024,
-            help="Number of processes, each with one model; probes use them too. 0: use this process.",
+            help="Number of processes, each with one model; probes use them too. 0: everything runs in this "
+            "process.",
         ),
     ] = 0,
     ray: RayAddress = None,
@@ -208,7 +209,7 @@ def _counters(bar: Any, prefix: str) -> Callable[..., None]:
 def table(
     file: File,
     name: Annotated[
-        str | None, typer.Argument(metavar="[NAME]", help="Table of the file; all of them by default.")
+        str | None, typer.Argument(metavar="[NAME]", help="Which table of the study file. Default: all.")
     ] = None,
     style: Format = "table",
     html: Annotated[
@@ -284,7 +285,7 @@ def _write_report(study: "LoadedStudy", html: Path, partial: bool) -> None:
 def figure(
     file: File,
     name: Annotated[
-        str | None, typer.Argument(metavar="[NAME]", help="Figure of the file; all of them by default.")
+        str | None, typer.Argument(metavar="[NAME]", help="Which figure of the study file. Default: all.")
     ] = None,
     out_folder: Annotated[
         Path, typer.Option("--out", metavar="FOLDER", help="Folder for PNG and PDF files.")
@@ -307,7 +308,12 @@ def figure(
 def pack(
     file: File,
     out_file: Annotated[
-        Path, typer.Option("--out", metavar="PATH", help="Zip file (*.zip), or a folder. A folder for a data set.")
+        Path,
+        typer.Option(
+            "--out",
+            metavar="PATH",
+            help="Zip file (*.zip) or folder to write. With --data-set it must be a folder.",
+        ),
     ],
     directions: Annotated[bool, typer.Option("--directions", help="Include the weights of probes.")] = False,
     pictures: Annotated[bool, typer.Option("--pictures", help="Include frames and videos.")] = False,

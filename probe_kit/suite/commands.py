@@ -101,7 +101,9 @@ def from_csv(
 def show(
     folder: ShownSuite = None,
     categories: Categories = None,
-    n: Annotated[int, typer.Option("--n", min=1, help="Number of items per category, the first ones.")] = 4,
+    n: Annotated[
+        int, typer.Option("--n", min=1, help="Show only this many items per category, the first ones.")
+    ] = 4,
     counts: Annotated[
         bool, typer.Option("--counts", help="List the categories with their item counts instead.")
     ] = False,
@@ -211,11 +213,17 @@ def convert(
     seed: Seed = 0,
     curation: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Reviewed file; use only the items it accepts.", rich_help_panel=REVIEW),
+        typer.Option(
+            metavar="FILE", help="Use only the items that this reviewed file accepts.", rich_help_panel=REVIEW
+        ),
     ] = None,
     emit_curation: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Write a file to review, with previews.", rich_help_panel=REVIEW),
+        typer.Option(
+            metavar="FILE",
+            help="Write a file in which you accept or reject each item, with previews of the pictures.",
+            rich_help_panel=REVIEW,
+        ),
     ] = None,
     option: Annotated[
         list[str] | None,

@@ -134,7 +134,7 @@ TestLabels = Annotated[
     ),
 ]
 AcrossWeights = Annotated[
-    bool, _transfer_option("--across-weights", help="Accept a run of other weights in --test-on.")
+    bool, _transfer_option("--across-weights", help="Accept that the run of --test-on has other weights.")
 ]
 
 # -- controls -----------------------------------------------------------------------------------------------

@@ -50,7 +50,8 @@ def power(
     width: Annotated[
         float | None,
         typer.Option(
-            help="Find the number of items for a success-rate interval of this width, in points.",
+            help="Find the number of items for which the 95 % interval of a success rate has this width, in "
+            "percentage points.",
             min=0.1,
             max=100,
             rich_help_panel=INVERSE,

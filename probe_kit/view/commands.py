@@ -32,7 +32,9 @@ def view(
     ],
     export: Annotated[
         Path | None,
-        typer.Option("--export", metavar="FOLDER", help="Write a folder that opens without a server, and stop."),
+        typer.Option(
+            "--export", metavar="FOLDER", help="Write the pages to a folder that opens without a server, and stop."
+        ),
     ] = None,
     categories: Annotated[
         Names | None, typer.Option("--only", **NAMED, help="Categories to export, comma-separated. Default: all.")

@@ -351,7 +351,7 @@ def test_what_no_site_knows_is_told_from_what_is_lost(run_of_many: Run, tmp_path
     new = ("--target", "coin", "--labels", table, "--no-inside")
     answer = run_command(run_of_many.location, *FRAMES, *new)
     assert answer.exit_code == 0, answer.output
-    assert "coin is never known" in " ".join(answer.output.split())
+    assert "coin cannot be read anywhere" in " ".join(answer.output.split())
 
 
 def test_a_table_without_a_target_is_refused(folder: Path) -> None:

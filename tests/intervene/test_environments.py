@@ -9,11 +9,22 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from probe_kit.errors import OtherFramesError, SettingsMismatchError, UsageError
+from probe_kit.errors import CaptureChangedActionError, OtherFramesError, SettingsMismatchError, UsageError
 from probe_kit.extract import EnvironmentSettings, ExtractSettings, prepare
 from probe_kit.extract.config_files import moved_of
-from probe_kit.hooks import Observation
-from probe_kit.intervene import AttentionReadout, ImageSwap, InstructionSwap, Interchange, run_intervention
+from probe_kit.extract.rollout.worker import torch_threads
+from probe_kit.extract.sources.environment_source import open_environment
+from probe_kit.hashing import derive_seed
+from probe_kit.hooks import AttentionCut, Observation, cut_attention
+from probe_kit.hooks.contract.sites import HEADS
+from probe_kit.intervene import (
+    AttentionReadout,
+    ImageSwap,
+    InstructionSwap,
+    Interchange,
+    Knockout,
+    run_intervention,
+)
 from probe_kit.intervene.frame_session import FrameSession
 from probe_kit.intervene.open_session import open_session
 from probe_kit.intervene.sessions import ReplayFiles
@@ -172,3 +183,71 @@ def test_a_mistyped_camera_and_an_unknown_frame_are_refused_before_the_model_is_
 def test_fewer_episodes_than_the_run_has_are_refused(played: Run, pi0_tiny: "Pi0") -> None:
     with pytest.raises(OtherFramesError, match="has no episode 'reach-04' any more"):
         open_session(played, ReplayFiles(moved={"options": {"count": "4"}}), lambda *_: pi0_tiny)
+
+
+# -- whole episodes ------------------------------------------------------------------------------------------
+
+
+def run_of(environment: str, folder: Path, policy: "Pi0", count: int) -> Run:
+    source = EnvironmentSettings(f"reach_env:{environment}", max_steps=6, options={"count": str(count)})
+    settings = ExtractSettings("pi0-tiny", source=source, captured_calls=2, execute=3, env_workers=0, batch=1)
+    prepare(settings, model=policy).run(folder)
+    return open_run(folder)
+
+
+@pytest.fixture(scope="module")
+def nearing(_own_modules: None, pi0_tiny: "Pi0", tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """Six episodes in three groups, which succeed if the hand comes nearer."""
+    return run_of("Nearing", tmp_path_factory.mktemp("nearing") / "run", pi0_tiny, EPISODES)
+
+
+def succeeds(run: Run, policy: "Pi0", row: int, is_cut: bool) -> bool:
+    """Play an episode by the contract alone, with the picture cut in all layers, and say how it ends."""
+    environment = open_environment(EnvironmentSettings("reach_env:Nearing", options={"count": str(EPISODES)}))
+    episode = list(environment.episodes())[row]
+    step, call = environment.reset(episode), 0
+    assert not isinstance(step, Observation)
+    for call in range(2):
+        seed = derive_seed(int(run.episodes["policy_seed"].iloc[row]), "inference", call)
+        keys = policy.roles([step.observation])["backbone"][0].mask("image")
+        cuts = dict.fromkeys(policy.streams["expert"].sites(HEADS), AttentionCut(keys)) if is_cut else {}
+        with torch_threads(1), cut_attention(policy, cuts):
+            chunk = policy.predict([step.observation], [seed])[0]
+        for action in chunk[:3]:
+            step = environment.step(action)
+    environment.close()
+    return bool(step.facts["success"])
+
+
+@pytest.mark.slow
+def test_a_cut_in_closed_loop_plays_the_environment_and_counts_success(nearing: Run, pi0_tiny: "Pi0") -> None:
+    intervention = Knockout(roles=("image",), window="3", controls=1, closed_loop=True)
+    result = run_intervention(nearing, intervention, load=lambda *_: pi0_tiny)
+    assert result.certificate["replay"]["equal"] == result.certificate["replay"]["outcomes_equal"] == EPISODES
+    cut = next(row for row in result.effects if not row.is_control)
+    rows = range(EPISODES)
+    assert cut.success == np.mean([succeeds(nearing, pi0_tiny, row, is_cut=True) for row in rows])
+    assert cut.success_clean == np.mean([succeeds(nearing, pi0_tiny, row, is_cut=False) for row in rows])
+    assert cut.success_clean == (nearing.episodes["outcome"] == "success").mean()
+    assert cut.lost == pytest.approx(cut.success_clean - cut.success)
+    assert cut.success_clean > 0
+    assert "of the success rate, success" in result.sentences[0]
+    assert result.findings == (
+        "All  unknown: with 3 groups of items no p can be below 0.12; 5 groups or more can show what is read.",
+    )
+    again = run_intervention(nearing, intervention, load=not_loaded)
+    assert again.to_csv() == result.to_csv()
+
+
+@pytest.mark.slow
+def test_an_environment_that_says_no_success_and_an_episode_that_ends_otherwise_are_refused(
+    pi0_tiny: "Pi0", nearing: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import reach_env
+
+    without = run_of("Unjudged", tmp_path / "run", pi0_tiny, 4)
+    with pytest.raises(UsageError, match=r"counts the fact 'success', and the environment of .* has block, left"):
+        Knockout(closed_loop=True).check_run(without)
+    monkeypatch.setattr(reach_env.Nearing, "_as_step", reach_env.ReachEnv._as_step)
+    with pytest.raises(CaptureChangedActionError, match="played again with nothing changed, ended failure"):
+        run_intervention(nearing, Knockout(closed_loop=True, controls=2), load=lambda *_: pi0_tiny)

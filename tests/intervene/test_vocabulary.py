@@ -15,9 +15,13 @@ from probe_kit.errors import UnsupportedInterventionError, UsageError
 from probe_kit.hooks import Model, capture, load_model
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.sites import Site
+from probe_kit.hooks.family import Family
+from probe_kit.hooks.registry import own_families
 from probe_kit.intervene import value_words
 from probe_kit.intervene.vocabulary import ValueWords, value_vectors
 from probe_kit.runs.direction_files import read_direction
+from probe_kit.suite import Suite
+from tests.support.acting_checkpoints import FAMILIES
 
 
 @pytest.fixture(scope="module")
@@ -153,6 +157,44 @@ def test_a_model_without_words_is_refused_by_name(policy: Model, monkeypatch: py
     monkeypatch.setattr(type(policy), "word_head", None)
     with pytest.raises(UnsupportedInterventionError, match="pi0-tiny has no vocabulary in its backbone"):
         value_words(policy)
+
+
+WITHOUT_WORDS = [name for name, family in own_families().items() if family.abilities.no_words]
+
+
+@pytest.mark.parametrize("name", WITHOUT_WORDS)
+def test_a_family_without_words_is_refused_before_its_weights_are_looked_for(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def not_checked(*_: object, **__: object) -> None:
+        raise AssertionError("nothing of the checkpoint is needed for this")
+
+    monkeypatch.setattr(Family, "check", not_checked)
+    monkeypatch.setattr(Family, "load", not_checked)
+    answer = CliRunner().invoke(app, ["words", name, "--random-weights"])
+    assert answer.exit_code == 2
+    assert f"probe-kit words cannot read {name}: " in " ".join(answer.output.split())
+
+
+def test_an_unknown_model_option_is_refused_before_the_weights_are_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Family, "load", lambda *_, **__: pytest.fail("it was loaded"))
+    answer = CliRunner().invoke(app, ["words", "pi0-tiny", "-M", "sise=small"])
+    assert answer.exit_code == 2
+    assert "pi0-tiny has no model option sise" in answer.output
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FAMILIES)
+def test_what_families_say_of_their_words_is_true_of_loaded_models(
+    name: str, small_suite: Suite, tmp_path: Path
+) -> None:
+    family, tiny = own_families()[name], FAMILIES[name]
+    model = load_model(name, tiny.prepare_checkpoint(small_suite, tmp_path), **tiny.options)
+    if family.abilities.no_words:
+        with pytest.raises(UnsupportedInterventionError):
+            value_words(model, tokens=1)
+    else:
+        assert len(value_words(model, tokens=1)) > 0
 
 
 @pytest.mark.parametrize(

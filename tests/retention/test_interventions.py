@@ -364,6 +364,18 @@ def test_a_knockout_shows_a_curve_a_role_over_its_controls(run: ArrayRun) -> Non
     assert any(name.endswith("knockout") for name in names)
 
 
+def test_places_of_kv_are_one_curve_by_the_block_that_is_read(run: ArrayRun) -> None:
+    answers = knockout_of({"image": [{2}]}, 0, "1")
+    roles = tuple(
+        f"kv.{cell.site[7:9]}" if cell.role == "image" and not cell.is_control else cell.role
+        for cell in answers.cells
+    )
+    store(run, "knockout", replace(answers, roles=roles))
+    (curve,) = KnockoutDisplay.from_run(run, "color").curves
+    assert (curve.role, curve.growth) == ("kv", "around")
+    np.testing.assert_array_equal(curve.is_read, [False, False, True, False, False, False])
+
+
 def test_without_a_knockout_there_is_no_such_figure(run: ArrayRun) -> None:
     with pytest.raises(NoInterventionsError, match="--kind knockout"):
         knockout_curve(run)

@@ -108,6 +108,29 @@ class Drifting(ReachEnv):
         return self._as_step(self._env.reset(seed=None if hasattr(self._env, "block") else self._first)[0])
 
 
+class Nearing(ReachEnv):
+    """Succeeds while the hand is nearer to the block than it was at the beginning."""
+
+    def reset(self, episode: EnvEpisode) -> Step:
+        """The beginning, whose distance is kept."""
+        self._away = 0.0
+        begin = super().reset(episode)
+        self._away = abs(self._env.hand[1] - self._env.block)
+        return begin
+
+    def _as_step(self, observed: dict[str, Any], done: bool = False, success: bool = False) -> Step:
+        del success
+        return super()._as_step(observed, done, bool(abs(self._env.hand[1] - self._env.block) < self._away))
+
+
+class Unjudged(ReachEnv):
+    """Says no success."""
+
+    def _as_step(self, observed: dict[str, Any], done: bool = False, success: bool = False) -> Step:
+        step = super()._as_step(observed, done, success)
+        return Step(step.observation, done, {name: fact for name, fact in step.facts.items() if name != "success"})
+
+
 class Reusing(ReachEnv):
     """Every picture is the same buffer."""
 

@@ -95,7 +95,11 @@ _option = partial(typer.Option, rich_help_panel="Own environments")
 
 EnvOptions = Annotated[
     list[str] | None,
-    _option("--env-option", metavar="KEY=VALUE", help="Argument of the environment; repeatable."),
+    _option(
+        "--env-option",
+        metavar="KEY=VALUE",
+        help="Argument of the environment's class, such as task=libero_goal; repeatable.",
+    ),
 ]
 
 
@@ -145,7 +149,7 @@ class EnvironmentSettings(SourceSettings):
         bool,
         _option(
             "--accept-nondeterminism",
-            help="Play an environment in which an episode does not repeat, such as a real robot.",
+            help="Play an environment whose episodes do not repeat with the same seed, such as a real robot.",
         ),
     ] = False
     pixels: Pixels = True
@@ -155,7 +159,7 @@ class EnvironmentSettings(SourceSettings):
     opens: ClassVar[str] = "probe_kit.extract.sources.environment_source:EnvironmentSource"
     moves: ClassVar[Mapping[str, str]] = {
         "environment": "The run's environment, if its module was moved or renamed.",
-        "options": "Argument of the environment beside those of the run; repeatable.",
+        "options": "Argument of the environment, in addition to those of the run; repeatable.",
     }
     played: ClassVar[str] = "in"
     subject: ClassVar[str] = "environments"

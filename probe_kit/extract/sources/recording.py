@@ -164,8 +164,8 @@ Rotations = Annotated[
     typer.Option(
         "--rotate",
         metavar="[CAMERA=]DEGREES",
-        help="Rotate pictures by 90, 180 or 270 degrees, such as 180 if they are upside down. CAMERA=DEGREES "
-        "rotates those of one camera; repeatable.",
+        help="Rotate pictures counterclockwise by 90, 180 or 270 degrees, such as 180 if they are upside "
+        "down. CAMERA=DEGREES rotates those of one camera; repeatable.",
         rich_help_panel="Recordings",
     ),
 ]

@@ -77,7 +77,7 @@ class SceneOptions(Part):
     ] = None
     epsilon: Annotated[
         float | None,
-        _option("--epsilon", help="Radius of the target zone in metres. Default: half a tile + 0.01."),
+        _option("--epsilon", help="Radius of the target zone in metres. Default: half a tile plus 0.01 m."),
     ] = None
     arm: Annotated[ArmName | None, _option("--arm", help="Robot arm.")] = None
     arm_urdf: Annotated[Path | None, _option("--arm-urdf", help="Your own URDF file of this arm.")] = None

@@ -83,7 +83,8 @@ class ServedSettings(SourceSettings):
         ),
     ] = ()
     instruction: Annotated[
-        str | None, _option("--instruction", help="What the model reads. Default: the words that clients send.")
+        str | None,
+        _option("--instruction", help="Instruction that the model reads. Default: the one that clients send."),
     ] = None
     every: Annotated[
         Annotated[int, Field(ge=1, le=MOST_CALLS * 1000)],
@@ -93,8 +94,8 @@ class ServedSettings(SourceSettings):
         Keep,
         _option(
             "--keep",
-            help="full: store pictures as they arrive. small: at 32 × 32 alone; `intervene` and `diagnose` are "
-            "then not possible.",
+            help="How pictures are stored. full: as they arrive. small: only at 32 × 32 pixels; `intervene` "
+            "and `diagnose` cannot use such a run.",
         ),
     ] = "full"
     source_name: Annotated[
@@ -109,8 +110,9 @@ class ServedSettings(SourceSettings):
         EpisodeRule,
         _option(
             "--episodes",
-            help="What begins an episode without marks. guessed: other words, a pause or a state that returns. "
-            "words: as guessed, an instruction is a group. connection: each one. said: refuse such clients.",
+            help="What begins an episode if the client marks none. guessed: a new instruction, a pause, or a "
+            "state that returns. words: the same, and each instruction is a group. connection: each "
+            "connection. said: refuse such clients.",
         ),
     ] = "guessed"
     pause: Annotated[
@@ -119,12 +121,16 @@ class ServedSettings(SourceSettings):
             "--pause",
             metavar="SECONDS",
             show_default="10 times the longest interval, at least 5",
-            help="Pause after which an episode of a client without marks ends.",
+            help="Seconds without a request that end an episode, if the client marks none.",
         ),
     ] = None
     most_calls: Annotated[
         Annotated[int, Field(ge=1, le=10_000)],
-        further_option("--most-calls", metavar="N", help="Number of inferences of --captured-calls all."),
+        further_option(
+            "--most-calls",
+            metavar="N",
+            help="Number of inferences that `--captured-calls all` stores per episode, at most.",
+        ),
     ] = MOST_CALLS
     run: Annotated[str | None, Field(exclude=True)] = None
 

@@ -32,9 +32,9 @@ from torch.overrides import TorchFunctionMode
 from probe_kit.errors import CaptureError, RolesMismatchError, UnknownSiteError, UsageError
 from probe_kit.hooks.capturing.capture_context import ActivationCache, capture, edit
 from probe_kit.hooks.capturing.edits import ActiveEdits, EditLog
-from probe_kit.hooks.contract.model import Model, Policy
+from probe_kit.hooks.contract.model import Model, Policy, Tap
 from probe_kit.hooks.contract.roles import Roles
-from probe_kit.hooks.contract.sites import HEADS, Site, Stream, first_of
+from probe_kit.hooks.contract.sites import HEADS, Site, first_of
 
 Read = tuple[int, int]
 """A block of the backbone whose keys and values are read, and the iteration in which it is."""
@@ -218,10 +218,11 @@ def cut_attention(model: Model, cuts: Mapping[Site, AttentionCut]) -> Iterator[E
         if outside := [head for head in cut.heads or () if not 0 <= head < count]:
             raise UsageError(f"{site} has {count} heads, counted from 0; there is no head {outside[0]}")
     calls, active, log = _AttentionCalls(model, cuts), ActiveEdits(), EditLog()
-    hidden = {site: torch.from_numpy(cut.keys) for site, cut in cuts.items() if cut.keys.any()}
+    # Sites with the same cut share its masks: every inference has many, and makes each mask once.
+    by_cut = {id(cut): _HiddenTokens(torch.from_numpy(cut.keys)) for cut in cuts.values() if cut.keys.any()}
 
     def change(site: Site, read: Tensor) -> Tensor:
-        new = _without(site, calls, read, cuts[site], hidden.get(site))
+        new = _without(site, calls, read, cuts[site], by_cut.get(id(cuts[site])))
         active.fired.append((site, read, new))
         return new
 
@@ -230,10 +231,33 @@ def cut_attention(model: Model, cuts: Mapping[Site, AttentionCut]) -> Iterator[E
     log.entries += active.measured()
 
 
+class _HiddenTokens:
+    """Tokens that are cut, as masks of every length that is attended to.
+
+    Attributes:
+        keys: (T',) bool.
+    """
+
+    def __init__(self, keys: Tensor) -> None:
+        self.keys = keys
+        self._masks: dict[tuple[int, torch.device], Tensor] = {}
+
+    def mask(self, site: Site, count: int, device: torch.device) -> Tensor:
+        """Return (T,) bool, False behind T'; raises RolesMismatchError for fewer tokens than T'."""
+        if (count, device) not in self._masks:
+            if len(self.keys) > count:
+                raise RolesMismatchError(
+                    f"{len(self.keys)} tokens are to be cut or kept; {site} attends to {count}. Take the roles "
+                    "of the observation that is inferred"
+                )
+            self._masks[count, device] = functional.pad(self.keys, (0, count - len(self.keys))).to(device)
+        return self._masks[count, device]
+
+
 def _without(
-    site: Site, calls: "_AttentionCalls", read: Tensor, cut: AttentionCut, hidden: Tensor | None
+    site: Site, calls: "_AttentionCalls", read: Tensor, cut: AttentionCut, hidden: "_HiddenTokens | None"
 ) -> Tensor:
-    """Return what the heads read (B, S, H · E) without the tokens that are cut: `hidden` (T',), None for none."""
+    """Return what the heads read (B, S, H · E) without the tokens that are cut; None for none."""
     weights, values = calls.at(site, read)
     if hidden is None:
         return read
@@ -256,24 +280,19 @@ def _without(
         return new.flatten(2)
 
 
-def _renormalised(site: Site, weights: Tensor, hidden: Tensor) -> Tensor:
+def _renormalised(site: Site, weights: Tensor, hidden: _HiddenTokens) -> Tensor:
     """Return weights (B, H, S, T) that are 0 on the cut tokens and sum to 1 over the others."""
-    count = hidden.shape[0]
-    if count > weights.shape[3]:
-        raise RolesMismatchError(
-            f"{count} tokens are to be cut or kept; {site} attends to {weights.shape[3]}. Take the roles "
-            "of the observation that is inferred"
-        )
-    hidden = functional.pad(hidden.to(weights.device), (0, weights.shape[3] - count))
-    left = weights.masked_fill(hidden, 0.0)
+    left = weights.masked_fill(hidden.mask(site, weights.shape[3], weights.device), 0.0)
     total = left.sum(dim=-1, keepdim=True)
+    if float(total.min()) > 0:
+        return left.div_(total)
     # A position that attended to nothing before, such as padding, has no weights to renormalise.
-    if float(total.min()) == 0 and bool(((total == 0) & (weights.sum(dim=-1, keepdim=True) > 0)).any()):
+    if bool(((total == 0) & (weights.sum(dim=-1, keepdim=True) > 0)).any()):
         raise CaptureError(
             f"{site}: the tokens that are left have no weight that float32 can hold, and cannot be renormalised. "
             "Cut fewer tokens"
         )
-    return left / total.clamp_min(torch.finfo(left.dtype).tiny)
+    return left.div_(total.clamp_min(torch.finfo(left.dtype).tiny))
 
 
 def attended_roles(model: Model, roles: Mapping[str, Sequence[Roles]], site: Site, tokens: int) -> list[Roles]:
@@ -342,8 +361,22 @@ class _Attention:
     values: Tensor
 
 
-_ATTENDING: "WeakKeyDictionary[nn.Module, ref[nn.Module]]" = WeakKeyDictionary()
-"""By output projection the module that owns it, if all attention that was asked for was computed inside of it."""
+@dataclass(frozen=True)
+class _Attending:
+    """A module inside which all attention was computed that an output projection put out.
+
+    Attributes:
+        owner: That module, which owns the projection.
+        begin: Child that ended last before the attention, where every call of the owner has one attention;
+            None to watch from the owner's beginning on.
+    """
+
+    owner: "ref[nn.Module]"
+    begin: "ref[nn.Module] | None"
+
+
+_ATTENDING: "WeakKeyDictionary[nn.Module, _Attending]" = WeakKeyDictionary()
+"""By output projection the module that attends, once it was watched."""
 
 
 class _AttentionCalls(TorchFunctionMode):
@@ -360,37 +393,76 @@ class _AttentionCalls(TorchFunctionMode):
     def __init__(self, model: Model, sites: Iterable[Site]) -> None:
         super().__init__()
         self.model = model
-        self.taps = {site: model.tap(site) for site in sites}
+        # Sites that differ only in the iteration have one tap.
+        taps: dict[tuple[str, int], Tap] = {}
+        self.taps: dict[Site, Tap] = {}
+        for site in sites:
+            if (site.stream, site.layer) not in taps:
+                taps[site.stream, site.layer] = model.tap(site)
+            self.taps[site] = taps[site.stream, site.layer]
+        self._unchecked: list[tuple[Site, Tensor, Tensor]] = []
+        self._unchecked_bytes = 0
         self.last: _Attention | None = None
         self.is_inside = False
         self.projections: dict[nn.Module, bool] = {}
         self._shares: Tensor | None = None
         self._depth = 0
+        self._is_entered = False
+        self._ended: nn.Module | None = None
+        self._begins: dict[nn.Module, set[nn.Module | None]] = {}
+        self._owner: nn.Module | None = None
+        self._noted = 0
 
     @contextmanager
     def watching(self) -> Iterator[None]:
         """Watch the calls of the model while it runs.
 
         Seeing each call costs as much as a third of a small model's inference. Where attention was computed
-        inside its own modules once, only these are watched.
+        inside its own modules once, only these are watched, from the last child before the attention to the output
+        projection.
         """
         projections = {tap.module for tap in self.taps.values()}
-        attending = {module: _ATTENDING[module]() for module in projections if module in _ATTENDING}
-        owners = {module: owner for module, owner in attending.items() if owner is not None}
+        known = {module: _ATTENDING[module] for module in projections if module in _ATTENDING}
+        owners = {module: owner for module, part in known.items() if (owner := part.owner()) is not None}
         is_known = len(owners) == len(projections)
         if not is_known:
             owners = _owners(getattr(self.model, "network", None), projections)
         with ExitStack() as stack:
             for owner in dict.fromkeys(owners.values()):
-                enter, leave = partial(self._enter, is_known), partial(self._leave, is_known)
-                stack.callback(owner.register_forward_pre_hook(enter, prepend=True).remove)
-                stack.callback(owner.register_forward_hook(leave, always_call=True).remove)
+                of_owner = [module for module, other in owners.items() if other is owner]
+                begin = known[of_owner[0]].begin if is_known and len(of_owner) == 1 else None
+                self._watch(owner, of_owner, is_known, None if begin is None else begin(), stack)
             if not is_known:
                 stack.enter_context(self)
             yield
+        self._check_readings()
         for module, is_inside in self.projections.items():
-            if is_inside and module in owners:
-                _ATTENDING[module] = ref(owners[module])
+            if is_inside and module in owners and not is_known:
+                begins = self._begins.get(owners[module], set())
+                child = next(iter(begins)) if len(begins) == 1 else None
+                _ATTENDING[module] = _Attending(ref(owners[module]), None if child is None else ref(child))
+
+    def _watch(
+        self,
+        owner: nn.Module,
+        projections: Sequence[nn.Module],
+        is_known: bool,
+        begin: nn.Module | None,
+        stack: ExitStack,
+    ) -> None:
+        """Attach the hooks to a module that attends; `begin` is the child behind which its calls are watched."""
+        hooks = [
+            owner.register_forward_pre_hook(partial(self._enter, is_known and begin is None), prepend=True),
+            owner.register_forward_hook(partial(self._leave, is_known), always_call=True),
+        ]
+        if begin is not None:
+            hooks.append(begin.register_forward_hook(self._begin))
+        elif not is_known:
+            hooks += [child.register_forward_hook(self._end_child) for child in owner.children()]
+        if is_known and len(projections) == 1:
+            hooks.append(projections[0].register_forward_pre_hook(self._pause, prepend=True))
+        for hook in hooks:
+            stack.callback(hook.remove)
 
     def at(self, site: Site, read: Tensor) -> tuple[Tensor, Tensor]:
         """Return the pattern (B, H, S, T) of the positions of a site, whose heads read `read` (B, S, H · E).
@@ -409,24 +481,74 @@ class _AttentionCalls(TorchFunctionMode):
         with torch._C.DisableTorchFunction():
             weights = last.weights()
             values = _repeat_for_heads(last.values, weights.shape[1]).float().to(weights.device)
-            computed = tap.rows.of((weights @ values).transpose(1, 2).flatten(2))[:, tap.tokens]
-        _check_reading(site, self.model.stream_of(site), weights.shape[1], computed, read)
+            computed = tap.rows.of((weights @ values).transpose(1, 2))[:, tap.tokens]
+            self._compare(site, computed, read)
         self.projections[tap.module] = self.projections.get(tap.module, True) and self.is_inside
         return tap.rows.of(weights)[:, :, tap.tokens], tap.rows.of(values)
 
-    def _enter(self, watches: bool, *_: Any) -> None:
+    def _compare(self, site: Site, computed: Tensor, read: Tensor) -> None:
+        """Keep by how much (B, S, H, E) differs from what the heads read (B, S, H · E), for `_check_readings`.
+
+        Raises:
+            CaptureError: For other shapes.
+        """
+        stream, shape = self.model.stream_of(site), computed.shape
+        if shape[2] != stream.heads or (*shape[:2], shape[2] * shape[3]) != tuple(read.shape):
+            raise _unlike_reading(
+                site, f"has {shape[2]} heads and {tuple(shape)}", f"{stream.heads} and {tuple(read.shape)}"
+            )
+        self._unchecked.append((site, computed - read.reshape(shape), read))
+        self._unchecked_bytes += read.numel() * 8
+        if self._unchecked_bytes > _UNCHECKED_BYTES:
+            self._check_readings()
+
+    def _check_readings(self) -> None:
+        """Raise CaptureError unless every pattern gives what the heads read: all together, as that costs less."""
+        if not self._unchecked:
+            return
+        sites, differences, readings = zip(*self._unchecked, strict=True)
+        self._unchecked, self._unchecked_bytes = [], 0
+        norms = [
+            torch.stack(torch._foreach_norm(list(tensors), ord=torch.inf)).tolist()
+            for tensors in (differences, readings)
+        ]
+        for site, apart, largest, read in zip(sites, *norms, readings, strict=True):
+            limit = TOLERANCE.get(read.dtype, TOLERANCE[torch.float32]) * largest
+            if not apart <= limit:  # negated, so that NaN is refused too
+                raise _unlike_reading(site, f"is off by {apart:.3g}", f"at most {limit:.3g}")
+
+    def _enter(self, watches: bool, owner: nn.Module, *_: Any) -> None:
         self._depth += 1
+        if self._depth == 1:
+            self._owner, self._ended, self._noted = owner, None, 0
         if watches and self._depth == 1:
             self.last = None
+            self._begin()
+
+    def _begin(self, *_: Any) -> None:
+        if self._depth and not self._is_entered:
+            self.last, self._is_entered = None, True
             self.__enter__()  # type: ignore[no-untyped-call]
+
+    def _pause(self, *_: Any) -> None:
+        if self._is_entered:
+            self._is_entered = False
+            self.__exit__(None, None, None)  # type: ignore[no-untyped-call]
 
     def _leave(self, watches: bool, *_: Any) -> None:
         if watches and self._depth == 1:
-            self.__exit__(None, None, None)  # type: ignore[no-untyped-call]
+            self._pause()
         self._depth -= 1
+
+    def _end_child(self, child: nn.Module, *_: Any) -> None:
+        self._ended = child
 
     def _note(self, attention: "_Attention | None") -> None:
         self.last, self.is_inside = attention, self._depth > 0
+        if self.is_inside and self._owner is not None:
+            self._noted += 1
+            begin = self._ended if self._noted == 1 else None  # of several in one call, each is watched
+            self._begins.setdefault(self._owner, set()).add(begin)
 
     def __torch_function__(
         self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
@@ -489,24 +611,18 @@ def _fused_attention(
 def _repeat_for_heads(heads: Tensor, count: int) -> Tensor:
     """Return keys or values (B, G, T, E) as (B, H, T, E), each of the G repeated for the heads that share it."""
     batch, groups, *shape = heads.shape
+    if groups == count:
+        return heads
     return heads[:, :, None].expand(batch, groups, count // groups, *shape).flatten(1, 2)
 
 
-def _check_reading(site: Site, stream: Stream, heads: int, computed: Tensor, read: Tensor) -> None:
-    """Raise CaptureError unless what a pattern gives is what the heads read."""
-    if heads == stream.heads and computed.shape == read.shape:
-        largest = partial(torch.linalg.vector_norm, ord=torch.inf)
-        limit = TOLERANCE.get(read.dtype, TOLERANCE[torch.float32]) * float(largest(read))
-        apart = float(largest(computed - read.float().nan_to_num(0.0)))
-        if apart <= limit:
-            return
-        actual, expected = f"is off by {apart:.3g}", f"at most {limit:.3g}"
-    else:
-        actual, expected = (
-            f"has {heads} heads and {tuple(computed.shape)}",
-            f"{stream.heads} and {tuple(read.shape)}",
-        )
-    raise CaptureError(
+_UNCHECKED_BYTES = 64_000_000
+"""Size of readings that are kept to be compared together."""
+
+
+def _unlike_reading(site: Site, actual: str, expected: str) -> CaptureError:
+    """Return the error of a pattern that does not give what the heads read."""
+    return CaptureError(
         f"the attention in front of {site} does not give what its heads read: it {actual}; expected {expected}. "
         "The block computes something between its attention and its output projection; correct the tap of `heads`"
     )

@@ -547,7 +547,9 @@ _ROLE_TERMS = {
     TILE_ROLES[0]: f"{', '.join(TILE_ROLES)}: on patches that see a tile",
 }
 """The entries of the legend by role."""
-_BY_ANSWER = "correct − other: on the correct picture's tile less the other's, by groups of items"
+_BY_ANSWER = (
+    "correct − other: share on the correct picture's tile minus that on the other's, interval by groups of items"
+)
 
 
 def _share_column(role: str) -> EffectColumn[Any]:

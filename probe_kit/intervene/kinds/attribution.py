@@ -243,12 +243,12 @@ def _columns(exchange: str) -> tuple[EffectColumn[AttributionEffect], ...]:
         EffectColumn(
             "exact [95 %]",
             lambda row: interval_cell(row.exact, row.exact_ci),
-            "exact: with these tokens patched",
+            "exact: the same share with these tokens patched for real",
         ),
         EffectColumn(
             "p",
             lambda row: p_of(row.p_fwe, is_resolved(row.exact)),
-            "p: of the exact patch, max-T over those of the category",
+            "p: of the exact patch, family-wise over those of the category",
         ),
         EffectColumn(
             "chosen",

@@ -598,7 +598,9 @@ def is_resolved(*effects: float | None) -> bool:
     return any(effect is not None and abs(effect) >= RESOLUTION for effect in effects)
 
 
-UNRESOLVED = f"p –: the effect is below {RESOLUTION}, the resolution of its measure, and significant of nothing"
+UNRESOLVED = (
+    f"p –: none is given, because the effect is below {RESOLUTION}, the smallest that its measure resolves"
+)
 """The entry of a legend for p-values that are not shown."""
 
 

@@ -330,7 +330,7 @@ def _cell_of_edits(cell: Callable[[ClosedLoopEffect], TableCell]) -> Callable[[C
 _ENDS = (
     EffectColumn[ClosedLoopEffect]("correct %", lambda row: rate(row.correct)),
     EffectColumn[ClosedLoopEffect]("wrong %", lambda row: rate(row.wrong)),
-    EffectColumn[ClosedLoopEffect]("in a zone %", lambda row: rate(row.in_zone), "in a zone: whichever picture"),
+    EffectColumn[ClosedLoopEffect]("in a zone %", lambda row: rate(row.in_zone), "in a zone: on either picture"),
     EffectColumn[ClosedLoopEffect]("wrong of these %", lambda row: rate(row.wrong_in_zone)),
 )
 _COMPARED = (
@@ -350,12 +350,13 @@ _COMPARED = (
     EffectColumn[ClosedLoopEffect](
         "p",
         _cell_of_edits(lambda row: p_of(row.p_fwe)),
-        "p: family-wise, of what goes beyond the controls, one-sided",
+        "p: family-wise and one-sided, of the net flip rate beyond that of the controls",
     ),
     EffectColumn[ClosedLoopEffect](
         "finding",
         lambda row: row.finding,
-        f"confirmed: p < 0.05 and {SMALLEST_EFFECT_OF_INTEREST} beyond the controls; task disrupted: in a zone "
-        f"less than {MIN_IN_ZONE_RATIO:g} times as often as with the identity patch, and then in no verdict",
+        f"confirmed: p < 0.05 and {SMALLEST_EFFECT_OF_INTEREST} beyond the controls; task disrupted: the cube "
+        f"ends in a zone less than {MIN_IN_ZONE_RATIO:g} times as often as with the identity patch; such edits "
+        "enter no verdict",
     ),
 )

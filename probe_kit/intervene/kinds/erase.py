@@ -210,7 +210,9 @@ class ConceptErasure(Intervention):
         lost = sorted((row for row in tried if row.finding == "effect"), key=lambda row: row.share_left or 0.0)
         if not lost:
             return f"not lost: no erasure of {len(tried)} takes the answer from the action beyond its controls"
-        return f"lost: the action leaves the answer after {share_of_edits(lost, len(tried), 'erasures')}"
+        return (
+            f"lost: the action no longer follows the answer after {share_of_edits(lost, len(tried), 'erasures')}"
+        )
 
     @staticmethod
     def notes(rows: "Sequence[ErasureEffect]") -> list[str]:
@@ -422,7 +424,7 @@ _ACTION = (
     EffectColumn[ErasureEffect](
         "kept",
         lambda row: absent("n/a") if row.share_left is None else TableCell(row.share_left, number),
-        "kept: of how far, n/a where it does not",
+        "kept: share of its distance toward the correct picture that is left, n/a where it does not go there",
     ),
     EffectColumn[ErasureEffect](
         "controls",
@@ -439,7 +441,7 @@ _ACTION = (
     EffectColumn[ErasureEffect](
         "relative change",
         lambda row: TableCell(row.relative_change, number),
-        "relative change: how far tokens were moved, in their own norms",
+        "relative change: how far tokens were moved, as a share of their norm",
     ),
 )
 _PROBE = (

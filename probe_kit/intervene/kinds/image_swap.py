@@ -199,25 +199,27 @@ _INPUT_COLUMNS = (
     EffectColumn[InputEffect](
         "size",
         lambda row: TableCell(row.size, number),
-        "size: mean change of the action in spreads of clean actions, by the donor's input",
+        "size: mean change of the action by the donor's input, in spreads of the clean actions",
     ),
     EffectColumn[InputEffect](
         "control",
         lambda row: TableCell(row.control_size, number),
-        "control: by a change of it that means nothing",
+        "control: the same by a change of it that means nothing, such as a full stop more or less",
     ),
     EffectColumn[InputEffect](
-        "full", lambda row: TableCell(row.full_size, number), "full: by all of the donor's inputs"
+        "full",
+        lambda row: TableCell(row.full_size, number),
+        "full: the same by all of the donor's inputs together",
     ),
     EffectColumn[InputEffect](
         "share [95 %]",
         lambda row: interval_cell(row.share, row.share_ci),
-        "share: displacement toward the donor's action, of the full exchange",
+        "share: displacement toward the donor's action, as a share of that by the full exchange",
     ),
     EffectColumn[InputEffect](
         "p",
         lambda row: p_of(row.p, is_resolved(row.size)),
-        "p: exact, that the change is larger than the control's, by item and by group, the larger one",
+        "p: exact, of a larger change than the control's; the larger of the tests by item and by group",
     ),
     EffectColumn[InputEffect]("n (episodes)", lambda row: TableCell(row.n_episodes, after=f" ({row.n_items})")),
     EffectColumn[InputEffect](
@@ -237,7 +239,7 @@ def _find_input(row: InputEffect) -> str:
         "decides": f"decides: the action follows the {row.vary}{share}",
         "moves": f"moves: the {row.vary} shifts the action without deciding it{share}",
         "no effect": f"no effect: another {row.vary} leaves the action where it is{remark}",
-        "open": f"open: the items do not tell whether the {row.vary} matters{remark}",
+        "open": f"open: these items do not decide whether the {row.vary} matters{remark}",
     }[row.finding]
 
 
@@ -441,7 +443,7 @@ SWAP_COLUMNS = (
     EffectColumn[ImageSwapEffect](
         "p",
         lambda row: p_of(row.follow_p, row.is_resolved),
-        "p: exact, by item and by group, the larger one",
+        "p: exact; the larger of the tests by item and by group",
     ),
     EffectColumn[ImageSwapEffect]("median displacement cm", lambda row: centimetres(row.median_displacement)),
     EffectColumn[ImageSwapEffect]("n (items)", lambda row: TableCell(row.n_episodes, after=f" ({row.n_items})")),

@@ -622,7 +622,7 @@ def _columns(exchange: str, is_scene: bool) -> list[EffectColumn[PatchEffect]]:
     change = EffectColumn[PatchEffect](
         "relative change",
         lambda row: TableCell(row.relative_change, number),
-        "relative change: how far tokens were moved, in their own norms",
+        "relative change: how far tokens were moved, as a share of their norm",
     )
     if not is_scene:
         return [

@@ -241,19 +241,19 @@ def _columns(exchange: str) -> "tuple[EffectColumn[JointEffect], ...]":
         EffectColumn(
             "alone [95 %]",
             lambda row: interval_cell(row.alone, row.alone_ci),
-            f"alone: share of the {exchange} with only these cells patched",
+            f"alone: share of the {exchange} that patching only these cells gives",
         ),
         EffectColumn(
             "needed [95 %]",
             lambda row: interval_cell(row.needed, row.needed_ci),
-            "needed: what all cells lose without them",
+            "needed: share that all other cells together lose without them",
         ),
         EffectColumn(
             "p",
             lambda row: p_of(
                 row.p if row.p_fwe is None else row.p_fwe, row.alone is None or is_resolved(row.alone)
             ),
-            "p: that the action moves toward the target side, of cells max-T over all",
+            "p: of moving toward the target side; of cells family-wise over all of them",
         ),
         EffectColumn("groups", lambda row: TableCell(row.n_groups)),
         EffectColumn("finding", lambda row: row.finding, _FINDINGS),

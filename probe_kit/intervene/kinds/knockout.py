@@ -19,6 +19,12 @@ such effect, the size of the change, in spreads of the clean actions, is compare
 
 A control cuts as many tokens. Where other roles have less than half as many, as the words beside a picture, there
 is none of that size; without sides a change then counts from a tenth of the spread on.
+
+The role `kv.NN` is a place: all that the acting stream reads of block NN of the backbone. That is every token of
+the backbone, in the one layer that reads the block, so that no other token is left for a control.
+
+With whole episodes in an environment the loss is of success: share of episodes that succeed without the cut and
+fail with it, minus that of the reverse.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,16 +35,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit._system.bounded_files import parse_json
+from probe_kit._system.counting import plural
 from probe_kit._system.escaping import as_argument
 from probe_kit._tables.content import Cell as TableCell
 from probe_kit._tables.content import absent
 from probe_kit._tables.numbers import number, percent, with_sign
 from probe_kit.errors import EmptyRoleError, UnsupportedInterventionError, UsageError
+from probe_kit.extract.sources.environment import SUCCESS
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.declared import InterventionKind
-from probe_kit.hooks.contract.sites import HEADS, Site, first_of
+from probe_kit.hooks.contract.sites import HEADS, KV_STREAM, Site, first_of
 from probe_kit.intervene.edited_cells import CONTROL, EditedCell
-from probe_kit.intervene.exchange import NOTHING
+from probe_kit.intervene.exchange import NOTHING, SwapShare
 from probe_kit.intervene.kinds.attention import backbone_of
 from probe_kit.intervene.kinds.base import (
     UNRESOLVED,
@@ -52,18 +60,22 @@ from probe_kit.intervene.kinds.base import (
     is_resolved,
     lines_of,
     mean_of,
+    net_interval,
     p_of,
 )
 from probe_kit.intervene.kinds.closed_loop import CORRECT
 from probe_kit.intervene.outcomes import CLEAN, UNCHANGED, ConditionOutcomes
-from probe_kit.intervene.places import ALL, TILES, roles_of
+from probe_kit.intervene.places import ALL, TILES, PlaceName, resolve_sites, roles_of
 from probe_kit.intervene.replay import CLEAN_RUN, SOURCE_RUN, Condition, ConditionContext, ConditionResult
 from probe_kit.intervene.settings import FIRST_CHUNK, has_sides
 from probe_kit.intervene.stored import Measurement, preferred_by_category, stored_interventions
+from probe_kit.runs.layout import DATASET, ENVIRONMENT
 from probe_kit.runs.reader import RunReader
 from probe_kit.runs.records import as_json
 from probe_kit.runs.run import Run
+from probe_kit.statistics.paired_tests import smallest_flip_p
 from probe_kit.statistics.significance import SIGNIFICANCE
+from probe_kit.statistics.sufficiency import groups_for_interventions
 
 if TYPE_CHECKING:
     from probe_kit._tables.table import Table
@@ -85,7 +97,8 @@ class Knockout(Intervention):
     """Cuts of the attention to every role, in windows of layers.
 
     Attributes:
-        roles: Roles of the backbone's tokens that are cut; empty for `ROLES`, as many as there are.
+        roles: Roles of the backbone's tokens that are cut; empty for `ROLES`, as many as there are. `kv.02` and
+            `kv.*` are all that the acting stream reads of a block of the backbone.
         window: `first`: layers 0 to n, for every n. `last`: layers n to the last, for every n. `both`. A number k:
             every k neighbouring layers.
         readers: Role of the backbone's tokens that no longer read; empty for the acting stream.
@@ -93,7 +106,7 @@ class Knockout(Intervention):
         controls: Number of controls per window and role.
         seed: Seed of the controls.
         closed_loop: Whether whole episodes are played with the cut at every inference. The loss is then of where
-            the cube ends.
+            the cube ends, in an environment of success.
         untrained: The same knockout in a network with random weights, as it is stored with that run; None for
             none. `stored_twin` finds it.
 
@@ -107,7 +120,7 @@ class Knockout(Intervention):
     asks_where: ClassVar[bool] = True
     needs: ClassVar[tuple[InterventionKind, ...]] = ("edit", "attention", "knockout")
     options: ClassVar[Mapping[str, str]] = {
-        "roles": "whose tokens are cut; default image,language,state",
+        "roles": "whose tokens are cut; default image,language,state. kv.02 or kv.*: all of a block",
         "window": "layers that are cut together: both (default), first, last, or a number of neighbours",
         "readers": "role of the backbone's tokens that no longer read; default the acting stream",
         "heads": "heads that no longer read; default all",
@@ -171,15 +184,12 @@ class Knockout(Intervention):
         """Refuse a run that cannot be played, or without anything to compare with; raises as the base does too.
 
         Raises:
-            UsageError: For no control in a run without sides, and for a closed loop of episodes that are not of
-                the scene.
+            UsageError: For no control in a run without sides, and for a closed loop of a run whose episodes cannot
+                be played again, or do not say whether they succeed.
         """
         super().check_run(run)
         if self.closed_loop and not has_sides(run):
-            raise UsageError(
-                f"--closed-loop plays episodes again, and {run.location} is no run of the scene. Leave it out, or "
-                "take a run of the scene"
-            )
+            _check_success(run)
         if not has_sides(run) and not self.controls:
             raise UsageError(
                 "--controls 0 leaves nothing to compare with: any cut changes an action. Take 1 or more"
@@ -205,23 +215,57 @@ class Knockout(Intervention):
         layers = stream.layers - 1
         conditions = [CLEAN_RUN, *([SOURCE_RUN] if has_sides(session.run) else [])]
         for role in self._roles(policy, backbone):
-            for first, last in windows(self.window, layers):
+            block = block_of(role)
+            spans = windows(self.window, layers) if block is None else [(block, block)]
+            controls = self.controls if block is None else 0  # no token of the backbone is left for one
+            for first, last in spans:
                 sites = [site for site in stream.sites(HEADS) if first <= site.layer <= last]
-                for name in (CUT, *(f"{CONTROL}{at + 1}" for at in range(self.controls))):
+                for name in (CUT, *(f"{CONTROL}{at + 1}" for at in range(controls))):
                     cell = EditedCell(f"{stream.name}.{first:02d}-{last:02d}.{HEADS}", role, name)
                     conditions.append(self._cut(cell, backbone, (first, last), sites))
         return conditions
 
     def _roles(self, policy: "Policy", backbone: str) -> tuple[str, ...]:
-        roles = self.roles or ROLES
-        present = roles_of(policy, backbone, roles)
         role_names = (*policy.role_names[policy.tokens_of(backbone)], *TILES)
+        roles: list[str] = []
+        for role in self.roles or ROLES:
+            if role.partition(".")[0] == KV_STREAM:
+                roles += self._blocks(policy, role)
+            else:
+                roles += roles_of(policy, backbone, (role,))
         for role in (*self.roles, *([self.readers] if self.readers else [])):
-            if role not in roles_of(policy, backbone, (role,)):
+            is_block = role in self.roles and role.partition(".")[0] == KV_STREAM
+            if not is_block and role not in roles_of(policy, backbone, (role,)):
                 raise UsageError(
                     f"no token of {backbone} has the role {role!r}; there are {', '.join(role_names)}"
                 )
-        return tuple(present)
+        return tuple(dict.fromkeys(roles))
+
+    def _blocks(self, policy: "Policy", pattern: str) -> list[str]:
+        """Return the places of `kv` that a pattern such as `kv.*` names, each all that is read of one block.
+
+        Raises:
+            UnsupportedInterventionError: For a family without `kv`, or whose layers do not read one block each.
+            UnknownSiteError: For a block that does not exist.
+            UsageError: For a part of a place, and with other readers or windows, which a place has itself.
+        """
+        names = [PlaceName.parse(group.name) for group in resolve_sites(pattern, policy)]
+        if any(name != PlaceName(KV_STREAM, name.layer) for name in names):
+            raise UsageError(f"--roles {pattern} is a part of a place; expected kv.* or a block, such as kv.02")
+        if self.readers:
+            raise UsageError(
+                f"--readers {self.readers} reads inside the backbone; {pattern} is what the acting part reads of "
+                "it. Leave one of both out"
+            )
+        assert policy.prompt_kv is not None
+        stream = policy.streams[acting_stream(policy)]
+        if stream.layers != policy.prompt_kv.layers:
+            raise UnsupportedInterventionError(
+                f"{stream.name} of {policy.card.family} has {stream.layers - 1} layers and kv "
+                f"{policy.prompt_kv.layers - 1} blocks: which layer reads which block is not said. Name a role "
+                "with --window 1, or patch the place (--kind interchange --sites kv.*)"
+            )
+        return [str(name) for name in names]
 
     def _cut(self, cell: EditedCell, backbone: str, window: tuple[int, int], sites: Sequence[Site]) -> Condition:
         """Return the clean inference in which nothing at these sites reads the tokens of a role, or a control."""
@@ -231,10 +275,11 @@ class Knockout(Intervention):
 
             tokens = context.tokens
             try:
-                keys = tokens.mask(backbone, cell.role)
+                keys = tokens.mask(backbone, cell.role if block_of(cell.role) is None else ALL)
             except EmptyRoleError:  # a tile may be hidden by the arm
                 return ConditionResult(context.act())
             readers = tokens.mask(backbone, self.readers) if self.readers else None
+            remaining = int(tokens.mask(backbone, ALL).sum() - keys.sum())
             if cell.is_control:
                 seed = derive_seed(
                     "knockout", self.seed, context.pair.episode, context.pair.step, str(cell), *window
@@ -244,7 +289,7 @@ class Knockout(Intervention):
                     return ConditionResult(context.act())  # no control of that size: nothing is cut
             cut = AttentionCut(keys, readers, self.heads or None)
             with cut_attention(context.session.policy, dict.fromkeys(sites, cut)) as log:
-                return ConditionResult(context.act(), log)
+                return ConditionResult(context.act(), log, token_counts=(int(keys.sum()), remaining))
 
         return Condition(str(cell), play, cell=cell)
 
@@ -288,6 +333,7 @@ class Knockout(Intervention):
             before=[
                 "layers: those in which the acting part cannot read the tokens",
                 "every episode played again with the cut at every inference" if _is_played(cuts) else "",
+                "kv.NN: all that the acting part reads of block NN of the backbone" if _has_blocks(cuts) else "",
             ],
             after=[UNRESOLVED if any(not row.is_resolved for row in cuts) else ""],
         )
@@ -296,7 +342,8 @@ class Knockout(Intervention):
     def sentence(rows: "Sequence[KnockoutEffect]", context: Measurement) -> str:
         """Return from which tokens the action reads, and in which layers, role by role."""
         del context
-        return "; ".join(reading_of(part) for part in by_role(rows).values())
+        text = "; ".join(reading_of(part) for part in by_role(rows).values())
+        return f"{text} ({too_few_groups_text(rows[0].n_groups)})" if has_too_few_groups(rows) else text
 
     @staticmethod
     def finding(rows: "Sequence[KnockoutEffect]", context: Measurement) -> str:
@@ -304,19 +351,25 @@ class Knockout(Intervention):
         del context
         roles = by_role(rows)
         read = {role: span for role, part in roles.items() if (span := layers_read(part)) is not None}
+        if has_too_few_groups(rows):
+            return f"unknown: {too_few_groups_text(rows[0].n_groups)}"
+        if any(row.has_nothing_to_lose for row in rows):
+            return "unknown: no episode succeeds without a cut, so that a cut has no success to lose"
         if not read:
-            return f"not read: no cut of {', '.join(roles)} loses more than its controls do"
+            return f"not read: no cut of {', '.join(roles)} loses more than its controls do, beyond chance"
         parts = [f"{role} in {span_text(*sorted(span))}" for role, span in read.items()]
         return f"read: {', '.join(parts)}"
 
     @staticmethod
     def notes(rows: "Sequence[KnockoutEffect]") -> list[str]:
-        """Return what a cut that loses nothing does not say."""
+        """Return how many tokens were cut, and what a cut that loses nothing does not say."""
+        notes = [text for part in by_role(rows).values() if (text := describe_token_counts(part))]
         if all(layers_read(part) is not None for part in by_role(rows).values()):
-            return []
+            return notes
         return [
+            *notes,
             "A cut that loses nothing says that the action does not read these tokens directly. What they say may "
-            "still reach it through other tokens of the backbone (--kind interchange)."
+            "still reach it through other tokens of the backbone (--kind interchange).",
         ]
 
     @staticmethod
@@ -332,12 +385,24 @@ class Knockout(Intervention):
 KIND = Knockout
 UNTRAINED_FILE = "untrained.json"
 """The effects of the same cuts in a network with random weights."""
-_SAME = ("roles", "window", "readers", "heads", "closed_loop")
+_SAME = ("roles", "window", "readers", "heads", "closed_loop", "controls", "seed", "wording")
 """Settings that two knockouts must share to be compared."""
+_SAME_OF_RUN: Mapping[str, str] = {
+    "model": "family",
+    "suite": "suite",
+    ENVIRONMENT: "environment",
+    DATASET: "data set",
+    "scene": "scene",
+    "seed": "seed",
+    "execute": "number of executed actions",
+    "rotation": "rotation",
+    "dtype": "dtype",
+}
+"""Settings that two runs must share so that their knockouts can be compared, with their names in messages."""
 
 
 def stored_twin(kind: Knockout, run: Run, untrained: Run) -> Measurement:
-    """Return the newest stored knockout of an untrained network that cuts as `kind` does.
+    """Return the newest stored knockout of an untrained network that cuts as `kind` does, in the same episodes.
 
     Args:
         kind: The knockout that is compared.
@@ -345,27 +410,78 @@ def stored_twin(kind: Knockout, run: Run, untrained: Run) -> Measurement:
         untrained: Run of the same episodes with random weights.
 
     Raises:
-        UsageError: For the run itself, trained weights, other episodes, and where no such knockout is stored.
+        UsageError: For the run itself, trained weights, another family, suite, seed or other setting of the run,
+            and where no such knockout of the same items is stored.
     """
+    where = f"--untrained {untrained.location}"
     if untrained.location.address == run.location.address or not untrained.random_weights:
         raise UsageError(
-            f"--untrained {untrained.location} has trained weights; expected a run of the same episodes that was "
+            f"{where} has trained weights; expected a run of the same episodes that was "
             "extracted with --random-weights"
         )
-    if untrained.suite != run.suite:
-        raise UsageError(f"--untrained {untrained.location} is on {untrained.suite}; expected {run.suite}")
-    settings = {name: kind.parameters()[name] for name in _SAME}
-    stored = [
-        result
-        for result in stored_interventions(untrained, Knockout.kind)
-        if {name: result.settings.get(name) for name in _SAME} == settings
-    ]
-    if not stored:
+    for name, words in _SAME_OF_RUN.items():
+        actual, expected = (_compared_setting(of_run, name, kind.closed_loop) for of_run in (untrained, run))
+        if actual != expected:
+            raise UsageError(
+                f"{where} has another {words}{_difference(actual, expected)}. Extract it with the settings of "
+                f"{run.location} and --random-weights"
+            )
+    settings = kind.parameters() | {"wording": run.wording}
+    required = {name: settings[name] for name in _SAME}
+    stored = list(stored_interventions(untrained, Knockout.kind))
+    alike = [result for result in stored if {name: result.settings.get(name) for name in _SAME} == required]
+    if not alike:
+        last = max(stored, key=lambda result: result.newest, default=None)
+        different = [] if last is None else [name for name in _SAME if last.settings.get(name) != required[name]]
+        why = f"; the newest one has other {', '.join(different)}" if different else ""
         raise UsageError(
-            f"{untrained.location} stores no knockout with these roles, window, readers and heads. Run "
+            f"{untrained.location} stores no knockout with these options{why}. Run "
             f"`probe-kit intervene {as_argument(untrained.location)} --kind knockout` with the same options first"
         )
-    return max(stored, key=lambda result: result.newest)
+    items = set(kind.items_in(run))
+    same = [result for result in alike if set(map(str, result.outcomes.items)) == items]
+    if not same:
+        counts = ", ".join(str(np.unique(result.outcomes.items).size) for result in alike)
+        raise UsageError(
+            f"{untrained.location} stores this knockout of other items ({counts} of them; here {len(items)}). Run "
+            f"`probe-kit intervene {as_argument(untrained.location)} --kind knockout` with the same --categories "
+            "and --items first"
+        )
+    return max(same, key=lambda result: result.newest)
+
+
+def _compared_setting(run: Run, name: str, closed_loop: bool) -> Any:
+    """Return a setting of a run; that of the scene without its number of steps, unless episodes are played."""
+    value = run.settings.get(name)
+    if name != "scene" or value is None or closed_loop:
+        return value
+    return {part: content for part, content in value.items() if part != "max_steps"}
+
+
+def _difference(actual: object, expected: object) -> str:
+    """Return how a setting differs, for short values and for tables of them."""
+    if isinstance(actual, Mapping) and isinstance(expected, Mapping):
+        names = [name for name in {**actual, **expected} if actual.get(name) != expected.get(name)]
+        return f" ({', '.join(map(str, names[:3]))})"
+    return f": {actual!r}; expected {expected!r}"
+
+
+def _check_success(run: Run) -> None:
+    """Refuse a run without sides whose episodes cannot be played again, or do not say whether they succeed.
+
+    Raises:
+        UsageError: As said.
+    """
+    if not run.in_own_environment:
+        raise UsageError(
+            f"--closed-loop plays episodes again, and {run.location} shows stored pictures, in which nothing "
+            "acts. Leave it out, or take a run of the scene or of an environment (--env)"
+        )
+    if SUCCESS not in (facts := run.settings[ENVIRONMENT]["columns"]):
+        raise UsageError(
+            f"--closed-loop counts the fact {SUCCESS!r}, and the environment of {run.location} has "
+            f"{', '.join(facts) or 'no facts'}. Let step() say it, or leave --closed-loop out"
+        )
 
 
 def stored_knockouts(run: RunReader) -> dict[str, list["KnockoutEffect"]]:
@@ -385,6 +501,12 @@ def acting_stream(policy: "Policy") -> str:
     name = first_of("action", policy.streams.values())
     assert name is not None, "every policy has a stream that acts"
     return name
+
+
+def block_of(role: str) -> int | None:
+    """Return the block of the backbone that a role such as `kv.02` names; None for a role of tokens."""
+    stream, _, block = role.partition(".")
+    return int(block) if stream == KV_STREAM and block.isdecimal() else None
 
 
 def windows(window: str, layers: int) -> list[tuple[int, int]]:
@@ -431,15 +553,22 @@ class KnockoutEffect(EffectRow):
         first: First layer that is cut.
         last: Last layer that is cut.
         readable: Number of layers that could be cut.
-        lost: Share of the picture's effect that is gone; None without sides, or without such an effect.
+        lost: Share of the picture's effect that is gone; of episodes in an environment, success that is gone. None
+            for other runs without sides, and without such an effect.
         lost_ci: The 95 % interval of `lost`, by groups; None likewise.
-        size: Mean change of the action, in spreads of the clean actions.
+        size: Mean change of the action, in spreads of the clean actions; of episodes in an environment, the share
+            whose success changes.
         control_lost: Mean `lost` of the controls; None likewise, or without controls.
         control_size: Mean `size` of the controls; None without any.
         p: The p-value of the loss beyond the controls; without sides of the change. None for controls.
         p_fwe: Family-wise p-value over all cuts of the category; None likewise.
         success: Success rate of the episodes that were played with the cut; None without a closed loop.
         success_clean: Success rate of the same episodes without it; None likewise.
+        n_groups: Number of groups of items.
+        is_of_success: Whether `lost` is of success.
+        cut_tokens: Mean number of tokens that are cut; None where it is not known, as in earlier versions.
+        other_tokens: Mean number of the other tokens, from which controls are drawn; None likewise.
+        control_tokens: Mean number of tokens that a control cuts; None likewise, and without controls.
         untrained_lost: `lost` of the same cut in an untrained network; None without one, or without an effect.
         untrained_size: `size` of the same; None without one.
     """
@@ -456,6 +585,11 @@ class KnockoutEffect(EffectRow):
     p_fwe: float | None
     success: float | None
     success_clean: float | None
+    n_groups: int
+    is_of_success: bool
+    cut_tokens: float | None
+    other_tokens: float | None
+    control_tokens: float | None
     untrained_lost: float | None = None
     untrained_size: float | None = None
 
@@ -463,6 +597,11 @@ class KnockoutEffect(EffectRow):
     def layers(self) -> str:
         """The layers that are cut, as text."""
         return span_text(self.first, self.last)
+
+    @property
+    def has_nothing_to_lose(self) -> bool:
+        """Whether the loss is of success, and no episode succeeds without the cut."""
+        return self.is_of_success and self.success_clean == 0
 
     @property
     def is_resolved(self) -> bool:
@@ -493,14 +632,14 @@ def knockout_effects(outcomes: ConditionOutcomes) -> list[KnockoutEffect]:
     moved = outcomes.displacement[rows] - clean
     # Of an episode that was played the change is where the cube ends.
     size = outcomes.size[rows] if outcomes.size is not None else np.abs(moved) / (clean.std() or 1.0)
-    exchange = outcomes.exchange() if outcomes.has_sides else None
-    shares = [None if exchange is None else exchange.share(away) for away in moved]
+    is_of_success = not outcomes.has_sides and outcomes.episode_outcomes is not None
+    losses = _losses(outcomes, moved, is_of_success)
     # A control that cut nothing is none.
     is_cut = outcomes.edit_log[rows, :, 0] > 0
     broken = {at for at, cell in enumerate(cells) if cell.is_control and not is_cut[at].any()}
     # Where a picture has an effect, a loss is a move away from the correct one; else any change counts.
-    if any(share is not None for share in shares):
-        tested = -correct * moved
+    if any(loss is not None for loss in losses):
+        tested = -correct * moved if outcomes.has_sides else -moved
     else:
         lonely = [at for at in range(len(cells)) if not _has_control(cells, at, broken)]
         tested = size.copy()
@@ -510,20 +649,22 @@ def knockout_effects(outcomes: ConditionOutcomes) -> list[KnockoutEffect]:
         tested[controls] = np.where(is_cut[controls], tested[controls], NOTHING)
     tests = compare_with_controls(np.asarray(tested), cells, outcomes, broken_controls=broken)
     ends = None if outcomes.episode_outcomes is None else (outcomes.episode_outcomes == CORRECT).mean(axis=1)
+    ends = outcomes.displacement.mean(axis=1) if is_of_success else ends  # 1 for success
     effects = []
     for at, (row, cell, test) in enumerate(zip(rows, cells, tests, strict=True)):
         right_before, right = correct * clean > 0, correct * outcomes.displacement[row] > 0
         gains = right_before.astype(float) - right if outcomes.has_sides else np.zeros(clean.size)
-        share = shares[at]
-        of_controls = [2 * part.value for control in test.controls if (part := shares[control]) is not None]
+        loss = losses[at]
+        of_controls = [part.value for control in test.controls if (part := losses[control]) is not None]
+        counts = _mean_counts(outcomes, row, [rows[control] for control in test.controls])
         effects.append(
             KnockoutEffect(
                 **common_columns(outcomes, row, cell, gains),
                 first=spans[at][0],
                 last=spans[at][1],
                 readable=readable,
-                lost=None if share is None else 2 * share.value,
-                lost_ci=None if share is None else (2 * share.low, 2 * share.high),
+                lost=None if loss is None else loss.value,
+                lost_ci=None if loss is None else (loss.low, loss.high),
                 size=float(size[at].mean()),
                 control_lost=mean_of(np.array(of_controls)),
                 control_size=mean_of(size[test.controls][is_cut[test.controls]]),
@@ -531,9 +672,36 @@ def knockout_effects(outcomes: ConditionOutcomes) -> list[KnockoutEffect]:
                 p_fwe=test.p_fwe,
                 success=None if ends is None else float(ends[row]),
                 success_clean=None if ends is None else float(ends[0]),
+                n_groups=np.unique(outcomes.groups).size,
+                is_of_success=is_of_success,
+                **counts,
             )
         )
     return effects
+
+
+def _losses(
+    outcomes: ConditionOutcomes, moved: NDArray[np.float64], is_of_success: bool
+) -> list[SwapShare | None]:
+    """Return the loss of each of K cuts that moved (K, E): of success or the picture's effect, None of neither."""
+    if is_of_success:
+        return [SwapShare(-float(away.mean()), *net_interval(-away, outcomes)) for away in moved]
+    exchange = outcomes.exchange() if outcomes.has_sides else None
+    shares = [None if exchange is None else exchange.share(away) for away in moved]
+    return [None if share is None else SwapShare(*(2 * number for number in share)) for share in shares]
+
+
+def _mean_counts(outcomes: ConditionOutcomes, row: int, controls: Sequence[int]) -> dict[str, Any]:
+    """Return mean numbers of tokens: hidden by a cut, hidden by its controls, and of which these are drawn."""
+    if outcomes.token_counts is None:
+        return dict.fromkeys(("cut_tokens", "other_tokens", "control_tokens"))
+    cut, remaining = outcomes.token_counts[row].T.astype(np.float64)
+    hidden = outcomes.token_counts[controls, :, 0].astype(np.float64)
+    return {
+        "cut_tokens": mean_of(cut[cut > 0]),
+        "other_tokens": mean_of(remaining[cut > 0]),
+        "control_tokens": mean_of(hidden[hidden > 0]),
+    }
 
 
 def _has_control(cells: Sequence[EditedCell], at: int, broken: set[int]) -> bool:
@@ -549,12 +717,57 @@ def layers_of(site_name: str) -> tuple[int, int]:
 
 
 def by_role(rows: "Sequence[KnockoutEffect]") -> dict[str, list[KnockoutEffect]]:
-    """Return cuts by role, without controls."""
+    """Return cuts by role, without controls; places of `kv` are together."""
     parts: dict[str, list[KnockoutEffect]] = {}
     for row in rows:
         if not row.is_control:
-            parts.setdefault(row.role, []).append(row)
+            parts.setdefault(row.role if block_of(row.role) is None else KV_STREAM, []).append(row)
     return parts
+
+
+def has_too_few_groups(rows: "Sequence[KnockoutEffect]") -> bool:
+    """Return whether there are so few groups of items that no cut can be significant."""
+    return smallest_flip_p(rows[0].n_groups) >= SIGNIFICANCE
+
+
+def too_few_groups_text(groups: int) -> str:
+    """Return what so few groups of items cannot show, and how many can."""
+    return (
+        f"with {plural(groups, 'group')} of items no p can be below {smallest_flip_p(groups):.2g}; "
+        f"{groups_for_interventions()} groups or more can show what is read"
+    )
+
+
+def describe_token_counts(rows: "Sequence[KnockoutEffect]") -> str:
+    """Return a sentence on the tokens that the cuts of one role hide, and their controls; empty where unknown."""
+    row = rows[0]
+    if row.cut_tokens is None or row.other_tokens is None:
+        return ""
+    role = describe_role(rows)
+    cut, remaining = _count(row.cut_tokens), _count(row.other_tokens)
+    if block_of(row.role) is not None:
+        return f"{role}: a cut hides {cut} tokens, all that the backbone has, so that there is no control."
+    if row.control_tokens is None:
+        return f"{role}: a cut hides {cut} tokens. There is no control; {remaining} tokens have other roles."
+    control = _count(row.control_tokens)
+    if row.control_tokens >= row.other_tokens:
+        fewer = ", fewer than the cut" if row.control_tokens < row.cut_tokens else ""
+        return (
+            f"{role}: a cut hides {cut} tokens, a control all {remaining} others{fewer}. Nothing is drawn there: "
+            "every control is the same cut."
+        )
+    return f"{role}: a cut hides {cut} tokens, a control {control} random ones of the {remaining} others."
+
+
+def _count(mean: float) -> str:
+    """Return a mean number of tokens as text: a whole number where every episode has as many."""
+    return f"{mean:.0f}" if mean == round(mean) else f"{mean:.1f}"
+
+
+def describe_role(rows: "Sequence[KnockoutEffect]") -> str:
+    """Return the role of the cuts of one role, or the place or places of `kv`."""
+    roles = list(dict.fromkeys(row.role for row in rows))
+    return roles[0] if len(roles) == 1 else KV_STREAM
 
 
 def windows_by_growth(rows: "Sequence[KnockoutEffect]") -> dict[str, list[KnockoutEffect]]:
@@ -563,7 +776,7 @@ def windows_by_growth(rows: "Sequence[KnockoutEffect]") -> dict[str, list[Knocko
     `up to`: from the first layer. `from`: to the last. `around`: neighbours that slide. The cut of all layers
     is in both of the first two.
     """
-    if len(rows) > 1 and are_sliding(rows):
+    if (len(rows) > 1 and are_sliding(rows)) or block_of(rows[0].role) is not None:
         return {"around": list(rows)}
     growths = {
         "up to": [row for row in rows if row.first == 0],
@@ -597,19 +810,25 @@ def layers_read(rows: "Sequence[KnockoutEffect]") -> tuple[int, int] | None:
 
 def reading_of(rows: "Sequence[KnockoutEffect]") -> str:
     """Return a clause on one role: the layers in which the action reads it, and what a cut loses."""
-    role, read = rows[0].role, layers_read(rows)
-    widest = max(rows, key=lambda row: row.last - row.first)
+    role, read = describe_role(rows), layers_read(rows)
+    widest = max(rows, key=lambda row: (row.last - row.first, row.size))
+    cut = f"cut in {widest.layers}" if block_of(widest.role) is None else f"cut of {widest.role}"
     loss = (
         f"change of {number(widest.size)} spreads"
         if widest.lost is None
-        else f"loss of {interval_cell(widest.lost, widest.lost_ci).text} of the picture's effect"
+        else f"loss of {interval_cell(widest.lost, widest.lost_ci).text} of the "
+        + ("success rate" if widest.is_of_success else "picture's effect")
     )
     if widest.success is not None:
         loss += f", success {percent(widest.success)} % instead of {percent(widest.success_clean)} %"
+    if read is None and (has_too_few_groups(rows) or widest.has_nothing_to_lose):
+        return f"whether the action reads {role} is unknown: a {cut} is a {loss}"
+    if read is None and widest.is_of_success:
+        return f"success does not need {role}: a {cut} is a {loss}"
     if read is None and widest.lost is not None:
-        return f"the picture's effect does not come directly from {role}: a cut in {widest.layers} is a {loss}"
+        return f"the picture's effect does not come directly from {role}: a {cut} is a {loss}"
     if read is None:
-        return f"the action does not read {role} directly: a cut in {widest.layers} is a {loss}"
+        return f"the action does not read {role} directly: a {cut} is a {loss}"
     begin, end = read
     if begin > end:
         return (
@@ -618,6 +837,11 @@ def reading_of(rows: "Sequence[KnockoutEffect]") -> str:
         )
     behind = f"; behind layer {end} nothing is lost" if end < rows[0].readable - 1 else ""
     return f"the action reads {role} in {span_text(begin, end)} ({loss}){behind}"
+
+
+def _has_blocks(rows: "Sequence[KnockoutEffect]") -> bool:
+    """Return whether a place of `kv` is cut."""
+    return any(block_of(row.role) is not None for row in rows)
 
 
 def _is_played(rows: "Sequence[KnockoutEffect]") -> bool:
@@ -650,23 +874,26 @@ def _columns(rows: "Sequence[KnockoutEffect]", has_sides: bool) -> list[EffectCo
         "untrained: change by the same cut in a network with random weights",
     )
     twins = [twin] if any(row.untrained_size is not None for row in rows) else []
-    if not has_sides:
+    lost = "share of the picture's effect on the action that is gone, n/a where that effect is not beyond chance"
+    if any(row.is_of_success for row in rows):
+        lost = "success rate without the cut minus that with it, as a share of episodes"
+    elif not has_sides:
         plain = EffectColumn[KnockoutEffect]("controls", lambda row: TableCell(row.control_size, number), controls)
         return [change, plain, *twins, p]
+    wrong = EffectColumn[KnockoutEffect](
+        "wrong side",
+        lambda row: TableCell(row.net, with_sign),
+        "wrong side: share of episodes whose action leaves the correct picture's side, minus those that come",
+    )
     return [
         EffectColumn(
             "lost [95 %]",
             lambda row: absent("n/a") if row.lost is None else interval_cell(row.lost, row.lost_ci),
-            "lost: share of the picture's effect on the action that is gone, n/a where that effect is not beyond "
-            "chance",
+            f"lost: {lost}",
         ),
         EffectColumn("controls", lambda row: TableCell(row.control_lost, number), controls),
         change,
         *twins,
-        EffectColumn(
-            "wrong side",
-            lambda row: TableCell(row.net, with_sign),
-            "wrong side: share of episodes whose action leaves the correct picture's side, minus those that come",
-        ),
+        *([wrong] if has_sides else []),
         p,
     ]

@@ -176,19 +176,20 @@ ACCURACY = replace(
 DIFFERENCE_P = Column(
     key="difference.p",
     heading="p (Holm)",
-    help="Of a difference between two runs: probability that two equally good ones differ so much on these "
-    "questions. Signs of whole groups are flipped. In brackets: corrected by Holm for all categories and pairs. "
+    help="Of a difference between two runs, p: how often two equally good runs would differ at least this much on "
+    "these questions. Signs of whole groups are flipped. In brackets: corrected by Holm for all categories and "
+    "pairs. "
     f"{P_DECIDES[:1].upper()}{P_DECIDES[1:]}.",
     cell=lambda _: absent(""),
     sort=lambda _: None,
     difference=difference_test,
 )
 _MODELS = (
-    "Of a difference between groups of models: exact p of exchanging the models' labels, the model as the unit. "
-    "It tests that both groups have equal distributions. In brackets the least p that so few models allow, and "
-    "Welch's 95 % interval over models, which is no inversion of this test: where the two disagree, p decides. A "
-    "dash stands for p where the groups' spreads are too unlike: then only the interval holds. Other numbers "
-    "of the row are of these models on other items."
+    "Of a difference between groups of models: how often models that are dealt to the groups at random would "
+    "differ at least this much. It is exact, and the model is the unit. In brackets: the least p that so few "
+    "models allow, and Welch's 95 % interval over models. Where p and the interval disagree, p decides. A "
+    "dash stands for p where the spreads of the groups are too unlike: then only the interval holds. Other "
+    "numbers of the row are of these models on other items."
 )
 SR_MODELS = Column(
     key="difference.sr_models",
@@ -207,14 +208,14 @@ RETENTION_MODELS = replace(
 MARGIN = share(
     "success.chance_margin",
     "± Δ %",
-    "How far from 50 % guessing alone may lead, which decides the regime. It counts questions, and those that "
-    "share a picture and are answered alike as fewer.",
+    "The margin around 50 % that guessing alone can reach; it decides the regime. It depends on the number "
+    "of questions. Questions that share a picture and are answered alike count as fewer.",
     averaged=False,
 )
 PAPER_MARGIN = share(
     "success.chance_margin_episodes",
     "paper's Δ %",
-    "The same if every episode were a question of its own, as the paper has it. It decides nothing here.",
+    "The same margin if every episode counts as a question of its own, as in the paper. It decides nothing here.",
     averaged=False,
 )
 REGIME = Column(
@@ -242,9 +243,12 @@ LEFT = share(
 RIGHT = share(
     "success.sr_right",
     "right %",
-    "Success rate where it lay on the right. Left and right far apart: the policy goes to a side.",
+    "Success rate where it lay on the right. If left and right differ much, the policy prefers a side.",
     heat=True,
-    answers=("right %", "Accuracy where it lay on the right. Left and right far apart: one side is preferred."),
+    answers=(
+        "right %",
+        "Accuracy where it lay on the right. If left and right differ much, the model prefers a side.",
+    ),
 )
 FOLLOWS = Column(
     key="image_swap.follow_rate",
@@ -310,11 +314,13 @@ SWAPPED = share(
 GOES_LEFT = share(
     "success.side_preference",
     "goes left %",
-    "Among episodes that reached a picture, the share that ended on the left one. 50 %: no habit.",
+    "Among episodes that reached a picture, the share that ended on the left one. 50 % means no preference "
+    "for a side.",
     averaged=False,
     answers=(
         "answers left %",
-        "Among the answers that could be read, the share that named the left one. 50 %: no habit.",
+        "Among the answers that could be read, the share that named the left one. 50 % means no preference "
+        "for a side.",
     ),
     both="goes left / answers left %",
 )
@@ -344,7 +350,8 @@ RIGHT_TWICE_P = replace(
     p_value(
         "success.paired.p",
         "p (twice)",
-        "Probability that luck alone gives so many questions right twice rather than wrong twice.",
+        "How often luck alone would give at least so many questions right in both layouts, rather than wrong "
+        "in both.",
     ),
     cell=lambda row: Cell(None if row.success.paired is None else row.success.paired.p, p_text),
     sort=lambda row: None if row.success.paired is None else row.success.paired.p,
@@ -432,19 +439,20 @@ ANSWERS = (
     share(
         "answers.share_by_clause",
         "by clause %",
-        "Share of answers in text that were found among other words, by rules about clauses and denials. The "
-        "others are a letter or a side and nothing else.",
+        "Share of text answers that stand among other words and are read by rules about clauses and denials. "
+        "The others are a letter or a side and nothing else.",
     ),
     share(
         "answers.accuracy_strict",
         "strict %",
-        "Share by text with answers found among other words as unparsable; given where they are more than 5 %.",
+        "Share right by text if answers among other words count as unparsable. It is given where they are "
+        "more than 5 %.",
     ),
-    share("answers.share_near_tie", "near ties %", "Share of choices that rounding may have made."),
+    share("answers.share_near_tie", "near ties %", "Share of choices that rounding alone may have decided."),
     share(
         "answers.option_mass",
         "option mass",
-        "Mean probability of the admissible answers together.",
+        "Mean probability that the model gives to all admissible answers together.",
         cell=lambda row: Cell(row.answers.option_mass, number),
     ),
     share(
@@ -499,31 +507,34 @@ PROBE_MINUS_SR = share(
     both="probe − SR / probe − accuracy %",
 )
 _P = (
-    "Probability that the best layer of a stream looks this good when the labels are permuted at random. It "
-    "allows for having looked at all layers (family-wise)."
+    "How often the best layer of a stream would look at least this good with labels that are permuted at "
+    "random. Family-wise: it takes into account that all layers were tried."
 )
-_PEAK = "Accuracy of the site that is best on all questions, scored on them too; too high by having been chosen."
-_CHANCE = "Mean score of a label with labels exchanged between groups, at the site with the largest excess."
+_PEAK = "Accuracy of the best site on the same questions by which it was chosen. It is therefore too high."
+_CHANCE = (
+    "Chance at that site: the mean score of a label with labels that are exchanged between groups. The site is "
+    "the one with the largest score above chance."
+)
 _LABEL_PEAK = (
-    "Held-out score at the site of a label with the largest excess over its own chance: accuracy balanced between "
-    "classes, or R²; too high by having been chosen."
+    "Held-out score of a label at the site with the largest score above chance: accuracy balanced between "
+    "classes, or R². It is too high, because the site was chosen by it."
 )
 _ABOVE_CHANCE = (
     "Score of a label above chance at sites that other groups chose, with its 95 % interval. Chance is subtracted "
     "at each site. Bold: the signal is shown."
 )
 _LAYER = (
-    "Where the best probe reads: 0 enters the first block, the last one leaves the last block. The first of "
-    "several that are equally good; after +: how many others are."
+    "Layer that the best probe reads: 0 is the input of the first block, the last number the output of the "
+    "last block. Of several equally good layers the first is given; after + stands the number of the others."
 )
 _SCORE = (
-    "Accuracy of a linear probe on questions that took no part in training it or in choosing its site, "
-    "balanced between the sides: chance is 50 %. Bold: the signal is shown."
+    "Accuracy of a linear probe on questions that were used neither to train it nor to choose its site. It "
+    "is balanced between the sides, so that chance is 50 %. Bold: the signal is shown."
 )
 _VERDICT = (
-    "Shown: above chance, family-wise, and above every control that was run. Absent, for a linear probe of so "
-    "many items: not shown, the best site can be at most as accurate as stated, below 65 % by default, and so "
-    "many items would have shown 65 %. Not shown: everything else, with what it could be at most."
+    "Shown: above chance, family-wise, and above every control that was run. Absent, for a linear probe: not "
+    "shown, and the best site's accuracy is at most the stated limit, which is below 65 % by default; so "
+    "many items would have shown 65 %. Not shown: everything else, with the limit of what it could be."
 )
 _EXCEEDS = (
     "The controls that the best site is shown to exceed, paired by question: chance; random-features, an "
@@ -626,8 +637,8 @@ ACTION_CHANCE = _chance("action")
 FIRST_ITERATION = share(
     "action.first_peak",
     "first iteration %",
-    "Best layer at the first iteration, which has seen nothing of the action. Late iterations hold the decision "
-    "itself, as a noisy action or as the tokens before.",
+    "Best layer at the first iteration, before the network has seen any part of the action. Later iterations "
+    "already contain the decision: a noisy action, or the tokens before.",
     answers=("first iteration %", "Best layer at the first iteration."),
 )
 METRIC = Column(

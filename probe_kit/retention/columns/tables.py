@@ -448,7 +448,7 @@ def _vlm_vla_table(vlm: str, policy: str, rows: Sequence[Difference]) -> Table:
 
 Columns = Sequence[tuple[Heading | str, Callable[[CategoryCounts], Cell]]]
 _p4 = partial(number, digits=4)
-_BOTH_LAYOUTS = "each in both layouts of an item, which a coin manages in 25 %"
+_BOTH_LAYOUTS = "each counts only where both layouts of an item are right, which a coin reaches in 25 %"
 _NAMES = {"answered": "answer", "encoded": "probe", "acted": "success"}
 _CODES = "a capital letter for what is right, a small one for what is not"
 _TESTS = "p: exact McNemar over items or over whole groups, the larger; (Holm) over all categories and pairs shown"

@@ -647,8 +647,13 @@ class KnockoutDisplay(Display):
 
 
 def measure_of_cuts(effects: Sequence[KnockoutEffect]) -> str:
-    """Return the measure of the cuts of one category: the picture's effect, or the action where that has none."""
-    return KnockoutDisplay.measure if _are_shares(effects) else "change of the action, in spreads"
+    """Return the measure of the cuts of one category: the picture's effect, success, or the action's change."""
+    if effects[0].is_of_success:
+        return "lost success, % of episodes"
+    if _are_shares(effects):
+        return KnockoutDisplay.measure
+    changed = "action" if effects[0].success is None else "cube's end"
+    return f"change of the {changed}, in spreads"
 
 
 def cut_curves(effects: Sequence[KnockoutEffect]) -> tuple[CutCurve, ...]:

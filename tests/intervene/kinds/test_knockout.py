@@ -3,6 +3,8 @@
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -10,9 +12,12 @@ from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 from probe_kit.cli import app
-from probe_kit.errors import UsageError
+from probe_kit.env import SceneSpec
+from probe_kit.errors import UnknownSiteError, UsageError
 from probe_kit.extract import ExtractSettings, extract_run
+from probe_kit.hooks import AttentionCut, cut_attention
 from probe_kit.intervene import ConditionOutcomes, InterventionResult, Knockout, run_intervention
+from probe_kit.intervene.edited_cells import columns_of
 from probe_kit.intervene.kinds.knockout import (
     KnockoutEffect,
     by_role,
@@ -20,13 +25,20 @@ from probe_kit.intervene.kinds.knockout import (
     layers_read,
     random_tokens,
     reading_of,
+    stored_twin,
     windows,
 )
+from probe_kit.intervene.replay import ConditionContext
+from probe_kit.intervene.sessions import ReplaySession
 from probe_kit.intervene.stored import stored_interventions
+from probe_kit.intervene.tokens import PairTokens
 from probe_kit.runs import Run, open_run
 from probe_kit.suite import Suite
 from tests.intervene.answers import KNOCKOUT_EPISODES, KNOCKOUT_LAYERS, knockout_of
 from tests.support.organisms import READERS, is_true_of, reader_run
+
+if TYPE_CHECKING:
+    from probe_kit.hooks import Policy
 
 Losses = NDArray[np.float64]
 
@@ -143,6 +155,117 @@ def test_frames_without_a_control_do_not_weaken_that_of_the_others(
     assert rows[0].control_size == pytest.approx(0.05, abs=0.005)
 
 
+def in_an_environment(success: dict[str, float], groups: int = 12) -> ConditionOutcomes:
+    """Episodes without sides; `success` is by condition the share of episodes that succeed, `clean` among them."""
+    of_scene = knockout_of({"image": []}, 0, str(KNOCKOUT_LAYERS))
+    names = ("clean", *of_scene.conditions[2:])
+    rows = [0, *range(2, len(of_scene.conditions))]
+    count = KNOCKOUT_EPISODES
+    ends = np.array([np.arange(count) % 12 < 12 * success[name.rpartition("|")[2]] for name in names])
+    cells = of_scene.cells
+    return replace(
+        of_scene,
+        conditions=names,
+        **columns_of([cells[row] for row in rows]),
+        items=np.array([f"item-{number}" for number in range(count)]),
+        groups=np.array([f"group-{number % groups}" for number in range(count)]),
+        sides=np.full(count, ""),
+        displacement=ends.astype(np.float64),
+        max_action_change=np.zeros(ends.shape),
+        edit_log=np.ones((*ends.shape, 5)),
+        episode_outcomes=np.where(ends, "success", "failure"),
+        toward=None,
+        size=None,
+    )
+
+
+def test_in_an_environment_a_cut_loses_success_beyond_its_controls() -> None:
+    """Of twelve episodes in a round nine succeed, three with the cut, and eight with the first control."""
+    shares = {"clean": 9 / 12, "cut": 3 / 12, "control-1": 8 / 12, "control-2": 9 / 12}
+    (row,) = read_by(in_an_environment(shares))["image"]
+    assert (row.success_clean, row.success, row.lost) == (0.75, 0.25, 0.5)
+    assert row.lost_ci is not None
+    assert row.lost_ci[0] < 0.5 < row.lost_ci[1]
+    assert row.control_lost == pytest.approx(1 / 24)
+    assert layers_read([row]) == (0, KNOCKOUT_LAYERS - 1)
+    assert "of the success rate, success 25.0 % instead of 75.0 %" in reading_of([row])
+
+
+@pytest.mark.parametrize(
+    ("shares", "verdict"),
+    [
+        ({"clean": 0.75, "cut": 0.25, "control-1": 0.25, "control-2": 0.25}, "success does not need image"),
+        ({"clean": 0.75, "cut": 0.75, "control-1": 0.75, "control-2": 0.75}, "success does not need image"),
+        ({"clean": 0.0, "cut": 0.0, "control-1": 0.0, "control-2": 0.0}, "action reads image is unknown"),
+    ],
+)
+def test_what_controls_lose_as_well_is_not_needed_and_without_success_nothing_is_known(
+    shares: dict[str, float], verdict: str
+) -> None:
+    rows = read_by(in_an_environment(shares))["image"]
+    assert layers_read(rows) is None
+    assert verdict in reading_of(rows)
+
+
+def test_too_few_groups_of_items_make_the_verdict_unknown() -> None:
+    """One group less than can be significant, and as many as can."""
+    shares = {"clean": 1.0, "cut": 0.0, "control-1": 1.0, "control-2": 1.0}
+    few, enough = (knockout_effects(in_an_environment(shares, groups)) for groups in (4, 5))
+    context: Any = None
+    assert Knockout.finding([row for row in few if not row.is_control], context) == (
+        "unknown: with 4 groups of items no p can be below 0.062; 5 groups or more can show what is read"
+    )
+    assert Knockout.finding([row for row in enough if not row.is_control], context).startswith("read: image")
+    assert "(with 4 groups of items no p can be below 0.062" in Knockout.sentence(few, context)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "sentence"),
+    [
+        ((36, 9, 9), "image: a cut hides 36 tokens, a control all 9 others, fewer than the cut. Nothing is drawn"),
+        ((8, 37, 8), "image: a cut hides 8 tokens, a control 8 random ones of the 37 others."),
+        ((36, 9, 0), "image: a cut hides 36 tokens. There is no control; 9 tokens have other roles."),
+    ],
+)
+def test_notes_say_how_many_tokens_are_cut_and_how_many_a_control_is_drawn_from(
+    numbers: tuple[int, int, int], sentence: str
+) -> None:
+    outcomes = knockout_of({"image": []}, 0)
+    cut, remaining, control = numbers
+    counts = np.zeros((*outcomes.displacement.shape, 2), np.int64)
+    for row, cell in enumerate(outcomes.cells):
+        counts[row] = (control, remaining) if cell.is_control else (cut, remaining)
+    notes = Knockout.notes(knockout_effects(replace(outcomes, token_counts=counts)))
+    assert notes[0].startswith(sentence)
+    assert not any("hides" in note for note in Knockout.notes(knockout_effects(outcomes)))
+
+
+def test_places_of_kv_are_cut_in_the_layer_that_reads_them_and_parts_are_refused(
+    session: ReplaySession, twin: "Policy"
+) -> None:
+    conditions = Knockout(roles=("kv.*", "image"), window="first").conditions(session)
+    cells = [condition.cell for condition in conditions if condition.cell.role.startswith("kv")]
+    assert [(cell.site, cell.role, cell.direction) for cell in cells] == [
+        (f"expert.0{block}-0{block}.heads", f"kv.0{block}", "cut") for block in range(3)
+    ]
+    (pair, _) = session.pairs(str(session.run.episodes["item_id"].iloc[0]))
+    blocked = next(condition for condition in conditions if condition.cell.role == "kv.01")
+    played = blocked.play(ConditionContext(session, pair))
+    valid = PairTokens(twin, pair).mask("backbone", "all")
+    sites = [site for site in twin.streams["expert"].sites("heads") if site.layer == 1]
+    with cut_attention(twin, dict.fromkeys(sites, AttentionCut(valid))):
+        np.testing.assert_array_equal(played.chunk, session.act(pair.clean, pair.seed))
+    assert played.token_counts == (valid.sum(), 0)
+    for options, message in (
+        ({"roles": ("kv.01.keys",)}, "is a part of a place"),
+        ({"roles": ("kv.01",), "readers": "language"}, "is what the acting part reads of it"),
+    ):
+        with pytest.raises(UsageError, match=message):
+            Knockout(**options).conditions(session)  # type: ignore[arg-type]
+    with pytest.raises(UnknownSiteError, match="has 4 layers"):
+        Knockout(roles=("kv.07",)).conditions(session)
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
@@ -198,19 +321,51 @@ def test_the_same_cut_in_an_untrained_network_is_shown_beside_it(
     """The recorded run has random weights; a trained policy plays the same items."""
     command = ["--kind", "knockout", "--window", "3", "--controls", "0", "--roles", "image"]
     trained = tmp_path / "trained"
-    settings = ExtractSettings("pi0-tiny", suite=small_suite.folder, items=6, max_steps=2, env_workers=0)
+    scene = SceneSpec.from_json(copy.settings["scene"], {})
+    settings = ExtractSettings("pi0-tiny", suite=small_suite.folder, items=6, scene=scene, env_workers=0)
     extract_run(settings, trained)
     runner = CliRunner()
     before = runner.invoke(app, ["intervene", str(trained), *command, "--untrained", str(copy.path)])
-    assert "stores no knockout with these roles" in before.stderr
+    assert "stores no knockout with these options" in before.stderr
     assert runner.invoke(app, ["intervene", str(copy.path), *command]).exit_code == 0
     answer = runner.invoke(app, ["intervene", str(trained), *command, "--untrained", str(copy.path)])
     assert answer.exit_code == 0, answer.output
     assert "untrained" in answer.stdout
+    fewer = runner.invoke(
+        app, ["intervene", str(trained), *command, "--items", "2", "--untrained", str(copy.path)]
+    )
+    assert "stores this knockout of other items" in fewer.stderr
+    seeded = runner.invoke(
+        app, ["intervene", str(trained), *command, "--seed", "3", "--untrained", str(copy.path)]
+    )
+    assert "the newest one has other seed" in seeded.stderr
     (stored,) = stored_interventions(open_run(trained))
     twin = {row.category: row.size for row in knockout_effects_of(copy)}
     for row in InterventionResult.of_stored(stored).effects:
         assert row.untrained_size == pytest.approx(twin[row.category])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"model": "pi0"}, "has another family: 'pi0'; expected 'pi0-tiny'"),
+        ({"suite": {"identity": "other@1"}}, "has another suite"),
+        ({"seed": 7}, "has another seed: 7; expected 0"),
+        ({"execute": 1}, "has another number of executed actions: 1"),
+        ({"scene": {"picture_size": [640, 480]}}, r"has another scene \(.*picture_size"),
+        ({"dtype": "bfloat16"}, "has another dtype: 'bfloat16'"),
+    ],
+)
+def test_an_untrained_network_of_another_experiment_is_refused_by_what_differs(
+    copy: Run, changes: dict[str, object], message: str
+) -> None:
+    scene = copy.settings["scene"] | changes.get("scene", {})  # type: ignore[operator]
+    location = SimpleNamespace(address="elsewhere")
+    other: Any = SimpleNamespace(
+        settings={**copy.settings, **changes, "scene": scene}, random_weights=True, location=location
+    )
+    with pytest.raises(UsageError, match=message):
+        stored_twin(Knockout(roles=("image",)), copy, other)
 
 
 def knockout_effects_of(run: Run) -> list[KnockoutEffect]:

@@ -289,7 +289,7 @@ FINDINGS: list[tuple[type[Intervention], Sequence[Any], str]] = [
     (
         ConceptErasure,
         [erasure(0.1, 0.001)],
-        "lost: the action leaves the answer after 1 of 1 erasures, at backbone.02 image.",
+        "lost: the action no longer follows the answer after 1 of 1 erasures, at backbone.02 image.",
     ),
     (
         ConceptErasure,
@@ -345,7 +345,7 @@ INPUTS = [
         "moves: the picture.wrist shifts the action without deciding it, by 0.20 of what all inputs do.",
     ),
     (input_row(1.0, 0.0, "no effect"), "no effect: another picture.wrist leaves the action where it is."),
-    (input_row(1.0, None, "open"), "open: the items do not tell whether the picture.wrist matters."),
+    (input_row(1.0, None, "open"), "open: these items do not decide whether the picture.wrist matters."),
 ]
 
 
@@ -399,9 +399,9 @@ def test_an_effect_below_the_resolution_of_its_measure_is_significant_of_nothing
     table = Steering.table(doses, context(None))
     assert [row[table.columns.index("p")] for row in table.texts] == ["–", "–", "–"]
     assert "lengths of the file's vector" in table.all_notes[0]
-    assert "significant of nothing" in table.all_notes[0]
+    assert "the smallest that its measure resolves" in table.all_notes[0]
     steering_table = Steering.table([replace(patch("backbone.02", 0.6, 0.004), coefficient="1")], context(None))
-    assert "significant of nothing" not in steering_table.all_notes[0]
+    assert "the smallest that its measure resolves" not in steering_table.all_notes[0]
     assert unit_of_doses("mean-difference:1") == unit_of_doses("probe") == "half class-mean differences"
 
 

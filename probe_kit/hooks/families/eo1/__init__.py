@@ -2,7 +2,7 @@
 
 from probe_kit.hooks.contract.declared import Interventions, backbone, expert
 from probe_kit.hooks.contract.sites import QUANTITIES
-from probe_kit.hooks.families.shared.kinds import MERGED, lerobot_family
+from probe_kit.hooks.families.shared.kinds import MERGED, NO_HEAD, lerobot_family
 from probe_kit.hooks.family_parts import Abilities, Checkpoints, Requirements
 
 INTERVENTIONS = Interventions(
@@ -42,6 +42,6 @@ FAMILIES = (
                 )
             },
         ),
-        abilities=Abilities(interventions=INTERVENTIONS),
+        abilities=Abilities(interventions=INTERVENTIONS, no_words=NO_HEAD),
     ),
 )

@@ -2,7 +2,7 @@
 
 from probe_kit.hooks.contract.declared import TEXT, DeclaredStream, Interventions, Option, backbone, expert
 from probe_kit.hooks.contract.sites import QUANTITIES, Stream
-from probe_kit.hooks.families.shared.kinds import MERGED, lerobot_family
+from probe_kit.hooks.families.shared.kinds import MERGED, NO_HEAD, lerobot_family
 from probe_kit.hooks.family_parts import Abilities, Checkpoints, Requirements
 
 RESIZES = ("nvidia", "lerobot")
@@ -66,6 +66,6 @@ FAMILIES = (
             },
         ),
         requirements=Requirements(always_float32=True, packages=(("diffusers", "groot"),)),
-        abilities=Abilities(interventions=INTERVENTIONS),
+        abilities=Abilities(interventions=INTERVENTIONS, no_words=NO_HEAD),
     ),
 )

@@ -18,7 +18,7 @@ from probe_kit.hooks.contract.declared import (
 )
 from probe_kit.hooks.contract.sites import QUANTITIES, Stream
 from probe_kit.hooks.families.shared.action_statistics import ActionStatistics
-from probe_kit.hooks.families.shared.kinds import MERGED
+from probe_kit.hooks.families.shared.kinds import MERGED, NO_HEAD
 from probe_kit.hooks.family import Family
 from probe_kit.hooks.family_parts import Abilities, Checkpoints
 
@@ -78,6 +78,7 @@ FAMILIES = (
             outputs="probe_kit.hooks.families.internvla.adapter:internvla_outputs",
             units="probe_kit.hooks.families.internvla.adapter:internvla_units",
             interventions=INTERVENTIONS,
+            no_words=NO_HEAD,
         ),
         checkpoints=Checkpoints(
             source="qwen2.5-vl",

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 from probe_kit.hooks.contract.declared import backbone, expert
 from probe_kit.hooks.contract.sites import QUANTITIES
-from probe_kit.hooks.families.shared.kinds import FLOW, MERGED, lerobot_family
+from probe_kit.hooks.families.shared.kinds import FLOW, MERGED, NO_HEAD, lerobot_family
 from probe_kit.hooks.family_parts import Abilities, Checkpoints
 
 EXPERT = ("residual", "attention", "cross_attention", "mlp", "final_norm")
@@ -44,6 +44,6 @@ FAMILIES = (
                 )
             },
         ),
-        abilities=Abilities(interventions=LAYERWISE),
+        abilities=Abilities(interventions=LAYERWISE, no_words=NO_HEAD),
     ),
 )

@@ -47,6 +47,8 @@ MAPS = replace(
 )
 """The interventions `TOKENS` without tiles, where a picture becomes maps of several crops."""
 
+NO_HEAD = "its checkpoint holds no head of a language model behind the end of its backbone"
+"""The reason why a family that acts by an expert has no words for units of its backbone."""
 _FAMILIES = "probe_kit.hooks.families"
 NO_CHECKPOINTS, NO_ABILITIES = Checkpoints(), Abilities()
 """Declarations of a family that adds nothing to what its kind has."""

@@ -1,7 +1,7 @@
 """SmolVLA through lerobot."""
 
 from probe_kit.hooks.contract.declared import backbone, expert
-from probe_kit.hooks.families.shared.kinds import FLOW, lerobot_family
+from probe_kit.hooks.families.shared.kinds import FLOW, NO_HEAD, lerobot_family
 from probe_kit.hooks.family_parts import Abilities, Checkpoints, Requirements
 
 FAMILIES = (
@@ -24,6 +24,6 @@ FAMILIES = (
             not_acting=("lerobot/smolvla_base",),
         ),
         requirements=Requirements(always_float32=True),
-        abilities=Abilities(interventions=FLOW),
+        abilities=Abilities(interventions=FLOW, no_words=NO_HEAD),
     ),
 )

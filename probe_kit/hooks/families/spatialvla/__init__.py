@@ -41,6 +41,7 @@ FAMILIES = (
             words="probe_kit.hooks.families.spatialvla.adapter:check_spatialvla_words",
             units="probe_kit.hooks.families.spatialvla.adapter:spatialvla_units",
             interventions=TOKENS,
+            no_words="a feed-forward block of Gemma 2 ends in a norm, so that a unit adds no vector of its own",
         ),
         checkpoints=Checkpoints(
             of_default={"unnorm_key": "bridge_orig/1.0.0"},

@@ -4,7 +4,7 @@ from probe_kit.hooks.contract.card import SourceWeights
 from probe_kit.hooks.contract.declared import ACT2ANSWER, Interventions, Option, ProtocolRow, backbone, expert
 from probe_kit.hooks.contract.observation import OPENNESS
 from probe_kit.hooks.contract.sites import QUANTITIES
-from probe_kit.hooks.families.shared.kinds import MERGED, TOKENIZER_FOLDER
+from probe_kit.hooks.families.shared.kinds import MERGED, NO_HEAD, TOKENIZER_FOLDER
 from probe_kit.hooks.family import Family
 from probe_kit.hooks.family_parts import Abilities, Checkpoints
 
@@ -50,6 +50,7 @@ FAMILIES = (
             outputs="probe_kit.hooks.families.xiaomi.adapter:xiaomi_outputs",
             units="probe_kit.hooks.families.xiaomi.adapter:xiaomi_units",
             interventions=INTERVENTIONS,
+            no_words=NO_HEAD,
         ),
         checkpoints=Checkpoints(
             source="qwen3-vl",

@@ -2,7 +2,7 @@
 
 from probe_kit.hooks.contract.declared import TEXT, DeclaredStream, Interventions, Option, expert
 from probe_kit.hooks.contract.sites import Stream
-from probe_kit.hooks.families.shared.kinds import MERGED, lerobot_family
+from probe_kit.hooks.families.shared.kinds import MERGED, NO_HEAD, lerobot_family
 from probe_kit.hooks.family_parts import Abilities, Checkpoints
 
 PICTURES = ("padded", "squashed")
@@ -57,6 +57,6 @@ FAMILIES = (
                 )
             },
         ),
-        abilities=Abilities(interventions=INTERVENTIONS),
+        abilities=Abilities(interventions=INTERVENTIONS, no_words=NO_HEAD),
     ),
 )
