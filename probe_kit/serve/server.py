@@ -23,6 +23,7 @@ from probe_kit.extract.rollout.tasks import Act
 from probe_kit.extract.settings import ExtractSettings
 from probe_kit.extract.sizes import planned_sizes
 from probe_kit.extract.sources.served_source import ServedSource
+from probe_kit.extract.sources.source import raise_together
 from probe_kit.hashing import canonical_json
 from probe_kit.runs.layout import DATASET, StoredStream
 from probe_kit.runs.root import Root, find_continuable
@@ -174,7 +175,6 @@ def plan_server(settings: ExtractSettings, out: str) -> ServerPlan:
         if model is not None:
             plan.cameras = model.card.cameras
             plan.chunk = model.card.chunk, None
-            source.check_cameras(model.card.cameras)
     return plan
 
 
@@ -272,7 +272,26 @@ def _open_source(
     assert isinstance(opened, ExtractSettings)
     assert isinstance(source, ServedSource)
     _check_stored(opened, source, root, location)
+    if not loaded:
+        _check_before_weights(opened, source)
     return opened, source
+
+
+def _check_before_weights(settings: ExtractSettings, source: ServedSource) -> None:
+    """Compare cameras, state and edits with what the checkpoint's files say, before its weights are read.
+
+    Raises:
+        UsageError: For what does not fit.
+    """
+    checkpoint = settings.model.checkpoint or settings.model.family
+    if (inputs := Act().declared_inputs(settings)) is not None:
+        raise_together(source.early_checks(inputs, checkpoint))
+    if conditions := [condition for condition in source.settings.conditions if condition.edits]:
+        sizes = planned_sizes(settings, source.instructions)
+        outlined = None if sizes is None or sizes.outline is None else sizes.outline.model
+        for condition in conditions:
+            if outlined is not None:
+                condition.check(outlined, None)
 
 
 def _check_stored(settings: ExtractSettings, source: ServedSource, root: Root | None, location: Location) -> None:

@@ -2,14 +2,15 @@
 
 from collections.abc import Mapping
 from functools import partial
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import typer
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator, Field, PlainSerializer
 
 from probe_kit._terminal.console import split
 from probe_kit._terminal.options import further_option
 from probe_kit.errors import UsageError
+from probe_kit.extract.sources.conditions import Condition, read_conditions
 from probe_kit.extract.sources.recording import Pairs, read_pairs_of, read_turns
 from probe_kit.extract.sources.source import SourceSettings
 
@@ -26,6 +27,16 @@ _option = partial(typer.Option, rich_help_panel="Keys of observations")
 def _read_keys(value: Any) -> Any:
     """Return the parts of KEY,KEY as they are written, and a sequence as it is."""
     return split(value) or () if isinstance(value, str) else tuple(value or ())
+
+
+if TYPE_CHECKING:
+    Conditions = tuple[Condition, ...]
+else:
+    Conditions = Annotated[
+        Any,
+        BeforeValidator(read_conditions),
+        PlainSerializer(lambda conditions: [condition.to_json() for condition in conditions]),
+    ]
 
 
 class ServedSettings(SourceSettings):
@@ -46,10 +57,11 @@ class ServedSettings(SourceSettings):
         pause: The seconds between two observations after which a new episode begins; None for ten times the
             longest interval so far, at least 5.
         most_calls: The number of captured inferences that `all` stands for.
+        conditions: The conditions, of which each episode gets one; empty for episodes that are all alike.
         run: The address of the run whose stored observations are shown again; None for a server.
 
     Raises:
-        UsageError: For a camera or key that is given twice.
+        UsageError: For a camera or key that is given twice, and for conditions of episodes that are guessed.
     """
 
     kind: Literal["served"] = "served"
@@ -126,6 +138,15 @@ class ServedSettings(SourceSettings):
         Annotated[int, Field(ge=1, le=10_000)],
         further_option("--most-calls", metavar="N", help="Number of inferences of --captured-calls all."),
     ] = MOST_CALLS
+    conditions: Annotated[
+        Conditions,
+        _option(
+            "--condition",
+            metavar="NAME[=FILE]",
+            help="Change the streams of some episodes: each gets a condition, drawn in balanced blocks within its "
+            "group. none changes nothing; FILE holds edits. Repeatable; needs --episodes said.",
+        ),
+    ] = ()
     run: Annotated[str | None, Field(exclude=True)] = None
 
     command: ClassVar[str] = "probe-kit serve"
@@ -155,6 +176,11 @@ class ServedSettings(SourceSettings):
         ):
             raise UsageError(
                 f"--source is {self.source_name[:80]!r}; expected 1 to {LONGEST_NAME} printable characters"
+            )
+        if self.conditions and self.rule != "said":
+            raise UsageError(
+                "--condition gives each episode a condition, and a guessed episode may be two. Add --episodes "
+                "said, and let clients name their episodes (probe_kit/episode)"
             )
         if self.instruction is not None and not self.instruction.strip():
             raise UsageError("--instruction is empty; give the words, or leave it out")
