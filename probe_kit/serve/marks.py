@@ -32,6 +32,7 @@ class Mark:
         group: What folds keep together; None for the episode alone.
         step: The number of actions that were executed before the observation; None where that is not said.
         condition: The condition of the episode; None for one that is drawn.
+        columns: Further columns of the episode's row, such as the name of its task.
         end: Whether the episode is over.
         facts: Numbers and truth values of the whole episode, by name.
     """
@@ -42,6 +43,7 @@ class Mark:
     condition: str | None = None
     end: bool = False
     facts: Facts = field(default_factory=lambda: MappingProxyType({}))
+    columns: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
 
 
 def read_mark(value: Any) -> Mark:

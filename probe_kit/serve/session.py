@@ -85,6 +85,8 @@ class OpenEpisode:
         failure: Why it is given up, with the traceback; None while nothing failed.
         is_marked: Whether the client said that it began.
         condition: The condition whose edits it gets; empty where the run has no conditions.
+        columns: Further columns of its row, as the client said them.
+        actions: The number of actions that were executed; None where that is unknown.
     """
 
     name: str
@@ -100,6 +102,8 @@ class OpenEpisode:
     inferences: int = 0
     steps: list[int | None] = field(default_factory=list)
     last_step: int = -1
+    columns: Mapping[str, str] = field(default_factory=dict)
+    actions: int | None = None
     failure: tuple[str, str] | None = None
 
 
@@ -257,6 +261,11 @@ class Session:
         return writer
 
     @property
+    def source(self) -> ServedSource:
+        """The source, which knows cameras and shapes."""
+        return self._source
+
+    @property
     def streams(self) -> tuple[StoredStream, ...]:
         """The storage of the streams of the policy, for one instruction."""
         controller = self._controller
@@ -281,7 +290,7 @@ class Session:
                 "versions": dict(self._versions),
                 "keys": dict(self._keys),
                 "never_read": sorted(self._keys.keys() - self._source.read_keys()),
-                "episodes": settings.rule,
+                "episodes": "said" if settings.says_episodes else settings.rule,
                 "clients": self._connected,
                 "committed": self.committed,
                 "largest_latency_s": round(self._latency, 3),
@@ -348,7 +357,6 @@ class Session:
         sent: Mapping[str, Any],
         mark: Mark | None,
         arrived: float | None = None,
-        words: str | None = None,
     ) -> NDArray[np.float32]:
         """Return the actions (chunk, D) for an observation, captured if it is one of those.
 
@@ -359,7 +367,6 @@ class Session:
             sent: The observation by key.
             mark: What the client says of the episode; None for nothing.
             arrived: When it arrived, by the monotonic clock; other clients may be answered first. None for now.
-            words: The instruction, where the wire has it beside the observation.
 
         Raises:
             ObservationError: For what cannot be shown; the episode stays open.
@@ -369,12 +376,12 @@ class Session:
         self._finish_check()
         arrived = monotonic() if arrived is None else arrived
         try:
-            if mark is None and self._source.settings.rule == "said":
+            if mark is None and self._source.settings.says_episodes:
                 raise ObservationError(
                     "the observation says no episode, and the server takes said ones only (--episodes said). Add "
                     "the key probe_kit/episode, such as {'id': 'task3/7'}"
                 )
-            received = self._source.receive(sent, words)
+            received = self._source.receive(sent)
             episode = self._episode_of(client, received, mark, arrived)
             actions = self._infer(episode, received, mark)
         except _OF_A_REQUEST:
@@ -391,13 +398,25 @@ class Session:
         self._latency = max(self._latency, monotonic() - arrived)
         return actions
 
-    def end(self, client: Client, mark: Mark) -> bool:
-        """End the episode of a client as it says; return False if there is none of which anything was captured."""
+    def abandon(self, client: Client) -> None:
+        """End the episode of a client that begins the next one and never said how it ended."""
+        self._finish_check()
+        self._end(client, "start")
+
+    def end(self, client: Client, mark: Mark, steps: int | None = None) -> bool:
+        """End the episode of a client as it says; return False if there is none of which anything was captured.
+
+        Args:
+            client: The connection.
+            mark: The statement, with the facts of the episode.
+            steps: The number of actions that were executed; None where that is unknown.
+        """
         self._finish_check()
         episode = client.episode
         if episode is None or (mark.id and mark.id != episode.item):
             return False
         stored = episode.inferences > 0 and episode.failure is None
+        episode.actions = steps
         self._end(client, "said", mark.facts)
         return stored
 
@@ -431,7 +450,7 @@ class Session:
             self._check_store()
             self._check_units(received, group)
             self._end(client, ended)
-            return self._begin(client, received, mark.id, group, ended, True, condition)
+            return self._begin(client, received, mark.id, group, ended, True, condition, mark.columns)
         reason = self._reason_to_split(client, received, arrived)
         if episode is not None and reason is None:
             return episode
@@ -523,6 +542,7 @@ class Session:
         began: str,
         is_marked: bool,
         condition: str = "",
+        further_columns: Mapping[str, str] | None = None,
     ) -> OpenEpisode:
         name, began = self._row_name(item, began, is_marked)
         self._names.add(name)
@@ -536,6 +556,7 @@ class Session:
         episode = OpenEpisode(
             name, item, group, began, client.name, received.observation.instruction,
             Playing(row, self._take_buffers(), False), ServedEpisode(), is_marked, condition,
+            columns=further_columns or {},
         )  # fmt: skip
         self._count_condition(episode, 1)
         client.episode = episode
@@ -697,6 +718,7 @@ class Session:
             "policy_seed": episode.playing.planned.policy_seed,
             "content_blake2b": episode.record.content_blake2b,
             **({CONDITION: episode.condition} if episode.condition else {}),
+            **episode.columns,
         }
         return Row(-1, columns)
 
@@ -720,7 +742,9 @@ class Session:
             playing.control_steps = _control_steps(episode, self._source.settings.every)
             playing.instruction_ids = self._instruction_ids(episode.instruction)
             playing.lost_words = self._lost_words[episode.instruction]
-            ending = episode.record.ending({**outcome, "inferences": episode.inferences})
+            counts = {"inferences": episode.inferences}
+            counts |= {} if episode.actions is None else {"steps": episode.actions}
+            ending = episode.record.ending({**outcome, **counts})
             assert self._controller is not None, "it inferred"
             write_episode(self._writer, self._controller, self._settings, playing, ending, self.certified())
             self.committed += 1

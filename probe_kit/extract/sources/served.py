@@ -14,7 +14,9 @@ from probe_kit.extract.sources.conditions import Condition, read_conditions
 from probe_kit.extract.sources.recording import Pairs, read_pairs_of, read_turns
 from probe_kit.extract.sources.source import SourceSettings
 
-Wire = Literal["openpi"]
+Wire = Literal["openpi", "vla-eval"]
+WORDS: Mapping[Wire, str] = {"openpi": "prompt", "vla-eval": "task_description"}
+"""The key of the words in an observation, by wire."""
 EpisodeRule = Literal["guessed", "words", "connection", "said"]
 Keep = Literal["full", "small"]
 MOST_CALLS = 64
@@ -65,7 +67,14 @@ class ServedSettings(SourceSettings):
     """
 
     kind: Literal["served"] = "served"
-    wire: Wire = "openpi"
+    wire: Annotated[
+        Wire,
+        typer.Option(
+            "--wire",
+            help="openpi: the websocket of robots and benchmarks. vla-eval: that harness, which says its "
+            "episodes.",
+        ),
+    ] = "openpi"
     cameras: Annotated[
         Pairs,
         BeforeValidator(partial(read_pairs_of, "--camera", "base=observation/image")),
@@ -154,7 +163,7 @@ class ServedSettings(SourceSettings):
     played: ClassVar[str] = "served"
     subject: ClassVar[str] = "served observations"
     loads: ClassVar[str] = "model"
-    refuses: ClassVar[tuple[str, ...]] = ("protocol", "rotation", "video", "batch=auto", "execute", "edits")
+    refuses: ClassVar[tuple[str, ...]] = ("protocol", "rotation", "video", "batch=auto", "edits")
     shows: ClassVar[str] = "a policy server, whose clients act"
     of_run: ClassVar[bool] = True
 
@@ -177,13 +186,28 @@ class ServedSettings(SourceSettings):
             raise UsageError(
                 f"--source is {self.source_name[:80]!r}; expected 1 to {LONGEST_NAME} printable characters"
             )
-        if self.conditions and self.rule != "said":
+        if self.wire == "vla-eval" and self.rule not in ("guessed", "said"):
+            raise UsageError(
+                f"--episodes {self.rule} does not apply with --wire vla-eval, whose harness says its episodes; "
+                "remove it"
+            )
+        if self.conditions and not self.says_episodes:
             raise UsageError(
                 "--condition gives each episode a condition, and a guessed episode may be two. Add --episodes "
                 "said, and let clients name their episodes (probe_kit/episode)"
             )
         if self.instruction is not None and not self.instruction.strip():
             raise UsageError("--instruction is empty; give the words, or leave it out")
+
+    @property
+    def says_episodes(self) -> bool:
+        """Whether only episodes are taken of which the client says where they begin."""
+        return self.rule == "said" or self.wire == "vla-eval"
+
+    @property
+    def words_key(self) -> str:
+        """The key of the words in an observation."""
+        return WORDS[self.wire]
 
     @property
     def name(self) -> str:

@@ -36,8 +36,6 @@ if TYPE_CHECKING:
     from probe_kit.hooks import Policy
     from probe_kit.hooks.contract.card import DeclaredInputs
 
-PROMPT = "prompt"
-"""The key of the words in an observation of openpi."""
 LONGEST_WORDS = 1 << 16
 MOST_SIDE = 8192
 """The most pixels along a side of a picture."""
@@ -229,12 +227,11 @@ class ServedSource(Source[ServedSettings]):
 
     # -- what arrives --------------------------------------------------------------------------------
 
-    def receive(self, sent: Mapping[str, Any], words: str | None = None) -> Received:
+    def receive(self, sent: Mapping[str, Any]) -> Received:
         """Return what a client sent as the model is shown it. The first one decides sizes and, untyped, cameras.
 
         Args:
             sent: Values by key; `/` in a key of the settings leads into nested maps.
-            words: The instruction, where the wire has it beside the observation; None for the key `prompt`.
 
         Raises:
             ObservationError: For a picture, state or instruction that is missing or has another size or type.
@@ -242,7 +239,7 @@ class ServedSource(Source[ServedSettings]):
         cameras = self.cameras or self._guessed(sent)
         pictures = {camera: self._picture(sent, camera, key) for camera, key in cameras}
         state = self._state(sent)
-        instruction = self.settings.instruction or _words(sent, words)
+        instruction = self.settings.instruction or _words(sent, self.settings.words_key)
         turned = {
             camera: np.ascontiguousarray(np.rot90(picture, degrees_of(self.settings.rotations, camera) // 90))
             for camera, picture in pictures.items()
@@ -271,7 +268,7 @@ class ServedSource(Source[ServedSettings]):
 
     def read_keys(self) -> set[str]:
         """Return the keys that are read of an observation."""
-        words = set() if self.settings.instruction is not None else {PROMPT}
+        words = set() if self.settings.instruction is not None else {self.settings.words_key}
         return {key for _, key in self.cameras} | set(self.settings.state) | words
 
     def _guessed(self, sent: Mapping[str, Any]) -> Pairs:
@@ -564,15 +561,15 @@ def _in_words(value: Any) -> str:
     return f"a {type(value).__name__}"
 
 
-def _words(sent: Mapping[str, Any], words: str | None) -> str:
+def _words(sent: Mapping[str, Any], key: str) -> str:
     """Return the instruction. Raises ObservationError for none, and for what is no plain text."""
-    text: Any = _find(sent, PROMPT) if words is None else words
+    text: Any = _find(sent, key)
     if isinstance(text, bytes):
         text = text.decode(errors="replace")
     if not isinstance(text, str) or not text.strip():
         described = "none" if text is None else f"{text!r:.80}"
         raise ObservationError(
-            f"the observation has no words: {PROMPT} is {described}; expected a text. Send it, or start the "
+            f"the observation has no words: {key} is {described}; expected a text. Send it, or start the "
             "server with --instruction TEXT"
         )
     if UNSAFE.search(text) or len(text) > LONGEST_WORDS:
