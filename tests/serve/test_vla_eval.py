@@ -1,14 +1,10 @@
 """The wire of vla-eval: its harness plays gym-aloha, and its results say what the run says."""
 
 import json
-import os
-import signal
 import subprocess
 import sys
-import sysconfig
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -22,7 +18,7 @@ from probe_kit.hooks import Policy
 from probe_kit.runs import open_run
 from probe_kit.serve.server import open_server
 from probe_kit.serve.vla_eval import read_metrics, read_start
-from tests.support.made_once import made_once
+from tests.support.client_environments import client_python, drawing, server_process
 from tests.support.served_sessions import Opens, settings
 
 SUPPORT = Path(__file__).parents[1] / "support"
@@ -86,49 +82,20 @@ def test_the_wire_stands_at_this_machine_alone_and_takes_said_episodes(
 def harness(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A Python with our packages, the harness and gym-aloha; skipped where these cannot be installed or drawn."""
 
-    def make(folder: Path) -> None:
-        subprocess.run([sys.executable, "-m", "venv", str(folder / "harness")], check=True, timeout=200)
-        (packages,) = (folder / "harness" / "lib").glob("python*/site-packages")
-        folders = [sysconfig.get_path("purelib"), str(Path(__file__).parents[2])]
-        lines = [f"import site; site.addsitedir({path!r})" for path in folders]
-        (packages / "probe-kit-of-tests.pth").write_text("\n".join(lines), encoding="utf-8")
-        python = folder / "harness" / "bin" / "python"
-        subprocess.run(
-            [python, "-m", "pip", "install", "-q", *PACKAGES], check=False, capture_output=True, timeout=500
-        )
-
-    if find_spec("vla_eval") and find_spec("gym_aloha"):
-        python = Path(sys.executable)
-    else:
-        python = made_once(tmp_path_factory, "vla-eval", make) / "harness" / "bin" / "python"
     draws = "import vla_eval, gym_aloha, gymnasium as g; g.make('gym_aloha/AlohaTransferCube-v0').reset(seed=0)"
-    drawn = subprocess.run([python, "-c", draws], check=False, capture_output=True, env=environment(), timeout=200)
-    if drawn.returncode:
-        pytest.skip(f"{' and '.join(PACKAGES)} cannot be installed, or draw no picture here")
-    return python
+    if find_spec("vla_eval") and find_spec("gym_aloha"):
+        return Path(sys.executable)
+    return client_python(tmp_path_factory, "vla-eval", PACKAGES, draws, with_ours=True)
 
 
 def environment() -> dict[str, str]:
-    drawing = {"MUJOCO_GL": os.environ.get("MUJOCO_GL", "egl")}
-    return os.environ | drawing | {"PYTHONPATH": str(SUPPORT), "PYTHONUNBUFFERED": "1"}
+    return drawing({"PYTHONPATH": str(SUPPORT)})
 
 
-@contextmanager
-def served(python: Path, out: Path, port: str = "0", *options: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """A server of its own process, which ended when the body is left, and its address."""
-    command = [
-        str(python), "-m", "probe_kit", "serve", "--model", "pi0-tiny", "--out", str(out), "--wire", "vla-eval",
-        "--port", port, "--camera", "base=images/top", "--state", "states", "--accept-units",
-        "--source", "aloha@1", "--captured-calls", "2", "--execute", "2", *options,
-    ]  # fmt: skip
-    server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, encoding="utf-8", env=environment())
-    assert server.stdout is not None
-    try:
-        yield server, server.stdout.readline().strip()
-    finally:
-        if server.poll() is None:
-            server.send_signal(signal.SIGINT)
-        server.wait(300)
+def served(python: Path, out: Path, port: str = "0") -> AbstractContextManager[tuple[subprocess.Popen[str], str]]:
+    keys = ("--camera", "base=images/top", "--state", "states", "--accept-units", "--source", "aloha@1")
+    counts = ("--captured-calls", "2", "--execute", "2")
+    return server_process(out, "--wire", "vla-eval", "--port", port, *keys, *counts, python=python)
 
 
 def shard(python: Path, url: str, out: Path, episodes: int, number: int, shards: int) -> subprocess.Popen[bytes]:
@@ -198,9 +165,7 @@ def test_the_rest_of_an_episode_whose_server_was_killed_has_no_row_and_the_next_
     stored = set(run.episodes["eid"])
     assert stored.isdisjoint(failed)
     assert stored <= episodes.keys()
-    assert (
-        len(stored) >= len(episodes) - len(failed) - 1
-    )  # the kill may cost one more
+    assert len(stored) >= len(episodes) - len(failed) - 1  # the kill may cost one more
     assert run.episodes["episode_id"].is_unique
 
 
