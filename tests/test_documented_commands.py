@@ -159,7 +159,7 @@ LOOKED_FOR = {
     "show": "kitchen is no LeRobotDataset|Make one with",
     "check-environment": "there is no module kitchen",
     "ask": "accepted so far",
-    "serve": "accepted so far|DIR",
+    "serve": "accepted so far|DIR|there is no such file",
     "view": "Make one with",
     "labels": "Make one with",
     "targets": "Make one with",

@@ -194,7 +194,7 @@ class AskCapture(Part):
 # -- tasks --------------------------------------------------------------------------------------------------
 
 
-def _edit(value: Any) -> Any:
+def read_edit(value: Any) -> Any:
     """Return an edit from its entry in a file; one that is an edit is returned as it is."""
     if not isinstance(value, Mapping):
         return value
@@ -205,7 +205,7 @@ def _edit(value: Any) -> Any:
 if TYPE_CHECKING:
     PlainEdit = Edit
 else:
-    PlainEdit = Annotated[Edit, BeforeValidator(_edit), PlainSerializer(Edit.to_json)]
+    PlainEdit = Annotated[Edit, BeforeValidator(read_edit), PlainSerializer(Edit.to_json)]
 
 
 class ActTask(Part):

@@ -77,6 +77,11 @@ class Frames:
         self.cameras = tuple(camera if isinstance(camera, str) else camera[0] for camera in inputs["cameras"])
         self._cached = lru_cache(maxsize=CACHED)(self.observe)
         self.index = list(self._listed())
+        if not self.index:
+            raise UsageError(
+                f"{run.location} has no frame that can be shown again: the streams of all its episodes were "
+                "edited (--condition). Serve episodes of the condition none as well"
+            )
 
     @cached_property
     def by_name(self) -> dict[tuple[str, int], Frame]:

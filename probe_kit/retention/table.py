@@ -43,8 +43,10 @@ from probe_kit.retention.rows.build import (
 )
 from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.runs.environment_success import EnvironmentSuccess, why_no_rates
+from probe_kit.runs.layout import AT_END, CONDITION, UNEDITED
 from probe_kit.runs.reader import RunReader, check_sides
 from probe_kit.runs.store import Location
+from probe_kit.statistics.paired_tests import holm, overlap_p
 from probe_kit.statistics.sufficiency import ABSENT_BELOW
 from probe_kit.train.choices import SIDES
 from probe_kit.train.results.probe_results import ProbeResults
@@ -623,8 +625,43 @@ def _success_notes(runs: Sequence[TableRun]) -> Iterator[str]:
     for table_run in runs:
         if (success := EnvironmentSuccess.of(table_run.run.episodes)) is not None:
             yield f"{table_run.name}: {success.sentence}."
+            yield from _condition_notes(table_run)
         if (reason := why_no_rates(table_run.run.episodes)) is not None:
             yield f"{table_run.name}: {reason}."
+
+
+def _condition_notes(table_run: TableRun) -> Iterator[str]:
+    """Yield a test per condition of a policy server against `none`: success is dealt anew within each group.
+
+    That is how conditions were drawn, so that the test needs no assumption about episodes or groups.
+    """
+    episodes = table_run.run.episodes
+    rated = episodes.dropna(subset=[AT_END])
+    if CONDITION not in rated:
+        return
+    names = [name for name in sorted(rated[CONDITION].unique()) if name != UNEDITED]
+    both = [rated[rated[CONDITION].isin([name, UNEDITED])] for name in names]
+    p_values = holm(
+        [
+            overlap_p(
+                part[AT_END].to_numpy(bool), (part[CONDITION] == name).to_numpy(), part["group_id"], _DEALS_SEED
+            )
+            if part[CONDITION].nunique() == 2
+            else None
+            for name, part in zip(names, both, strict=True)
+        ]
+    )
+    for name, p in zip(names, p_values, strict=True):
+        if p is not None:
+            corrected = f", corrected for {len(names)} conditions (Holm)" if len(names) > 1 else ""
+            yield (
+                f"{table_run.name}: condition {name} against {UNEDITED}: p {p:.3f}{corrected}; conditions are "
+                "dealt anew within each group."
+            )
+
+
+_DEALS_SEED = 0
+"""The seed of the draws of `overlap_p`, so that a table repeats."""
 
 
 def _in_words(tried: Mapping[str, int]) -> str:

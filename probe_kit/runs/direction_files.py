@@ -155,12 +155,12 @@ def write_directions(
 
 def about_direction(category: str, view: str, site: Site, weights: str | None) -> tuple[str, dict[str, str]]:
     """Return the name of a direction of a category, view and site, and its entry in a file."""
-    name = _place_name(str(site))
+    name = place_name(str(site))
     role = role_of_view(view) or ""  # the last token plays no role of its own
     return f"{category}.{view}.{name}", {"site": name, "role": role, "space": "raw", "weights": weights or ""}
 
 
-def _place_name(site: str) -> str:
+def place_name(site: str) -> str:
     """Return a site as interventions name it, without the residual stream's name."""
     return site.replace(".residual", "")
 
@@ -264,5 +264,5 @@ def _direction(
     plain = "".join(letter if letter.isalnum() or letter in "-." else "-" for letter in name)
     # A hash in the name: directions of one name in two files, or of a changed file, stay apart in results.
     parts = {part: str(about.get(part) or "") for part in ("site", "role", "weights")}
-    parts["site"] = _place_name(parts["site"])
+    parts["site"] = place_name(parts["site"])
     return FileDirection(f"{plain}-{digest}", vectors, **parts, rounding=rounding)

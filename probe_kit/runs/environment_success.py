@@ -1,14 +1,42 @@
 """Success rates of runs in environments of the user's own or of clients, and what may have lowered them."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, Self
 
 from probe_kit._system.counting import describe_range, plural
-from probe_kit.runs.layout import AT_END, LIMIT, ONCE
+from probe_kit.runs.layout import AT_END, CONDITION, LIMIT, ONCE, UNEDITED
 
 if TYPE_CHECKING:
     import pandas as pd
+
+
+@dataclass(frozen=True)
+class ConditionSuccess:
+    """The success rate of the episodes of one condition.
+
+    Attributes:
+        n_episodes: The number of episodes of which success is said.
+        sr: The share of them with success.
+        difference: The mean over groups of the rate minus that of the condition `none` in the same group; None for
+            `none` itself, and where no group has both.
+        n_groups: The number of groups that have both.
+    """
+
+    name: str
+    n_episodes: int
+    sr: float
+    difference: float | None = None
+    n_groups: int = 0
+
+    @property
+    def words(self) -> str:
+        """The rate, and the difference within groups."""
+        rate = f"{self.name} {self.sr:.0%} of {self.n_episodes}"
+        if self.difference is None:
+            return rate
+        groups = plural(self.n_groups, "group")
+        return f"{rate} ({100 * self.difference:+.0f} points within {groups})"
 
 
 @dataclass(frozen=True)
@@ -22,6 +50,7 @@ class EnvironmentSuccess:
         stopped: The number of episodes that `--max-steps` ended before the environment's own limit.
         steps: The actions after which they ended.
         limits: The environment's own limits of these episodes, in actions.
+        conditions: The rates by condition, where a policy server changed the streams of some episodes.
     """
 
     n_episodes: int
@@ -30,6 +59,7 @@ class EnvironmentSuccess:
     stopped: int = 0
     steps: tuple[int, ...] = ()
     limits: tuple[int, ...] = ()
+    conditions: tuple[ConditionSuccess, ...] = ()
 
     @classmethod
     def of(cls, episodes: "pd.DataFrame") -> Self | None:
@@ -47,6 +77,7 @@ class EnvironmentSuccess:
             len(stopped),
             tuple(sorted({int(steps) for steps in stopped["steps"]})) if len(stopped) else (),
             tuple(sorted({int(limit) for limit in stopped[LIMIT]})) if len(stopped) else (),
+            _by_condition(rated),
         )
 
     def to_json(self) -> Mapping[str, Any]:
@@ -57,12 +88,16 @@ class EnvironmentSuccess:
             ONCE: self.success_once,
             "stopped_below_limit": self.stopped,
             "limits": list(self.limits),
+            **({"conditions": [asdict(rate) for rate in self.conditions]} if self.conditions else {}),
         }
 
     @property
     def sentence(self) -> str:
         """Both rates, and that `--max-steps` lowered them where it may have."""
         episodes = plural(self.n_episodes, "episode")
+        if self.conditions:
+            rates = "; ".join(rate.words for rate in self.conditions)
+            return f"success rate by condition, of {episodes}: {rates}"
         if self.success_once is None:
             return f"success rate {self.sr:.0%} of {episodes}, as their clients said at the end"
         rates = (
@@ -76,6 +111,22 @@ class EnvironmentSuccess:
             f"{rates}. --max-steps ended {self.stopped} of them after {counted_steps(self.steps)}, and the "
             f"environment's own {limit}: both rates may be too low"
         )
+
+
+def _by_condition(episodes: "pd.DataFrame") -> tuple[ConditionSuccess, ...]:
+    """Return the rates by condition, `none` in front; empty where episodes have no condition."""
+    if CONDITION not in episodes:
+        return ()
+    success = episodes[AT_END].astype(float)
+    in_groups = success.groupby([episodes["group_id"], episodes[CONDITION]]).mean().unstack()
+    rates = []
+    for name in sorted(in_groups.columns, key=lambda name: (name != UNEDITED, name)):
+        of_condition = success[episodes[CONDITION] == name]
+        gains = (in_groups[name] - in_groups.get(UNEDITED, float("nan"))).dropna()
+        compared = name != UNEDITED and len(gains) > 0
+        difference, groups = (float(gains.mean()), len(gains)) if compared else (None, 0)
+        rates.append(ConditionSuccess(name, len(of_condition), float(of_condition.mean()), difference, groups))
+    return tuple(rates)
 
 
 MARKED = "marked"

@@ -98,6 +98,12 @@ the first observation.
 """
 CAPTURE_ONLY = "capture_only"
 """The outcome of an episode whose model was captured and did not act: there is no success rate."""
+CONDITION = "condition"
+"""The column of served episodes with the name of the edits that each was played with."""
+CONDITIONS = "conditions"
+"""The entry of a certificate with what the last edit of each condition did."""
+UNEDITED = "none"
+"""The condition without edits, with which others are compared."""
 DATASET = "dataset"
 """The part of a run's settings that names the recordings, pictures or other stored observations it shows.
 

@@ -44,6 +44,7 @@ from probe_kit.runs.commits import (
 )
 from probe_kit.runs.layout import (
     CAPTURE_ONLY,
+    CONDITIONS,
     DATA,
     DATASET,
     ENVIRONMENT,
@@ -327,7 +328,12 @@ class Run:
                 for name, value in check.items()
                 if name.endswith("_with_hooks_sha256")
             )
-        return {**certificate, "processes": processes, "mixed": list(self.mixed)}
+        # A server writes a record at its end too, and one when a condition comes for the first time.
+        edits: dict[str, Any] = {}
+        for process in sorted(processes, key=lambda record: record.get("served", {}).get("committed", 0)):
+            edits |= process.get(CONDITIONS, {})
+        conditions = {CONDITIONS: edits} if edits else {}
+        return {**certificate, **conditions, "processes": processes, "mixed": list(self.mixed)}
 
     @cached_property
     def origins(self) -> tuple[Origin, ...]:

@@ -5,7 +5,7 @@ bytes fit their shape; nothing in it is ever a pickle, a path or code.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import msgpack
@@ -32,6 +32,10 @@ class _Counter:
     def __init__(self) -> None:
         self._values = 0
 
+    def plain_map(self, entries: dict[Any, Any]) -> dict[Any, Any]:
+        self._count(len(entries))
+        return entries
+
     def map(self, entries: dict[Any, Any]) -> Any:
         self._count(len(entries))
         if _ARRAY in entries:
@@ -55,11 +59,24 @@ def unpack(content: bytes) -> dict[str, Any]:
         MessageError: For what is no msgpack within the bounds.
         ObservationError: For an array of another kind than numbers, or whose bytes do not fit its shape.
     """
-    counter = _Counter()
+    message = _read(content, (counter := _Counter()).map, counter)
+    if not isinstance(message, dict) or not all(isinstance(key, str) for key in message):
+        raise MessageError(f"the message is a {type(message).__name__}; expected a map whose keys are texts")
+    _check_depth(message)
+    return message
+
+
+def check_bounds(content: bytes) -> None:
+    """Check a message that another library decodes, arrays and all. Raises MessageError beyond the bounds."""
+    message = _read(content, (counter := _Counter()).plain_map, counter)
+    _check_depth({"message": message})
+
+
+def _read(content: bytes, read_map: Callable[[dict[Any, Any]], Any], counter: "_Counter") -> Any:
     try:
-        message = msgpack.unpackb(
+        return msgpack.unpackb(
             content,
-            object_hook=counter.map,
+            object_hook=read_map,
             list_hook=counter.list,
             strict_map_key=True,
             max_map_len=MOST_ENTRIES,
@@ -79,10 +96,6 @@ def unpack(content: bytes) -> dict[str, Any]:
         OverflowError,
     ) as error:
         raise MessageError(f"the message is no msgpack within the bounds: {type(error).__name__}") from None
-    if not isinstance(message, dict) or not all(isinstance(key, str) for key in message):
-        raise MessageError(f"the message is a {type(message).__name__}; expected a map whose keys are texts")
-    _check_depth(message)
-    return message
 
 
 def _check_depth(message: Mapping[str, Any]) -> None:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from probe_kit.serve.session import Line, Session
 
 _NOT_SERVED = frozenset(
-    ("protocol", "execute", "rotation", "no_act", "batch", "video", "frames", "env_workers", "workers", "ray",
+    ("protocol", "rotation", "no_act", "batch", "video", "frames", "env_workers", "workers", "ray",
      "inference_limit")
 )  # fmt: skip
 """The options of `extract` that a server has no use for."""
@@ -92,12 +92,13 @@ def serve(
     """Answer the wire of a benchmark or a robot, and store the activations of its episodes.
 
     The client plays; a run of its episodes is written here. Clients of openpi need no change. One more key in
-    their observations, probe_kit/episode, names episodes. Ctrl-C commits what was played. The same command
-    continues the run.
+    their observations, probe_kit/episode, names episodes. The harness vla-eval names its own. Ctrl-C commits what
+    was played. The same command continues the run.
 
     \b
     probe-kit serve --model pi0 --checkpoint DIR --out runs/libero --camera base=observation/image \\
         --state observation/state --source libero_spatial@1
+    probe-kit serve --model pi0 --checkpoint DIR --out runs/libero --wire vla-eval --state states
     probe-kit serve --model pi0-tiny --out runs/mine --state observation/state --dry-run
     """  # noqa: D301 - click reads the \b
     from probe_kit.serve.server import open_server, plan_server
@@ -141,9 +142,7 @@ def _print_plan(plan: "ServerPlan", address: str) -> None:
     from rich.table import Table
 
     from probe_kit.extract.sizes import weights_needed
-    from probe_kit.extract.sources.served_source import PROMPT
     from probe_kit.runs.run_folders import in_units
-    from probe_kit.serve.marks import KEY
 
     settings, source = plan.settings, plan.source
     served: Any = settings.source
@@ -151,7 +150,7 @@ def _print_plan(plan: "ServerPlan", address: str) -> None:
     cameras = [f"{key} → {camera}, uint8 (height, width, 3)" for camera, key in source.cameras]
     names = ", ".join(plan.cameras) or "unknown before the model is loaded"
     pictures = "; ".join(cameras) or f"a picture by the name of a camera ({names}), or the only one"
-    words = f"none: --instruction {served.instruction!r}" if served.instruction else f"{PROMPT}, a text"
+    words = f"none: --instruction {served.instruction!r}" if served.instruction else f"{served.words_key}, a text"
     per_call = sum(stream.raw_bytes(capture.tokens == "all", 1) for stream in plan.streams)
     episode = sum(
         stream.raw_bytes(capture.tokens == "all", capture.calls, capture.later_views) for stream in plan.streams
@@ -168,9 +167,7 @@ def _print_plan(plan: "ServerPlan", address: str) -> None:
         "send": pictures,
         "state": " and ".join(served.state) + ", numbers of one axis" if served.state else "none is read",
         "words": words,
-        "mark": f"{KEY}: {{id, group?, step?}}; alone {{end: true, facts: {{success: true}}}}"
-        + ("" if served.rule == "said" else f"; without it: --episodes {served.rule}"),
-        "comes back": f"actions, float32 ({', '.join(chunk)}): chunk and numbers",
+        **_wire_rows(settings, chunk),
         "stores": f"the first {plural(capture.calls, 'inference')} of an episode"
         + (f", of each {served.every}th" if served.every > 1 else ""),
         "streams": (streams or "unknown before the model is loaded")
@@ -186,6 +183,29 @@ def _print_plan(plan: "ServerPlan", address: str) -> None:
         if value:
             table.add_row(markup("[dim]{}[/]", name), terminal_safe(value))
     err.print(table)
+
+
+def _wire_rows(settings: ExtractSettings, chunk: tuple[str, ...]) -> dict[str, str]:
+    """Return what says where episodes begin, and what an answer holds."""
+    from probe_kit.serve.marks import KEY
+
+    served: Any = settings.source
+    conditions = [condition.name for condition in served.conditions]
+    if served.wire == "vla-eval":
+        execute = settings.task.execute or "as many as the checkpoint executes"
+        return {
+            "episodes": "EPISODE_START names task and episode_idx, EPISODE_END has the metrics",
+            "comes back": f"actions, float32 ({chunk[-1]}), one per observation",
+            "executed": f"{execute} of the {chunk[0]} actions of each chunk",
+            "conditions": ", ".join(conditions),
+        }
+    condition = ", condition?" if conditions else ""
+    return {
+        "mark": f"{KEY}: {{id, group?, step?{condition}}}; alone {{end: true, facts: {{success: true}}}}"
+        + ("" if served.rule == "said" else f"; without it: --episodes {served.rule}"),
+        "comes back": f"actions, float32 ({', '.join(chunk)}): chunk and numbers",
+        "conditions": ", ".join(conditions),
+    }
 
 
 def _print_end(run: "Run | None", session: "Session") -> None:

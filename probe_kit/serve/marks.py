@@ -18,7 +18,7 @@ MOST_FACTS = 64
 LARGEST_STEP = 10**9
 SUCCESS = "success"
 """The fact that becomes the outcome."""
-_PARTS = frozenset({"id", "group", "step", "end", "facts"})
+_PARTS = frozenset({"id", "group", "step", "condition", "end", "facts"})
 
 Facts = Mapping[str, float | bool]
 
@@ -31,6 +31,8 @@ class Mark:
         id: The name of the episode; empty for an end without one.
         group: What folds keep together; None for the episode alone.
         step: The number of actions that were executed before the observation; None where that is not said.
+        condition: The condition of the episode; None for one that is drawn.
+        columns: Further columns of the episode's row, such as the name of its task.
         end: Whether the episode is over.
         facts: Numbers and truth values of the whole episode, by name.
     """
@@ -38,8 +40,10 @@ class Mark:
     id: str = ""
     group: str | None = None
     step: int | None = None
+    condition: str | None = None
     end: bool = False
     facts: Facts = field(default_factory=lambda: MappingProxyType({}))
+    columns: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
 
 
 def read_mark(value: Any) -> Mark:
@@ -56,11 +60,12 @@ def read_mark(value: Any) -> Mark:
         raise ObservationError(f"{KEY}: {what}; expected an id with an observation, and {{'end': true}} alone")
     name = plain_name(value["id"], "id") if "id" in value else ""
     group = plain_name(value["group"], "group") if value.get("group") is not None else None
-    return Mark(name, group, _step(value.get("step")), end, read_facts(value.get("facts") or {}))
+    condition = plain_name(value["condition"], "condition") if value.get("condition") is not None else None
+    return Mark(name, group, _step(value.get("step")), condition, end, read_facts(value.get("facts") or {}))
 
 
 def plain_name(value: Any, what: str) -> str:
-    """Return an id or a group as text. Raises ObservationError for anything but plain characters."""
+    """Return an id, a group or a condition as text. Raises ObservationError for anything but plain characters."""
     text = str(value) if isinstance(value, int) and not isinstance(value, bool) else value
     if not isinstance(text, str) or not text.strip() or len(text) > LONGEST or UNSAFE.search(text):
         raise ObservationError(f"{KEY}: the {what} is {value!r:.80}; expected 1 to {LONGEST} plain characters")

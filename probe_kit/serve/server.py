@@ -22,7 +22,9 @@ from probe_kit.extract.rollout.capturing import stored_streams
 from probe_kit.extract.rollout.tasks import Act
 from probe_kit.extract.settings import ExtractSettings
 from probe_kit.extract.sizes import planned_sizes
+from probe_kit.extract.sources.served import Wire
 from probe_kit.extract.sources.served_source import ServedSource
+from probe_kit.extract.sources.source import raise_together
 from probe_kit.hashing import canonical_json
 from probe_kit.runs.layout import DATASET, StoredStream
 from probe_kit.runs.root import Root, find_continuable
@@ -33,8 +35,14 @@ from probe_kit.serve.session import EXAMPLE, Line, Session
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
+    from probe_kit.serve.wire import WireServer
 
-EXTRA = "serve"
+PACKAGES: Mapping[Wire, tuple[str, tuple[str, ...]]] = {
+    "openpi": ("serve", ("websockets", "msgpack")),
+    "vla-eval": ("vla-eval", ("websockets", "msgpack", "vla_eval")),
+}
+"""The extra and the packages of a wire."""
+LOOPBACK = ("127.0.0.1", "localhost", "::1")
 _NOT_YET = ("dtype", "execute")
 """The settings whose value the loaded model decides."""
 _LONGEST_TOKEN, _TOKEN_BYTES = 4096, 32
@@ -96,8 +104,6 @@ class Server:
         asyncio.run(self._serve(stop_after, ready, note))
 
     async def _serve(self, stop_after: int | None, ready: Callable[[], None], note: Callable[[str], None]) -> None:
-        from probe_kit.serve.openpi import OpenpiServer
-
         loop, stop = asyncio.get_running_loop(), self.stop
         before = {number: signal.getsignal(number) for number in _ENDING}
 
@@ -110,7 +116,7 @@ class Server:
         for number in _ENDING:
             with suppress(RuntimeError, ValueError):  # another thread, as in a notebook
                 loop.add_signal_handler(number, end)
-        wire = OpenpiServer(self.session, self.listener, self.token, self.metadata, stop.set, note)
+        wire = self._wire(stop.set, note)
         try:
             server = await wire.start()
         except OSError as error:  # another server was bound to the port while both loaded their models
@@ -125,6 +131,16 @@ class Server:
         server.close()
         await server.wait_closed()
         await wire.close()
+
+    def _wire(self, stop: Callable[[], None], note: Callable[[str], None]) -> "WireServer":
+        from probe_kit.serve.openpi import OpenpiServer
+        from probe_kit.serve.vla_eval import VlaEvalServer
+
+        parts = self.session, self.listener, self.token, self.metadata, stop, note
+        if self.session.source.settings.wire == "openpi":
+            return OpenpiServer(*parts)
+        assert self.plan.settings.task.execute is not None, "it was decided with the model"
+        return VlaEvalServer(*parts, execute=self.plan.settings.task.execute)
 
     def close(self) -> Run | None:
         """Commit what was played, seal the run and return it; None where nothing was played.
@@ -174,7 +190,6 @@ def plan_server(settings: ExtractSettings, out: str) -> ServerPlan:
         if model is not None:
             plan.cameras = model.card.cameras
             plan.chunk = model.card.chunk, None
-            source.check_cameras(model.card.cameras)
     return plan
 
 
@@ -206,9 +221,11 @@ def open_server(
         SettingsMismatchError: If the place holds a run with other settings.
         ProbeKitError: For a model that cannot be loaded.
     """
-    packages = ("websockets", "msgpack")
+    wire: Wire = dict(settings.source)["wire"]
+    _check_network(wire, host, token_file, metadata)
+    extra, packages = PACKAGES[wire]
     for package in packages:
-        require(package, EXTRA)
+        require(package, extra)
     location = locate(out)
     root = find_continuable(location)
     settings = _with_source_name(settings, root, location)
@@ -220,6 +237,7 @@ def open_server(
         policy = policy or Act().load(opened)
         assert policy is not None, "scripts are refused before"
         source, policy = source.check(policy, opened.machine.accept_units)
+        opened = _with_executed(opened, policy)
         versions = {package: version(package) for package in packages}
         session = Session(opened, source, policy, location, report, versions)
         session.open_stored(stored)
@@ -271,8 +289,28 @@ def _open_source(
     opened, source = open_checked(settings, location, loaded, fetch)
     assert isinstance(opened, ExtractSettings)
     assert isinstance(source, ServedSource)
+    decides_execution(opened)
     _check_stored(opened, source, root, location)
+    if not loaded:
+        _check_before_weights(opened, source)
     return opened, source
+
+
+def _check_before_weights(settings: ExtractSettings, source: ServedSource) -> None:
+    """Compare cameras, state and edits with what the checkpoint's files say, before its weights are read.
+
+    Raises:
+        UsageError: For what does not fit.
+    """
+    checkpoint = settings.model.checkpoint or settings.model.family
+    if (inputs := Act().declared_inputs(settings)) is not None:
+        raise_together(source.early_checks(inputs, checkpoint))
+    if conditions := [condition for condition in source.settings.conditions if condition.edits]:
+        sizes = planned_sizes(settings, source.instructions)
+        outlined = None if sizes is None or sizes.outline is None else sizes.outline.model
+        for condition in conditions:
+            if outlined is not None:
+                condition.check(outlined, None)
 
 
 def _check_stored(settings: ExtractSettings, source: ServedSource, root: Root | None, location: Location) -> None:
@@ -286,6 +324,49 @@ def _check_stored(settings: ExtractSettings, source: ServedSource, root: Root | 
     if settings.model.dtype is not None:
         requested["dtype"], stored["dtype"] = settings.model.dtype, root.own_settings.get("dtype")
     check_other_settings(stored, requested, str(location))
+
+
+def _check_network(wire: Wire, host: str, token_file: Path | None, metadata: Mapping[str, Any]) -> None:
+    """Raise UsageError for an address or a token of a wire whose clients can send none."""
+    if wire == "openpi":
+        return
+    if host not in LOOPBACK or token_file is not None:
+        raise UsageError(
+            f"clients of {wire} send no token, so that this wire stands at 127.0.0.1 alone. Leave --host and "
+            "--token-file out; from another machine use a tunnel, such as ssh -L 8000:127.0.0.1:8000 HOST"
+        )
+    if metadata:
+        raise UsageError(f"--metadata is for clients of openpi; {wire} has no first message. Leave it out")
+
+
+def _with_executed(settings: ExtractSettings, policy: "Policy") -> ExtractSettings:
+    """Return the settings with the number of actions that are sent of a chunk, where that is ours to decide.
+
+    Raises:
+        UsageError: For another number than a chunk has.
+    """
+    if not decides_execution(settings):
+        return settings
+    execute, chunk = settings.task.execute or policy.card.execute, policy.card.chunk
+    if not 1 <= execute <= chunk:
+        raise UsageError(f"--execute {execute}: a chunk of {policy.card.checkpoint} has {chunk} actions")
+    return settings.changed(execute=execute)
+
+
+def decides_execution(settings: ExtractSettings) -> bool:
+    """Whether the server decides how many actions of a chunk are executed.
+
+    Raises:
+        UsageError: For `--execute` on a wire whose clients decide it.
+    """
+    if (wire := dict(settings.source)["wire"]) == "vla-eval":
+        return True
+    if settings.task.execute is not None:
+        raise UsageError(
+            f"--execute does not apply with --wire {wire}: the client decides how many actions of a chunk it "
+            "executes. Remove it"
+        )
+    return False
 
 
 def _bound(host: str, port: int) -> socket.socket:
@@ -312,7 +393,7 @@ def _token(host: str, file: Path | None) -> tuple[str, Path | None]:
         if not text.isascii() or not text.isprintable() or not text:
             raise UsageError(f"--token-file {file} holds no token; write one line of plain characters")
         return text, None
-    if host in ("127.0.0.1", "localhost", "::1"):
+    if host in LOOPBACK:
         return "", None
     drawn = secrets.token_urlsafe(_TOKEN_BYTES)
     handle, name = tempfile.mkstemp(prefix="probe-kit-", suffix="-token")  # which only its owner can read

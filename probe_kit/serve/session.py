@@ -5,7 +5,7 @@ Another thread writes.
 """
 
 import itertools
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, suppress
@@ -30,11 +30,12 @@ from probe_kit.extract.rollout.capturing import EpisodeBuffers, stored_streams
 from probe_kit.extract.rollout.controllers import PolicyController, Turn, count_lost_words
 from probe_kit.extract.rollout.worker import Playing, certificate_of, torch_threads, write_episode
 from probe_kit.extract.settings import CONFIG, ExtractSettings, run_label
+from probe_kit.extract.sources.conditions import next_condition
 from probe_kit.extract.sources.player import EPISODE_ERRORS, traceback_of
 from probe_kit.extract.sources.served_source import Received, ServedEpisode, ServedSource, flat_keys
 from probe_kit.hashing import derive_seed
 from probe_kit.runs.commits import failure_key, read_commits
-from probe_kit.runs.layout import AT_END, CAPTURE_ONLY, DATASET, UNITS, StoredStream
+from probe_kit.runs.layout import AT_END, CAPTURE_ONLY, CONDITION, DATASET, UNITS, StoredStream
 from probe_kit.runs.plan import Plan, Row
 from probe_kit.runs.provenance import provenance_here
 from probe_kit.runs.run import Run
@@ -83,6 +84,9 @@ class OpenEpisode:
         steps: The number of actions executed before each captured inference, as far as it is said.
         failure: Why it is given up, with the traceback; None while nothing failed.
         is_marked: Whether the client said that it began.
+        condition: The condition whose edits it gets; empty where the run has no conditions.
+        columns: Further columns of its row, as the client said them.
+        actions: The number of actions that were executed; None where that is unknown.
     """
 
     name: str
@@ -94,9 +98,12 @@ class OpenEpisode:
     playing: Playing
     record: ServedEpisode
     is_marked: bool
+    condition: str = ""
     inferences: int = 0
     steps: list[int | None] = field(default_factory=list)
     last_step: int = -1
+    columns: Mapping[str, str] = field(default_factory=dict)
+    actions: int | None = None
     failure: tuple[str, str] | None = None
 
 
@@ -186,6 +193,8 @@ class Session:
         self._check: tuple[OpenEpisode, Turn, Received, NDArray[np.float32]] | None = None
         self._names: set[str] = set()
         self._numbers: Counter[str] = Counter()
+        self._certified: set[str] = set()
+        self._conditions: defaultdict[str, Counter[str]] = defaultdict(Counter)
         self._connections: Counter[str] = Counter()
         self._first_states: list[NDArray[np.float32]] = []
         self._begun_groups: set[str] = set()
@@ -217,6 +226,8 @@ class Session:
             client = str(row["client"])
             self._names.add(str(row["episode_id"]))
             self._connections[client] = max(self._connections[client], int(row["connection"]))
+            if (condition := row.get(CONDITION)) is not None and row["began"] != "words":
+                self._conditions[str(row["group_id"])][str(condition)] += 1
             if not row["marked"]:
                 number = int(str(row["item_id"]).rpartition("/")[2])
                 self._numbers[client] = max(self._numbers[client], number)
@@ -250,6 +261,11 @@ class Session:
         return writer
 
     @property
+    def source(self) -> ServedSource:
+        """The source, which knows cameras and shapes."""
+        return self._source
+
+    @property
     def streams(self) -> tuple[StoredStream, ...]:
         """The storage of the streams of the policy, for one instruction."""
         controller = self._controller
@@ -274,8 +290,9 @@ class Session:
                 "versions": dict(self._versions),
                 "keys": dict(self._keys),
                 "never_read": sorted(self._keys.keys() - self._source.read_keys()),
-                "episodes": settings.rule,
+                "episodes": "said" if settings.says_episodes else settings.rule,
                 "clients": self._connected,
+                "committed": self.committed,
                 "largest_latency_s": round(self._latency, 3),
             }
         }
@@ -340,7 +357,6 @@ class Session:
         sent: Mapping[str, Any],
         mark: Mark | None,
         arrived: float | None = None,
-        words: str | None = None,
     ) -> NDArray[np.float32]:
         """Return the actions (chunk, D) for an observation, captured if it is one of those.
 
@@ -351,7 +367,6 @@ class Session:
             sent: The observation by key.
             mark: What the client says of the episode; None for nothing.
             arrived: When it arrived, by the monotonic clock; other clients may be answered first. None for now.
-            words: The instruction, where the wire has it beside the observation.
 
         Raises:
             ObservationError: For what cannot be shown; the episode stays open.
@@ -361,12 +376,12 @@ class Session:
         self._finish_check()
         arrived = monotonic() if arrived is None else arrived
         try:
-            if mark is None and self._source.settings.rule == "said":
+            if mark is None and self._source.settings.says_episodes:
                 raise ObservationError(
                     "the observation says no episode, and the server takes said ones only (--episodes said). Add "
                     "the key probe_kit/episode, such as {'id': 'task3/7'}"
                 )
-            received = self._source.receive(sent, words)
+            received = self._source.receive(sent)
             episode = self._episode_of(client, received, mark, arrived)
             actions = self._infer(episode, received, mark)
         except _OF_A_REQUEST:
@@ -383,13 +398,25 @@ class Session:
         self._latency = max(self._latency, monotonic() - arrived)
         return actions
 
-    def end(self, client: Client, mark: Mark) -> bool:
-        """End the episode of a client as it says; return False if there is none of which anything was captured."""
+    def abandon(self, client: Client) -> None:
+        """End the episode of a client that begins the next one and never said how it ended."""
+        self._finish_check()
+        self._end(client, "start")
+
+    def end(self, client: Client, mark: Mark, steps: int | None = None) -> bool:
+        """End the episode of a client as it says; return False if there is none of which anything was captured.
+
+        Args:
+            client: The connection.
+            mark: The statement, with the facts of the episode.
+            steps: The number of actions that were executed; None where that is unknown.
+        """
         self._finish_check()
         episode = client.episode
         if episode is None or (mark.id and mark.id != episode.item):
             return False
         stored = episode.inferences > 0 and episode.failure is None
+        episode.actions = steps
         self._end(client, "said", mark.facts)
         return stored
 
@@ -410,14 +437,20 @@ class Session:
         words = received.observation.instruction
         if mark is not None:
             same = episode is not None and episode.is_marked and episode.item == mark.id
+            if episode is not None and same and mark.condition not in (None, episode.condition):
+                raise ObservationError(
+                    f"probe_kit/episode: the condition of {episode.item!r} is {mark.condition!r} now; it began "
+                    "with another one. A new episode has another id"
+                )
             if episode is not None and same and words == episode.instruction:
                 self._check_step(episode, mark)
                 return episode
+            group, ended = mark.group or mark.id, "words" if same else "said"
+            condition = episode.condition if episode is not None and same else self._condition_of(mark, group)
             self._check_store()
-            self._check_units(received, mark.group or mark.id)
-            ended = "words" if same else "said"
+            self._check_units(received, group)
             self._end(client, ended)
-            return self._begin(client, received, mark.id, mark.group or mark.id, "words" if same else "said", True)
+            return self._begin(client, received, mark.id, group, ended, True, condition, mark.columns)
         reason = self._reason_to_split(client, received, arrived)
         if episode is not None and reason is None:
             return episode
@@ -428,6 +461,26 @@ class Session:
         self._numbers[client.name] += 1
         name = f"{client.name}/{self._numbers[client.name]:06d}"
         return self._begin(client, received, name, group, reason or "connection", False)
+
+    def _condition_of(self, mark: Mark, group: str) -> str:
+        """Return the condition of a new episode: the mark's, else one that is drawn in balanced blocks."""
+        names = [condition.name for condition in self._source.settings.conditions]
+        if mark.condition is not None and mark.condition not in names:
+            served = ", ".join(names) or "no conditions; start it with --condition"
+            raise ObservationError(
+                f"probe_kit/episode: the condition is {mark.condition!r}; the server has {served}"
+            )
+        if mark.condition is not None or not names:
+            return mark.condition or ""
+        counts = self._conditions[group]
+        block = min(counts[name] for name in names)
+        rng = np.random.default_rng(derive_seed(self._settings.seed, CONDITION, group, block))
+        return next_condition(names, counts, rng.permutation(len(names)).tolist())
+
+    def _count_condition(self, episode: OpenEpisode, more: int) -> None:
+        """Count the condition of an episode; one row of an episode of two instructions counts."""
+        if episode.condition and episode.began != "words":
+            self._conditions[episode.group][episode.condition] += more
 
     def _reason_to_split(self, client: Client, received: Received, arrived: float) -> str | None:
         """Return why an observation without a mark begins a row; None if it does not."""
@@ -481,7 +534,15 @@ class Session:
         self._begun_groups.add(group)
 
     def _begin(
-        self, client: Client, received: Received, item: str, group: str, began: str, is_marked: bool
+        self,
+        client: Client,
+        received: Received,
+        item: str,
+        group: str,
+        began: str,
+        is_marked: bool,
+        condition: str = "",
+        further_columns: Mapping[str, str] | None = None,
     ) -> OpenEpisode:
         name, began = self._row_name(item, began, is_marked)
         self._names.add(name)
@@ -490,11 +551,14 @@ class Session:
             self._policy = self._source.with_cameras_of(self._loaded)
             self._begin_controller()
         seed = derive_seed(self._settings.seed, "policy", name)
-        row = Row(-1, {"episode_id": name, "policy_seed": seed, "instruction": received.observation.instruction})
+        columns = {"episode_id": name, "policy_seed": seed, "instruction": received.observation.instruction}
+        row = Row(-1, columns | ({CONDITION: condition} if condition else {}))
         episode = OpenEpisode(
             name, item, group, began, client.name, received.observation.instruction,
-            Playing(row, self._take_buffers(), False), ServedEpisode(), is_marked,
+            Playing(row, self._take_buffers(), False), ServedEpisode(), is_marked, condition,
+            columns=further_columns or {},
         )  # fmt: skip
+        self._count_condition(episode, 1)
         client.episode = episode
         return episode
 
@@ -506,6 +570,7 @@ class Session:
         self._source.unsettle()
         if client.episode is not None:
             self._names.discard(client.episode.name)
+            self._count_condition(client.episode, -1)
             client.episode = None
         self._free.clear()
 
@@ -626,6 +691,7 @@ class Session:
             return
         if not episode.inferences and episode.failure is None:
             self._names.discard(episode.name)
+            self._count_condition(episode, -1)
             self._give_back(episode.playing.buffers)
             return
         row = self._row_of(episode, ended, client)
@@ -651,6 +717,8 @@ class Session:
             "recorded_frames": episode.inferences,
             "policy_seed": episode.playing.planned.policy_seed,
             "content_blake2b": episode.record.content_blake2b,
+            **({CONDITION: episode.condition} if episode.condition else {}),
+            **episode.columns,
         }
         return Row(-1, columns)
 
@@ -674,10 +742,13 @@ class Session:
             playing.control_steps = _control_steps(episode, self._source.settings.every)
             playing.instruction_ids = self._instruction_ids(episode.instruction)
             playing.lost_words = self._lost_words[episode.instruction]
-            ending = episode.record.ending({**outcome, "inferences": episode.inferences})
+            counts = {"inferences": episode.inferences}
+            counts |= {} if episode.actions is None else {"steps": episode.actions}
+            ending = episode.record.ending({**outcome, **counts})
             assert self._controller is not None, "it inferred"
             write_episode(self._writer, self._controller, self._settings, playing, ending, self.certified())
             self.committed += 1
+            self._certify_condition(episode.condition)
             self._say(episode, number, outcome["outcome"])
         except Exception as error:  # noqa: BLE001 - whatever it is, the clients play on
             reason = f"{type(error).__name__}: {error}"
@@ -687,6 +758,15 @@ class Session:
             self._say(episode, number, "not stored", reason)
         finally:
             self._give_back(playing.buffers)
+
+    def _certify_condition(self, name: str) -> None:
+        """Record what the edits of a condition did when it comes for the first time: a kill keeps that record."""
+        if not name or name in self._certified:
+            return
+        assert self._writer is not None, "its episode is committed"
+        with suppress(OSError, ProbeKitError):  # the episode is committed, and the record at the end raises
+            self._writer.write_certificate({**self._certificate(), **self.certified()}, again=True)
+            self._certified.add(name)
 
     def _add(self, row: Row, spans: Sequence[Mapping[str, Sequence[tuple[str, int, int]]]]) -> Row:
         assert self._writer is not None, "it was made before"

@@ -1,20 +1,16 @@
 """The real openpi-client, in an environment of its own, which cannot share ours: it requires numpy below 2."""
 
 import json
-import os
-import shutil
-import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import pytest
 
 from probe_kit.runs import open_run
-from tests.support.made_once import made_once
+from tests.support.client_environments import client_python, server_process
 
 pytestmark = pytest.mark.slow
 CLIENT = ("openpi-client==0.1.2", "numpy<2", "typing_extensions")
@@ -51,23 +47,7 @@ print(json.dumps(sent))
 @pytest.fixture(scope="session")
 def client(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A Python with the client; the test is skipped where it cannot be installed."""
-
-    def make(folder: Path) -> None:
-        subprocess.run([sys.executable, "-m", "venv", str(folder / "client")], check=True, timeout=200)
-        python = folder / "client" / "bin" / "python"
-        uv = shutil.which("uv")
-        tool = (
-            [uv, "pip", "install", "--python", str(python)] if uv else [str(python), "-m", "pip", "install", "-q"]
-        )
-        subprocess.run([*tool, *CLIENT], check=False, capture_output=True, timeout=300)
-
-    python = made_once(tmp_path_factory, "openpi-client", make) / "client" / "bin" / "python"
-    completed = subprocess.run(
-        [python, "-c", "import openpi_client"], check=False, capture_output=True, timeout=60
-    )
-    if completed.returncode:
-        pytest.skip("openpi-client 0.1.2 cannot be installed here")
-    return python
+    return client_python(tmp_path_factory, "openpi-client", CLIENT, "import openpi_client")
 
 
 def probe_kit(*words: str, codes: tuple[int, ...] = (0,)) -> str:
@@ -82,22 +62,9 @@ def probe_kit(*words: str, codes: tuple[int, ...] = (0,)) -> str:
     return ended.stdout
 
 
-@contextmanager
-def served(out: Path, *options: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """A server of its own process, which ended when the body is left, and its address."""
-    command = [
-        sys.executable, "-m", "probe_kit", "serve", "--model", "pi0-tiny", "--out", str(out), "--port", "0",
-        "--camera", "base=observation/image", "--state", "observation/state", "--source", "noise@1", *options,
-    ]  # fmt: skip
-    environment = os.environ | {"PYTHONUNBUFFERED": "1"}
-    server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, encoding="utf-8", env=environment)
-    assert server.stdout is not None
-    try:
-        yield server, server.stdout.readline().strip()
-    finally:
-        if server.poll() is None:
-            server.send_signal(signal.SIGINT)
-        server.wait(300)
+def served(out: Path, *options: str) -> AbstractContextManager[tuple[subprocess.Popen[str], str]]:
+    keys = ("--camera", "base=observation/image", "--state", "observation/state")
+    return server_process(out, "--port", "0", *keys, "--source", "noise@1", *options)
 
 
 def play(python: Path, address: str, first: int, last: int) -> dict[str, list[list[float]]]:

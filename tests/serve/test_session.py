@@ -1,13 +1,16 @@
 """Episodes of clients, the rules that bound them, and the run that they make."""
 
 import re
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from probe_kit.errors import ObservationError, PolicyFailedError, SettingsMismatchError, UnitsError, UsageError
+from probe_kit.extract import ExtractSettings
 from probe_kit.extract.rollout.worker import torch_threads
+from probe_kit.extract.sources.served import ServedSettings
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks import Policy
 from probe_kit.hooks.contract.observation import Observation
@@ -17,7 +20,7 @@ from probe_kit.runs import Run, open_run
 from probe_kit.runs.verify import verify_run
 from probe_kit.serve import session as sessions
 from probe_kit.serve.marks import Mark
-from probe_kit.serve.server import Server
+from probe_kit.serve.server import Server, open_server
 from probe_kit.serve.session import Client, Line
 from probe_kit.train.target import Target
 from tests.support.served_sessions import WORDS, Opens, observation
@@ -243,6 +246,34 @@ def test_the_same_command_continues_a_run_and_another_one_is_refused(opened: Ope
     assert run.episodes[["episode", "episode_id", "client"]].to_numpy().tolist() == [
         [0, "a", "client-001"], [1, "a#2", "client-002"]
     ]  # fmt: skip
+
+
+GOLDEN = Path(__file__).parents[1] / "golden" / "pi0" / "checkpoint"
+
+
+@pytest.mark.parametrize(
+    ("choices", "complaint"),
+    [
+        ({"cameras": ["elbow=observation/image"]}, "the model has no such camera"),
+        ({"state": ()}, "and no key of it is given"),
+        ({"rule": "said", "conditions": ["none", "steer=FILE"]}, "backbone"),
+    ],
+)
+def test_cameras_state_and_edits_are_refused_before_the_weights_are_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, choices: dict[str, Any], complaint: str
+) -> None:
+    def loads(*_: object) -> None:
+        raise AssertionError("the weights were read")
+
+    monkeypatch.setattr("probe_kit.serve.server.Act.load", loads)
+    file = tmp_path / "steer.json"
+    file.write_text('{"edits": [{"kind": "zero", "sites": ["backbone.99.residual"]}]}', encoding="utf-8")
+    if "conditions" in choices:
+        choices = {**choices, "conditions": ["none", f"steer={file}"]}
+    source = ServedSettings(**{"state": "observation/state", "source_name": "noise@1", **choices})
+    settings = ExtractSettings("pi0", str(GOLDEN), source=source, device="cpu")
+    with pytest.raises(UsageError, match=complaint):
+        open_server(settings, str(tmp_path / "run"), "127.0.0.1", 0, None, {}, lambda _: None)
 
 
 # -- clients without marks ---------------------------------------------------------------------------------------

@@ -27,7 +27,7 @@ from probe_kit.hashing import derive_seed
 from probe_kit.hooks.checkpoints.third_party import begin_randomness, copy_observations, while_acting
 from probe_kit.hooks.contract.declared import PLAIN, Rotation
 from probe_kit.hooks.contract.observation import Observation
-from probe_kit.runs.layout import StoredStream
+from probe_kit.runs.layout import CONDITION, CONDITIONS, StoredStream
 from probe_kit.runs.plan import Row
 from probe_kit.runs.provenance import INPUT_CHECK
 
@@ -272,6 +272,11 @@ class Turn:
     buffers: "EpisodeBuffers | None"
     past: list[NDArray[np.float32]] = field(default_factory=list)
 
+    @property
+    def condition(self) -> str:
+        """The condition whose edits the inference gets; empty for those of the run."""
+        return str(self.row.columns.get(CONDITION, ""))
+
     def derived_seed(self, of: str) -> int:
         """Return the seed of this inference for the purpose `of`."""
         return derive_seed(self.row.policy_seed, of, self.row.noise_of(self.call))
@@ -423,11 +428,11 @@ class PolicyController(ModelController["Policy", Observation]):
         self.execute = task.execute or card.execute
         self.rotation: Rotation = task.rotation or PLAIN
         self.captured_calls = settings.with_every_call(self.execute).capture.calls
-        self._edits, self._vectors = task.edits, task.vectors
+        self._edits = {"": (task.edits, task.vectors), **source.edits_by_condition()}
         self.identity |= {"execute": self.execute} if source.executes else {}
         if self.capture_only and (deaf := policy.zero_filled_inputs()):
             self.identity["zeros_for"] = list(deaf)
-        self._edit_log: list[dict[str, Any]] = []
+        self._edit_logs: dict[str, list[dict[str, Any]]] = {}
 
     def infer(self, turns: Sequence[Turn]) -> list[Inference]:
         """Return per turn the first `execute` actions of a fresh chunk, from one call of the policy.
@@ -450,6 +455,10 @@ class PolicyController(ModelController["Policy", Observation]):
     def _captured(self, turns: Sequence[Turn]) -> NDArray[np.float32]:
         """Return the chunks (B, chunk, D) of one call, with activations kept for the turns that are captured."""
         observations = copy_observations([turn.observation for turn in turns])
+        edited = partial(self._edited, observations, turns[0].condition)
+        assert {turn.condition for turn in turns} == {turns[0].condition}, (
+            "one call makes the edits of one condition"
+        )
         seeds = [turn.derived_seed("inference") for turn in turns]
         infer = partial(self._chunks, [turn.observation for turn in turns], seeds)
         captured = {
@@ -458,14 +467,14 @@ class PolicyController(ModelController["Policy", Observation]):
             if turn.buffers is not None and len(turn.buffers.roles) < self.captured_calls
         }
         if not captured:
-            with self._edited(observations):
+            with edited():
                 return infer()
         return self._capturer.run(
             infer,
             lambda actions: actions,
             self.model.roles(observations),
             captured,
-            lambda: self._edited(observations),
+            edited,
         )
 
     def infer_plainly(self, turn: Turn) -> NDArray[np.float32]:
@@ -473,7 +482,7 @@ class PolicyController(ModelController["Policy", Observation]):
         with self._acting():
             begin_randomness(derive_seed("global", turn.derived_seed("call")))
             observations = copy_observations([turn.observation])
-            with self._edited(observations):
+            with self._edited(observations, turn.condition):
                 chunk: NDArray[np.float32] = self._chunks(observations, [turn.derived_seed("inference")])[0]
         return chunk
 
@@ -522,19 +531,29 @@ class PolicyController(ModelController["Policy", Observation]):
     def certificate(self) -> dict[str, Any]:
         """Return the certificate of every model, with the rotation that reached the arm's controller and edits."""
         rotation = {} if self.capture_only or self._source.own_units else {"rotation": self.rotation}
-        return {**super().certificate(), **rotation, **({"edits": self._edit_log} if self._edits else {})}
+        logs: dict[str, Any] = {"edits": self._edit_logs.get("", [])} if self._edits[""][0] else {}
+        if len(self._edits) > 1:
+            # A copy: a server asks for it on the thread that writes.
+            logs[CONDITIONS] = {name: log for name, log in dict(self._edit_logs).items() if name}
+        return {**super().certificate(), **rotation, **logs}
 
     @contextmanager
-    def _edited(self, observations: Sequence[Observation]) -> Iterator[None]:
-        """Apply the edits of this run for one inference; the certificate shows what the last one did."""
-        if not self._edits:
+    def _edited(self, observations: Sequence[Observation], condition: str = "") -> Iterator[None]:
+        """Apply the edits of this run or of a condition for one inference.
+
+        The certificate shows what the last one did.
+        """
+        edits, vectors = self._edits[condition]
+        if not edits:
             yield
+            if condition:
+                self._edit_logs[condition] = []
             return
         from probe_kit.hooks import apply_edits
 
-        with apply_edits(self.model, self._edits, observations, self._vectors) as edit_log:
+        with apply_edits(self.model, edits, observations, vectors) as edit_log:
             yield
-        self._edit_log = [asdict(entry) for entry in edit_log.entries]
+        self._edit_logs[condition] = [asdict(entry) for entry in edit_log.entries]
 
 
 def _own_flags(flagged: object, count: int) -> NDArray[np.bool_] | None:

@@ -2,18 +2,21 @@
 
 from collections.abc import Mapping
 from functools import partial
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import typer
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator, Field, PlainSerializer
 
 from probe_kit._terminal.console import split
 from probe_kit._terminal.options import further_option
 from probe_kit.errors import UsageError
+from probe_kit.extract.sources.conditions import Condition, read_conditions
 from probe_kit.extract.sources.recording import Pairs, read_pairs_of, read_turns
 from probe_kit.extract.sources.source import SourceSettings
 
-Wire = Literal["openpi"]
+Wire = Literal["openpi", "vla-eval"]
+WORDS: Mapping[Wire, str] = {"openpi": "prompt", "vla-eval": "task_description"}
+"""The key of the words in an observation, by wire."""
 EpisodeRule = Literal["guessed", "words", "connection", "said"]
 Keep = Literal["full", "small"]
 MOST_CALLS = 64
@@ -26,6 +29,16 @@ _option = partial(typer.Option, rich_help_panel="Keys of observations")
 def _read_keys(value: Any) -> Any:
     """Return the parts of KEY,KEY as they are written, and a sequence as it is."""
     return split(value) or () if isinstance(value, str) else tuple(value or ())
+
+
+if TYPE_CHECKING:
+    Conditions = tuple[Condition, ...]
+else:
+    Conditions = Annotated[
+        Any,
+        BeforeValidator(read_conditions),
+        PlainSerializer(lambda conditions: [condition.to_json() for condition in conditions]),
+    ]
 
 
 class ServedSettings(SourceSettings):
@@ -46,14 +59,22 @@ class ServedSettings(SourceSettings):
         pause: The seconds between two observations after which a new episode begins; None for ten times the
             longest interval so far, at least 5.
         most_calls: The number of captured inferences that `all` stands for.
+        conditions: The conditions, of which each episode gets one; empty for episodes that are all alike.
         run: The address of the run whose stored observations are shown again; None for a server.
 
     Raises:
-        UsageError: For a camera or key that is given twice.
+        UsageError: For a camera or key that is given twice, and for conditions of episodes that are guessed.
     """
 
     kind: Literal["served"] = "served"
-    wire: Wire = "openpi"
+    wire: Annotated[
+        Wire,
+        typer.Option(
+            "--wire",
+            help="openpi: the websocket of robots and benchmarks. vla-eval: that harness, which says its "
+            "episodes.",
+        ),
+    ] = "openpi"
     cameras: Annotated[
         Pairs,
         BeforeValidator(partial(read_pairs_of, "--camera", "base=observation/image")),
@@ -132,6 +153,15 @@ class ServedSettings(SourceSettings):
             help="Number of inferences that `--captured-calls all` stores per episode, at most.",
         ),
     ] = MOST_CALLS
+    conditions: Annotated[
+        Conditions,
+        _option(
+            "--condition",
+            metavar="NAME[=FILE]",
+            help="Change the streams of some episodes: each gets a condition, drawn in balanced blocks within its "
+            "group. none changes nothing; FILE holds edits. Repeatable; needs --episodes said.",
+        ),
+    ] = ()
     run: Annotated[str | None, Field(exclude=True)] = None
 
     command: ClassVar[str] = "probe-kit serve"
@@ -139,7 +169,7 @@ class ServedSettings(SourceSettings):
     played: ClassVar[str] = "served"
     subject: ClassVar[str] = "served observations"
     loads: ClassVar[str] = "model"
-    refuses: ClassVar[tuple[str, ...]] = ("protocol", "rotation", "video", "batch=auto", "execute", "edits")
+    refuses: ClassVar[tuple[str, ...]] = ("protocol", "rotation", "video", "batch=auto", "edits")
     shows: ClassVar[str] = "a policy server, whose clients act"
     of_run: ClassVar[bool] = True
 
@@ -162,8 +192,28 @@ class ServedSettings(SourceSettings):
             raise UsageError(
                 f"--source is {self.source_name[:80]!r}; expected 1 to {LONGEST_NAME} printable characters"
             )
+        if self.wire == "vla-eval" and self.rule not in ("guessed", "said"):
+            raise UsageError(
+                f"--episodes {self.rule} does not apply with --wire vla-eval, whose harness says its episodes; "
+                "remove it"
+            )
+        if self.conditions and not self.says_episodes:
+            raise UsageError(
+                "--condition gives each episode a condition, and a guessed episode may be two. Add --episodes "
+                "said, and let clients name their episodes (probe_kit/episode)"
+            )
         if self.instruction is not None and not self.instruction.strip():
             raise UsageError("--instruction is empty; give the words, or leave it out")
+
+    @property
+    def says_episodes(self) -> bool:
+        """Whether only episodes are taken of which the client says where they begin."""
+        return self.rule == "said" or self.wire == "vla-eval"
+
+    @property
+    def words_key(self) -> str:
+        """The key of the words in an observation."""
+        return WORDS[self.wire]
 
     @property
     def name(self) -> str:

@@ -1,6 +1,6 @@
 """Observations as clients send them: the map to those of a model, what an episode keeps, and its replay."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from hashlib import blake2b
@@ -24,9 +24,10 @@ from probe_kit.extract.sources.recording import EVERY_CAMERA, Pairs, degrees_of
 from probe_kit.extract.sources.served import ServedSettings
 from probe_kit.extract.sources.source import Played, Source, check_units, compare_states
 from probe_kit.extract.sources.units import Units
+from probe_kit.hooks.capturing.edits import Edit, Vectors
 from probe_kit.hooks.contract.observation import ARM_NUMBERS, Observation
 from probe_kit.runs.arrays import PICTURE_OF
-from probe_kit.runs.layout import DATASET, OTHER_ACTIONS, RECORDED_EPISODES, source_settings_of
+from probe_kit.runs.layout import CONDITION, DATASET, OTHER_ACTIONS, RECORDED_EPISODES, source_settings_of
 from probe_kit.runs.plan import Row
 from probe_kit.runs.run import Run, read_run
 from probe_kit.runs.store import locate
@@ -35,8 +36,6 @@ if TYPE_CHECKING:
     from probe_kit.hooks import Policy
     from probe_kit.hooks.contract.card import DeclaredInputs
 
-PROMPT = "prompt"
-"""The key of the words in an observation of openpi."""
 LONGEST_WORDS = 1 << 16
 MOST_SIDE = 8192
 """The most pixels along a side of a picture."""
@@ -134,19 +133,42 @@ class ServedSource(Source[ServedSettings]):
             Row(
                 commit.episode,
                 {name: value for name, value in plan[commit.episode].items() if name != "episode"},
-                frames=tuple(commit.control_steps[: len(commit.roles)]),
+                frames=() if self._is_edited(commit.episode) else tuple(commit.control_steps[: len(commit.roles)]),
                 noise=tuple(number * self.settings.every for number in range(len(commit.roles))),
             )
             for commit in commits
         )
 
+    def edits_by_condition(self) -> Mapping[str, tuple[Sequence[Edit], Vectors]]:
+        """Return the edits of the conditions, with their vectors; empty without conditions."""
+        return {condition.name: (condition.edits, condition.vectors) for condition in self.settings.conditions}
+
+    def _is_edited(self, number: int) -> bool:
+        """Whether the streams of an episode were edited: its predictions are not those of the model as it is."""
+        assert self.run is not None, "a stored run has episodes"
+        name = self.run.root.planned[number].get(CONDITION)
+        return any(condition.edits for condition in self.settings.conditions if condition.name == name)
+
     # -- a model -------------------------------------------------------------------------------------
+
+    def early_checks(self, inputs: "DeclaredInputs", checkpoint: str) -> list[Callable[[], object]]:
+        """Return checks of typed cameras and of the state."""
+        return [lambda: self.check_cameras(inputs.cameras), lambda: self._check_state(inputs.state, checkpoint)]
+
+    def _check_state(self, numbers: int | None, checkpoint: str) -> None:
+        """Raise UsageError for a policy that reads a state of which no key is given; None reads none."""
+        if numbers is not None and not self.settings.state:
+            raise UsageError(
+                f"{checkpoint} reads a state of {numbers} numbers, and no key of it is given. Name it, such as "
+                "--state observation/state"
+            )
 
     def check(self, policy: "Policy", accept_units: bool) -> "tuple[Self, Policy]":
         """Fit typed cameras and the state to a policy. What a client sends is checked as it arrives.
 
         Raises:
-            UsageError: For a camera that the model lacks, a state that is not named, and averaged chunks.
+            UsageError: For a camera that the model lacks, a state that is not named, averaged chunks, and edits
+                that do not fit.
             CheckpointError: For a policy whose predictions are no actions.
         """
         del accept_units
@@ -161,11 +183,9 @@ class ServedSource(Source[ServedSettings]):
                 f"{card.family} averages overlapping chunks, and a client executes a chunk as it is. Leave that "
                 "option out"
             )
-        if policy.state_numbers is not None and not self.settings.state:
-            raise UsageError(
-                f"{card.checkpoint} reads a state of {policy.state_numbers} numbers, and no key of it is given. "
-                "Name it, such as --state observation/state"
-            )
+        self._check_state(policy.state_numbers, card.checkpoint)
+        for condition in self.settings.conditions if self.run is None else ():
+            condition.check(policy, card.weights_sha256)
         self._needed_state, self.model_cameras = policy.state_numbers, tuple(card.cameras)
         self.check_cameras(card.cameras)
         return self, self.with_cameras_of(policy) if self.cameras else policy
@@ -207,12 +227,11 @@ class ServedSource(Source[ServedSettings]):
 
     # -- what arrives --------------------------------------------------------------------------------
 
-    def receive(self, sent: Mapping[str, Any], words: str | None = None) -> Received:
+    def receive(self, sent: Mapping[str, Any]) -> Received:
         """Return what a client sent as the model is shown it. The first one decides sizes and, untyped, cameras.
 
         Args:
             sent: Values by key; `/` in a key of the settings leads into nested maps.
-            words: The instruction, where the wire has it beside the observation; None for the key `prompt`.
 
         Raises:
             ObservationError: For a picture, state or instruction that is missing or has another size or type.
@@ -220,7 +239,7 @@ class ServedSource(Source[ServedSettings]):
         cameras = self.cameras or self._guessed(sent)
         pictures = {camera: self._picture(sent, camera, key) for camera, key in cameras}
         state = self._state(sent)
-        instruction = self.settings.instruction or _words(sent, words)
+        instruction = self.settings.instruction or _words(sent, self.settings.words_key)
         turned = {
             camera: np.ascontiguousarray(np.rot90(picture, degrees_of(self.settings.rotations, camera) // 90))
             for camera, picture in pictures.items()
@@ -249,7 +268,7 @@ class ServedSource(Source[ServedSettings]):
 
     def read_keys(self) -> set[str]:
         """Return the keys that are read of an observation."""
-        words = set() if self.settings.instruction is not None else {PROMPT}
+        words = set() if self.settings.instruction is not None else {self.settings.words_key}
         return {key for _, key in self.cameras} | set(self.settings.state) | words
 
     def _guessed(self, sent: Mapping[str, Any]) -> Pairs:
@@ -364,6 +383,7 @@ class ServedSource(Source[ServedSettings]):
     def early_identity(self) -> dict[str, Any]:
         """Return the part of the identity that is known before the first observation."""
         settings = self.settings
+        conditions = {condition.name: condition.to_json()["edits"] for condition in settings.conditions}
         return {
             "kind": "served",
             "wire": settings.wire,
@@ -376,6 +396,7 @@ class ServedSource(Source[ServedSettings]):
             "instruction": settings.instruction,
             "keep": settings.keep,
             "columns": [],
+            **({"conditions": conditions} if conditions else {}),
         }
 
     def identity(self, execute: int) -> dict[str, Any]:
@@ -540,15 +561,15 @@ def _in_words(value: Any) -> str:
     return f"a {type(value).__name__}"
 
 
-def _words(sent: Mapping[str, Any], words: str | None) -> str:
+def _words(sent: Mapping[str, Any], key: str) -> str:
     """Return the instruction. Raises ObservationError for none, and for what is no plain text."""
-    text: Any = _find(sent, PROMPT) if words is None else words
+    text: Any = _find(sent, key)
     if isinstance(text, bytes):
         text = text.decode(errors="replace")
     if not isinstance(text, str) or not text.strip():
         described = "none" if text is None else f"{text!r:.80}"
         raise ObservationError(
-            f"the observation has no words: {PROMPT} is {described}; expected a text. Send it, or start the "
+            f"the observation has no words: {key} is {described}; expected a text. Send it, or start the "
             "server with --instruction TEXT"
         )
     if UNSAFE.search(text) or len(text) > LONGEST_WORDS:

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from probe_kit.env import SceneSpec
     from probe_kit.extract.sources.player import Opens
     from probe_kit.hooks import Policy
+    from probe_kit.hooks.capturing.edits import Edit, Vectors
     from probe_kit.hooks.contract.card import DeclaredInputs
     from probe_kit.runs.plan import Row
     from probe_kit.suite import Suite
@@ -295,6 +296,10 @@ class Source[Chosen: SourceSettings](ABC):
         They are empty where the source has not shown anything yet.
         """
         return ()
+
+    def edits_by_condition(self) -> "Mapping[str, tuple[Sequence[Edit], Vectors]]":
+        """Return the edits of the conditions of rows, with their vectors; empty where no row has a condition."""
+        return {}
 
     def unit_notes(self, accepted: bool) -> dict[str, UnitsNote]:
         """Return what does not fit the statistics of the policy that was checked, by heading.
