@@ -559,7 +559,7 @@ class Run:
                 "without them. Extract it again to have them"
             )
         rows = EpisodeRows(open_array(self.data, TRAJECTORY), self._numbers)
-        return Trajectories(rows, self.episodes["steps"].astype(int).tolist(), str(self.location))
+        return Trajectories(rows, self._every_episode["steps"].astype(int).tolist(), str(self.location))
 
     def trajectory(self, episode: str | int) -> "Trajectory":
         """Return the trajectory of one episode, frame by frame; `.to_xarray()` labels it.
@@ -588,15 +588,14 @@ class Run:
         """
         if last_steps == 1:
             return self._watched[0][check_rule(rule)].copy()
-        return judge_again(
-            self.trajectories, self.episodes["side_correct"], self.settings["scene"], rule, last_steps
-        )
+        sides = self._every_episode["side_correct"]
+        return judge_again(self.trajectories, sides, self.settings["scene"], rule, last_steps)
 
     def under(self, rule: str, last_steps: int = 1) -> "Run":
         """Return the same run with its outcomes by another rule, for tables and figures; see `judge_again`."""
         if (check_rule(rule), last_steps) == (self.rule, self.last_steps):
             return self
-        episodes = with_outcomes(self.episodes, self.judged(rule, last_steps))
+        episodes = with_outcomes(self.episodes, self.judged(rule, last_steps).loc[self.episodes.index])
         return view_run(self, episodes, rule=rule, last_steps=last_steps)
 
     @cached_property
@@ -607,12 +606,20 @@ class Run:
             NoTrajectoryError: If the run keeps no trajectories.
         """
         return (
-            self._watched[1].assign(episode_id=self.episodes["episode_id"]).set_index("episode_id").reset_index()
+            self._watched[1]
+            .assign(episode_id=self._every_episode["episode_id"])
+            .set_index("episode_id")
+            .reset_index()
         )
 
     @cached_property
     def _watched(self) -> tuple[dict[str, pd.DataFrame], pd.DataFrame]:
-        return watch(self.trajectories, self.episodes["side_correct"], self.settings["scene"])
+        return watch(self.trajectories, self._every_episode["side_correct"], self.settings["scene"])
+
+    @property
+    def _every_episode(self) -> pd.DataFrame:
+        """The episodes that rows of arrays are of; a view may show some of them only."""
+        return self.episodes if self.viewed is None else self.viewed.episodes
 
     def instruction_ids(self, episode: str | int) -> tuple[int, ...] | None:
         """Return the token ids of one episode's instruction as the policy received it; None if none are stored."""
@@ -621,7 +628,7 @@ class Run:
 
     def _position(self, episode: str | int) -> int:
         """Return the row in `episodes`. Raises UsageError for an unknown episode."""
-        names = self.episodes["episode_id"].tolist()
+        names = self._every_episode["episode_id"].tolist()
         if isinstance(episode, str) and episode in names:
             return names.index(episode)
         if isinstance(episode, int) and 0 <= episode < len(names):
@@ -786,8 +793,9 @@ class Run:
             array = array.rename(renamed).transpose("episode", "call", *renamed.values())
             arrays[f"{name}_pooled"] = array.assign_coords({f"{name}_view": list(stored.views)})
         labels = ("episode_id", "category", "layout", "side_correct", "outcome")
-        available = [label for label in labels if label in self.episodes]
-        return xr.Dataset(arrays, coords={label: ("episode", self.episodes[label]) for label in available})
+        episodes = self._every_episode
+        available = [label for label in labels if label in episodes]
+        return xr.Dataset(arrays, coords={label: ("episode", episodes[label]) for label in available})
 
     # -- tokens ----------------------------------------------------------------------------------------
 

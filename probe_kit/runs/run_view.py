@@ -19,7 +19,7 @@ class Viewable(Protocol):
 
 
 def view_run[R: Viewable](run: R, episodes: "pd.DataFrame", **reading: Any) -> R:
-    """Return a run with other episodes or outcomes; activations and trajectories stay those of the run.
+    """Return a run with other episodes or outcomes; rows of arrays and trajectories stay those of the whole run.
 
     Args:
         run: A run, or a view of one.

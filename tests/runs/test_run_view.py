@@ -23,6 +23,16 @@ def test_a_view_shows_its_episodes_and_leaves_the_run_as_it_was(recorded_run: Ru
     np.testing.assert_array_equal(view.column(site)[left.index], recorded_run.column(site)[left.index])
 
 
+def test_trajectories_and_judgements_of_a_view_are_of_every_episode_of_the_run(recorded_run: Run) -> None:
+    every = recorded_run.episodes
+    view = view_run(recorded_run, every.iloc[3:])
+    last = str(every["episode_id"].iloc[-1])
+    np.testing.assert_array_equal(view.trajectory(last).tool, recorded_run.trajectory(last).tool)
+    assert view.judged("disc").equals(recorded_run.judged("disc"))
+    assert view.behaviour.equals(recorded_run.behaviour)
+    assert view.under("box").episodes.equals(recorded_run.under("box").episodes.loc[view.episodes.index])
+
+
 def test_a_view_of_a_view_knows_the_run_that_both_are_of(recorded_run: Run) -> None:
     first = view_run(recorded_run, recorded_run.episodes[:4])
     second = view_run(first, first.episodes[:2])
