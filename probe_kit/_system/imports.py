@@ -113,7 +113,8 @@ def require(module: str, extra: str) -> Any:
         return import_module(module)
     except ImportError as error:
         raise MissingExtraError(
-            f"this needs {module.partition('.')[0]}, which is not installed; `{install_command(extra)}`"
+            f"this needs {module.partition('.')[0]}, which is not installed. Install it: "
+            f"`{install_command(extra)}`"
         ) from error
 
 

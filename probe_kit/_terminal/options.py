@@ -112,7 +112,7 @@ SuiteFolder = Annotated[
 ]
 Categories = Annotated[
     Names | None,
-    typer.Option("--categories", **NAMED, help="Categories, comma-separated. Default: all."),
+    typer.Option("--categories", **NAMED, help="Question categories, comma-separated. Default: all."),
 ]
 Items = Annotated[int | None, typer.Option("--items", help="Number of items per category. Default: all.")]
 Wording = Annotated[

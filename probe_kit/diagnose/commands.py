@@ -59,7 +59,7 @@ Require = Annotated[
         "--require",
         parser=common.Names.parse,
         metavar="A,B,…",
-        help="Inputs that must change the action. Default: all that vary.",
+        help="Inputs that must matter, else the exit code is 1. Default: all that vary.",
     ),
 ]
 Paraphrases = Annotated[

@@ -274,8 +274,8 @@ def check_size(extraction: "Extraction", location: "Location", agreed: bool) -> 
     if needed > LARGE and not agreed:
         raise DiskSpaceError(
             f"{location} would take up to {in_units(needed)}; more than {in_units(LARGE)} is written with --yes "
-            "only. Choose fewer episodes, inferences (--captured-calls) or frames (--select every:N), leave "
-            "--tokens all out, or add --yes"
+            "only. Add --yes, or make the run smaller: fewer episodes, inferences (--captured-calls) or frames "
+            "(--select every:N), or no --tokens all"
         )
 
 

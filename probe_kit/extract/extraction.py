@@ -327,7 +327,7 @@ def check_model(settings: Settings, fetch: bool = True) -> None:
         ProbeKitError: For whatever else `Family.check` refuses.
     """
     if settings.machine.ray is not None and find_spec("ray") is None:
-        raise MissingExtraError(f"--ray needs ray, which is not installed; `{install_command('ray')}`")
+        raise MissingExtraError(f"--ray needs ray, which is not installed. Install it: `{install_command('ray')}`")
     model, scripts = settings.model, tuple(SCRIPTED)
     family = None if model.family in SCRIPTED else find_family(model.family, scripts)
     task_of(settings).check_family(settings, family)

@@ -15,7 +15,9 @@ if TYPE_CHECKING:
 
 def verify(
     family: Annotated[str, typer.Argument(help="Model family; `probe-kit models` lists them.")],
-    folder: Annotated[Path | None, typer.Argument(help="Folder with checkpoint/ and reference.npz.")] = None,
+    folder: Annotated[
+        Path | None, typer.Argument(help="Folder that holds checkpoint/ and its recorded outputs, reference.npz.")
+    ] = None,
     keys: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="File of the full-size model's tensor names, to compare with."),

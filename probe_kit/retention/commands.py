@@ -159,7 +159,8 @@ IterationChoice = Annotated[
     typer.Option(
         "--iterations",
         metavar="all|best|last|N",
-        help="Which iterations of the action stream count. best: layer curves show the best iteration only.",
+        help="Which iterations of the action stream count: flow steps or action tokens, not training steps. "
+        "best: layer curves show the best one only.",
         rich_help_panel=RUNS,
     ),
 ]

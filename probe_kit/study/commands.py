@@ -45,7 +45,10 @@ File = Annotated[
     typer.Argument(metavar="FILE", help="Study file, or the name of a study of the package: embedded or paper."),
 ]
 Only = Annotated[
-    str | None, typer.Option("--only", metavar="NAME", help="Play only the runs of this block or this model.")
+    str | None,
+    typer.Option(
+        "--only", metavar="NAME", help="Play only the runs of this block of the study file, or of this model."
+    ),
 ]
 
 

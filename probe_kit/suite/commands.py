@@ -171,7 +171,10 @@ def validate(
         bool, typer.Option("--baselines", help="Also test for leaks through pixels, text or side alone.")
     ] = False,
     power: Annotated[
-        bool, typer.Option("--power", help="Also print the smallest leak that a suite of this size can detect.")
+        bool,
+        typer.Option(
+            "--power", help="Also print the smallest leak that the tests can detect in a suite of this size."
+        ),
     ] = False,
     as_json: AsJson = False,
 ) -> None:

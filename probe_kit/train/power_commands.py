@@ -29,10 +29,17 @@ def power(
     signal: Annotated[
         str,
         typer.Option(
-            metavar="X,X,…", help="Probe accuracies above chance, in percentage points, comma-separated."
+            metavar="X,X,…",
+            help="How far probes lie above chance, in percentage points, comma-separated. "
+            "15 is an accuracy of 65 %.",
         ),
     ] = "10,15,25",
-    sites: Annotated[int, typer.Option(help="Number of sites that are tested.", min=1, max=10_000)] = 19,
+    sites: Annotated[
+        int,
+        typer.Option(
+            help="Number of sites, such as layers, that are probed and corrected for.", min=1, max=10_000
+        ),
+    ] = 19,
     draws: Annotated[
         int, typer.Option(help="Number of simulated experiments per estimate.", min=20, max=100_000)
     ] = 400,

@@ -231,7 +231,7 @@ def test_a_cut_in_closed_loop_plays_the_environment_and_counts_success(nearing: 
     assert cut.success_clean == (nearing.episodes["outcome"] == "success").mean()
     assert cut.lost == pytest.approx(cut.success_clean - cut.success)
     assert cut.success_clean > 0
-    assert "of the success rate, success" in result.sentences[0]
+    assert "percentage points: success " in result.sentences[0]
     assert result.findings == (
         "All  unknown: with 3 groups of items no p can be below 0.12; 5 groups or more can show what is read.",
     )

@@ -168,8 +168,8 @@ def check_not_ignored(reaches: Mapping[str, Reach], model: str) -> None:
         layer = ", nor of its last layer" if "nothing" in reaches.values() else ""
         raise IgnoredInputsError(
             f"another {' and another '.join(tested)} changed no number of the first output of {model}{layer}; "
-            "expected at least one of them to. `probe-kit diagnose` takes the same settings and says "
-            "where they are lost. --accept-ignored-inputs extracts it nevertheless"
+            "expected that at least one of them does. `probe-kit diagnose` takes the same settings and finds "
+            "where the input is lost. To extract nevertheless, add --accept-ignored-inputs"
         )
 
 

@@ -63,7 +63,10 @@ class SceneOptions(Part):
         _option("--rendering", help="visual-matching: draw robot, cube and tiles over a photo."),
     ] = None
     background: Annotated[
-        Path | None, _option("--background", help="Photo for visual-matching. Default: the embedded photo.")
+        Path | None,
+        _option(
+            "--background", help="Photo of the table for --rendering visual-matching. Default: the embedded photo."
+        ),
     ] = None
     picture_size: Annotated[
         tuple[int, int] | None,

@@ -32,7 +32,7 @@ from torch.overrides import TorchFunctionMode
 from probe_kit.errors import CaptureError, RolesMismatchError, UnknownSiteError, UsageError
 from probe_kit.hooks.capturing.capture_context import ActivationCache, capture, edit
 from probe_kit.hooks.capturing.edits import ActiveEdits, EditLog
-from probe_kit.hooks.contract.model import Model, Policy, Tap
+from probe_kit.hooks.contract.model import EVERY, Model, Policy, Tap
 from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import HEADS, Site, first_of
 
@@ -451,13 +451,16 @@ class _AttentionCalls(TorchFunctionMode):
         stack: ExitStack,
     ) -> None:
         """Attach the hooks to a module that attends; `begin` is the child behind which its calls are watched."""
-        hooks = [
-            owner.register_forward_pre_hook(partial(self._enter, is_known and begin is None), prepend=True),
-            owner.register_forward_hook(partial(self._leave, is_known), always_call=True),
-        ]
-        if begin is not None:
+        hooks = []
+        if begin is not None:  # hooks of the owner itself would cost as much as those calls
             hooks.append(begin.register_forward_hook(self._begin))
-        elif not is_known:
+            stack.callback(self._pause)
+        else:
+            hooks += [
+                owner.register_forward_pre_hook(partial(self._enter, is_known), prepend=True),
+                owner.register_forward_hook(partial(self._leave, is_known), always_call=True),
+            ]
+        if not is_known:
             hooks += [child.register_forward_hook(self._end_child) for child in owner.children()]
         if is_known and len(projections) == 1:
             hooks.append(projections[0].register_forward_pre_hook(self._pause, prepend=True))
@@ -481,10 +484,12 @@ class _AttentionCalls(TorchFunctionMode):
         with torch._C.DisableTorchFunction():
             weights = last.weights()
             values = _repeat_for_heads(last.values, weights.shape[1]).float().to(weights.device)
-            computed = tap.rows.of((weights @ values).transpose(1, 2))[:, tap.tokens]
+            computed = tap.rows.of((weights @ values).transpose(1, 2))
+            if tap.tokens != EVERY:
+                computed, weights = computed[:, tap.tokens], weights[:, :, tap.tokens]
             self._compare(site, computed, read)
         self.projections[tap.module] = self.projections.get(tap.module, True) and self.is_inside
-        return tap.rows.of(weights)[:, :, tap.tokens], tap.rows.of(values)
+        return tap.rows.of(weights), tap.rows.of(values)
 
     def _compare(self, site: Site, computed: Tensor, read: Tensor) -> None:
         """Keep by how much (B, S, H, E) differs from what the heads read (B, S, H · E), for `_check_readings`.
@@ -526,7 +531,7 @@ class _AttentionCalls(TorchFunctionMode):
             self._begin()
 
     def _begin(self, *_: Any) -> None:
-        if self._depth and not self._is_entered:
+        if not self._is_entered:
             self.last, self._is_entered = None, True
             self.__enter__()  # type: ignore[no-untyped-call]
 

@@ -119,7 +119,10 @@ class Adapter:
             WeightsError: For tensors that are none of these, NaN or infinite ones, and ones that are missing.
         """
         if damaged := [name for name, tensor in self.tensors.items() if not torch.isfinite(tensor).all()]:
-            raise WeightsError(f"{self.folder}: NaN or infinite tensors in the adapter: {_few(damaged)}")
+            raise WeightsError(
+                f"{self.folder}: NaN or infinite tensors in the adapter: {_few(damaged)}. Its training diverged, "
+                "or the file is damaged: take an earlier checkpoint, or download it again"
+            )
         factors: dict[str, dict[str, Tensor]] = {}
         copies: dict[str, Tensor] = {}
         bases: dict[str, Tensor] = {}
@@ -377,7 +380,10 @@ def _read_folder(folder: Path, unlisted: Iterable[str]) -> Weights:
     for name, expected in shards.items():
         content, metadata = _read_file(folder / name)
         if expected is not None and (difference := sorted((set(content) ^ expected) - (set(unlisted) - expected))):
-            raise WeightsError(f"{folder / name} and {INDEX_FILE} disagree about {_few(difference)}")
+            raise WeightsError(
+                f"{folder / name} and {INDEX_FILE} disagree about {_few(difference)}: one of them belongs to "
+                "another checkpoint. Download the checkpoint again"
+            )
         tensors |= content
         random = random or metadata.get(RANDOM_MARK, "").startswith("random")
     return Weights(tensors, str(folder), random)

@@ -238,7 +238,7 @@ def _find_input(row: InputEffect) -> str:
     return {
         "decides": f"decides: the action follows the {row.vary}{share}",
         "moves": f"moves: the {row.vary} shifts the action without deciding it{share}",
-        "no effect": f"no effect: another {row.vary} leaves the action where it is{remark}",
+        "no effect": f"no effect: another {row.vary} hardly changes the action{remark}",
         "open": f"open: these items do not decide whether the {row.vary} matters{remark}",
     }[row.finding]
 

@@ -184,8 +184,8 @@ class InstructionSwap(Swap):
         follows = "followed" if row.is_resolved and row.follow_p < SIGNIFICANCE else "not shown"
         verdict = "reversed" if row.is_resolved and row.reversal_p < SIGNIFICANCE else follows
         return (
-            f"{verdict}: another instruction turns the action in {100 * row.follow_rate:.0f} % of the episodes, "
-            f"and the other way in {100 * row.reversal_rate:.0f} %"
+            f"{verdict}: another instruction turns the action to its own picture in "
+            f"{100 * row.follow_rate:.0f} % of the episodes, and away from it in {100 * row.reversal_rate:.0f} %"
         )
 
 

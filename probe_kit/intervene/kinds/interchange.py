@@ -513,13 +513,13 @@ class PatchKind(AlongDirection):
             return f"moved: to the target side by {share_of_edits(moving, tried)}" if moving else nothing
         if localised:
             what = (
-                f"steered: half of the {context.exchange}'s effect by"
+                f"steered: at least half of the {context.exchange}'s effect by"
                 if steered
-                else "located: half of it passes in"
+                else "located: at least half of the effect passes in"
             )
             return f"{what} {share_of_edits(localised, tried)}"
         if not tried:
-            return "not located: all edits carry the effect by construction, which locates nothing"
+            return "not located: every edit lies where the whole effect must pass, which shows no place"
         verdict = "not steered" if steered else "not located"
         return f"{verdict}: no edit of {tried} has half of the {context.exchange}'s effect"
 

@@ -29,6 +29,7 @@ fail with it, minus that of the reverse.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, get_args
 
 import numpy as np
@@ -813,18 +814,13 @@ def reading_of(rows: "Sequence[KnockoutEffect]") -> str:
     role, read = describe_role(rows), layers_read(rows)
     widest = max(rows, key=lambda row: (row.last - row.first, row.size))
     cut = f"cut in {widest.layers}" if block_of(widest.role) is None else f"cut of {widest.role}"
-    loss = (
-        f"change of {number(widest.size)} spreads"
-        if widest.lost is None
-        else f"loss of {interval_cell(widest.lost, widest.lost_ci).text} of the "
-        + ("success rate" if widest.is_of_success else "picture's effect")
-    )
-    if widest.success is not None:
-        loss += f", success {percent(widest.success)} % instead of {percent(widest.success_clean)} %"
+    loss = _loss_text(widest)
+    if read is None:
+        loss += _controls_text(widest)
     if read is None and (has_too_few_groups(rows) or widest.has_nothing_to_lose):
         return f"whether the action reads {role} is unknown: a {cut} is a {loss}"
     if read is None and widest.is_of_success:
-        return f"success does not need {role}: a {cut} is a {loss}"
+        return f"it is not shown that success needs {role}: a {cut} is a {loss}"
     if read is None and widest.lost is not None:
         return f"the picture's effect does not come directly from {role}: a {cut} is a {loss}"
     if read is None:
@@ -837,6 +833,32 @@ def reading_of(rows: "Sequence[KnockoutEffect]") -> str:
         )
     behind = f"; behind layer {end} nothing is lost" if end < rows[0].readable - 1 else ""
     return f"the action reads {role} in {span_text(begin, end)} ({loss}){behind}"
+
+
+def _loss_text(row: KnockoutEffect) -> str:
+    """Return what a cut loses, in words that follow *loss of* or *change of*."""
+    rates = ""
+    if row.success is not None:
+        rates = f"success {percent(row.success)} % instead of {percent(row.success_clean)} %"
+    if row.is_of_success:
+        lost, ends = row.lost, row.lost_ci
+        hundredfold = None if ends is None else (100 * ends[0], 100 * ends[1])
+        points = interval_cell(None if lost is None else 100 * lost, hundredfold, partial(number, digits=0)).text
+        return f"loss of {points} percentage points: {rates}"
+    loss = (
+        f"change of {number(row.size)} spreads"
+        if row.lost is None
+        else f"loss of {interval_cell(row.lost, row.lost_ci).text} of the picture's effect"
+    )
+    return ", ".join(filter(None, (loss, rates)))
+
+
+def _controls_text(row: KnockoutEffect) -> str:
+    """Return what the controls of a cut that is not beyond them lose; empty without any."""
+    value = row.control_size if row.lost is None else row.control_lost
+    if value is None:
+        return ""
+    return f"; its controls lose {f'{100 * value:.0f} points' if row.is_of_success else number(value)}"
 
 
 def _has_blocks(rows: "Sequence[KnockoutEffect]") -> bool:

@@ -290,8 +290,8 @@ UNREAD = replace(
 NEVER_MOVED = share(
     "success.share_never_moved",
     "never moved %",
-    "Share of episodes, part of outside, in which the cube was never carried away: a failed grasp rather than a "
-    "wrong answer.",
+    "Share of all episodes in which the cube was never carried away: a failed grasp rather than a wrong "
+    "answer. They are among those outside.",
 )
 INVALID_ACTION = share(
     "success.share_invalid_action",
@@ -428,7 +428,8 @@ ANSWERS = (
     share(
         "answers.accuracy_logits",
         "by logits %",
-        "Share of questions in which the logit of the right option is larger. A constant answer is right in half.",
+        "Share of questions in which the logit of the right option is larger than that of the wrong one. A "
+        "constant answer is right in half.",
     ),
     share(
         "answers.accuracy_order_balanced",
@@ -439,8 +440,8 @@ ANSWERS = (
     share(
         "answers.share_by_clause",
         "by clause %",
-        "Share of text answers that stand among other words and are read by rules about clauses and denials. "
-        "The others are a letter or a side and nothing else.",
+        "Share of text answers, right or wrong, that stand among other words and are read by rules about "
+        "clauses and denials. The others are a letter or a side and nothing else.",
     ),
     share(
         "answers.accuracy_strict",
@@ -529,7 +530,7 @@ _LAYER = (
 )
 _SCORE = (
     "Accuracy of a linear probe on questions that were used neither to train it nor to choose its site. It "
-    "is balanced between the sides, so that chance is 50 %. Bold: the signal is shown."
+    "is balanced between the sides, so that chance is 50 %. Bold: above chance and every control."
 )
 _VERDICT = (
     "Shown: above chance, family-wise, and above every control that was run. Absent, for a linear probe: not "

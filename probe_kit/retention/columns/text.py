@@ -40,7 +40,7 @@ NOT_ACTED = "n/a"
 """The text in place of a success rate, for a model that did not act."""
 ABOVE_CHANCE = "above chance"
 """The end of a cell that tables colour red: the suite gives the answer away without a model."""
-P_DECIDES = "intervals are of another method than p: where one of the two excludes zero alone, p decides"
+P_DECIDES = "intervals and p come from different methods: where only one of them excludes zero, p decides"
 """The note on intervals and p.
 
 The exact test under no difference has no inversion: it would be of zero width where all groups agree.

@@ -188,14 +188,23 @@ def test_in_an_environment_a_cut_loses_success_beyond_its_controls() -> None:
     assert row.lost_ci[0] < 0.5 < row.lost_ci[1]
     assert row.control_lost == pytest.approx(1 / 24)
     assert layers_read([row]) == (0, KNOCKOUT_LAYERS - 1)
-    assert "of the success rate, success 25.0 % instead of 75.0 %" in reading_of([row])
+    assert reading_of([row]) == (
+        "the action reads image in layers 0 to 5 (loss of 50 [25, 75] percentage points: success 25.0 % instead "
+        "of 75.0 %)"
+    )
 
 
 @pytest.mark.parametrize(
     ("shares", "verdict"),
     [
-        ({"clean": 0.75, "cut": 0.25, "control-1": 0.25, "control-2": 0.25}, "success does not need image"),
-        ({"clean": 0.75, "cut": 0.75, "control-1": 0.75, "control-2": 0.75}, "success does not need image"),
+        (
+            {"clean": 0.75, "cut": 0.25, "control-1": 0.25, "control-2": 0.25},
+            "not shown that success needs image",
+        ),
+        (
+            {"clean": 0.75, "cut": 0.75, "control-1": 0.75, "control-2": 0.75},
+            "not shown that success needs image",
+        ),
         ({"clean": 0.0, "cut": 0.0, "control-1": 0.0, "control-2": 0.0}, "action reads image is unknown"),
     ],
 )
@@ -205,6 +214,7 @@ def test_what_controls_lose_as_well_is_not_needed_and_without_success_nothing_is
     rows = read_by(in_an_environment(shares))["image"]
     assert layers_read(rows) is None
     assert verdict in reading_of(rows)
+    assert f"its controls lose {100 * (shares['clean'] - shares['cut']):.0f} points" in reading_of(rows)
 
 
 def test_too_few_groups_of_items_make_the_verdict_unknown() -> None:

@@ -229,17 +229,19 @@ FINDINGS: list[tuple[type[Intervention], Sequence[Any], str]] = [
     (
         InstructionSwap,
         [swap("reverses")],
-        "reversed: another instruction turns the action in 0 % of the episodes, and the other way in 90 %.",
+        "reversed: another instruction turns the action to its own picture in 0 % of the episodes, and away from "
+        "it in 90 %.",
     ),
     (
         InstructionSwap,
         [swap("open")],
-        "not shown: another instruction turns the action in 20 % of the episodes, and the other way in 10 %.",
+        "not shown: another instruction turns the action to its own picture in 20 % of the episodes, and away "
+        "from it in 10 %.",
     ),
     (
         Interchange,
         [patch("backbone.01", 0.97, 0.001), patch("backbone.02", 0.6, 0.01), patch("backbone.03", 0.9, 0.4)],
-        "located: half of it passes in 2 of 3 edits, most at backbone.01 image.",
+        "located: at least half of the effect passes in 2 of 3 edits, most at backbone.01 image.",
     ),
     (
         Interchange,
@@ -249,7 +251,7 @@ FINDINGS: list[tuple[type[Intervention], Sequence[Any], str]] = [
     (
         Interchange,
         [patch("expert.01", 1.0, 0.001)],
-        "not located: all edits carry the effect by construction, which locates nothing.",
+        "not located: every edit lies where the whole effect must pass, which shows no place.",
     ),
     (
         Interchange,
@@ -264,7 +266,7 @@ FINDINGS: list[tuple[type[Intervention], Sequence[Any], str]] = [
     (
         Steering,
         [replace(patch("backbone.02", 0.9, 0.001), coefficient="2")],
-        "steered: half of the image swap's effect by 1 of 1 edits, at backbone.02 image.",
+        "steered: at least half of the image swap's effect by 1 of 1 edits, at backbone.02 image.",
     ),
     (
         Steering,
@@ -344,7 +346,7 @@ INPUTS = [
         input_row(1.0, 0.2, "moves"),
         "moves: the picture.wrist shifts the action without deciding it, by 0.20 of what all inputs do.",
     ),
-    (input_row(1.0, 0.0, "no effect"), "no effect: another picture.wrist leaves the action where it is."),
+    (input_row(1.0, 0.0, "no effect"), "no effect: another picture.wrist hardly changes the action."),
     (input_row(1.0, None, "open"), "open: these items do not decide whether the picture.wrist matters."),
 ]
 
