@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from probe_kit.cli import app
 from probe_kit.errors import ObservationError, UsageError
-from probe_kit.extract.sources.conditions import Condition, read_conditions
+from probe_kit.extract.sources.conditions import ServedCondition, read_conditions
 from probe_kit.extract.sources.served import ServedSettings
 from probe_kit.hooks import Policy
 from probe_kit.hooks.capturing.edits import vector_hash
@@ -222,7 +222,7 @@ def test_guessed_episodes_get_no_condition() -> None:
         ServedSettings(conditions=["none"])
     stored = ServedSettings(conditions=["none"], rule="said").model_dump(mode="json")
     assert stored["conditions"] == [{"name": "none", "edits": []}]
-    assert ServedSettings(**stored).conditions == (Condition("none"),)
+    assert ServedSettings(**stored).conditions == (ServedCondition("none"),)
     assert read_mark({"id": "a", "condition": "steer"}).condition == "steer"
     with pytest.raises(ObservationError, match="the condition is 5"):
         read_mark({"id": "a", "condition": 5.5})

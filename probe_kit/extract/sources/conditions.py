@@ -28,7 +28,7 @@ _EXAMPLE = (
 
 
 @dataclass(frozen=True)
-class Condition:
+class ServedCondition:
     """A named list of edits, which are made at every inference of an episode.
 
     Attributes:
@@ -89,13 +89,13 @@ class Condition:
                     direction.check(place_name(str(site)), stream.width, weights_here)
 
 
-def read_conditions(value: Any) -> tuple[Condition, ...]:
+def read_conditions(value: Any) -> tuple[ServedCondition, ...]:
     """Return conditions from NAME=FILE texts of a command line, or from the plain values of stored settings.
 
     Raises:
         UsageError: For a name that comes twice, and for what is no condition.
     """
-    texts = [value] if isinstance(value, str | Mapping | Condition) else list(value or ())
+    texts = [value] if isinstance(value, str | Mapping | ServedCondition) else list(value or ())
     conditions = tuple(_condition(entry) for entry in texts)
     names = [condition.name for condition in conditions]
     if twice := [name for name in names if names.count(name) > 1]:
@@ -103,21 +103,21 @@ def read_conditions(value: Any) -> tuple[Condition, ...]:
     return conditions
 
 
-def _condition(value: Any) -> Condition:
-    if isinstance(value, Condition):
+def _condition(value: Any) -> ServedCondition:
+    if isinstance(value, ServedCondition):
         return value
     if isinstance(value, Mapping):
-        return Condition(value["name"], tuple(read_edit(entry) for entry in value[_PART]))
+        return ServedCondition(value["name"], tuple(read_edit(entry) for entry in value[_PART]))
     name, equals, file = str(value).partition("=")
     if not name.strip() or len(name) > LONGEST_NAME or UNSAFE.search(name):
         raise UsageError(f"--condition {value!r:.80}; expected {UNEDITED}, or NAME=FILE with a file of edits")
     if (name == UNEDITED) == bool(equals):
         why = f"{UNEDITED} is the condition without edits" if equals else "a condition has a file of edits"
         raise UsageError(f"--condition {value!r:.80}: {why}; expected --condition {UNEDITED}, or NAME=FILE")
-    return Condition(name) if name == UNEDITED else _read(name, Path(file).expanduser())
+    return ServedCondition(name) if name == UNEDITED else _read(name, Path(file).expanduser())
 
 
-def _read(name: str, path: Path) -> Condition:
+def _read(name: str, path: Path) -> ServedCondition:
     """Return the condition of a file, with its directions."""
     where = f"--condition {name}={path}"
     if not path.is_file():
@@ -134,7 +134,7 @@ def _read(name: str, path: Path) -> Condition:
             raise UsageError(f"{where}, edit {number}: {error}") from error
         edits.append(edit)
         directions |= {} if direction is None else {edit.vector: direction}
-    return Condition(name, tuple(edits), directions)
+    return ServedCondition(name, tuple(edits), directions)
 
 
 def _edit(entry: Any, folder: Path) -> tuple[Edit, FileDirection | None]:

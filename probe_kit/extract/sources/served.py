@@ -10,7 +10,7 @@ from pydantic import BeforeValidator, Field, PlainSerializer
 from probe_kit._terminal.console import split
 from probe_kit._terminal.options import further_option
 from probe_kit.errors import UsageError
-from probe_kit.extract.sources.conditions import Condition, read_conditions
+from probe_kit.extract.sources.conditions import ServedCondition, read_conditions
 from probe_kit.extract.sources.recording import Pairs, read_pairs_of, read_turns
 from probe_kit.extract.sources.source import SourceSettings
 
@@ -32,7 +32,7 @@ def _read_keys(value: Any) -> Any:
 
 
 if TYPE_CHECKING:
-    Conditions = tuple[Condition, ...]
+    Conditions = tuple[ServedCondition, ...]
 else:
     Conditions = Annotated[
         Any,

@@ -422,15 +422,15 @@ class _AttentionCalls(TorchFunctionMode):
         projection.
         """
         projections = {tap.module for tap in self.taps.values()}
-        known = {module: _ATTENDING[module] for module in projections if module in _ATTENDING}
-        owners = {module: owner for module, part in known.items() if (owner := part.owner()) is not None}
+        attending = {module: _ATTENDING[module] for module in projections if module in _ATTENDING}
+        owners = {module: owner for module, part in attending.items() if (owner := part.owner()) is not None}
         is_known = len(owners) == len(projections)
         if not is_known:
             owners = _owners(getattr(self.model, "network", None), projections)
         with ExitStack() as stack:
             for owner in dict.fromkeys(owners.values()):
                 of_owner = [module for module, other in owners.items() if other is owner]
-                begin = known[of_owner[0]].begin if is_known and len(of_owner) == 1 else None
+                begin = attending[of_owner[0]].begin if is_known and len(of_owner) == 1 else None
                 self._watch(owner, of_owner, is_known, None if begin is None else begin(), stack)
             if not is_known:
                 stack.enter_context(self)
