@@ -1,6 +1,6 @@
 """What serving costs: requests with and without capture, adding an episode, and opening a long run.
 
-    python benchmarks/serve.py [--requests 200] [--episodes 2000] [--checkpoint DIR]
+    python benchmarks/serve.py [--requests 200] [--episodes 2000] [--wide LAYERS]
 
 Requests alternate between captured and plain ones of one process, behind one socket; the median of their ratios is
 printed. A quiet machine is assumed.
@@ -12,17 +12,20 @@ import statistics
 import tempfile
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import replace
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter, process_time
 from typing import Any
 
 import numpy as np
+from capture_subjects import FULL, WRITERS, written
+from numpy.typing import NDArray
 from websockets.sync.client import ClientConnection, connect
 
 from probe_kit.extract import ExtractSettings
 from probe_kit.extract.sources.served import ServedSettings
+from probe_kit.hooks import Policy, load_policy
 from probe_kit.runs import open_run
 from probe_kit.runs.plan import Plan, Row
 from probe_kit.runs.store import locate
@@ -31,6 +34,7 @@ from probe_kit.serve.codec import pack, unpack
 from probe_kit.serve.server import Server, open_server
 
 MARK = "probe_kit/episode"
+WORDS = "put the cube on the red shape"
 
 
 @contextmanager
@@ -64,36 +68,110 @@ def ask(client: ClientConnection, message: dict[str, Any]) -> float:
     return took
 
 
-def requests(folder: Path, family: str, checkpoint: str | None, count: int) -> None:
-    """Print the ratio of captured to plain requests: inferences 0, 2, 4 … of an episode are captured."""
-    source = ServedSettings(
-        cameras={} if checkpoint else {"base": "observation/image"},
-        state="observation/state",
-        source_name="bench",
-        every=2,
-    )
-    settings = ExtractSettings(family, checkpoint, source=source, captured_calls=8)
-    server = open_server(settings, str(folder / "requests"), "127.0.0.1", 0, None, {}, lambda _: None)
+@dataclass(frozen=True)
+class Served:
+    """What is served, and what its clients send.
+
+    Attributes:
+        cameras: The cameras that get a picture of noise, 224 x 224.
+        state: The state, near that of training.
+        policy: The loaded policy.
+        settings: Its settings but those of the source.
+    """
+
+    cameras: tuple[str, ...]
+    state: NDArray[np.float64]
+    policy: Policy
+    settings: dict[str, Any]
+
+    def server(self, out: Path, **choices: Any) -> Server:
+        """Return a server; every second inference of an episode is captured, up to 8."""
+        cameras = {camera: f"observation/{camera}" for camera in self.cameras}
+        options = {"state": "observation/state", "source_name": "bench", "every": 2} | choices
+        source = ServedSettings(cameras=cameras, **options)
+        settings = ExtractSettings(**self.settings, source=source, captured_calls=8, accept_units=True)
+        return open_server(settings, str(out), "127.0.0.1", 0, None, {}, lambda _: None, self.policy)
+
+    def observation(self, number: int) -> dict[str, Any]:
+        """Return the observation of a number."""
+        rng = np.random.default_rng(number)
+        pictures = {f"observation/{name}": rng.integers(0, 256, (224, 224, 3), np.uint8) for name in self.cameras}
+        return {**pictures, "observation/state": self.state, "prompt": WORDS}
+
+
+def tiny() -> Served:
+    """Return pi0-tiny, the worst case: 44 sites on 0.8 M parameters."""
     state = np.array([0.39, 0.02, 0.08, 0, 0.05, 0, 0, 0.64])
-    rng = np.random.default_rng(0)
-    pairs, socket_only = [], []
+    policy = load_policy("pi0-tiny")
+    return Served(policy.card.cameras[:1], state, policy, {"model": "pi0-tiny"})
+
+
+def wide(folder: Path, layers: int) -> Served:
+    """Return golden π0's files at the released width, with so many layers in each network and random weights."""
+    parts = {"vlm": {"depth": layers}, "expert": {"depth": layers}, "vision": {"layers": layers}}
+    sizes = {name: {**values, **parts.get(name, {})} for name, values in FULL["pi0"]["dims.json"].items()}
+    files = written("pi0", folder / "files", {"pi0": {**FULL["pi0"], "dims.json": sizes}})
+    options = {**WRITERS["pi0"][1], "statistics": "none"}
+    policy = load_policy("pi0", str(files), "cpu", None, random_weights=True, **options)
+    assert policy.state_numbers is not None
+    requested = {"checkpoint": str(files), "random_weights": True, "options": options, "device": "cpu"}
+    return Served(policy.card.cameras, np.zeros(policy.state_numbers), policy, {"model": "pi0", **requested})
+
+
+def play(client: ClientConnection, served: Served, name: str, inferences: int = 16) -> list[float]:
+    """Return the milliseconds of the requests of one episode, with that of its end."""
+    number = int(name.rpartition("/")[2])
+    took = [ask(client, {**served.observation(number), MARK: {"id": name}}) for _ in range(inferences)]
+    return [*took, ask(client, {MARK: {"end": True}})]
+
+
+def requests(folder: Path, served: Served, count: int, keep: str) -> None:
+    """Print the ratio of captured to plain requests: inferences 0, 2, 4 … of an episode are captured."""
+    server = served.server(folder / f"requests-{keep}", keep=keep)
+    pairs, ends, after_end = list[tuple[float, float]](), list[float](), list[float]()
     with serving(server) as address, connect(address, compression=None, max_size=None) as client:
         client.recv()
         for episode in range(-(-count // 8) + 1):
-            picture = rng.integers(0, 256, (224, 224, 3), np.uint8)
-            sent = {
-                "observation/image": picture,
-                "observation/state": state,
-                "prompt": "put the cube on the red shape",
-            }
-            took = [ask(client, {**sent, MARK: {"id": f"e/{episode}"}}) for _ in range(16)]
-            pairs += list(zip(took[::2], took[1::2], strict=True)) if episode else []
-            socket_only.append(ask(client, {MARK: {"end": True}}))
+            *took, end = play(client, served, f"e/{episode}")
+            if episode:  # the first one is checked and proved
+                pairs += list(zip(took[::2], took[1::2], strict=True))
+                ends.append(end)
+                after_end.append(took[0] - statistics.median(took[2::2]))
     server.close()
     ratio = statistics.median(captured / plain for captured, plain in pairs)
     plain = statistics.median(plain for _, plain in pairs)
-    print(f"{family}: {len(pairs)} pairs, plain {plain:.1f} ms, captured / plain {ratio:.3f}")
-    print(f"an end (socket, codec and queue without the model): {statistics.median(socket_only):.2f} ms")
+    print(f"--keep {keep}: {len(pairs)} pairs, plain {plain:.1f} ms, captured / plain {ratio:.3f}")
+    print(
+        f"  an end (socket, codec and queue without the model) {statistics.median(ends):.2f} ms; the first "
+        f"request after one, while it is written, {statistics.median(after_end):+.2f} ms"
+    )
+
+
+def clients(folder: Path, served: Served, count: int) -> None:
+    """Print the ratio of the time of three clients at once to that of the same episodes one after another."""
+    ratios = []
+    for block in range(max(3, count // 48)):
+        server = served.server(folder / f"clients-{block}")
+        with serving(server) as address, ExitStack() as stack:
+            three = [stack.enter_context(connect(address, compression=None, max_size=None)) for _ in range(3)]
+            for client in three:
+                client.recv()
+            play(three[0], served, "first/0", 2)
+            began = perf_counter()
+            for number, client in enumerate(three):
+                play(client, served, f"one-by-one/{number}")
+            alone, began = perf_counter() - began, perf_counter()
+            threads = [
+                threading.Thread(target=play, args=(client, served, f"at-once/{number}"))
+                for number, client in enumerate(three)
+            ]
+            for thread in threads:
+                thread.start()
+            for thread in threads:
+                thread.join()
+            ratios.append((perf_counter() - began) / alone)
+        server.close()
+    print(f"three clients at once / one after another: {statistics.median(ratios):.3f} ({len(ratios)} blocks)")
 
 
 def adding(folder: Path, episodes: int) -> None:
@@ -140,12 +218,22 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--requests", type=int, default=200, help="pairs of requests")
     parser.add_argument("--episodes", type=int, default=2000, help="episodes of the long run")
-    parser.add_argument("--model", default="pi0-tiny")
-    parser.add_argument("--checkpoint", default=None)
+    parser.add_argument(
+        "--wide",
+        type=int,
+        metavar="LAYERS",
+        help="serve π0's shapes at real width, with so many layers",
+    )
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
-        adding(Path(name), arguments.episodes)
-        requests(Path(name), arguments.model, arguments.checkpoint, arguments.requests)
+        folder = Path(name)
+        if arguments.episodes:
+            adding(folder, arguments.episodes)
+        served = tiny() if arguments.wide is None else wide(folder, arguments.wide)
+        print(f"{served.policy.card.family}: {served.policy.card.parameters / 1e6:.1f} M parameters")
+        for keep in ("small", "full"):
+            requests(folder, served, arguments.requests, keep)
+        clients(folder, served, arguments.requests)
 
 
 if __name__ == "__main__":

@@ -18,11 +18,14 @@ from probe_kit.train import load_results
 NAMES = (
     "01-first-run", "02-layer-curves", "03-compare-models", "04-your-own-model", "05-your-own-questions",
     "06-vlm-against-vla", "07-from-readable-to-used", "08-your-own-labels", "09-your-own-recordings",
-    "10-why-does-my-policy-ignore-me",
+    "10-why-does-my-policy-ignore-me", "11-a-policy-server",
 )  # fmt: skip
 WHOLE_ONLY = NAMES[2:]
 """They run in the slow suite only: the tests in `acceptance/` use the same commands in the default one."""
-EXTRAS = dict.fromkeys(("09-your-own-recordings", "10-why-does-my-policy-ignore-me"), ("datasets", "av"))
+EXTRAS = {
+    **dict.fromkeys(("09-your-own-recordings", "10-why-does-my-policy-ignore-me"), ("datasets", "av")),
+    "11-a-policy-server": ("websockets", "msgpack"),
+}
 """Modules of extras that a notebook needs; the tenth reads the recordings of the ninth."""
 MACHINE = re.compile(r"/(?:home|root|tmp|Users|usr|opt|work|private|var)/|site-packages|[A-Z]:\\\\")
 
