@@ -29,11 +29,13 @@ class ConditionContext:
 
     Attributes:
         clean: (chunk, D) actions of the first condition; empty before that was played.
+        results: Results of this pair that several conditions share, by what decides them.
     """
 
     session: "ReplaySession"
     pair: Pair
     clean: Chunk = field(default_factory=lambda: np.zeros((0, 7), np.float32))
+    results: "dict[object, ConditionResult]" = field(default_factory=dict, init=False, repr=False)
     _source: "ActivationCache | None" = field(default=None, init=False, repr=False)
 
     @cached_property

@@ -288,9 +288,14 @@ class Knockout(Intervention):
                 count, keys = keys.sum(), random_tokens(keys, tokens.mask(backbone, ALL), seed)
                 if not has_sides(context.session.run) and 2 * keys.sum() < count:
                     return ConditionResult(context.act())  # no control of that size: nothing is cut
-            cut = AttentionCut(keys, readers, self.heads or None)
-            with cut_attention(context.session.policy, dict.fromkeys(sites, cut)) as log:
-                return ConditionResult(context.act(), log, token_counts=(int(keys.sum()), remaining))
+            # Where a control cuts all other tokens, every control is the same cut, and is inferred once.
+            same = (cell.site, keys.tobytes())
+            if same not in context.results:
+                cut = AttentionCut(keys, readers, self.heads or None)
+                with cut_attention(context.session.policy, dict.fromkeys(sites, cut)) as log:
+                    chunk = context.act()
+                context.results[same] = ConditionResult(chunk, log)
+            return replace(context.results[same], token_counts=(int(keys.sum()), remaining))
 
         return Condition(str(cell), play, cell=cell)
 

@@ -276,6 +276,24 @@ def test_places_of_kv_are_cut_in_the_layer_that_reads_them_and_parts_are_refused
         Knockout(roles=("kv.07",)).conditions(session)
 
 
+def test_controls_that_cut_all_other_tokens_are_one_inference(
+    session: ReplaySession, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A picture of the embedded policy has more tokens than all others together; words do not."""
+    calls: list[int] = []
+    act = session.act
+    monkeypatch.setattr(session, "act", lambda *given: (calls.append(1), act(*given))[1])
+    (pair, _) = session.pairs(str(session.run.episodes["item_id"].iloc[0]))
+    for role, inferences in (("image", 2), ("language", 4)):
+        context = ConditionContext(session, pair)
+        kind = Knockout(roles=(role,), window="3", controls=3)
+        calls.clear()
+        results = [condition.play(context) for condition in kind.conditions(session)[2:]]
+        assert len(calls) == inferences
+        assert len(results) == 4
+        assert all(result.edit_log is not None and result.edit_log.fires for result in results)
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
