@@ -199,11 +199,6 @@ class ConditionOutcomes:
         """Whether the correct picture lies on a side; else displacements are toward the source's action."""
         return bool(self.sides.size) and bool(self.sides[0])
 
-    @property
-    def has_sides(self) -> bool:
-        """The same as `is_scene`."""
-        return self.is_scene
-
     def of(self, condition: str) -> NDArray[np.float64]:
         """Return the displacement (E,) of one condition."""
         return np.asarray(self.displacement[self.conditions.index(condition)])

@@ -120,11 +120,6 @@ def settings_of(intervention: Choice, run: Run) -> dict[str, Any]:
     }
 
 
-def has_sides(run: Run) -> bool:
-    """Whether a run's questions have a correct picture on a side, as those of the scene have."""
-    return run.source.is_scene
-
-
 def key_of(settings: Mapping[str, Any]) -> str:
     """Return the first 12 hex digits of the settings' sha256: the name of the results' folder."""
     return sha256_json(settings)[:12]

@@ -168,11 +168,6 @@ class Measurement:
         return self.outcomes.is_scene
 
     @property
-    def lacks_sides(self) -> bool:
-        """Whether the run is not of the scene."""
-        return not self.is_scene
-
-    @property
     def exchange(self) -> str:
         """The change of inputs of which effects are shares, in words."""
         return "image swap" if self.is_scene else f"exchange of the {self.settings.get('vary') or ''}"

@@ -68,7 +68,7 @@ from probe_kit.intervene.kinds.closed_loop import CORRECT
 from probe_kit.intervene.outcomes import CLEAN, UNCHANGED, ConditionOutcomes
 from probe_kit.intervene.places import ALL, TILES, PlaceName, resolve_sites, roles_of
 from probe_kit.intervene.replay import CLEAN_RUN, SOURCE_RUN, Condition, ConditionContext, ConditionResult
-from probe_kit.intervene.settings import FIRST_CHUNK, has_sides
+from probe_kit.intervene.settings import FIRST_CHUNK
 from probe_kit.intervene.stored import Measurement, preferred_by_category, stored_interventions
 from probe_kit.runs.layout import DATASET, ENVIRONMENT
 from probe_kit.runs.reader import RunReader
@@ -189,9 +189,9 @@ class Knockout(Intervention):
                 be played again, or do not say whether they succeed.
         """
         super().check_run(run)
-        if self.closed_loop and not has_sides(run):
+        if self.closed_loop and not run.source.is_scene:
             _check_success(run)
-        if not has_sides(run) and not self.controls:
+        if not run.source.is_scene and not self.controls:
             raise UsageError(
                 "--controls 0 leaves nothing to compare with: any cut changes an action. Take 1 or more"
             )
@@ -214,7 +214,7 @@ class Knockout(Intervention):
         if outside := [head for head in self.heads if head >= stream.heads]:
             raise UsageError(f"{stream.name} has {stream.heads} heads, counted from 0; there is no {outside[0]}")
         layers = stream.layers - 1
-        conditions = [CLEAN_RUN, *([SOURCE_RUN] if has_sides(session.run) else [])]
+        conditions = [CLEAN_RUN, *([SOURCE_RUN] if session.run.source.is_scene else [])]
         for role in self._roles(policy, backbone):
             block = block_of(role)
             spans = windows(self.window, layers) if block is None else [(block, block)]
@@ -286,7 +286,7 @@ class Knockout(Intervention):
                     "knockout", self.seed, context.pair.episode, context.pair.step, str(cell), *window
                 )
                 count, keys = keys.sum(), random_tokens(keys, tokens.mask(backbone, ALL), seed)
-                if not has_sides(context.session.run) and 2 * keys.sum() < count:
+                if not context.session.run.source.is_scene and 2 * keys.sum() < count:
                     return ConditionResult(context.act())  # no control of that size: nothing is cut
             # Where a control cuts all other tokens, every control is the same cut, and is inferred once.
             same = (cell.site, keys.tobytes())
@@ -334,7 +334,7 @@ class Knockout(Intervention):
             f"From which tokens does it read? {context.subject}, knockout",
             ("category", "cut"),
             lines_of(cuts, lambda row: f"{row.role}, {row.layers}"),
-            {"What the action loses": _columns(cuts, not context.lacks_sides)},
+            {"What the action loses": _columns(cuts, context.is_scene)},
             lambda row: row.matters,
             before=[
                 "layers: those in which the acting part cannot read the tokens",
@@ -638,14 +638,14 @@ def knockout_effects(outcomes: ConditionOutcomes) -> list[KnockoutEffect]:
     moved = outcomes.displacement[rows] - clean
     # Of an episode that was played the change is where the cube ends.
     size = outcomes.size[rows] if outcomes.size is not None else np.abs(moved) / (clean.std() or 1.0)
-    is_of_success = not outcomes.has_sides and outcomes.episode_outcomes is not None
+    is_of_success = not outcomes.is_scene and outcomes.episode_outcomes is not None
     losses = _losses(outcomes, moved, is_of_success)
     # A control that cut nothing is none.
     is_cut = outcomes.edit_log[rows, :, 0] > 0
     broken = {at for at, cell in enumerate(cells) if cell.is_control and not is_cut[at].any()}
     # Where a picture has an effect, a loss is a move away from the correct one; else any change counts.
     if any(loss is not None for loss in losses):
-        tested = -correct * moved if outcomes.has_sides else -moved
+        tested = -correct * moved if outcomes.is_scene else -moved
     else:
         lonely = [at for at in range(len(cells)) if not _has_control(cells, at, broken)]
         tested = size.copy()
@@ -659,7 +659,7 @@ def knockout_effects(outcomes: ConditionOutcomes) -> list[KnockoutEffect]:
     effects = []
     for at, (row, cell, test) in enumerate(zip(rows, cells, tests, strict=True)):
         right_before, right = correct * clean > 0, correct * outcomes.displacement[row] > 0
-        gains = right_before.astype(float) - right if outcomes.has_sides else np.zeros(clean.size)
+        gains = right_before.astype(float) - right if outcomes.is_scene else np.zeros(clean.size)
         loss = losses[at]
         of_controls = [part.value for control in test.controls if (part := losses[control]) is not None]
         counts = _mean_counts(outcomes, row, [rows[control] for control in test.controls])
@@ -692,7 +692,7 @@ def _losses(
     """Return the loss of each of K cuts that moved (K, E): of success or the picture's effect, None of neither."""
     if is_of_success:
         return [SwapShare(-float(away.mean()), *net_interval(-away, outcomes)) for away in moved]
-    exchange = outcomes.exchange() if outcomes.has_sides else None
+    exchange = outcomes.exchange() if outcomes.is_scene else None
     shares = [None if exchange is None else exchange.share(away) for away in moved]
     return [None if share is None else SwapShare(*(2 * number for number in share)) for share in shares]
 
@@ -876,8 +876,8 @@ def _is_played(rows: "Sequence[KnockoutEffect]") -> bool:
     return any(row.success is not None for row in rows)
 
 
-def _columns(rows: "Sequence[KnockoutEffect]", has_sides: bool) -> list[EffectColumn[KnockoutEffect]]:
-    """Return the columns of cuts; `has_sides` is whether a loss is a share of the picture's effect."""
+def _columns(rows: "Sequence[KnockoutEffect]", is_scene: bool) -> list[EffectColumn[KnockoutEffect]]:
+    """Return the columns of cuts; `is_scene` is whether a loss is a share of the picture's effect."""
     p = EffectColumn[KnockoutEffect](
         "p",
         lambda row: p_of(row.p_fwe, row.is_resolved),
@@ -904,7 +904,7 @@ def _columns(rows: "Sequence[KnockoutEffect]", has_sides: bool) -> list[EffectCo
     lost = "share of the picture's effect on the action that is gone, n/a where that effect is not beyond chance"
     if any(row.is_of_success for row in rows):
         lost = "success rate without the cut minus that with it, as a share of episodes"
-    elif not has_sides:
+    elif not is_scene:
         plain = EffectColumn[KnockoutEffect]("controls", lambda row: TableCell(row.control_size, number), controls)
         return [change, plain, *twins, p]
     wrong = EffectColumn[KnockoutEffect](
@@ -921,6 +921,6 @@ def _columns(rows: "Sequence[KnockoutEffect]", has_sides: bool) -> list[EffectCo
         EffectColumn("controls", lambda row: TableCell(row.control_lost, number), controls),
         change,
         *twins,
-        *([wrong] if has_sides else []),
+        *([wrong] if is_scene else []),
         p,
     ]
