@@ -1,6 +1,5 @@
 """Imports: lazy names of packages, entry points, optional libraries, and the command that installs one."""
 
-import csv
 import shlex
 import shutil
 import sys
@@ -91,7 +90,8 @@ def _top_level_modules(package: metadata.Distribution) -> set[str]:
     if (listed := package.read_text("RECORD")) is None:
         paths = [str(path) for path in package.files or ()]
     else:
-        paths = [row[0] for row in csv.reader(listed.splitlines()) if row]
+        # Each line holds a path, a hash and a size; a path with a comma is quoted.
+        paths = [line.rsplit(",", 2)[0].strip('"') for line in listed.splitlines()]
     parts = {path.partition("/")[:2] for path in paths}
     names = {name if folder else getmodulename(name) or name for name, folder in parts}
     return {name for name in names if "." not in name}

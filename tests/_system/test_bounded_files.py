@@ -128,6 +128,7 @@ ELSEWHERE = {
     "_system/bounded_files.py": "the reader itself",
     "runs/export_vectors.py": "the matrix that it has just written",
     "_system/parquet_files.py": "the reader itself",
+    "_system/imports.py": "lists of the installed packages",
     "_system/machine.py": "files of the system",
     "doctor.py": "files of the system",
     "hooks/new_adapter/__init__.py": "files of the package",

@@ -37,8 +37,10 @@ def test_modules_are_read_from_the_list_of_files_of_a_package(
     for package, files in {"listed": 'listed_module.py,,\n"listed/with, comma.py",,\n', "listless": None}.items():
         folder = tmp_path / f"{package}-1.0.dist-info"
         folder.mkdir()
-        (folder / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
+        (folder / "METADATA").write_text(
+            f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n", encoding="utf-8"
+        )
         if files is not None:
-            (folder / "RECORD").write_text(f"{files}{folder.name}/METADATA,,\n")
+            (folder / "RECORD").write_text(f"{files}{folder.name}/METADATA,,\n", encoding="utf-8")
     monkeypatch.setattr("sys.path", [str(tmp_path)])
     assert packages_by_module() == {"listed_module": ["listed"], "listed": ["listed"]}

@@ -18,7 +18,7 @@ from probe_kit.extract.sources.served import ServedSettings
 from probe_kit.hooks import Policy
 from probe_kit.hooks.capturing.edits import vector_hash
 from probe_kit.intervene.frame_session import Frames
-from probe_kit.intervene.sessions import ReplaySource
+from probe_kit.intervene.sessions import ReplayFiles
 from probe_kit.runs import open_run
 from probe_kit.runs.direction_files import write_directions
 from probe_kit.runs.environment_success import EnvironmentSuccess
@@ -110,7 +110,7 @@ def test_conditions_are_balanced_in_each_group_and_none_changes_no_bit(
     assert "success rate by condition, of 24 episodes: none" in table
     assert "condition steer against none: p " in table
 
-    frames = Frames(after, ReplaySource())
+    frames = Frames(after, ReplayFiles())
     replayed = {frame.episode for frame in frames.index}
     assert replayed == {
         name for (name, _, _), condition in zip(names, conditions, strict=True) if condition == "none"
@@ -236,5 +236,5 @@ def test_a_run_of_edited_episodes_alone_cannot_be_shown_again(
     run = server.close()
     assert run is not None
     with pytest.raises(UsageError, match="all its episodes were edited"):
-        Frames(open_run(run.location), ReplaySource())
+        Frames(open_run(run.location), ReplayFiles())
     assert WORDS in run.episodes["instruction"].tolist()

@@ -282,7 +282,7 @@ def test_controls_that_cut_all_other_tokens_are_one_inference(
     """A picture of the embedded policy has more tokens than all others together; words do not."""
     calls: list[int] = []
     act = session.act
-    monkeypatch.setattr(session, "act", lambda *given: (calls.append(1), act(*given))[1])
+    monkeypatch.setattr(session, "act", lambda *inputs: (calls.append(1), act(*inputs))[1])
     (pair, _) = session.pairs(str(session.run.episodes["item_id"].iloc[0]))
     for role, inferences in (("image", 2), ("language", 4)):
         context = ConditionContext(session, pair)
