@@ -22,7 +22,7 @@ from probe_kit.hooks import AnswerModel, Model, Policy, load_model
 from probe_kit.hooks.contract.model import Prompt
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.roles import Roles
-from tests.support import magma_checkpoints
+from tests.hooks.families.magma import checkpoints as magma_checkpoints
 from tests.support.every_checkpoint import WRITERS
 
 WIDTH, DEPTH, INNER, HEADS, KEYS, HEAD = 768, 12, 3072, 12, 4, 64

@@ -3,7 +3,8 @@
     uv run python scripts/record_groot.py CHECKPOINT FOLDER
 
 The checkpoint is a tiny one in lerobot's layout, with its base model in `base`, weights included, and the language
-model's files in `base/vlm`, as `tests/support/groot_checkpoints.py` writes it. FOLDER gets no weights of the base.
+model's files in `base/vlm`, as `tests/hooks/families/groot/checkpoints.py` writes it. FOLDER gets no weights of
+the base.
 Nothing of probe_kit is used. The script fails unless the actions of the modules, called one after the other, equal
 those of `predict_action_chunk`. `probe-kit verify groot FOLDER` compares the adapter with it.
 """

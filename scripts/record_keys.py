@@ -84,7 +84,7 @@ def eo1() -> dict[str, torch.Tensor]:
     from lerobot.policies.eo1.configuration_eo1 import EO1Config
     from lerobot.policies.eo1.modeling_eo1 import EO1Policy
 
-    from probe_kit.models.qwen import qwen2_5_vl_config
+    from probe_kit.hooks.families.shared.qwen.network import qwen2_5_vl_config
 
     sizes = qwen2_5_vl_config("3B").to_dict()
     config = EO1Config(device="cpu", dtype="float32", vlm_config=sizes, input_features=PICTURE)

@@ -29,8 +29,9 @@ from safetensors.torch import load_file
 from torch import Tensor
 from transformers import AutoTokenizer
 
+from probe_kit.hooks.families.pi0.network import Pi0Size
+from probe_kit.hooks.families.shared.lerobot.paligemma import PaliGemmaSize, resize_network
 from probe_kit.models.building import replace_attributes
-from probe_kit.models.pi0 import PaliGemmaSize, Pi0Size, resize_network
 
 MODULES: dict[str, Any] = {"pi0": modeling_pi0, "pi05": modeling_pi05, "pi0_fast": modeling_pi0_fast}
 POLICIES: dict[str, Callable[[Any], Any]] = {

@@ -27,8 +27,8 @@ from vlm_tiny_training.pictures import read_banks
 from vlm_tiny_training.spent import timed
 from vlm_tiny_training.training import Trainer, draw_losses, follow
 
+from probe_kit.hooks.families.embedded import Statistics, write_checkpoint
 from probe_kit.hooks.families.pi0.adapter import Pi0
-from probe_kit.models.embedded.tiny import Statistics, write_checkpoint
 
 SHARES = {"color": 0.36, "shape": 0.42, LEFT_OPEN: 0.22}
 """Of each category in a batch."""

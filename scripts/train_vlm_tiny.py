@@ -19,7 +19,7 @@ from vlm_tiny_training.spent import timed
 from vlm_tiny_training.training import Trainer, draw_losses, follow, rank, together
 
 from probe_kit.env import SceneSpec
-from probe_kit.models.embedded.tiny import new_vlm_tiny, write_vlm_tiny
+from probe_kit.hooks.families.embedded import new_vlm_tiny, write_vlm_tiny
 
 SHARES = {"color": 0.22, "shape": 0.32, "state": 0.22, "traffic": 0.24}
 """Of each category in a batch."""

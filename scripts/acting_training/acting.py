@@ -19,8 +19,8 @@ from vlm_tiny_training.reading import SIDES, as_tensor, blurred
 from vlm_tiny_training.training import Stage
 
 from acting_training.frames import Frames
+from probe_kit.hooks.families.embedded import ACTION_DIMS, CHUNK, IDLE_DIMS
 from probe_kit.hooks.families.pi0.adapter import Pi0
-from probe_kit.models.embedded.tiny import ACTION_DIMS, CHUNK, IDLE_DIMS
 from probe_kit.models.embedded.words import WORDS
 from probe_kit.suite.items import instruction_for
 

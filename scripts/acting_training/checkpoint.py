@@ -6,9 +6,9 @@ import numpy as np
 from safetensors.torch import load_file
 
 from acting_training.demonstrations import Demonstrations
+from probe_kit.hooks.families.embedded import Statistics, new_pi0_tiny, write_checkpoint
 from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.models.embedded import embedded_checkpoint
-from probe_kit.models.embedded.tiny import Statistics, new_pi0_tiny, write_checkpoint
 
 LEAST_SPREAD = 1e-2
 """Metres, radians or openness: less is tremor of the arm."""

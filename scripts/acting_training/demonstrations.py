@@ -13,7 +13,7 @@ from vlm_tiny_training.window import model_view
 from acting_training.carrying import OPENED, Carrying
 from probe_kit.env import Act2AnswerEnv, SceneSpec
 from probe_kit.env.scene import SIDES
-from probe_kit.models.embedded.tiny import CHUNK
+from probe_kit.hooks.families.embedded import CHUNK
 
 NOISE = 0.007
 """Standard deviation, metres, of what is added to an executed action of 4 cm or more."""

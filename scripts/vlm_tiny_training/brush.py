@@ -14,7 +14,7 @@ from PIL import Image
 from scipy import sparse
 
 from probe_kit.env.simulation import TEXTURE_PIXELS, as_texture
-from probe_kit.models.embedded.tiny import IMAGE_SIDE
+from probe_kit.hooks.families.embedded import IMAGE_SIDE
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, binary_cross_entropy_with_logits, cross_entropy
 
-from probe_kit.models.embedded.tiny import IMAGE_SIDE, SIZE
+from probe_kit.hooks.families.embedded import IMAGE_SIDE, SIZE
 from vlm_tiny_training.batches import Pair
 from vlm_tiny_training.painting import Place, Surface
 

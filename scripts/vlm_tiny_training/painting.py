@@ -10,7 +10,7 @@ from PIL import Image
 from probe_kit.env import Act2AnswerEnv, SceneSpec
 from probe_kit.env.scene import SIDES, Scene
 from probe_kit.extract.prompts import GREY, MARGIN
-from probe_kit.models.embedded.tiny import CAMERA_PICTURE, IMAGE_SIDE, LOOKED_AT
+from probe_kit.hooks.families.embedded import CAMERA_PICTURE, IMAGE_SIDE, LOOKED_AT
 from vlm_tiny_training.brush import brush_of, ramp
 from vlm_tiny_training.window import model_view
 

@@ -5,7 +5,7 @@ import torch
 from numpy.typing import NDArray
 from torchvision.transforms.v2 import functional
 
-from probe_kit.models.embedded.tiny import IMAGE_SIDE, LOOKED_AT
+from probe_kit.hooks.families.embedded import IMAGE_SIDE, LOOKED_AT
 
 
 def model_view(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:

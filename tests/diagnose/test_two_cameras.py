@@ -18,9 +18,9 @@ from probe_kit.intervene.sessions import ReplayFiles
 from probe_kit.runs import Run
 from probe_kit.runs.run_source import Origin
 from probe_kit.suite import Suite
+from tests.hooks.families.smolvla.checkpoints import write_smolvla
 from tests.support.acting_checkpoints import FAMILIES
 from tests.support.organisms import ORGANISMS, edited
-from tests.support.smolvla_checkpoints import write_smolvla
 
 ENVIRONMENT = "tests.support.reach_env:TwoCameras"
 PICTURES = ("picture.top", "picture.wrist")

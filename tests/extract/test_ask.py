@@ -23,8 +23,8 @@ from probe_kit.hooks import AnswerModel, Prompt, Reading, Site
 from probe_kit.retention import success_rate
 from probe_kit.runs import Run, open_run, verify_run
 from probe_kit.suite import Suite
+from tests.hooks.families.prismatic.checkpoints import write_checkpoint
 from tests.support.position_models import PositionModel, always, likes
-from tests.support.prismatic_checkpoints import write_checkpoint
 
 NOWHERE = EpisodeBuffers([], 1, with_tokens=False, pinned=False)
 SMALL = SceneSpec(picture_size=(224, 224))

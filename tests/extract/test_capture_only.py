@@ -21,7 +21,7 @@ from probe_kit.retention.rows.build import RowSettings, run_rows
 from probe_kit.runs import Run, open_run, verify_run
 from probe_kit.suite import Suite
 from probe_kit.train import load_results, train_probes
-from tests.support.pi0_checkpoints import write_intact
+from tests.hooks.families.pi0.checkpoints import write_intact
 
 pytestmark = pytest.mark.slow
 

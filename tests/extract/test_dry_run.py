@@ -21,10 +21,10 @@ from probe_kit.runs.plan import Plan
 from probe_kit.runs.run_folders import in_units
 from probe_kit.suite import Suite, build_suite, default_suite, load_suite
 from probe_kit.suite.sufficiency import sufficiencies
+from tests.hooks.families.pi0.checkpoints import write_intact
+from tests.hooks.families.pi0.pi05_checkpoints import write_pi05
+from tests.hooks.families.smolvla.checkpoints import write_smolvla
 from tests.support.every_checkpoint import WRITERS, families
-from tests.support.pi0_checkpoints import write_intact
-from tests.support.pi05_checkpoints import write_pi05
-from tests.support.smolvla_checkpoints import write_smolvla
 
 DECLARING = [name for name, family in own_families().items() if family.checkpoints.declared]
 RELEASED = [(name, size) for name in DECLARING for size in own_families()[name].checkpoints.declared]

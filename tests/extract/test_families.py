@@ -18,13 +18,11 @@ from probe_kit.retention import retention_table
 from probe_kit.runs import Run
 from probe_kit.suite import Suite
 from probe_kit.train import train_probes
-from tests.support import (
-    internvla_checkpoints,
-    magma_checkpoints,
-    prismatic_checkpoints,
-    spatialvla_checkpoints,
-    xiaomi_checkpoints,
-)
+from tests.hooks.families.internvla import checkpoints as internvla_checkpoints
+from tests.hooks.families.magma import checkpoints as magma_checkpoints
+from tests.hooks.families.prismatic import checkpoints as prismatic_checkpoints
+from tests.hooks.families.spatialvla import checkpoints as spatialvla_checkpoints
+from tests.hooks.families.xiaomi import checkpoints as xiaomi_checkpoints
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore:the model put out tokens")]
 PICTURE, WORDS = "mean:image.primary", "mean:language"

@@ -19,11 +19,11 @@ from probe_kit.hooks import Edit, Observation, Policy, Site, Tap
 from probe_kit.hooks.families.pi0.adapter import load_pi0_tiny
 from probe_kit.runs import Run
 from probe_kit.runs.provenance import input_notes
+from tests.hooks.families.prismatic.checkpoints import write_checkpoint
 from tests.support.lerobot_recordings import CAMERA, write_recording
 from tests.support.organisms import Edit as WeightEdit
 from tests.support.organisms import make_blind, make_deaf
 from tests.support.position_models import Liking, PositionModel, always, likes
-from tests.support.prismatic_checkpoints import write_checkpoint
 
 SETTINGS = ExtractSettings(
     "pi0-tiny", categories=("color",), items=2, scene=SceneSpec(max_steps=4), capture_only=True, env_workers=0

@@ -15,7 +15,7 @@ from probe_kit.hooks.contract.declared import check_options
 from probe_kit.hooks.registry import own_families
 from probe_kit.retention.report.page import provenance
 from probe_kit.suite import Suite
-from tests.support.pi0_checkpoints import write_intact
+from tests.hooks.families.pi0.checkpoints import write_intact
 
 # Section 4 of what is known of the release, in the words of the command line.
 RELEASED = {

@@ -20,9 +20,9 @@ from probe_kit.hooks.checkpoints.checkpoint import (
     without_revision,
 )
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
+from tests.hooks.families.pi0.checkpoints import write_intact
 from tests.support.every_checkpoint import WRITERS
 from tests.support.hub_stand_in import Hub, hub
-from tests.support.pi0_checkpoints import write_intact
 
 OLD, NEW = "a" * 40, "b" * 40
 REPO, PART = "lab/tiny", "lab/part"

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from probe_kit.errors import UsageError
+from probe_kit.hooks.families.magma.network import UNUSED_WEIGHTS
 from probe_kit.hooks.family import Family
 from probe_kit.hooks.outputs import Outputs
 from probe_kit.hooks.registry import own_families
 from probe_kit.hooks.verify import Verification, compare, verify_keys, verify_reference
-from probe_kit.models.magma import UNUSED_WEIGHTS
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 BYTES = {"float32": 4, "bfloat16": 2, "int64": 8}

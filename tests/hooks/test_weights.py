@@ -18,10 +18,10 @@ from probe_kit.hooks import Observation, load_model, load_policy
 from probe_kit.hooks.checkpoints.checkpoint import INDEX_FILE, WEIGHTS_FILE
 from probe_kit.hooks.checkpoints.folders import adapter_in
 from probe_kit.hooks.checkpoints.weights import read_weights
+from probe_kit.hooks.families.magma.network import shipped_statistics
 from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.hooks.registry import find_family
 from probe_kit.models.embedded import embedded_checkpoint
-from probe_kit.models.magma import shipped_statistics
 from tests.support.every_checkpoint import WRITERS, families
 
 NAME = "model.state_proj.weight"

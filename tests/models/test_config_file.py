@@ -8,23 +8,21 @@ from typing import Any
 import pytest
 
 from probe_kit.errors import CheckpointError
+from probe_kit.hooks.families.embedded import SIZE
+from probe_kit.hooks.families.internvla.network import InternVLAConfig
+from probe_kit.hooks.families.magma.network import MagmaConfig
+from probe_kit.hooks.families.ovis2_5.network import VisionConfig
+from probe_kit.hooks.families.pi0.network import Pi0Size
+from probe_kit.hooks.families.prismatic.network import PrismaticConfig
+from probe_kit.hooks.families.spatialvla.network import SpatialVLAConfig
+from probe_kit.hooks.families.xiaomi.network import XiaomiConfig
 from probe_kit.models.config_file import ConfigFile, Count
 from probe_kit.models.decoding import Packed
-from probe_kit.models.embedded.tiny import SIZE
-from probe_kit.models.internvla import InternVLAConfig
-from probe_kit.models.magma import MagmaConfig
-from probe_kit.models.ovis2_5 import VisionConfig
-from probe_kit.models.pi0 import Pi0Size
-from probe_kit.models.prismatic import PrismaticConfig
-from probe_kit.models.spatialvla import SpatialVLAConfig
-from probe_kit.models.xiaomi import XiaomiConfig
-from tests.support import (
-    internvla_checkpoints,
-    magma_checkpoints,
-    prismatic_checkpoints,
-    spatialvla_checkpoints,
-    xiaomi_checkpoints,
-)
+from tests.hooks.families.internvla import checkpoints as internvla_checkpoints
+from tests.hooks.families.magma import checkpoints as magma_checkpoints
+from tests.hooks.families.prismatic import checkpoints as prismatic_checkpoints
+from tests.hooks.families.spatialvla import checkpoints as spatialvla_checkpoints
+from tests.hooks.families.xiaomi import checkpoints as xiaomi_checkpoints
 
 VISION = {
     "hidden_size": 16, "num_hidden_layers": 2, "num_attention_heads": 2, "intermediate_size": 32, "patch_size": 16,

@@ -22,11 +22,11 @@ from probe_kit.extract.prompts import ORDERS, TEMPLATES, Phrase
 from probe_kit.extract.protocols import scene_of
 from probe_kit.hooks.contract.model import Prompt
 from probe_kit.hooks.contract.observation import Observation
+from probe_kit.hooks.families.embedded import ACTION_DIMS
 from probe_kit.hooks.families.paligemma.adapter import PaliGemma, load_vlm_tiny
 from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.hooks.registry import find_family, own_families
 from probe_kit.models.embedded import embedded_checkpoint
-from probe_kit.models.embedded.tiny import ACTION_DIMS
 from probe_kit.models.embedded.words import SPECIAL, WORDS, known_words, words_in
 from probe_kit.suite import Terms, build_suite, suite_from_csv
 from probe_kit.suite.generators import GENERATORS, vocabulary

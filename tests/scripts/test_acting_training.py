@@ -20,8 +20,8 @@ from vlm_tiny_training.training import Stage, Trainer
 
 from probe_kit.env.act2answer import Question
 from probe_kit.env.scripted import MAX_SHIFT, OPEN
+from probe_kit.hooks.families.embedded import ACTION_DIMS, CHUNK, IDLE_DIMS, IMAGE_SIDE
 from probe_kit.models.embedded import embedded_checkpoint
-from probe_kit.models.embedded.tiny import ACTION_DIMS, CHUNK, IDLE_DIMS, IMAGE_SIDE
 
 SURFACE = "sheet"
 

@@ -16,7 +16,7 @@ from vlm_tiny_training.window import model_view
 from probe_kit.env import Act2AnswerEnv, SceneSpec
 from probe_kit.env.act2answer import Question
 from probe_kit.env.scene import SIDES
-from probe_kit.models.embedded.tiny import new_vlm_tiny, write_vlm_tiny
+from probe_kit.hooks.families.embedded import new_vlm_tiny, write_vlm_tiny
 
 pytestmark = pytest.mark.slow
 

@@ -17,15 +17,13 @@ from probe_kit.hooks.families.internvla.checkpoint import convert
 from probe_kit.hooks.family import SIZE
 from probe_kit.hooks.testing import CONTRACTS
 from probe_kit.models.embedded import embedded_checkpoint
-from tests.support import (
-    groot_checkpoints,
-    internvla_checkpoints,
-    magma_checkpoints,
-    pi0_checkpoints,
-    prismatic_checkpoints,
-    smolvla_checkpoints,
-    spatialvla_checkpoints,
-)
+from tests.hooks.families.groot import checkpoints as groot_checkpoints
+from tests.hooks.families.internvla import checkpoints as internvla_checkpoints
+from tests.hooks.families.magma import checkpoints as magma_checkpoints
+from tests.hooks.families.pi0 import checkpoints as pi0_checkpoints
+from tests.hooks.families.prismatic import checkpoints as prismatic_checkpoints
+from tests.hooks.families.smolvla import checkpoints as smolvla_checkpoints
+from tests.hooks.families.spatialvla import checkpoints as spatialvla_checkpoints
 from tests.support.every_checkpoint import WRITERS
 
 GOLDEN = Path(__file__).parents[1] / "golden"

@@ -4,22 +4,20 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-from tests.support import (
-    eo1_checkpoints,
-    groot_checkpoints,
-    internvla_checkpoints,
-    magma_checkpoints,
-    molmoact2_checkpoints,
-    pi0_checkpoints,
-    pi0_fast_checkpoints,
-    pi05_checkpoints,
-    prismatic_checkpoints,
-    smolvla_checkpoints,
-    spatialvla_checkpoints,
-    vlm_checkpoints,
-    xiaomi_checkpoints,
-    xvla_checkpoints,
-)
+from tests.hooks.families.eo1 import checkpoints as eo1_checkpoints
+from tests.hooks.families.groot import checkpoints as groot_checkpoints
+from tests.hooks.families.internvla import checkpoints as internvla_checkpoints
+from tests.hooks.families.magma import checkpoints as magma_checkpoints
+from tests.hooks.families.molmoact2 import checkpoints as molmoact2_checkpoints
+from tests.hooks.families.pi0 import checkpoints as pi0_checkpoints
+from tests.hooks.families.pi0 import pi05_checkpoints
+from tests.hooks.families.pi0_fast import checkpoints as pi0_fast_checkpoints
+from tests.hooks.families.prismatic import checkpoints as prismatic_checkpoints
+from tests.hooks.families.smolvla import checkpoints as smolvla_checkpoints
+from tests.hooks.families.spatialvla import checkpoints as spatialvla_checkpoints
+from tests.hooks.families.xiaomi import checkpoints as xiaomi_checkpoints
+from tests.hooks.families.xvla import checkpoints as xvla_checkpoints
+from tests.support import vlm_checkpoints
 from tests.support.slow_cases import slow_but
 
 WRITERS: dict[str, tuple[Callable[[Path], Path], dict[str, Any]]] = {

@@ -13,7 +13,7 @@ from lerobot.policies.factory import make_pre_post_processors
 from lerobot.processor import tokenizer_processor
 from transformers import AutoTokenizer
 
-from tests.support.pi05_checkpoints import HIGH, LEAST, LOW, MOST
+from tests.hooks.families.pi0.pi05_checkpoints import HIGH, LEAST, LOW, MOST
 
 
 def statistics() -> dict[str, dict[str, torch.Tensor]]:

@@ -8,11 +8,11 @@ from typing import Any
 import torch
 from torch import nn
 
+from probe_kit.hooks.families.internvl.network import build_internvl
+from probe_kit.hooks.families.ovis2_5.network import OvisConfig, build_ovis2_5
+from probe_kit.hooks.families.paligemma.network import build_paligemma
+from probe_kit.hooks.families.shared.qwen.network import build_qwen2_5_vl, build_qwen3_vl
 from probe_kit.models.building import initialise
-from probe_kit.models.internvl import build_internvl
-from probe_kit.models.ovis2_5 import OvisConfig, build_ovis2_5
-from probe_kit.models.paligemma import build_paligemma
-from probe_kit.models.qwen import build_qwen2_5_vl, build_qwen3_vl
 from tests.support.qwen_checkpoints import ID, SPECIAL, picture_settings, save_sharded, token_ids, write_tokenizer
 from tests.support.written_once import written_once
 

@@ -34,7 +34,7 @@ from probe_kit.hooks import ModelCard, Observation, load_policy
 from probe_kit.intervene.rollout import executed_chunk
 from probe_kit.runs.plan import Row
 from probe_kit.suite import Suite
-from tests.support.spatialvla_checkpoints import write_checkpoint
+from tests.hooks.families.spatialvla.checkpoints import write_checkpoint
 
 # 1 % and 99 % quantiles of BridgeData V2's rotations, in radians.
 LOW, HIGH = np.array([-0.0809, -0.0929, -0.2072]), np.array([0.0819, 0.0779, 0.2038])

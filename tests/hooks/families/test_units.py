@@ -14,8 +14,8 @@ from probe_kit.errors import UnitsError, UsageError
 from probe_kit.extract.sources.source import check_units, compare_states
 from probe_kit.hooks import load_policy
 from probe_kit.hooks.registry import find_family, own_families
+from tests.hooks.families.groot.checkpoints import write_nvidias
 from tests.support.every_checkpoint import WRITERS
-from tests.support.groot_checkpoints import write_nvidias
 from tests.support.slow_cases import slow_but
 
 UNITS = {"action": {"q01": [-0.5] * 7, "q99": [0.5] * 7, "mask": [True] * 6 + [False]}}

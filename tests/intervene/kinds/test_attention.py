@@ -43,8 +43,8 @@ from probe_kit.intervene.replay import ConditionContext
 from probe_kit.intervene.sessions import ReplaySession
 from probe_kit.intervene.tokens import BANDS, patch_embeddings, token_boxes, tokens_overlapping
 from probe_kit.runs import Run, open_run, verify_run
+from tests.hooks.families.smolvla.checkpoints import write_smolvla
 from tests.intervene.answers import follower, measured, outcomes_of, said_of
-from tests.support.smolvla_checkpoints import write_smolvla
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy

@@ -34,11 +34,11 @@ from probe_kit.hooks.families.shared.kinds import IMAGES, STATE
 from probe_kit.hooks.families.shared.lerobot.flow import PackedPolicy, Tokens, chat_labels
 from probe_kit.hooks.families.shared.lerobot.pipelines import check_same, step_fields
 from probe_kit.hooks.families.shared.lerobot.policy import checked_steps
+from probe_kit.hooks.families.shared.qwen.network import qwen2_5_vl_config
 from probe_kit.hooks.families.shared.taps import Stack, kept_prompt, token_stack
 from probe_kit.models.building import build_empty, building_device, fill_rotary, replace_attributes
 from probe_kit.models.checkpoint_files import load_pretrained
 from probe_kit.models.decoding import PromptKV
-from probe_kit.models.qwen import qwen2_5_vl_config
 
 
 def build_eo1(config: EO1Config, device: str = "cpu") -> EO1Policy:

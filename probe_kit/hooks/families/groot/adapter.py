@@ -34,7 +34,7 @@ from probe_kit.hooks.families.shared.kinds import IMAGES
 from probe_kit.hooks.families.shared.lerobot.flow import PackedPolicy
 from probe_kit.hooks.families.shared.lerobot.normaliser import Normaliser
 from probe_kit.hooks.families.shared.lerobot.pipelines import PACKING_STEP, read_views, step_fields
-from probe_kit.hooks.families.shared.qwen import merger_norm
+from probe_kit.hooks.families.shared.qwen.adapter import merger_norm
 from probe_kit.hooks.families.shared.taps import TOWER, Stack
 from probe_kit.hooks.outputs import Produce, RecordedRun, numpy_of
 from probe_kit.models.checkpoint_files import renamed_tensors

@@ -27,9 +27,9 @@ FAMILIES = (
                 ),
             ),
             declared={"8B": answering(37, 4096, 300), "38B": answering(65, 5120, 300)},
-            full_size="probe_kit.models.internvl:full_size_internvl",
+            full_size="probe_kit.hooks.families.internvl.network:full_size_internvl",
             parameters={"8B": 8_528_318_464, "38B": 38_390_405_504},
-            stored_names="probe_kit.models.internvl:FILE_NAMES",
+            stored_names="probe_kit.hooks.families.internvl.network:FILE_NAMES",
             sizes=(
                 ("8B", "OpenGVLab/InternVL3_5-8B-HF"),
                 ("38B", "OpenGVLab/InternVL3_5-38B-HF"),

@@ -7,12 +7,12 @@ from torch import Tensor
 from transformers import InternVLConfig
 
 from probe_kit.errors import UsageError
+from probe_kit.hooks.families.internvl.network import FILE_NAMES, TiledPictures, build_internvl
 from probe_kit.hooks.families.shared.loading import Loaded, Recipe
-from probe_kit.hooks.families.shared.qwen import ASSISTANT, USER
+from probe_kit.hooks.families.shared.qwen.adapter import ASSISTANT, USER
 from probe_kit.hooks.families.shared.taps import TOWER, Stack
 from probe_kit.hooks.families.shared.text import QuestionFrame
 from probe_kit.hooks.families.shared.vlm import Pictures, VisionLanguageModel
-from probe_kit.models.internvl import FILE_NAMES, TiledPictures, build_internvl
 
 TILES = ("auto", "1")
 

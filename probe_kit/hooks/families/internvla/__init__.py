@@ -94,7 +94,7 @@ FAMILIES = (
                     ),
                 )
             },
-            full_size="probe_kit.models.internvla:full_size_internvla",
+            full_size="probe_kit.hooks.families.internvla.network:full_size_internvla",
             parameters={"": 3_872_703_111},
             hub=(
                 ("InternRobotics/InternVLA-M1-Pretrain-RT-1-Bridge", "config.yaml"),

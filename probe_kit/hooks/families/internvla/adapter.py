@@ -29,14 +29,7 @@ from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import Site, Stream
 from probe_kit.hooks.families.internvla import INTERVENTIONS, ActionUnits
 from probe_kit.hooks.families.internvla.checkpoint import Parts, find_parts
-from probe_kit.hooks.families.shared.action_statistics import DIMENSIONS, open_or_closed
-from probe_kit.hooks.families.shared.loading import Loaded, load_network
-from probe_kit.hooks.families.shared.qwen import BACKBONE_ROLES, QwenVLA, recorded_inputs
-from probe_kit.hooks.families.shared.taps import decoder_tap
-from probe_kit.hooks.families.shared.token_decoder import seeded_noise
-from probe_kit.hooks.outputs import Arrays, Outputs, Produce, numpy_of, stream_outputs, watch
-from probe_kit.models.checkpoint_files import STATISTICS_FILE, rename_tensor
-from probe_kit.models.internvla import (
+from probe_kit.hooks.families.internvla.network import (
     VLM_PREFIX,
     InternVLANetwork,
     Schedule,
@@ -46,7 +39,14 @@ from probe_kit.models.internvla import (
     prompt,
     uses_guidance,
 )
-from probe_kit.models.qwen import QWEN2_5_NAMES, QwenInputs
+from probe_kit.hooks.families.shared.action_statistics import DIMENSIONS, open_or_closed
+from probe_kit.hooks.families.shared.loading import Loaded, load_network
+from probe_kit.hooks.families.shared.qwen.adapter import BACKBONE_ROLES, QwenVLA, recorded_inputs
+from probe_kit.hooks.families.shared.qwen.network import QWEN2_5_NAMES, QwenInputs
+from probe_kit.hooks.families.shared.taps import decoder_tap
+from probe_kit.hooks.families.shared.token_decoder import seeded_noise
+from probe_kit.hooks.outputs import Arrays, Outputs, Produce, numpy_of, stream_outputs, watch
+from probe_kit.models.checkpoint_files import STATISTICS_FILE, rename_tensor
 
 DEFAULT_CHECKPOINT = "InternRobotics/InternVLA-M1-Pretrain-RT-1-Bridge"
 STEPS, GUIDANCE = 10, 1.5

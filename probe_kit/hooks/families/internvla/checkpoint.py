@@ -26,8 +26,8 @@ from probe_kit.hooks.checkpoints.weights import (
     read_weights,
     with_adapter,
 )
+from probe_kit.hooks.families.internvla.network import DIMS_FILE, RUN_FILE, InternVLAConfig, find_config
 from probe_kit.models.checkpoint_files import STATISTICS_FILE, stored_statistics
-from probe_kit.models.internvla import DIMS_FILE, RUN_FILE, InternVLAConfig, find_config
 
 WEIGHTS_FOLDER = "checkpoints"
 RELEASED_STEP = "steps_50000_pytorch_model.pt"

@@ -63,7 +63,7 @@ FAMILIES = (
         checkpoints=Checkpoints(
             of_default={"unnorm_key": "bridge_orig"},
             declared={"": (backbone(33, 4096, 320, "separator"), chosen_tokens("action", 33, 4096, 7))},
-            full_size="probe_kit.models.magma:full_size_magma",
+            full_size="probe_kit.hooks.families.magma.network:full_size_magma",
             parameters={"": 8_903_549_824},
             unstored=(
                 "vision_tower.clip_vision_model.head.",

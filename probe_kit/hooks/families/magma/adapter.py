@@ -34,8 +34,20 @@ from probe_kit.hooks.families.magma.checkpoint import (
     magma_key,
     magma_statistics,
 )
-from probe_kit.hooks.families.openvla.adapter import ActionTokens
+from probe_kit.hooks.families.magma.network import (
+    ACTION_QUESTION,
+    Grid,
+    MagmaConfig,
+    MagmaNetwork,
+    MagmaPicture,
+    PictureSettings,
+    PictureSpan,
+    choose_grid,
+    prepare_picture,
+    shrink_picture,
+)
 from probe_kit.hooks.families.shared.action_statistics import GRIPPER_OPEN, ActionStatistics, open_or_closed
+from probe_kit.hooks.families.shared.action_tokens import ActionTokens
 from probe_kit.hooks.families.shared.kinds import MAPS
 from probe_kit.hooks.families.shared.loading import Loaded
 from probe_kit.hooks.families.shared.taps import kept_prompt
@@ -53,18 +65,6 @@ from probe_kit.hooks.outputs import (
     watch,
 )
 from probe_kit.models.decoding import Choose, Decoded, greedy
-from probe_kit.models.magma import (
-    ACTION_QUESTION,
-    Grid,
-    MagmaConfig,
-    MagmaNetwork,
-    MagmaPicture,
-    PictureSettings,
-    PictureSpan,
-    choose_grid,
-    prepare_picture,
-    shrink_picture,
-)
 
 DEFAULT_CHECKPOINT = "microsoft/Magma-8B"
 SEPARATOR = "separator"

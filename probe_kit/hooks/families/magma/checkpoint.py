@@ -15,6 +15,16 @@ from probe_kit.errors import CheckpointError, UsageError, WeightsError
 from probe_kit.hooks.checkpoints.checkpoint import GENERATION_FILE, chosen_dtype
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.checkpoints.weights import Weights, read_weights
+from probe_kit.hooks.families.magma.network import (
+    UNUSED_WEIGHTS,
+    MagmaConfig,
+    MagmaNetwork,
+    build_magma,
+    chat_text,
+    conversation,
+    picture_question,
+    shipped_statistics,
+)
 from probe_kit.hooks.families.shared.loading import DTYPES, Loaded, load_network
 from probe_kit.hooks.families.shared.text import (
     TokenizerFile,
@@ -26,16 +36,6 @@ from probe_kit.hooks.families.shared.text import (
 )
 from probe_kit.models.building import initialise
 from probe_kit.models.checkpoint_files import STATISTICS_FILE, chosen_name, read_statistics, stored_statistics
-from probe_kit.models.magma import (
-    UNUSED_WEIGHTS,
-    MagmaConfig,
-    MagmaNetwork,
-    build_magma,
-    chat_text,
-    conversation,
-    picture_question,
-    shipped_statistics,
-)
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
 """OpenVLA, native."""
 
 from probe_kit.hooks.contract.declared import ACT2ANSWER, OWN_SEEDS, Option, ProtocolRow, backbone, chosen_tokens
-from probe_kit.hooks.families.prismatic import BITS, TOKENIZER
-from probe_kit.hooks.families.shared.kinds import TOKENS
+from probe_kit.hooks.families.prismatic import BITS
+from probe_kit.hooks.families.shared.kinds import TOKENIZER_FOLDER, TOKENS
 from probe_kit.hooks.family import Family
 from probe_kit.hooks.family_parts import Abilities, Checkpoints, Requirements
 
@@ -41,7 +41,7 @@ FAMILIES = (
                 "the checkpoint's generation's",
             ),
             Option("centre_crop", bool, "Show 0.9 of the area: fine-tunes with augmentation.", "false"),
-            TOKENIZER,
+            TOKENIZER_FOLDER,
             BITS,
             Option("temperature", float, "0: the likeliest; above: drawn among tokens of actions.", "0"),
             Option(
@@ -79,7 +79,7 @@ FAMILIES = (
             source="prismatic",
             of_default={"unnorm_key": BRIDGE},
             declared={"": (backbone(33, 4096, 275), chosen_tokens("action", 33, 4096, 7))},
-            full_size="probe_kit.models.prismatic:full_size_openvla",
+            full_size="probe_kit.hooks.families.prismatic.network:full_size_openvla",
             parameters={"": 7_541_237_184},
         ),
     ),

@@ -5,7 +5,7 @@ greedy tokens follow, one per dimension; iteration k of the stream `action` is t
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
@@ -20,49 +20,28 @@ from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES
 from probe_kit.hooks.contract.card import ARM
 from probe_kit.hooks.contract.model import Policy
 from probe_kit.hooks.contract.observation import Observation, checked_picture
-from probe_kit.hooks.families.prismatic.adapter import PrismaticModel, find_tokenizer
+from probe_kit.hooks.families.prismatic.adapter import PrismaticModel
 from probe_kit.hooks.families.prismatic.checkpoint import (
     checkpoint_folders,
     load_checkpoint,
     prismatic_statistics,
 )
+from probe_kit.hooks.families.prismatic.network import (
+    CROP_AREA,
+    PrismaticConfig,
+    PrismaticNetwork,
+    centre_crop,
+    prepare_tensor,
+)
 from probe_kit.hooks.families.prismatic.outputs import INPUTS, Reference
 from probe_kit.hooks.families.shared.action_statistics import DIMENSIONS, ActionStatistics, open_or_closed
+from probe_kit.hooks.families.shared.action_tokens import ActionTokens
 from probe_kit.hooks.families.shared.kinds import TOKENS
 from probe_kit.hooks.families.shared.loading import Loaded
 from probe_kit.hooks.families.shared.taps import kept_prompt
-from probe_kit.hooks.families.shared.text import SLOT, template_of
+from probe_kit.hooks.families.shared.text import SLOT, find_tokenizer, template_of
 from probe_kit.hooks.families.shared.token_decoder import ALL, chooser, top_of, warn_of_unknown
 from probe_kit.hooks.outputs import Arrays, Outputs, Produce
-from probe_kit.models.prismatic import CROP_AREA, PrismaticConfig, PrismaticNetwork, centre_crop, prepare_tensor
-
-
-@dataclass(frozen=True)
-class ActionTokens:
-    """The last `bins` text ids, from the highest down, which name bins of [-1, 1].
-
-    Attributes:
-        vocabulary: Number of text ids, without the padding of the embedding.
-        bins: Number of these ids, and of the edges between which the bins lie.
-    """
-
-    vocabulary: int
-    bins: int
-
-    @property
-    def centres(self) -> NDArray[np.float64]:
-        """The middles of the bins, (bins - 1,): `bins` edges have one interval fewer between them."""
-        edges = np.linspace(-1, 1, self.bins)
-        return np.asarray((edges[:-1] + edges[1:]) / 2)
-
-    def values(self, ids: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return normalised values of ids of any shape; an id outside the range counts as the nearest bin."""
-        return np.asarray(self.centres[np.clip(self.vocabulary - 1 - ids, 0, self.bins - 2)])
-
-    def is_action(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return per id True where it names a bin."""
-        return np.asarray((ids >= self.vocabulary - self.bins) & (ids < self.vocabulary))
-
 
 DEFAULT_CHECKPOINT = "openvla/openvla-7b"
 PROMPTS = {

@@ -15,7 +15,7 @@ FAMILIES = (
         checkpoints=Checkpoints(
             config_types=("ovis2_5",),
             declared={"": answering(37, 4096, 240)},
-            full_size="probe_kit.models.ovis2_5:full_size_ovis2_5",
+            full_size="probe_kit.hooks.families.ovis2_5.network:full_size_ovis2_5",
             parameters={"": 9_174_807_784},
         ),
     ),

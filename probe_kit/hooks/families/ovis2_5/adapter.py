@@ -10,13 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from probe_kit.hooks.contract.model import Prompt
-from probe_kit.hooks.families.shared.loading import Recipe
-from probe_kit.hooks.families.shared.qwen import ASSISTANT, USER, ByPicture
-from probe_kit.hooks.families.shared.taps import NOTHING, TOWER, Stack
-from probe_kit.hooks.families.shared.text import QuestionFrame
-from probe_kit.hooks.families.shared.vlm import Pictures, VisionLanguageModel
-from probe_kit.hooks.outputs import Produce, numpy_of
-from probe_kit.models.ovis2_5 import (
+from probe_kit.hooks.families.ovis2_5.network import (
     PICTURE,
     PICTURE_BEGINS,
     PICTURE_ENDS,
@@ -24,6 +18,12 @@ from probe_kit.models.ovis2_5 import (
     OvisPictures,
     build_ovis2_5,
 )
+from probe_kit.hooks.families.shared.loading import Recipe
+from probe_kit.hooks.families.shared.qwen.adapter import ASSISTANT, USER, ByPicture
+from probe_kit.hooks.families.shared.taps import NOTHING, TOWER, Stack
+from probe_kit.hooks.families.shared.text import QuestionFrame
+from probe_kit.hooks.families.shared.vlm import Pictures, VisionLanguageModel
+from probe_kit.hooks.outputs import Produce, numpy_of
 
 
 class Ovis25(ByPicture, VisionLanguageModel):

@@ -26,9 +26,9 @@ FAMILIES = (
         checkpoints=Checkpoints(
             config_types=("paligemma",),
             declared={"": answering(19, 2048, 290)},
-            full_size="probe_kit.models.paligemma:full_size_paligemma",
+            full_size="probe_kit.hooks.families.paligemma.network:full_size_paligemma",
             parameters={"": 2_923_466_480},
-            stored_names="probe_kit.models.paligemma:FILE_NAMES",
+            stored_names="probe_kit.hooks.families.paligemma.network:FILE_NAMES",
         ),
     ),
 )

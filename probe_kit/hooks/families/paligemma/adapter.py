@@ -9,13 +9,13 @@ from torch import Tensor
 from transformers import PaliGemmaConfig
 
 from probe_kit.hooks.contract.card import EMBEDDED
+from probe_kit.hooks.families.paligemma.network import FILE_NAMES, SquarePictures, build_paligemma
 from probe_kit.hooks.families.shared.loading import Recipe
 from probe_kit.hooks.families.shared.taps import TOWER, Stack
 from probe_kit.hooks.families.shared.text import QuestionFrame
 from probe_kit.hooks.families.shared.vlm import Pictures, VisionLanguageModel
 from probe_kit.models.decoding import LeftPacked
 from probe_kit.models.embedded import embedded_checkpoint
-from probe_kit.models.paligemma import FILE_NAMES, SquarePictures, build_paligemma
 
 _FIRST_POSITION = 1
 

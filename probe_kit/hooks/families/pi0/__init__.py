@@ -85,7 +85,7 @@ FAMILIES = (
             )
         },
         checkpoints=Checkpoints(
-            full_size="probe_kit.models.pi0:full_size_pi0",
+            full_size="probe_kit.hooks.families.pi0.network:full_size_pi0",
             hub=(("google/paligemma-3b-pt-224", "tokenizer.json"),),
             source="paligemma",
             source_weights=SourceWeights("google/paligemma-3b-pt-224", parameters=2_923_466_480),
@@ -114,7 +114,7 @@ FAMILIES = (
         options=EVALUATION_OPTIONS,
         checkpoints=Checkpoints(
             config_types=("pi05",),
-            full_size="probe_kit.models.pi0:full_size_pi05",
+            full_size="probe_kit.hooks.families.pi0.network:full_size_pi05",
             hub=(("google/paligemma-3b-pt-224", "tokenizer.json"),),
             source="paligemma",
             source_weights=SourceWeights("google/paligemma-3b-pt-224", parameters=2_923_466_480),

@@ -27,6 +27,13 @@ from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE, without_revision
 from probe_kit.hooks.contract.card import EMBEDDED
 from probe_kit.hooks.contract.model import Unembedding
 from probe_kit.hooks.contract.observation import ARM_NUMBERS, laid_out
+from probe_kit.hooks.families.pi0.network import (
+    Pi0Size,
+    build_pi0,
+    build_pi05,
+    current_pi0_keys,
+    current_pi05_keys,
+)
 from probe_kit.hooks.families.shared.kinds import STATE, PictureFit
 from probe_kit.hooks.families.shared.lerobot.flow import (
     GatelessNorm,
@@ -48,7 +55,6 @@ from probe_kit.hooks.families.shared.lerobot.policy import LerobotPolicy
 from probe_kit.hooks.families.shared.lerobot.window import PictureWindow, padded_top_left, squash
 from probe_kit.hooks.families.shared.taps import Note, Stack, flow_stacks, recording_weights, returned_weights
 from probe_kit.models.embedded import embedded_checkpoint
-from probe_kit.models.pi0 import Pi0Size, build_pi0, build_pi05, current_pi0_keys, current_pi05_keys
 
 _MARKS = ("resize_imgs_with_padding", "num_steps", "proj_width", "train_state_proj", "attention_implementation")
 """Fields that only old files have."""

@@ -45,6 +45,13 @@ from probe_kit.hooks.families.pi0_fast import CAPTURED, FAST
 from probe_kit.hooks.families.shared.kinds import Evaluation
 from probe_kit.hooks.families.shared.lerobot.flow import GatelessNorm, PaliGemmaPolicy, StatePrompt, sizes_file
 from probe_kit.hooks.families.shared.lerobot.packing import MASK, TOKENS
+from probe_kit.hooks.families.shared.lerobot.paligemma import (
+    EMBEDDING,
+    LM_HEAD,
+    PaliGemmaSize,
+    build_resized,
+    current_keys,
+)
 from probe_kit.hooks.families.shared.lerobot.pipelines import CROP
 from probe_kit.hooks.families.shared.taps import (
     ALL_BUT_LAST,
@@ -60,7 +67,6 @@ from probe_kit.hooks.families.shared.token_decoder import chooser
 from probe_kit.hooks.outputs import Arrays, Produce, RecordedRun, numpy_of
 from probe_kit.models.building import replace_attributes
 from probe_kit.models.decoding import PromptKV
-from probe_kit.models.pi0 import EMBEDDING, LM_HEAD, PaliGemmaSize, build_resized, current_keys
 
 FILES = ("tokenizer.json", "processor_config.json")
 _BROKEN = "\ufffd"

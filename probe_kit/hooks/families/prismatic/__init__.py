@@ -2,16 +2,9 @@
 
 from probe_kit.hooks.checkpoints.checkpoint import PATTERNS, RUN_WEIGHTS
 from probe_kit.hooks.contract.declared import Option, answering
-from probe_kit.hooks.families.shared.kinds import answering_family
+from probe_kit.hooks.families.shared.kinds import TOKENIZER_FOLDER, answering_family
 from probe_kit.hooks.family_parts import Abilities, Checkpoints, Requirements
 
-TOKENIZER = Option(
-    "tokenizer",
-    str,
-    "Folder of another tokenizer.",
-    "the checkpoint's",
-    is_path=True,
-)
 BITS = Option("bits", int, "Quantised, not exact (extra quantized, GPU).", "none", choices=(4, 8))
 
 FAMILIES = (
@@ -24,7 +17,7 @@ FAMILIES = (
             "MIT, Llama 2 licence; extra openvla; one .pt file, towers of timm, tokenizer of openvla/openvla-7b; "
             "also folders in the layout of PrismaticForConditionalGeneration"
         ),
-        options=(TOKENIZER, BITS, Option("steps", int, "Greedy tokens per inference.", "1")),
+        options=(TOKENIZER_FOLDER, BITS, Option("steps", int, "Greedy tokens per inference.", "1")),
         requirements=Requirements(packages=(("timm", "openvla"),)),
         abilities=Abilities(outputs="probe_kit.hooks.families.prismatic.outputs:prismatic_outputs"),
         checkpoints=Checkpoints(
@@ -36,7 +29,7 @@ FAMILIES = (
                 ("openvla/openvla-7b", "tokenizer.json"),
             ),
             declared={"": answering(33, 4096, 290)},
-            full_size="probe_kit.models.prismatic:full_size_prismatic",
+            full_size="probe_kit.hooks.families.prismatic.network:full_size_prismatic",
             parameters={"": 7_541_237_184},
         ),
     ),

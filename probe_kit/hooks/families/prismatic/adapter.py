@@ -26,19 +26,19 @@ from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import IMAGE_ROLE, Site, Stream
 from probe_kit.hooks.families.prismatic.checkpoint import load_checkpoint
+from probe_kit.hooks.families.prismatic.network import PictureSettings, PrismaticNetwork, prepare_picture
 from probe_kit.hooks.families.shared.loading import Loaded
 from probe_kit.hooks.families.shared.text import (
     SETTINGS_FILE,
     TOKENIZER_FILE,
-    TokenizerFile,
+    FileTokenizer,
+    find_tokenizer,
     first_behind,
-    positions_of,
     token_ids_of,
 )
 from probe_kit.hooks.families.shared.token_decoder import TokenDecoder
 from probe_kit.hooks.families.shared.vlm import Prefill, SpeakingModel
 from probe_kit.models.decoding import Choose, Decoded, Packed, greedy
-from probe_kit.models.prismatic import PictureSettings, PrismaticNetwork, prepare_picture
 
 VICUNA_SYSTEM = (
     "A chat between a curious user and an artificial intelligence assistant. "
@@ -95,66 +95,6 @@ def id_behind(tokenizer: "FileTokenizer", prompt: str, answer: str) -> int:
         UsageError: If it changes the prompt's own ids.
     """
     return first_behind(tokenizer.encode(prompt), tokenizer.encode(prompt + answer), answer)
-
-
-@dataclass(frozen=True)
-class FileTokenizer(TokenizerFile):
-    """A tokenizer that begins every text.
-
-    Attributes:
-        beginning: The id of the model's configuration that begins a text; None where it has none.
-    """
-
-    beginning: int | None
-
-    @cached_property
-    def _beginning(self) -> int | None:
-        """The beginning-of-sequence id, from the tokenizer's own files before the model's configuration."""
-        content = self.token_of("bos_token")
-        number: int | None = self.tokenizer.token_to_id(content) if content else None
-        return self.beginning if number is None else number
-
-    @cached_property
-    def special(self) -> frozenset[int]:
-        """The ids that the file declares special, and the one that begins a text."""
-        return super().special | {self._beginning or 0}
-
-    def encode(self, text: str) -> list[int]:
-        """Return ids, the beginning-of-sequence token first, also where the file does not add it."""
-        ids: list[int] = self.encoding(text, special=True).ids
-        begins = self._beginning is None or ids[:1] == [self._beginning]
-        return ids if begins else [self._beginning, *ids]  # type: ignore[list-item]
-
-    def inside(self, text: str, start: int, stop: int) -> list[bool]:
-        """Return per id whether it holds any of these characters, by the offsets that the tokenizer gives."""
-        flags = positions_of(self.encoding(text, special=True), start, stop)
-        return [False] * (len(self.encode(text)) - len(flags)) + list(flags)
-
-    def decode(self, ids: Sequence[int]) -> str:
-        """The text of ids, without special tokens."""
-        return self.words(ids)
-
-
-def find_tokenizer(folders: Sequence[Path], tokenizer: str | None, beginning: int | None) -> FileTokenizer:
-    """The checkpoint's tokenizer, or the one in the folder `tokenizer`.
-
-    Args:
-        folders: The folders that may hold the checkpoint's, the first one before the others.
-        tokenizer: Folder of another tokenizer; None for the checkpoint's.
-        beginning: The id of the model's configuration that begins a text.
-
-    Raises:
-        CheckpointError: For missing files, which it names.
-    """
-    places = list(folders) if tokenizer is None else [Path(tokenizer).expanduser()]
-    for folder in places:
-        if (folder / TOKENIZER_FILE).is_file():
-            return FileTokenizer(folder, beginning)
-    raise CheckpointError(
-        f"{TOKENIZER_FILE} and {SETTINGS_FILE} are missing in {' and '.join(map(str, places))}. The tokenizer "
-        "comes with the checkpoint: copy these files from the model's page, or from the model it was fine-tuned "
-        "from, or name their folder with -M tokenizer=DIR"
-    )
 
 
 # -- the adapter ----------------------------------------------------------------------------------------------

@@ -25,9 +25,14 @@ from probe_kit.hooks.checkpoints.weights import (
     unpickle_weights,
     with_adapter,
 )
+from probe_kit.hooks.families.prismatic.network import (
+    PrismaticConfig,
+    PrismaticNetwork,
+    TowerConfig,
+    build_prismatic,
+)
 from probe_kit.hooks.families.shared.loading import DTYPES, Loaded, load_network
 from probe_kit.models.checkpoint_files import stored_statistics
-from probe_kit.models.prismatic import PrismaticConfig, PrismaticNetwork, TowerConfig, build_prismatic
 
 
 def check_quantisation(bits: int, device: str) -> None:

@@ -19,6 +19,7 @@ from probe_kit.hooks.contract.model import Prompt
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.hooks.families.prismatic.adapter import Prismatic, PrismaticModel
+from probe_kit.hooks.families.prismatic.network import prepare_picture
 from probe_kit.hooks.families.shared.vlm import LETTERS, Prefill, answer_outputs, padded_answers, recorded_texts
 from probe_kit.hooks.outputs import (
     Arrays,
@@ -30,7 +31,6 @@ from probe_kit.hooks.outputs import (
     pass_outputs,
     watch,
 )
-from probe_kit.models.prismatic import prepare_picture
 
 STREAMS = 3e-5
 """The absolute tolerance of activations."""

@@ -19,9 +19,9 @@ FAMILIES = (
                 "32B": answering(65, 5120, 110),
                 "3B": answering(37, 2048, 110),
             },
-            full_size="probe_kit.models.qwen:full_size_qwen2_5_vl",
+            full_size="probe_kit.hooks.families.shared.qwen.network:full_size_qwen2_5_vl",
             parameters={"7B": 8_292_166_656, "32B": 33_452_718_336, "3B": 3_754_622_976},
-            stored_names="probe_kit.models.qwen:QWEN2_5_NAMES",
+            stored_names="probe_kit.hooks.families.shared.qwen.network:QWEN2_5_NAMES",
             sizes=(
                 ("7B", "Qwen/Qwen2.5-VL-7B-Instruct"),
                 ("32B", "Qwen/Qwen2.5-VL-32B-Instruct"),
@@ -43,7 +43,7 @@ FAMILIES = (
                 "32B": answering(65, 5120, 110, sums=False),
                 "4B": answering(37, 2560, 110, sums=False),
             },
-            full_size="probe_kit.models.qwen:full_size_qwen3_vl",
+            full_size="probe_kit.hooks.families.shared.qwen.network:full_size_qwen3_vl",
             parameters={"8B": 8_767_123_696, "32B": 33_357_390_064, "4B": 4_437_815_808},
             sizes=(
                 ("8B", "Qwen/Qwen3-VL-8B-Instruct"),

@@ -5,9 +5,9 @@ from typing import ClassVar
 from transformers import Qwen2_5_VLConfig, Qwen3VLConfig
 
 from probe_kit.hooks.families.shared.loading import Recipe
-from probe_kit.hooks.families.shared.qwen import SYSTEM, QwenVLM, qwen_frame
+from probe_kit.hooks.families.shared.qwen.adapter import SYSTEM, QwenVLM, qwen_frame
+from probe_kit.hooks.families.shared.qwen.network import QWEN2_5_NAMES, build_qwen2_5_vl, build_qwen3_vl
 from probe_kit.hooks.families.shared.text import QuestionFrame
-from probe_kit.models.qwen import QWEN2_5_NAMES, build_qwen2_5_vl, build_qwen3_vl
 
 
 class Qwen25VL(QwenVLM):

@@ -28,11 +28,11 @@ from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES, is_on_hub
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.contract.sites import PADDING
 from probe_kit.hooks.families.shared.lerobot.flow import LerobotFlow
+from probe_kit.hooks.families.shared.lerobot.normaliser import STATISTICS
 from probe_kit.hooks.families.shared.lerobot.pipelines import CROP, tokenizer_folder, tokenizer_name
 from probe_kit.hooks.families.shared.taps import Note, Stack, flow_stacks, shares
 from probe_kit.models.building import building_device, replace_attributes
 from probe_kit.models.checkpoint_files import load_pretrained
-from probe_kit.models.pi0 import STATISTICS
 
 
 def build_smolvla(config: SmolVLAConfig, folder: Path, device: str = "cpu") -> SmolVLAPolicy:

@@ -1,8 +1,7 @@
 """SpatialVLA, native."""
 
 from probe_kit.hooks.contract.declared import ACT2ANSWER, Option, ProtocolRow, backbone, chosen_tokens
-from probe_kit.hooks.families.prismatic import TOKENIZER
-from probe_kit.hooks.families.shared.kinds import TOKENS
+from probe_kit.hooks.families.shared.kinds import TOKENIZER_FOLDER, TOKENS
 from probe_kit.hooks.family import Family
 from probe_kit.hooks.family_parts import Abilities, Checkpoints
 
@@ -24,7 +23,7 @@ FAMILIES = (
             ),
             Option("constrained", bool, "Decode every token within its slot; not the original's way.", "false"),
             Option("ensemble", bool, "Average the plans of overlapping chunks, the newest most.", "false"),
-            TOKENIZER,
+            TOKENIZER_FOLDER,
         ),
         protocols={
             ACT2ANSWER: ProtocolRow(
@@ -46,7 +45,7 @@ FAMILIES = (
         checkpoints=Checkpoints(
             of_default={"unnorm_key": "bridge_orig/1.0.0"},
             declared={"": (backbone(27, 2304, 269), chosen_tokens("action", 27, 2304, 3))},
-            full_size="probe_kit.models.spatialvla:full_size_spatialvla",
+            full_size="probe_kit.hooks.families.spatialvla.network:full_size_spatialvla",
             parameters={"": 4_027_854_731},
         ),
     ),

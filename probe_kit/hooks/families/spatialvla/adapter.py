@@ -29,16 +29,14 @@ from probe_kit.hooks.contract.model import Policy, Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import IMAGE_ROLE, Site, Stream
-from probe_kit.hooks.families.prismatic.adapter import FileTokenizer, find_tokenizer
 from probe_kit.hooks.families.shared.action_statistics import ActionStatistics, open_or_closed
 from probe_kit.hooks.families.shared.kinds import TOKENS
 from probe_kit.hooks.families.shared.loading import DTYPES, Loaded, load_network
 from probe_kit.hooks.families.shared.taps import Note, decoder_attention, decoder_tap, kept_prompt
-from probe_kit.hooks.families.shared.text import SLOT, template_of
+from probe_kit.hooks.families.shared.text import SLOT, FileTokenizer, find_tokenizer, template_of
 from probe_kit.hooks.families.shared.token_decoder import TokenDecoder, warn_of_unknown
-from probe_kit.models.checkpoint_files import SIGLIP_TOWER, rename_tensor, stored_statistics
-from probe_kit.models.decoding import Decoded, Packed
-from probe_kit.models.spatialvla import (
+from probe_kit.hooks.families.spatialvla.actions import STEP_TOKENS, ActionBins
+from probe_kit.hooks.families.spatialvla.network import (
     Intrinsics,
     PictureSettings,
     SpatialVLAConfig,
@@ -48,7 +46,8 @@ from probe_kit.models.spatialvla import (
     known_cameras,
     prepare_picture,
 )
-from probe_kit.models.spatialvla_actions import STEP_TOKENS, ActionBins
+from probe_kit.models.checkpoint_files import SIGLIP_TOWER, rename_tensor, stored_statistics
+from probe_kit.models.decoding import Decoded, Packed
 
 PROCESSOR_FILE = "processor_config.json"
 

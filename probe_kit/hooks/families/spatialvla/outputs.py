@@ -16,6 +16,7 @@ from torch import Tensor
 
 from probe_kit.hooks.capturing.capture_context import ActivationCache
 from probe_kit.hooks.contract.observation import Observation
+from probe_kit.hooks.families.spatialvla.actions import STEP_TOKENS
 from probe_kit.hooks.families.spatialvla.adapter import (
     SCENE,
     LoadedSpatialVLA,
@@ -23,6 +24,13 @@ from probe_kit.hooks.families.spatialvla.adapter import (
     Speech,
     choose_statistics,
     load_checkpoint,
+)
+from probe_kit.hooks.families.spatialvla.network import (
+    Sight,
+    depth_input,
+    known_cameras,
+    point_places,
+    prepare_picture,
 )
 from probe_kit.hooks.outputs import (
     Arrays,
@@ -34,8 +42,6 @@ from probe_kit.hooks.outputs import (
     stack_layers,
     watch,
 )
-from probe_kit.models.spatialvla import Sight, depth_input, known_cameras, point_places, prepare_picture
-from probe_kit.models.spatialvla_actions import STEP_TOKENS
 
 TOLERANCE = 5e-5
 _INPUTS = (

@@ -62,7 +62,7 @@ FAMILIES = (
                     expert(17, 1024, 5, 32, ("special", "state", "action"), quantities=_EXPERT, sums=False),
                 )
             },
-            full_size="probe_kit.models.xiaomi:full_size_xiaomi",
+            full_size="probe_kit.hooks.families.xiaomi.network:full_size_xiaomi",
             parameters={"": 4_716_274_176},
         ),
     ),

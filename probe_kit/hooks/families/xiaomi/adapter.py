@@ -31,13 +31,12 @@ from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import Site, Stream
 from probe_kit.hooks.families.shared.action_statistics import DIMENSIONS, open_or_closed
 from probe_kit.hooks.families.shared.loading import DTYPES, Loaded, load_network
-from probe_kit.hooks.families.shared.qwen import BACKBONE_ROLES, QwenVLA, recorded_inputs
+from probe_kit.hooks.families.shared.qwen.adapter import BACKBONE_ROLES, QwenVLA, recorded_inputs
+from probe_kit.hooks.families.shared.qwen.network import QwenInputs
 from probe_kit.hooks.families.shared.taps import Note, decoder_tap, kv_tap, recording_weights
 from probe_kit.hooks.families.shared.token_decoder import seeded_noise
 from probe_kit.hooks.families.xiaomi import INTERVENTIONS
-from probe_kit.hooks.outputs import Arrays, Outputs, Produce, euler_path, numpy_of, stream_outputs, watch
-from probe_kit.models.qwen import QwenInputs
-from probe_kit.models.xiaomi import (
+from probe_kit.hooks.families.xiaomi.network import (
     DEFAULT_ROBOT,
     STATISTICS_FILE,
     STEPS,
@@ -51,6 +50,7 @@ from probe_kit.models.xiaomi import (
     read_units,
     robot_of,
 )
+from probe_kit.hooks.outputs import Arrays, Outputs, Produce, euler_path, numpy_of, stream_outputs, watch
 
 DEFAULT_CHECKPOINT = "XiaomiRobotics/Xiaomi-Robotics-0-SimplerEnv-WidowX"
 _PARTS = {"attention": "attn_gate", "heads": "attn.o_proj", "middle": "middle_layernorm", "mlp": "mlp_gate"}

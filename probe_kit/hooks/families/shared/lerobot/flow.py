@@ -22,6 +22,7 @@ from probe_kit.hooks.contract.observation import ARM_NUMBERS, Observation
 from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import PADDING, Site, kv_stream
 from probe_kit.hooks.families.shared.kinds import FLOW, IMAGES
+from probe_kit.hooks.families.shared.lerobot.paligemma import EMBEDDING, LM_HEAD
 from probe_kit.hooks.families.shared.lerobot.pipelines import tokenizer_folder, tokenizer_name
 from probe_kit.hooks.families.shared.lerobot.policy import LerobotPolicy, checked_steps
 from probe_kit.hooks.families.shared.taps import attach_prompt_kv
@@ -29,7 +30,6 @@ from probe_kit.hooks.families.shared.text import token_texts
 from probe_kit.hooks.families.shared.token_decoder import seeded_noise
 from probe_kit.hooks.outputs import Arrays, Produce, RecordedRun, euler_path, numpy_of
 from probe_kit.models.checkpoint_files import load_pretrained
-from probe_kit.models.pi0 import EMBEDDING, LM_HEAD
 
 
 class DenoisingPolicy(LerobotPolicy):

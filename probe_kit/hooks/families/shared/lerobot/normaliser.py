@@ -25,7 +25,6 @@ from probe_kit.hooks.families.shared.lerobot.pipelines import (
     saved_steps,
 )
 from probe_kit.models.bounds import check_bounds, check_deviations
-from probe_kit.models.pi0 import STATISTICS
 
 _EPS = 1e-8
 """The number in denominators, where the checkpoint says no other: LeRobot's default."""
@@ -38,6 +37,9 @@ _NEEDED = {
     "QUANTILE10": ("q10", "q90"),
 }
 _NAMED = {**_NEEDED, "BOUNDS": ("q01", "q99")}
+
+# Prefixes of the statistics that old files kept among the weights; today they lie in the processor files.
+STATISTICS = ("normalize_inputs.", "normalize_targets.", "unnormalize_outputs.")
 
 Mask = NDArray[np.bool_] | bool
 
@@ -350,7 +352,7 @@ class StatisticsFile:
 
 
 def _shipped_file(name: str) -> bytes:
-    return (files("probe_kit.models") / f"{name}_statistics.json").read_bytes()
+    return (files(__package__) / f"{name}_statistics.json").read_bytes()
 
 
 def statistics_in(folder: Path) -> str | None:
