@@ -1,1 +1,4 @@
-"""Networks: pi0 and pi0.5 of lerobot at any size, and families without a maintained package. No capture logic."""
+"""What networks of all families are built of and read with, and the embedded models' words and checkpoints.
+
+The network of a family stands in the family's folder, `probe_kit/hooks/families/<family>/network.py`.
+"""

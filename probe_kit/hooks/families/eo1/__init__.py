@@ -1,4 +1,7 @@
-"""EO-1 through lerobot."""
+"""EO-1 through lerobot.
+
+Its page is `docs/pi0.md`; its golden reference is `tests/golden/eo1`.
+"""
 
 from probe_kit.hooks.contract.declared import Interventions, backbone, expert
 from probe_kit.hooks.contract.sites import QUANTITIES

@@ -1,4 +1,7 @@
-"""GR00T N1.7 through lerobot."""
+"""GR00T N1.7 through lerobot.
+
+Its page is `docs/pi0.md`; its golden reference is `tests/golden/groot`.
+"""
 
 from probe_kit.hooks.contract.declared import TEXT, DeclaredStream, Interventions, Option, backbone, expert
 from probe_kit.hooks.contract.sites import QUANTITIES, Stream

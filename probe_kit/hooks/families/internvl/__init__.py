@@ -1,4 +1,7 @@
-"""InternVL, on transformers' own network."""
+"""InternVL, on transformers' own network.
+
+Its page is `docs/answer-models.md`; its golden reference is `tests/golden/vlm/internvl`.
+"""
 
 from probe_kit.hooks.contract.declared import Option, answering
 from probe_kit.hooks.families.shared.kinds import TOKENIZER_FOLDER, answering_family

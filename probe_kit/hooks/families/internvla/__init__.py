@@ -1,4 +1,7 @@
-"""InternVLA-M1, native."""
+"""InternVLA-M1, native.
+
+Its page is `docs/qwen-vla.md`; its golden reference is `tests/golden/internvla_m1`.
+"""
 
 from typing import Any, ClassVar
 

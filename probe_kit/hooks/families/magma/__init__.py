@@ -1,4 +1,7 @@
-"""Magma, native."""
+"""Magma, native.
+
+Its page is `docs/token-policies.md`; its golden reference is `tests/golden/magma`.
+"""
 
 from probe_kit.hooks.contract.declared import ACT2ANSWER, OWN_SEEDS, Option, ProtocolRow, backbone, chosen_tokens
 from probe_kit.hooks.families.shared.kinds import MAPS

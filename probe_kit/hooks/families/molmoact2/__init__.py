@@ -1,4 +1,7 @@
-"""MolmoAct2 through lerobot."""
+"""MolmoAct2 through lerobot.
+
+Its page is `docs/pi0.md`; its golden reference is `tests/golden/molmoact2`.
+"""
 
 from dataclasses import replace
 

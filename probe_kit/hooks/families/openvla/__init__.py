@@ -1,4 +1,7 @@
-"""OpenVLA, native."""
+"""OpenVLA, native.
+
+Its page is `docs/token-policies.md`; its golden reference is `tests/golden/openvla`.
+"""
 
 from probe_kit.hooks.contract.declared import ACT2ANSWER, OWN_SEEDS, Option, ProtocolRow, backbone, chosen_tokens
 from probe_kit.hooks.families.prismatic import BITS

@@ -1,4 +1,7 @@
-"""Ovis2.5, native."""
+"""Ovis2.5, native.
+
+Its page is `docs/answer-models.md`; its golden reference is `tests/golden/vlm/ovis2_5`.
+"""
 
 from probe_kit.hooks.contract.declared import answering
 from probe_kit.hooks.families.shared.kinds import TOKENIZER_FOLDER, answering_family

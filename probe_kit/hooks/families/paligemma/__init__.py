@@ -1,4 +1,7 @@
-"""PaliGemma, on transformers' own network, and the embedded VLM of 0.61 million parameters."""
+"""PaliGemma, on transformers' own network, and the embedded VLM of 0.61 million parameters.
+
+Its page is `docs/answer-models.md`; its golden reference is `tests/golden/vlm/paligemma`.
+"""
 
 from probe_kit.hooks.contract.declared import EMBEDDED, answering
 from probe_kit.hooks.families.shared.kinds import TOKENIZER_FOLDER, answering_family

@@ -1,4 +1,7 @@
-"""pi0 and pi0.5 through lerobot, and the embedded policies, which are pi0 at 0.84 million parameters."""
+"""pi0 and pi0.5 through lerobot, and the embedded policies, which are pi0 at 0.84 million parameters.
+
+Its page is `docs/pi0.md`; its golden references are `tests/golden/pi0` and `tests/golden/pi05`.
+"""
 
 from probe_kit.hooks.contract.card import SourceWeights
 from probe_kit.hooks.contract.declared import (

@@ -1,4 +1,7 @@
-"""pi0-FAST through lerobot."""
+"""pi0-FAST through lerobot.
+
+Its page is `docs/pi0.md`; its golden reference is `tests/golden/pi0_fast`.
+"""
 
 from dataclasses import replace
 

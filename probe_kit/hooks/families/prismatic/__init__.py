@@ -1,4 +1,8 @@
-"""Prismatic vision-language models, native."""
+"""Prismatic vision-language models, native.
+
+Its page is `docs/answer-models.md`. Its golden references are
+`tests/golden/prismatic` and `tests/golden/vlm/prismatic`.
+"""
 
 from probe_kit.hooks.checkpoints.checkpoint import PATTERNS, RUN_WEIGHTS
 from probe_kit.hooks.contract.declared import Option, answering

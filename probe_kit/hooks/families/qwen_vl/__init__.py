@@ -1,4 +1,8 @@
-"""Qwen2.5-VL and Qwen3-VL, on transformers' own networks."""
+"""Qwen2.5-VL and Qwen3-VL, on transformers' own networks.
+
+Its page is `docs/answer-models.md`. Its golden references are
+`tests/golden/vlm/qwen2_5_vl` and `tests/golden/vlm/qwen3_vl`.
+"""
 
 from probe_kit.hooks.contract.declared import answering
 from probe_kit.hooks.families.shared.kinds import TOKENIZER_FOLDER, answering_family

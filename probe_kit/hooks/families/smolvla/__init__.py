@@ -1,4 +1,7 @@
-"""SmolVLA through lerobot."""
+"""SmolVLA through lerobot.
+
+Its page is `docs/pi0.md`; its golden reference is `tests/golden/smolvla`.
+"""
 
 from probe_kit.hooks.contract.declared import backbone, expert
 from probe_kit.hooks.families.shared.kinds import FLOW, NO_HEAD, lerobot_family

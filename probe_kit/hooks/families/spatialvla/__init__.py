@@ -1,4 +1,7 @@
-"""SpatialVLA, native."""
+"""SpatialVLA, native.
+
+Its page is `docs/token-policies.md`; its golden reference is `tests/golden/spatialvla`.
+"""
 
 from probe_kit.hooks.contract.declared import ACT2ANSWER, Option, ProtocolRow, backbone, chosen_tokens
 from probe_kit.hooks.families.shared.kinds import TOKENIZER_FOLDER, TOKENS

@@ -1,4 +1,7 @@
-"""Xiaomi-Robotics-R0, native."""
+"""Xiaomi-Robotics-R0, native.
+
+Its page is `docs/qwen-vla.md`; its golden reference is `tests/golden/xiaomi_r0`.
+"""
 
 from probe_kit.hooks.contract.card import SourceWeights
 from probe_kit.hooks.contract.declared import ACT2ANSWER, Interventions, Option, ProtocolRow, backbone, expert

@@ -1,4 +1,7 @@
-"""X-VLA through lerobot."""
+"""X-VLA through lerobot.
+
+Its page is `docs/pi0.md`; its golden reference is `tests/golden/xvla`.
+"""
 
 from probe_kit.hooks.contract.declared import TEXT, DeclaredStream, Interventions, Option, expert
 from probe_kit.hooks.contract.sites import Stream

@@ -1,0 +1,1 @@
+"""Models on Qwen's vision-language models: base adapters, and parts of the networks."""
