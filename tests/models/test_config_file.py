@@ -94,3 +94,12 @@ def test_padding_stands_before_the_last_token_so_that_no_other_token_moves() -> 
     packed = Packed.of([[1, 7, 8, 9, 10], [1, 7, 29]], padding=0)
     assert packed.ids.tolist() == [[1, 7, 8, 9, 10], [1, 7, 0, 0, 29]]
     assert packed.mask.tolist() == [[True] * 5, [True, True, False, False, True]]
+
+
+def test_a_configuration_that_names_no_model_type_is_an_error_of_its_class() -> None:
+    class Nameless(ConfigFile):
+        width: Count
+
+    assert Nameless.read({"width": 3}, "config.json").width == 3
+    with pytest.raises(TypeError, match=r"Nameless has no model_types; name those .* of its config\.json"):
+        Nameless.from_json({"model_type": "nameless", "width": 3})

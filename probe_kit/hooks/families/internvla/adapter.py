@@ -203,7 +203,6 @@ class InternVLA(QwenVLA):
 
     def infer(self, inputs: QwenInputs, views: Tensor, noise: Tensor) -> Tensor:
         """Return normalised actions (B, A, action numbers); one inference, as `capture` counts it."""
-        self._grid = inputs.grid
         with torch.inference_mode():
             condition = self.network.read(inputs, views)
             return self.network.denoise(condition, noise, self.schedule, self.guidance)

@@ -211,7 +211,6 @@ class Xiaomi(QwenVLA):
             used: Mask of the numbers that an action has, in the shape of `noise`.
             noise: (B, A, action numbers).
         """
-        self._grid = inputs.grid
         with torch.inference_mode():
             actions: Tensor = self.network(inputs, state, used, noise, self.steps)
         return actions

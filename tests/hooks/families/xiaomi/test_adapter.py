@@ -37,6 +37,15 @@ def test_only_the_last_blocks_memory_is_read(loaded: Xiaomi, observation: Observ
         assert (moved > 0) == (site.layer >= loaded.prompt_kv.layers - 1 - read), str(site)
 
 
+def test_the_vision_stream_has_a_row_per_picture_of_the_inputs(loaded: Xiaomi, observation: Observation) -> None:
+    """Qwen's tower runs over the patches of all pictures at once, whichever policy calls it."""
+    site = Site("vision", 1)
+    for count in (2, 3):
+        with capture(loaded, [site]) as activations:
+            loaded.act([observation] * count, range(count))
+        assert len(activations[site]) == count
+
+
 # -- captured sites ------------------------------------------------------------------------------------------
 
 

@@ -260,6 +260,7 @@ class QwenVLA(QwenVision, Policy):
         packed = pack_inputs(
             self.rows(observations), pixels, grid, self._image_token, 0 if padding is None else int(padding)
         )
+        self._grid = packed.grid
         return packed.to(self.device)
 
     @property
@@ -285,7 +286,8 @@ class QwenVLA(QwenVision, Policy):
 
 
 def recorded_inputs(policy: QwenVLA, recorded: Arrays) -> QwenInputs:
-    """Return the packed prompts of a golden reference."""
+    """Return the packed prompts of a golden reference, which the next inference of the policy is about."""
     names = ("in_input_ids", "in_attention_mask", "in_pixel_values", "in_image_grid_thw")
     ids, mask, pixels, grid = (torch.from_numpy(recorded[name]) for name in names)
+    policy._grid = grid
     return QwenInputs(ids, mask, pixels, grid, int(policy.vlm.config.image_token_id))
