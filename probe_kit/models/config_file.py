@@ -60,9 +60,7 @@ class ConfigFile(BaseModel):
             TypeError: For a class without `model_types`: it would refuse every file.
         """
         if not cls.model_types:
-            raise TypeError(
-                f"{cls.__name__} has no model_types; name those of its config.json"
-            )
+            raise TypeError(f"{cls.__name__} has no model_types; name those of its config.json")
         if (model_type := values.get("model_type")) not in cls.model_types:
             raise CheckpointError(
                 f"{source} holds a {model_type!r} model; expected {' or '.join(cls.model_types)} ({cls.network}). "
