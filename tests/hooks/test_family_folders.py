@@ -50,7 +50,7 @@ def test_what_one_family_alone_uses_stands_in_its_folder(graph: Graph) -> None:
 
 
 def test_a_network_of_one_family_in_a_common_folder_is_noticed() -> None:
-    magma, network = f"{FAMILIES}.magma.adapter", "probe_kit.models.magma"
+    magma, network = f"{FAMILIES}.magma.adapter", "probe_kit.models.trunk"
     assert only_users({magma: {network}, network: set()}) == {network: {"magma"}}
 
 
