@@ -1,7 +1,8 @@
 """Nested logistic probes of a site: C by the log-loss of the inner folds, for every column of labels at once.
 
 Three ways lead to the same optimum. Every fold is solved by itself; small problems of all folds are stacked; with
-many samples, training sets, permutations and C share the products with them.
+many samples, training sets, permutations and C share the products with them. C is chosen among optima of which
+only the losses are needed: rough ones do, as far as their errors are bounded and leave no doubt.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -280,11 +281,14 @@ ROUGH_FROM, ROUGH_AT_ONCE = 8, 800
 """Label columns from which on rough optima save more than they cost, and columns of all folds together, beyond
 which float32 arrays of some dozen samples leave a processor's cache."""
 
+ROUGH_MEMORY = IN_MEMORY // 4
+"""Bytes that the samples of all inner folds may take together, in float64. With more, products take the time."""
+
 
 def can_be_rough(samples: Samples, labels: NDArray[np.bool_]) -> bool:
     """Whether rough optima can choose C for most columns of (E, K) labels: of pooled samples, outside a device."""
     count, width = samples.features.shape
-    in_memory = 8 * INNER_FOLDS * count * (min(count, width) + width) <= IN_MEMORY
+    in_memory = 8 * INNER_FOLDS * count * (min(count, width) + width) <= ROUGH_MEMORY
     return samples.pools and isinstance(samples.means, np.ndarray) and labels.shape[1] >= ROUGH_FROM and in_memory
 
 
