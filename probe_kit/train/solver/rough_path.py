@@ -139,9 +139,9 @@ def decision_bounds(
     size = np.sqrt(np.vecdot(by_weight, by_weight) + of_intercept**2 / total)
     size += 1e-15 * strength * np.sqrt(np.square(samples).sum(axis=(1, 2)) * samples.shape[1])[:, None]
 
-    def norms(others: Matrix) -> Matrix:
-        """Return the norms (F, K, M) of samples (F, M, R) with the intercept's one."""
-        plain = others[..., :-1]
+    def norms(episodes: Matrix) -> Matrix:
+        """Return the norms (F, K, M) of episodes (F, M, R) with the intercept's one."""
+        plain = episodes[..., :-1]
         squares = np.vecdot(plain, plain)[:, None] - 2 * (mean @ plain.swapaxes(1, 2))
         squares += (np.vecdot(mean, mean) + 1 / total)[..., None]
         root: Matrix = np.sqrt(squares)
