@@ -1,7 +1,8 @@
 """Nested logistic probes of a site: C by the log-loss of the inner folds, for every column of labels at once.
 
 Three ways lead to the same optimum. Every fold is solved by itself; small problems of all folds are stacked; with
-many samples, training sets, permutations and C share the products with them.
+many samples, training sets, permutations and C share the products with them. C is chosen among optima of which
+only the losses are needed: rough ones do, as far as their errors are bounded and leave no doubt.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -14,23 +15,51 @@ from numpy.typing import NDArray
 
 from probe_kit._system.types import Matrix
 from probe_kit.errors import TooFewGroupsError
-from probe_kit.statistics.folds import Fold
+from probe_kit.statistics.folds import INNER_FOLDS, Fold
 from probe_kit.train.crossval.joint_objective import JointProblems, JointSite, solve
-from probe_kit.train.crossval.nested_folds import STRENGTHS, FittedFold, InnerQuality, NestedFold, select_c
+from probe_kit.train.crossval.nested_folds import (
+    STRENGTHS,
+    FittedFold,
+    InnerQuality,
+    NestedFold,
+    is_c_settled,
+    select_c,
+)
 from probe_kit.train.crossval.task_scores import log_loss, log_losses
 from probe_kit.train.samples import Samples
 from probe_kit.train.solver.arrays import Array, array_namespace, to_device_of, to_numpy
-from probe_kit.train.solver.design_matrix import IN_MEMORY, Projection, StackedDesign
+from probe_kit.train.solver.design_matrix import (
+    IN_MEMORY,
+    DenseDesign,
+    Projection,
+    StackedDesign,
+    StreamedDesign,
+    fold_samples,
+    stack_samples,
+)
 from probe_kit.train.solver.logistic import LogisticSolver, check_single_class
+from probe_kit.train.solver.rough_path import decision_bounds, rough_path
 
-# -- every fold by itself -----------------------------------------------------------------------------------------
+# -- the probes of a site -----------------------------------------------------------------------------------------
+
+Choice = tuple[Matrix, InnerQuality]
+"""The strengths (K,) of an outer fold's label columns, and the inner quality at them."""
 
 
-def cross_validate(samples: Samples, labels: NDArray[np.bool_], folds: list[NestedFold]) -> list[FittedFold]:
+def cross_validate(
+    samples: Samples, labels: NDArray[np.bool_], folds: list[NestedFold], *, all_qualities: bool = True
+) -> list[FittedFold]:
     """Return the probes of every outer fold, each column of (E, K) labels on its own.
 
     Problems that `can_be_joint` names, such as wide tokens with few columns, are solved for all training sets
     together where these have the same features. Small problems are also solved together.
+
+    Args:
+        samples: Samples of E episodes.
+        labels: (E, K) labels.
+        folds: Outer folds, each with inner folds.
+        all_qualities: Whether the inner quality is needed of all columns, and not of the first one alone. Without,
+            C may be chosen by rough optima where these settle the choice.
 
     Raises:
         ProbeNotConvergedError: If a probe stops before its optimum.
@@ -38,65 +67,83 @@ def cross_validate(samples: Samples, labels: NDArray[np.bool_], folds: list[Nest
     """
     if can_be_joint(samples, labels.shape[1]) and (site := JointSite.of(samples, folds)).alike:
         return cross_validate_jointly(site, samples, labels, folds)
+    if not all_qualities and can_be_rough(samples, labels):
+        choices = choose_roughly(samples, labels, folds)
+    elif is_small(samples, labels):
+        choices = choose_together(samples, labels, folds)
+    else:
+        choices = [choose_strengths(samples, labels, fold.inner) for fold in folds]
     if is_small(samples, labels):
-        return cross_validate_together(samples, labels, folds)
-    return [_fit_fold(samples, labels, f.outer, *choose_strengths(samples, labels, f.inner)) for f in folds]
+        return _fit_together(samples, labels, folds, choices)
+    return [_fit_fold(samples, labels, fold.outer, *choice) for fold, choice in zip(folds, choices, strict=True)]
 
 
-class _FoldProblem(NamedTuple):
-    """The training set of one fold.
+class _Training(NamedTuple):
+    """The samples of one fold.
 
     Attributes:
-        coordinates: Its n samples in R coordinates.
-        solver: Solver on these samples.
+        fold: Its training and test episodes.
+        design: Its n training samples in R coordinates.
         held_out: (m, R) coordinates of the test episodes.
-        labels: (n, K) labels by sample.
     """
 
-    coordinates: Projection
-    solver: LogisticSolver
+    fold: Fold
+    design: DenseDesign | StreamedDesign
     held_out: Array
-    labels: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, samples: Samples, labels: NDArray[np.bool_], fold: Fold) -> "_FoldProblem":
-        train = samples.of(fold.train)
-        coordinates = Projection.fit(train.features)
-        held_out = coordinates(samples.of(fold.test).means)
-        return cls(coordinates, LogisticSolver(coordinates.train), held_out, train.repeat(labels[fold.train]))
+    def of(cls, samples: Samples, fold: Fold) -> "_Training":
+        return cls(fold, *fold_samples(samples.of(fold.train).features, samples.of(fold.test).means))
+
+    @classmethod
+    def projected(cls, samples: Samples, fold: Fold) -> "tuple[_Training, Projection]":
+        """Return the samples, and the way from their weights to those of raw features."""
+        coordinates = Projection.fit(samples.of(fold.train).features)
+        return cls(fold, coordinates.train, coordinates(samples.of(fold.test).means)), coordinates
 
 
-def choose_strengths(
-    samples: Samples, labels: NDArray[np.bool_], folds: list[Fold]
-) -> tuple[Matrix, InnerQuality]:
+# -- every fold by itself -----------------------------------------------------------------------------------------
+
+
+def choose_strengths(samples: Samples, labels: NDArray[np.bool_], folds: list[Fold]) -> Choice:
     """Return for each label column the C with the lowest held-out log-loss, and the quality there.
 
     On ties it is the smaller C.
     """
+    return _choose_alone(samples, labels, (_Training.of(samples, fold) for fold in folds))
+
+
+def _choose_alone(samples: Samples, labels: NDArray[np.bool_], inner: Iterable[_Training]) -> Choice:
     loss = np.zeros((STRENGTHS.size, labels.shape[1]))
     by_episode = np.zeros((STRENGTHS.size, len(labels)))
-    for fold in folds:
-        training, truth = _FoldProblem.of(samples, labels, fold), labels[fold.test]
-        for step, weights in enumerate(training.solver.path(training.labels, STRENGTHS)):
+    for training in inner:
+        test, truth = training.fold.test, labels[training.fold.test]
+        for step, weights in enumerate(_path(samples, labels, training, STRENGTHS)):
             decisions = to_numpy(training.held_out @ weights)
-            loss[step] += log_loss(decisions, truth) * fold.test.size
-            by_episode[step, fold.test] = log_losses(decisions[:, 0], truth[:, 0])
+            loss[step] += log_loss(decisions, truth) * test.size
+            by_episode[step, test] = log_losses(decisions[:, 0], truth[:, 0])
     best = select_c(loss)
     return STRENGTHS[best], InnerQuality.of(-loss, -by_episode, best)
+
+
+def _path(samples: Samples, labels: NDArray[np.bool_], training: _Training, strengths: Matrix) -> Iterator[Array]:
+    """Yield the optimal weights (R, K) of a fold's training samples, for each of ascending `strengths`."""
+    by_sample = samples.of(training.fold.train).repeat(labels[training.fold.train])
+    return LogisticSolver(training.design).path(by_sample, strengths)
 
 
 def _fit_fold(
     samples: Samples, labels: NDArray[np.bool_], fold: Fold, strengths: Matrix, inner: InnerQuality
 ) -> FittedFold:
-    training = _FoldProblem.of(samples, labels, fold)
+    training, coordinates = _Training.projected(samples, fold)
     decisions = np.empty((fold.test.size, labels.shape[1]))
     for strength in np.unique(strengths):
         columns = np.flatnonzero(strengths == strength)
-        (weights,) = training.solver.path(training.labels[:, columns], np.array([strength]))
+        (weights,) = _path(samples, labels[:, columns], training, np.array([strength]))
         decisions[:, columns] = to_numpy(training.held_out @ weights)
         if columns[0] == 0:
             first = weights
-    return FittedFold.of(training.coordinates, first, decisions, strengths, inner)
+    return FittedFold.of(coordinates, first, decisions, strengths, inner)
 
 
 # -- small problems, stacked --------------------------------------------------------------------------------------
@@ -115,31 +162,40 @@ def is_small(samples: Samples, labels: NDArray[np.bool_]) -> bool:
     return samples.pools and labels.shape[1] <= STACKED_COLUMNS and count * min(count, width) ** 2 <= SMALL_HESSIAN
 
 
-def cross_validate_together(
-    samples: Samples, labels: NDArray[np.bool_], folds: list[NestedFold]
-) -> list[FittedFold]:
-    """Return the probes of every outer fold, each column of (E, K) labels on its own.
+def choose_together(samples: Samples, labels: NDArray[np.bool_], folds: Sequence[NestedFold]) -> list[Choice]:
+    """Return the choice of every outer fold, of whose inner folds many are solved at once.
 
     Raises:
         ProbeNotConvergedError: If a probe stops before its optimum.
         TooFewGroupsError: For a training set with a single class.
     """
-    inner = _at_once([fold for nested in folds for fold in nested.inner], labels)
-    parts = [_Together.of(samples, labels, some).losses() for some in inner]
+    return _choose_stacked(labels, [[_Training.of(samples, inner) for inner in fold.inner] for fold in folds])
+
+
+def _choose_stacked(labels: NDArray[np.bool_], inner: Sequence[Sequence[_Training]]) -> list[Choice]:
+    some = _at_once([training for trainings in inner for training in trainings], labels)
+    parts = [_Together.of(trainings, labels).losses() for trainings in some]
     loss, by_episode = (np.concatenate(part, axis=1) for part in zip(*parts, strict=True))
-    begins = np.cumsum([0, *(len(nested.inner) for nested in folds[:-1])])
+    begins = np.cumsum([0, *(len(trainings) for trainings in inner[:-1])])
     loss, by_episode = (np.add.reduceat(part, begins, axis=1) for part in (loss, by_episode))
     best = select_c(loss)
-    choices = [
-        (STRENGTHS[best[number]], InnerQuality.of(-loss[:, number], -by_episode[:, number], best[number]))
-        for number in range(len(folds))
-    ]
-    outer = zip(_at_once([fold.outer for fold in folds], labels), _at_once(choices, labels), strict=True)
     return [
-        fitted
-        for some, some_choices in outer
-        for fitted in _Together.of(samples, labels, some).fitted(some_choices)
+        (STRENGTHS[best[number]], InnerQuality.of(-loss[:, number], -by_episode[:, number], best[number]))
+        for number in range(len(inner))
     ]
+
+
+def _fit_together(
+    samples: Samples, labels: NDArray[np.bool_], folds: Sequence[NestedFold], choices: Sequence[Choice]
+) -> list[FittedFold]:
+    """Return the probes of every outer fold, each column of (E, K) labels on its own."""
+    fitted: list[FittedFold] = []
+    for some in _at_once(zip(folds, choices, strict=True), labels):
+        trainings, coordinates = zip(*(_Training.projected(samples, fold.outer) for fold, _ in some), strict=True)
+        of_folds = _Together.of(trainings, labels).decided([strengths for _, (strengths, _) in some])
+        for projection, (weights, decisions), (_, choice) in zip(coordinates, of_folds, some, strict=True):
+            fitted.append(FittedFold.of(projection, weights, decisions, *choice))
+    return fitted
 
 
 def _at_once[T](folds: Iterable[T], labels: NDArray[np.bool_]) -> Iterator[tuple[T, ...]]:
@@ -155,31 +211,20 @@ class _Together:
 
     Attributes:
         labels: (E, K) labels of all episodes.
-        coordinates: Training samples of every fold.
-        held_out: Test episodes of every fold, in its coordinates.
+        trainings: Training and test samples of every fold.
         signs: (N, F · K) labels −1/+1, 0 where a fold has fewer than N samples.
     """
 
-    folds: Sequence[Fold]
     labels: NDArray[np.bool_]
-    coordinates: list[Projection]
-    held_out: list[Array]
+    trainings: Sequence[_Training]
     solver: LogisticSolver
     signs: Array
 
     @classmethod
-    def of(cls, samples: Samples, labels: NDArray[np.bool_], folds: Sequence[Fold]) -> "_Together":
-        coordinates = [Projection.fit(samples.of(fold.train).features) for fold in folds]
-        held_out = [
-            projection(samples.of(fold.test).means) for projection, fold in zip(coordinates, folds, strict=True)
-        ]
-        design = StackedDesign.of_folds([projection.train for projection in coordinates], labels.shape[1])
-        signs = np.zeros((design.shape[0], len(folds), labels.shape[1]))
-        for number, fold in enumerate(folds):
-            check_single_class(labels[fold.train])
-            signs[: fold.train.size, number] = 2.0 * labels[fold.train] - 1.0
-        columns = to_device_of(design.samples, signs.reshape(len(signs), -1))
-        return cls(folds, labels, coordinates, held_out, LogisticSolver(design), columns)
+    def of(cls, trainings: Sequence[_Training], labels: NDArray[np.bool_]) -> "_Together":
+        design = StackedDesign.of_folds([training.design for training in trainings], labels.shape[1])
+        columns = _stacked_signs(trainings, labels).transpose(1, 0, 2).reshape(design.shape[0], -1)
+        return cls(labels, trainings, LogisticSolver(design), to_device_of(design.samples, columns))
 
     def losses(self) -> tuple[Matrix, Matrix]:
         """Return the log-losses along the grid of C: of all label columns, and of the first one by episode.
@@ -188,35 +233,112 @@ class _Together:
             (C, F, K) log-losses of the test episodes, summed; (C, F, E) log-losses of the first column, which are
             0 outside of a fold's test episodes.
         """
-        loss = np.empty((STRENGTHS.size, len(self.folds), self.labels.shape[1]))
-        by_episode = np.zeros((STRENGTHS.size, len(self.folds), len(self.labels)))
+        loss = np.empty((STRENGTHS.size, len(self.trainings), self.labels.shape[1]))
+        by_episode = np.zeros((STRENGTHS.size, len(self.trainings), len(self.labels)))
         for step, weights in enumerate(self.solver.path_of_signs(self.signs, STRENGTHS)):
-            parts = zip(self.held_out, self._of_folds(weights), self.folds, strict=True)
-            for number, (held_out, fold_weights, fold) in enumerate(parts):
-                decisions, truth = to_numpy(held_out @ fold_weights), self.labels[fold.test]
-                loss[step, number] = log_loss(decisions, truth) * fold.test.size
-                by_episode[step, number, fold.test] = log_losses(decisions[:, 0], truth[:, 0])
+            for number, (training, of_fold) in enumerate(
+                zip(self.trainings, self._of_folds(weights), strict=True)
+            ):
+                test = training.fold.test
+                decisions, truth = to_numpy(training.held_out @ of_fold), self.labels[test]
+                loss[step, number] = log_loss(decisions, truth) * test.size
+                by_episode[step, number, test] = log_losses(decisions[:, 0], truth[:, 0])
         return loss, by_episode
 
-    def fitted(self, choices: Sequence[tuple[Matrix, InnerQuality]]) -> list[FittedFold]:
-        """Return the probes of every fold with its choice: (K,) strengths, and the quality that chose them."""
-        strengths = np.array([strength for strength, _ in choices])
-        of_columns = to_device_of(self.signs, strengths.reshape(-1))
+    def decided(self, strengths: Sequence[Matrix]) -> Iterator[tuple[Array, Matrix]]:
+        """Yield the weights (R, K) of every fold at its (K,) strengths, and the decisions (m, K)."""
+        of_columns = to_device_of(self.signs, np.concatenate(strengths))
         (weights,) = self.solver.path_of_signs(self.signs, [of_columns])
-        return [
-            FittedFold.of(coordinates, fold_weights, to_numpy(held_out @ fold_weights), *choice)
-            for coordinates, fold_weights, held_out, choice in zip(
-                self.coordinates, self._of_folds(weights), self.held_out, choices, strict=True
-            )
-        ]
+        for training, of_fold in zip(self.trainings, self._of_folds(weights), strict=True):
+            yield of_fold, to_numpy(training.held_out @ of_fold)
 
     def _of_folds(self, weights: Array) -> Iterator[Array]:
         """Yield the weights (R, K) of every fold, without the padding."""
         count = self.labels.shape[1]
-        for number, coordinates in enumerate(self.coordinates):
-            fold_weights = weights[:, number * count : (number + 1) * count]
-            rank = coordinates.train.shape[1]
-            yield array_namespace(fold_weights).concatenate([fold_weights[: rank - 1], fold_weights[-1:]])
+        for number, training in enumerate(self.trainings):
+            of_fold = weights[:, number * count : (number + 1) * count]
+            rank = training.design.shape[1]
+            yield array_namespace(of_fold).concatenate([of_fold[: rank - 1], of_fold[-1:]])
+
+
+def _stacked_signs(trainings: Sequence[_Training], labels: NDArray[np.bool_]) -> Matrix:
+    """Return labels −1/+1 of the training episodes, (F, N, K), 0 where a fold has fewer than N.
+
+    Raises:
+        TooFewGroupsError: For a training set with a single class.
+    """
+    signs = np.zeros((len(trainings), max(part.fold.train.size for part in trainings), labels.shape[1]))
+    for number, part in enumerate(trainings):
+        of_fold = labels[part.fold.train]
+        check_single_class(of_fold)
+        signs[number, : len(of_fold)] = 2.0 * of_fold - 1.0
+    return signs
+
+
+# -- rough optima, where they settle the choice of C --------------------------------------------------------------
+
+ROUGH_FROM, ROUGH_AT_ONCE = 8, 800
+"""Label columns from which on rough optima save more than they cost, and columns of all folds together, beyond
+which float32 arrays of some dozen samples leave a processor's cache."""
+
+ROUGH_MEMORY = IN_MEMORY // 4
+"""Bytes that the samples of all inner folds may take together, in float64. With more, products take the time."""
+
+
+def can_be_rough(samples: Samples, labels: NDArray[np.bool_]) -> bool:
+    """Whether rough optima can choose C for most columns of (E, K) labels: of pooled samples, outside a device."""
+    count, width = samples.features.shape
+    in_memory = 8 * INNER_FOLDS * count * (min(count, width) + width) <= ROUGH_MEMORY
+    return samples.pools and isinstance(samples.means, np.ndarray) and labels.shape[1] >= ROUGH_FROM and in_memory
+
+
+def choose_roughly(samples: Samples, labels: NDArray[np.bool_], folds: Sequence[NestedFold]) -> list[Choice]:
+    """Return the choices that exact optima make, from rough ones in float32 as far as these settle them.
+
+    A choice is settled if no other C can have the lowest log-loss, by the bounds of the rough decisions. The first
+    column, whose inner quality is needed, and those that are not settled are solved exactly. The total quality of
+    a settled column is rough.
+
+    Raises:
+        ProbeNotConvergedError: If an exact probe stops before its optimum.
+        TooFewGroupsError: For a training set with a single class.
+    """
+    choices: list[Choice] = []
+    for some in batched(folds, max(1, ROUGH_AT_ONCE // (labels.shape[1] * INNER_FOLDS))):
+        inner = [[_Training.of(samples, fold) for fold in nested.inner] for nested in some]
+        loss, bound = _rough_losses(labels, [training for trainings in inner for training in trainings])
+        begins = np.cumsum([0, *(len(trainings) for trainings in inner[:-1])])
+        loss, bound = (np.add.reduceat(part, begins, axis=1) for part in (loss, bound))
+        for number, trainings in enumerate(inner):
+            best = select_c(loss[:, number])
+            open_ = ~is_c_settled(loss[:, number], bound[:, number], best)
+            open_[0] = True
+            few = labels[:, open_]
+            if is_small(samples, few):
+                (exact,) = _choose_stacked(few, [trainings])
+            else:
+                exact = _choose_alone(samples, few, trainings)
+            strengths, total = STRENGTHS[best], -np.take_along_axis(loss[:, number], best[None], 0)[0]
+            strengths[open_], total[open_] = exact[0], exact[1].total
+            choices.append((strengths, InnerQuality(total, exact[1].first)))
+    return choices
+
+
+def _rough_losses(labels: NDArray[np.bool_], trainings: Sequence[_Training]) -> tuple[Matrix, Matrix]:
+    """Return log-losses (C, F, K) of the test episodes, summed, of rough optima, and bounds of their errors."""
+    stacked = StackedDesign.of_folds([training.design for training in trainings], labels.shape[1]).samples
+    held_out = stack_samples([part.held_out for part in trainings])
+    signs = _stacked_signs(trainings, labels).swapaxes(1, 2)
+    loss, bound = np.empty((2, STRENGTHS.size, len(trainings), labels.shape[1]))
+    path = rough_path(stacked.astype(np.float32), signs.astype(np.float32), STRENGTHS)
+    for step, (strength, weights) in enumerate(zip(STRENGTHS, path, strict=True)):
+        decisions = weights @ held_out.swapaxes(1, 2)
+        bounds = decision_bounds(stacked, signs, weights, strength, held_out)
+        for number, training in enumerate(trainings):
+            test = training.fold.test
+            loss[step, number] = log_losses(decisions[number, :, : test.size].T, labels[test]).sum(axis=0)
+            bound[step, number] = bounds[number, :, : test.size].sum(axis=1)
+    return loss, bound
 
 
 # -- many samples, whose products are shared ----------------------------------------------------------------------

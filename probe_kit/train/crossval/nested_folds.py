@@ -117,7 +117,26 @@ class FittedFold:
         return cls(decisions, strengths, raw, intercept, along / length if length else 0.0, inner)
 
 
+LOSS_DECIMALS = 9
+"""Decimals to which log-losses are compared, so that equal ones are ties."""
+
+
 def select_c(loss: Matrix) -> NDArray[np.intp]:
     """Return the position of the least of `loss` (C, ...) along the grid; the smaller C on ties."""
-    best: NDArray[np.intp] = loss.round(9).argmin(axis=0)  # rounded, so that equal losses are ties
+    best: NDArray[np.intp] = loss.round(LOSS_DECIMALS).argmin(axis=0)
     return best
+
+
+def is_c_settled(loss: Matrix, bound: Matrix, best: NDArray[np.intp]) -> NDArray[np.bool_]:
+    """Return whether the exact losses are least where rough ones are, and are no tie, (K,).
+
+    Args:
+        loss: (C, K) rough losses along the grid.
+        bound: (C, K) by how much they can differ from the exact ones.
+        best: (K,) position of the least rough loss.
+    """
+    highest = np.take_along_axis(loss + bound, best[None], 0)[0]
+    lowest = loss - bound
+    np.put_along_axis(lowest, best[None], np.inf, 0)
+    settled: NDArray[np.bool_] = lowest.min(axis=0) > highest + 2 * 10.0**-LOSS_DECIMALS
+    return settled

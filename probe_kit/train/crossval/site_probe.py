@@ -25,7 +25,7 @@ from probe_kit.train.crossval.logistic_folds import cross_validate
 from probe_kit.train.crossval.nested_folds import FittedFold, InnerQuality, NestedFold
 from probe_kit.train.crossval.task_scores import balanced_scores, correctness, explained_scores
 from probe_kit.train.samples import Samples
-from probe_kit.train.solver.arrays import Standardiser, to_numpy
+from probe_kit.train.solver.arrays import Standardiser, threads_for, to_numpy
 
 # -- ridge ---------------------------------------------------------------------------------------------------
 
@@ -261,14 +261,19 @@ def check_non_finite(samples: Samples) -> None:
 
 
 def _predict(samples: Samples, labels: NDArray[Any], task: Task | None, folds: list[NestedFold]) -> Predictions:
-    """Predict by ridge, or by logistic regression for a side or a binary label.
+    """Predict by ridge, or by logistic regression for a side or a binary label."""
+    with threads_for(samples.features):
+        if task is not None and task != "binary":
+            return _predict_by_ridge(samples, labels, task, folds)
+        return _predict_by_logistic(samples, labels, task, folds)
 
-    The threshold of a binary label is shifted by the log-odds of its training classes.
-    """
-    if task is not None and task != "binary":
-        return _predict_by_ridge(samples, labels, task, folds)
+
+def _predict_by_logistic(
+    samples: Samples, labels: NDArray[Any], task: Task | None, folds: list[NestedFold]
+) -> Predictions:
+    """Predict a side, or a binary label, whose threshold is shifted by the log-odds of its training classes."""
     truth = labels == 1
-    values, fitted = np.empty(labels.shape), cross_validate(samples, truth, folds)
+    values, fitted = np.empty(labels.shape), cross_validate(samples, truth, folds, all_qualities=task is not None)
     for fold, probe in zip(folds, fitted, strict=True):
         decisions = probe.decisions
         if task == "binary":

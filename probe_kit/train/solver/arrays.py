@@ -1,6 +1,7 @@
 """Arrays of numpy and torch, rows of large ones, and their standardisation."""
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -74,6 +75,20 @@ def keep_freed_memory() -> None:
     and go with every step are otherwise mapped anew each time. Costs nothing: the block is never touched.
     """
     np.empty(2**25 - 2**16, np.uint8)  # below 32 MB, with what glibc adds to a block
+
+
+WORTH_THREADS = 2**18
+"""Size N · min(N, D) of features from which on several threads of BLAS gain more than they wait for another."""
+
+
+@contextmanager
+def threads_for(features: "Features") -> Iterator[None]:
+    """Let BLAS compute in one thread here, unless products of (N, D) features are worth several."""
+    from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
+
+    count, width = features.shape
+    with threadpool_limits(None if count * min(count, width) >= WORTH_THREADS else 1, user_api="blas"):
+        yield
 
 
 # -- rows of large arrays ------------------------------------------------------------------------------------

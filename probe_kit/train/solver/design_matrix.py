@@ -177,6 +177,17 @@ class DenseDesign(_OfAllColumns):
         return replace(self, samples=xp.asarray(self.samples, dtype=xp.float32))
 
 
+def stack_samples(folds: Sequence[Array]) -> Array:
+    """Return samples of folds, (n, r) each, as (F, N, R), filled up with zeros before the last column."""
+    xp, like = array_namespace(folds[0]), folds[0]
+    count, width = (max(samples.shape[axis] for samples in folds) for axis in (0, 1))
+    filled = xp.zeros((len(folds), count, width), dtype=like.dtype, device=like.device)
+    for fold, samples in zip(filled, folds, strict=True):
+        fold[: len(samples), : samples.shape[1] - 1] = samples[:, :-1]
+        fold[: len(samples), -1] = samples[:, -1]
+    return filled
+
+
 @dataclass(frozen=True)
 class StackedDesign:
     """The samples of several folds in memory, (F, N, R) float64, filled up with zeros before the last column.
@@ -193,14 +204,8 @@ class StackedDesign:
     @classmethod
     def of_folds(cls, folds: "Sequence[DenseDesign | StreamedDesign]", columns: int) -> "StackedDesign":
         """Return the stack of dense designs, each with so many label columns of its own."""
-        dense = [fold.samples for fold in folds if isinstance(fold, DenseDesign)]
-        xp, like = array_namespace(dense[0]), dense[0]
-        count, width = (max(samples.shape[axis] for samples in dense) for axis in (0, 1))
-        filled = xp.zeros((len(folds), count, width), dtype=like.dtype, device=like.device)
-        for fold, samples in zip(filled, dense, strict=True):
-            fold[: len(samples), : samples.shape[1] - 1] = samples[:, :-1]
-            fold[: len(samples), -1] = samples[:, -1]
-        numbers = xp.arange(len(folds) * columns, device=like.device)
+        filled = stack_samples([fold.samples for fold in folds if isinstance(fold, DenseDesign)])
+        numbers = array_namespace(filled).arange(len(folds) * columns, device=filled.device)
         return cls(filled, numbers // columns)
 
     @property
@@ -326,7 +331,11 @@ class Projection:
 
         Chosen rows whose copy in float64 would be large are never copied, at two to three times the time.
         """
-        standardise = Standardiser.fit(features)
+        return cls.of(features, Standardiser.fit(features))
+
+    @classmethod
+    def of(cls, features: Features, standardise: Standardiser) -> "Projection":
+        """Return the projection of (N, D) training samples that `standardise` was learned on."""
         if isinstance(features, RowSubset) and _stay(features):
             samples = (standardise(block) for block in features.blocks())
             variances, axes = module_of(features).linalg.eigh(sum(block.T @ block for block in samples))
@@ -345,6 +354,30 @@ class Projection:
         raw = np.zeros(self.standardise.varies.shape[0])
         raw[to_numpy(self.standardise.varies)] = varying
         return raw, float(weights[-1]) - float(to_numpy(self.standardise.mean) @ varying)
+
+
+def fold_samples(train: Features, held_out: Array) -> tuple[DenseDesign | StreamedDesign, Array]:
+    """Return the samples of a fold along the principal axes of the training ones, (N, R + 1) and (M, R + 1).
+
+    They equal those of a `Projection` but for rotations that change no probe. Of fewer samples than features the
+    triangular factor of all samples holds them already, so that no axes (D, N) are made.
+
+    Args:
+        train: (N, D) training samples.
+        held_out: (M, D) other samples.
+    """
+    standardise = Standardiser.fit(train)
+    count, width = len(train), len(standardise.mean)
+    if count >= width:
+        projection = Projection.of(train, standardise)
+        return projection.train, projection(held_out)
+    samples = standardise(train.read() if isinstance(train, RowSubset) else train)
+    xp = array_namespace(samples)
+    factor = xp.linalg.qr(xp.concatenate([samples, standardise(held_out)]).T, mode="r")
+    triangle = factor if isinstance(factor, np.ndarray) else factor[1]
+    inner = triangle[:count, :count].T
+    axes = principal_axes(inner)
+    return DenseDesign(_turned(inner, axes)), _turned(triangle[:count, count:].T, axes)
 
 
 def _stay(features: RowSubset) -> bool:
