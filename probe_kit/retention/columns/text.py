@@ -476,7 +476,11 @@ def more_items(row: RetentionRow) -> str:
     if not success.n_items or not success.n_groups or not success.n_episodes:
         return ""
     needed = items_for_absence(success.n_items, success.n_groups, success.n_episodes)
-    return f"fewer than {needed} items cannot tell what the backbone lacks" if needed > success.n_items else ""
+    return (
+        f"with fewer than {needed} items, probes cannot show that the backbone lacks it"
+        if needed > success.n_items
+        else ""
+    )
 
 
 def _items_for_success(success: SuccessRate) -> str:

@@ -105,8 +105,13 @@ def test_not_used_needs_as_many_groups_as_are_said_beforehand() -> None:
 def test_where_groups_would_tell_it_is_said_how_many_items_a_group_is() -> None:
     open_ = classify_behaviour(of(habit(40), groups=10), "shape").reason
     assert "groups would tell" in open_
-    assert size_of_groups(["", open_], [(20, 10), (12, 6)]) == "a group is 2 items that share a picture"
-    assert size_of_groups([open_], [(20, 10), (15, 10)]) == "a group is 1.5 to 2 items that share a picture"
+    assert (
+        size_of_groups(["", open_], [(20, 10), (12, 6)])
+        == "20 items are 10 independent groups, because 2 items share each picture"
+    )
+    assert size_of_groups([open_], [(20, 10), (15, 10)]) == (
+        "20 items are 10 independent groups, because 1.5 to 2 items share each picture"
+    )
     assert size_of_groups(["used"], [(20, 10)]) == ""
 
 
