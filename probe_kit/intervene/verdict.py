@@ -155,10 +155,14 @@ class UseVerdict:
             return in_reverse if self.reversed else ("used", "the action follows the answer")
         if self.behaviour in USES:
             direction = "goes against" if self.reversed else "follows"
-            how = f"only where it lies on the {self.side}" if self.side else "in some episodes or part of the way"
+            how = (
+                f"only where the correct picture lies on the {self.side}"
+                if self.side
+                else "in some episodes or part of the way"
+            )
             return "partly used", f"the action {direction} the answer {how}"
         if self.behaviour == "moves with it, does not decide":
-            return "not decisive", "the answer shifts the action without turning it"
+            return "not decisive", "the answer shifts the action, but not to the other picture"
         if self.behaviour == "not used":
             return "not used", "the action does not follow the answer"
         if self.lacks_control:

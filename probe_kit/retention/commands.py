@@ -191,8 +191,8 @@ LastSteps = Annotated[
     typer.Option(
         "--last-steps",
         min=1,
-        help="Number of control steps at the end of an episode that the rule judges. The released evaluation "
-        "averages 11.",
+        help="Number of control steps at the end of an episode that --rule judges; success is their mean. The "
+        "released evaluation uses 11.",
         rich_help_panel=RULES,
     ),
 ]

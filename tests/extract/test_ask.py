@@ -243,7 +243,7 @@ def test_of_an_absent_object_right_is_no(settings: AskSettings) -> None:
     [
         (
             {"model": "pi0-tiny", "checkpoint": None, "options": {}},
-            "acts and does not answer questions; those that do",
+            "acts and does not answer questions; choose among",
         ),
         ({"model": "expert", "checkpoint": None, "options": {}}, "acts and does not answer"),
         ({"query": "absent"}, "p1 does not ask for yes or no"),

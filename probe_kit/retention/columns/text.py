@@ -316,7 +316,7 @@ Readable = Literal[
 ]
 """The backbone's evidence, then success, where no image swap is stored: these never say *used*."""
 _EVIDENCE = {
-    "shown": "The probes find the answer in the backbone, beyond every control that was run",
+    "shown": "The probes read the answer in the backbone better than chance and every control that was run allow",
     "absent": "No linear probe of so many items reaches a stated accuracy in the backbone, 65 % by default, and "
     "so many items would have shown it",
     "not shown": "Neither shown nor absent: the items are too few to tell",
