@@ -341,7 +341,9 @@ def test_a_target_is_probed_at_the_sites_that_are_patched(run_of_many: Run) -> N
 
 
 @pytest.mark.slow
-def test_what_no_site_knows_is_told_from_what_is_lost(run_of_many: Run, tmp_path: Path) -> None:
+def test_what_no_site_knows_is_told_from_what_is_lost(
+    run_of_many: Run, tmp_path: Path
+) -> None:
     episodes = run_of_many.episodes
     # Heads and tails in turn: no site comes near to signal (p 0.9), where a drawn coin came to p 0.04.
     groups = {group: number % 2 for number, group in enumerate(sorted(set(episodes["group_id"])))}

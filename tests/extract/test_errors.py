@@ -274,9 +274,9 @@ def test_a_worker_that_joins_forgets_no_failure(settings: ExtractSettings, tmp_p
     writer = prepare(settings).writer(Folder(tmp_path / "run"))
     with writer.claim():
         writer.give_up(3, "it fell over")
-        with writer.joined():
+        with writer.take_part():
             pass
-    with writer.joined():
+    with writer.take_part():
         assert list(writer.location.read_all("failed", ".json"))
     with writer.claim():
         assert not list(writer.location.read_all("failed", ".json"))

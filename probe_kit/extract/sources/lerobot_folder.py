@@ -314,7 +314,7 @@ class LeRobotFrames:
     def __init__(self, folder: LeRobotFolder) -> None:
         self.folder = folder
         self.largest_drift: Drift | None = None
-        self._data_file = lru_cache(maxsize=2)(self._scanned)
+        self._data_file = lru_cache(maxsize=2)(self._scan)
         self._video = lru_cache(maxsize=_MOST_VIDEOS)(self._opened_video)
         self._video_times = lru_cache(maxsize=_MOST_VIDEOS)(self._named_times)
         self._regular: set[int] = set()
@@ -395,7 +395,7 @@ class LeRobotFrames:
             table = read_parquet(parquet, columns, groups.tolist()).select(columns)
             return table.rename_columns(list(names)), int((ends - sizes)[groups[0]])
 
-    def _scanned(self, path: Path) -> _DataFile:
+    def _scan(self, path: Path) -> _DataFile:
         """Return a data file whose rows are those that meta says. Raises RecordingError for others."""
         with self.folder.opened.parquet(path) as parquet:
             if missing := [name for name in (_EPISODE, _INDEX) if name not in parquet.schema_arrow.names]:

@@ -148,7 +148,7 @@ def p_value(key: str, heading: str, meaning: str, **more: Any) -> Column:
     return replace(column, **more)
 
 
-def _judged(column: Column) -> Column:
+def _judged_column(column: Column) -> Column:
     """Return the column, empty for a run that keeps no trajectories; `sr_idle` is known wherever they are."""
     cell = column.cell
     return replace(column, cell=lambda row: Cell(None) if row.rules.sr_idle is None else cell(row))
@@ -372,7 +372,7 @@ SIZES = Column(
 
 RULES = tuple(
     map(
-        _judged,
+        _judged_column,
         (
             share(
                 "rules.share_answered",

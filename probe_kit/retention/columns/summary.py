@@ -26,8 +26,8 @@ from probe_kit.retention.columns.text import (
     name_of,
     retention_value,
     title_of,
-    unprobed,
     verdict,
+    why_unprobed,
 )
 from probe_kit.retention.compare.compare import Difference
 from probe_kit.retention.rows.row import MEAN, RetentionRow, StreamPart
@@ -55,7 +55,7 @@ def finding(row: RetentionRow, vlm: RetentionRow | None = None) -> str:
     if row.label:
         return label_finding(row)
     if is_vlm(row):
-        return _of_vlm(row)
+        return _vlm_sentence(row)
     use = row.image_swap.use
     if use is None:
         return _without_swap(row, vlm)
@@ -63,7 +63,7 @@ def finding(row: RetentionRow, vlm: RetentionRow | None = None) -> str:
         return (
             f"{_missing_signal(row)}: {_list_clauses(_knows(vlm), _unread(row))}; the action does not follow it."
         )
-    return _of_use(row, vlm, use)
+    return _use_sentence(row, vlm, use)
 
 
 def _list_clauses(*clauses: str) -> str:
@@ -78,7 +78,7 @@ def count_words(sentence: str) -> int:
 # -- VLMs ----------------------------------------------------------------------------------------------------
 
 
-def _of_vlm(row: RetentionRow) -> str:
+def _vlm_sentence(row: RetentionRow) -> str:
     rate = f"{whole_percent(row.success.sr)} %"
     if knows(row):
         inside = ", and probes read it in the backbone" if _is_encoded(row) else ""
@@ -176,7 +176,7 @@ def _stages(row: RetentionRow, vlm: RetentionRow | None) -> str:
     return f"{known} and probes read it in the backbone{in_action}" if known else f"{_READ}{in_action}"
 
 
-def _of_use(row: RetentionRow, vlm: RetentionRow | None, use: UseVerdict) -> str:
+def _use_sentence(row: RetentionRow, vlm: RetentionRow | None, use: UseVerdict) -> str:
     """Return the sentence of a row whose pictures were swapped."""
     verdict, what = use.finding
     if verdict == "used":
@@ -215,7 +215,7 @@ def _is_encoded(row: RetentionRow) -> bool:
 def _missing(row: RetentionRow, answer: str = "it") -> list[str]:
     """Return the reason why the answer is not known to be in the backbone; nothing where it is."""
     if not is_probed(row):
-        return [unprobed(row)]
+        return [why_unprobed(row)]
     if _is_encoded(row):
         return []
     return [f"probes do not show {answer} in the backbone"]
@@ -265,11 +265,13 @@ def _without_swap(row: RetentionRow, vlm: RetentionRow | None) -> str:
     if is_probed(row):
         return _sentence(_missing_signal(row), _knows(vlm), _unread(row), row=row)
     if row.success.sr is None:
-        return f"not measured: {_success(row)}, and {unprobed(row)}."
+        return f"not measured: {_success(row)}, and {why_unprobed(row)}."
     words = {Regime.KNOWLEDGE: "success", Regime.FAILURE: "failure"}
     head = words.get(row.success.regime or Regime.NO_RELIABLE_KNOWLEDGE, "success not shown")
     against_guessing = "" if head == "success" else f", {_against_guessing(row)}"
-    return f"{head}: the cube ends right in {whole_percent(row.success.sr)} %{against_guessing}; {unprobed(row)}."
+    return (
+        f"{head}: the cube ends right in {whole_percent(row.success.sr)} %{against_guessing}; {why_unprobed(row)}."
+    )
 
 
 # -- what to do next ----------------------------------------------------------------------------------------------

@@ -302,7 +302,9 @@ def test_yes_and_no_are_read_where_the_prompt_asks_for_them(home: Path) -> None:
         (("--items", "2"), "--items does not apply with --pictures"),
     ],
 )
-def test_what_only_a_suite_has_is_refused_by_name(words: tuple[str, ...], message: str, home: Path) -> None:
+def test_what_only_a_suite_has_is_refused_by_name(
+    words: tuple[str, ...], message: str, home: Path
+) -> None:
     del home
     options, _ = ASKED["pictures"]
     refused = ask(*options, *words, "--dry-run")

@@ -223,7 +223,9 @@ def headings(shares: AttentionShares) -> tuple[str, ...]:
     return AttentionReadout.table([], said_of(measurement)).columns[2:]
 
 
-def test_what_nobody_plays_is_left_out_and_a_hidden_tile_counts_where_it_is_seen(weighed: AttentionShares) -> None:
+def test_what_nobody_plays_is_left_out_and_a_hidden_tile_counts_where_it_is_seen(
+    weighed: AttentionShares,
+) -> None:
     mass, at = weighed.mass.copy(), {role: weighed.roles.index(role) for role in ("special", "image.left")}
     mass[..., at["special"]] = np.nan
     mass[0, ..., at["image.left"]] = np.nan

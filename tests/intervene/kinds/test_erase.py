@@ -65,7 +65,9 @@ def test_writing_back_what_is_there_changes_no_action_bit_for_bit(effects: Inter
 
 
 @pytest.mark.slow
-def test_what_is_erased_is_moved_and_what_nothing_reads_is_not_missed(effects: InterventionResult) -> None:
+def test_what_is_erased_is_moved_and_what_nothing_reads_is_not_missed(
+    effects: InterventionResult,
+) -> None:
     for name in ("leace", "control-1"):
         read, unread = (row_of(effects, site, name) for site in ("backbone.02", "backbone.03"))
         assert read.fires == unread.fires == EPISODES
