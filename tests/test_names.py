@@ -212,6 +212,23 @@ def test_a_bare_participle_is_found_wherever_a_function_is_defined(text: str, is
     assert bool(list(unclear_functions(ast.parse(text)))) == is_unclear
 
 
+VAGUE_TESTS = re.compile(r"test_what_(is|was|cannot_be|does_not|it|its|no|nobody|never|means|names|needs|only)_")
+
+
+def test_names_of_tests_have_a_subject() -> None:
+    vague = [
+        f"{path.relative_to(ROOT)}: {name}"
+        for path in sorted((ROOT / "tests").rglob("test_*.py"))
+        if not any(path.is_relative_to(ROOT / "tests" / folder) for folder in NOT_RENAMED)
+        for name in re.findall(r"^ *def (test_\w+)", path.read_text(encoding="utf-8"), re.MULTILINE)
+        if VAGUE_TESTS.match(name)
+    ]
+    assert not vague, "say what is refused, stored or shown\n" + "\n".join(vague)
+
+
+NOT_RENAMED = ("acceptance", "models", "hooks/families")
+
+
 RULES = {
     "parameters": "a docstring explains parameters under `Args:` and fields under `Attributes:`",
     "names": "a name says what it holds; these are fillers",

@@ -170,7 +170,7 @@ def test_the_certificate_holds_what_was_measured_in_every_process(suite: Suite, 
         {"options": {"bits": 8}},
     ],
 )
-def test_what_means_nothing_to_a_scripted_policy_is_refused(suite: Suite, change: dict[str, object]) -> None:
+def test_an_option_without_effect_on_a_scripted_policy_is_refused(suite: Suite, change: dict[str, object]) -> None:
     with pytest.raises(UsageError, match="is scripted"):
         prepare(ExtractSettings("expert", suite=suite.folder, **change))
 

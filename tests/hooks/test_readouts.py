@@ -386,7 +386,7 @@ def test_without_ids_the_likeliest_tokens_of_every_layer_come_first(
     assert (np.take_along_axis(every, lens.ids, axis=-1) == lens.logits).all()
 
 
-def test_what_cannot_be_is_refused(
+def test_an_impossible_readout_is_refused(
     vlm: AnswerModel, read: tuple[ActivationCache, Reading], pi0_tiny: Pi0
 ) -> None:
     cache, _ = read

@@ -302,7 +302,7 @@ def test_yes_and_no_are_read_where_the_prompt_asks_for_them(home: Path) -> None:
         (("--items", "2"), "--items does not apply with --pictures"),
     ],
 )
-def test_what_only_a_suite_has_is_refused_by_name(
+def test_recordings_refuse_by_name_the_options_of_a_suite(
     words: tuple[str, ...], message: str, home: Path
 ) -> None:
     del home
