@@ -172,7 +172,7 @@ def _stages(row: RetentionRow, vlm: RetentionRow | None) -> str:
     elif _holds(row.action):
         in_action = f" and {stream}"
     else:
-        in_action = f", not in {stream}" if row.action.verdict == "absent" else f", not shown in {stream}"
+        in_action = f" but {'not' if row.action.verdict == 'absent' else 'do not show it'} in {stream}"
     return f"{known} and probes read it in the backbone{in_action}" if known else f"{_READ}{in_action}"
 
 
@@ -189,7 +189,8 @@ def _use_sentence(row: RetentionRow, vlm: RetentionRow | None, use: UseVerdict) 
         return _sentence("not used at first", what, *_missing(row), row=row, stages=_stages(row, vlm))
     if verdict == "not used":
         stages = _stages(row, vlm)
-        text = f"{stages}, but {what.replace('the answer', 'it')}" if stages else what
+        is_lost = row.action.verdict is not None and not _holds(row.action) and _is_encoded(row)
+        text = f"{stages}{';' if is_lost else ', but'} {what.replace('the answer', 'it')}" if stages else what
         return _sentence(verdict, text, *_missing(row), row=row)
     if use.behaviour == "undecided" and not use.lacks_control:
         if _is_encoded(row):

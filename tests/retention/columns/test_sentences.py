@@ -394,8 +394,8 @@ def test_the_sentences_say_where_the_answer_is_lost_between_backbone_and_action(
     actions = ("shown", "absent", "not shown")
     in_both, lost, open_ = (finding(policy("shown", action, "not used", "guessing")) for action in actions)
     assert "in the backbone and the action expert, but the action does not follow it" in in_both
-    assert "in the backbone, not in the action expert, but the action does not follow it" in lost
-    assert "in the backbone, not shown in the action expert, but the action does not follow it" in open_
+    assert "in the backbone but not in the action expert; the action does not follow it" in lost
+    assert "in the backbone but do not show it in the action expert; the action does not follow it" in open_
 
 
 @pytest.mark.parametrize(
