@@ -30,9 +30,9 @@ def check_is_data_set(root: Path) -> None:
         return
     if (root / _OLD_INFO).is_file():
         raise RecordingError(f"{root.name} {_older('v1.x')}")
-    seen = f"it has no {INFO}" if root.is_dir() else "there is no such folder"
+    problem = f"it has no {INFO}" if root.is_dir() else "there is no such folder"
     raise RecordingError(
-        f"{root} is no LeRobotDataset: {seen}. Give the folder that holds meta, data and videos, or the hub's "
+        f"{root} is no LeRobotDataset: {problem}. Give the folder that holds meta, data and videos, or the hub's "
         "USER/NAME"
     )
 
