@@ -135,13 +135,13 @@ def _open_sentence(head: str, row: RetentionRow, vlm: RetentionRow | None, neede
         vlm: The row of a VLM that answered the same questions; None without one.
         needed: How much data would decide; empty if that is not the question.
     """
-    known = _knows(vlm)
-    read = "probes read it in the backbone" if known else _READ
+    knowledge = _knows(vlm)
+    read = "probes read it in the backbone" if knowledge else _READ
     guessing = _compare_with_guessing(row)
     stream = _action_evidence(row)
     # From most to least said: the first that is short enough.
     for in_action, guess in ((stream, guessing), (stream, ""), ("", guessing), ("", "")):
-        stages = f"{known} and {read}{in_action}" if known else f"{read}{in_action}"
+        stages = f"{knowledge} and {read}{in_action}" if knowledge else f"{read}{in_action}"
         sentence = f"{head}: {_list_clauses(stages, needed, _success(row))}{guess}."
         if count_words(sentence) < _MOST_WORDS_OF_CLAUSES and len(re.findall(r"\d+", sentence)) <= MOST_NUMBERS:
             break
@@ -163,9 +163,9 @@ def _knows(vlm: RetentionRow | None) -> str:
 
 def _stages(row: RetentionRow, vlm: RetentionRow | None) -> str:
     """Return a clause: whether the VLM knows the answer, and in which streams of the policy probes read it."""
-    known = _knows(vlm)
+    knowledge = _knows(vlm)
     if not _is_encoded(row):
-        return known
+        return knowledge
     stream = f"the {row.run.action_name}"
     if row.action.verdict is None:
         in_action = ""
@@ -173,7 +173,7 @@ def _stages(row: RetentionRow, vlm: RetentionRow | None) -> str:
         in_action = f" and {stream}"
     else:
         in_action = f" but {'not' if row.action.verdict == 'absent' else 'do not show it'} in {stream}"
-    return f"{known} and probes read it in the backbone{in_action}" if known else f"{_READ}{in_action}"
+    return f"{knowledge} and probes read it in the backbone{in_action}" if knowledge else f"{_READ}{in_action}"
 
 
 def _use_sentence(row: RetentionRow, vlm: RetentionRow | None, use: UseVerdict) -> str:
@@ -197,8 +197,8 @@ def _use_sentence(row: RetentionRow, vlm: RetentionRow | None, use: UseVerdict) 
             needed = more_groups(row.image_swap, row.success.n_groups or 0)
             return _open_sentence(f"encoded, {verdict}", row, vlm, needed)
         needed = items_to_decide(row.image_swap, row.success.n_items or 0, row.success.n_groups or 0)
-        known = _knows(vlm)
-        return _sentence(verdict, known, *_missing(row, "it" if known else "the answer"), needed, row=row)
+        knowledge = _knows(vlm)
+        return _sentence(verdict, knowledge, *_missing(row, "it" if knowledge else "the answer"), needed, row=row)
     if verdict in ("not decisive", "use undecided"):
         return _sentence(verdict, what, *_missing(row), row=row, stages=_stages(row, vlm))
     return _sentence(verdict, what, row=row)
