@@ -4,6 +4,7 @@ Every package keeps its own commands, which parse, call the library and print; t
 stderr.
 """
 
+import re
 import sys
 import warnings
 from functools import cache
@@ -108,9 +109,29 @@ class Commands(typer.core.TyperGroup):
                 f"{option} is not an option of this command, but of {listed}.",
                 None,
             )
-        error.message = terminal_safe(str(error.message))
+        error.message = terminal_safe(_expected_value(str(error.message)))
         advised: Exception = error
         return advised
+
+
+_PYDANTIC = (
+    (r"^Value error, ", ""),
+    (r"^Input should be greater than or equal to (\S+)$", r"expected at least \1"),
+    (r"^Input should be less than or equal to (\S+)$", r"expected at most \1"),
+    (r"^Input should be greater than (\S+)$", r"expected more than \1"),
+    (r"^Input should be less than (\S+)$", r"expected less than \1"),
+    (r"^Input should be a valid integer.*$", "expected a whole number"),
+    (r"^Input should be a valid number.*$", "expected a number"),
+    (r"^Input should be ", "expected "),
+)
+"""What pydantic writes about a typed value, from which typer takes it, and our words."""
+
+
+def _expected_value(message: str) -> str:
+    """Return the message about a typed value in the words of all other messages."""
+    for pattern, replacement in _PYDANTIC:
+        message = re.sub(pattern, replacement, message)
+    return message
 
 
 def commands_of(group: Any, ctx: Any, prefix: str = "") -> list[tuple[str, Any]]:

@@ -321,7 +321,7 @@ TO_TYPE = {
 }
 
 
-def test_what_is_shortened_replaced_or_left_out_is_still_on_the_pages() -> None:
+def test_every_shortened_replaced_or_skipped_line_is_still_on_the_pages() -> None:
     for page, patterns in STAND_INS.items():
         texts = [command.text for command in TYPED if command.page == page]
         assert [p for p in patterns if not any(re.search(p, text) for text in texts)] == []

@@ -67,7 +67,7 @@ def test_no_two_children_of_a_folder_import_each_other(graph: Graph) -> None:
 
 
 @pytest.mark.parametrize("room", ["train", "retention"])
-def test_what_reads_runs_knows_neither_models_nor_simulators(room: str, graph: Graph) -> None:
+def test_packages_that_read_runs_import_neither_models_nor_simulators(room: str, graph: Graph) -> None:
     imported_rooms = {
         other
         for module, imported in graph.items()
@@ -84,7 +84,7 @@ def test_what_reads_runs_knows_neither_models_nor_simulators(room: str, graph: G
     assert not strange
 
 
-def test_what_no_test_machine_installs_is_imported_by_require_alone() -> None:
+def test_packages_that_no_test_machine_installs_are_imported_by_require_alone() -> None:
     """An `import` of it is an error of types in a fresh clone, and none where a developer happens to have it."""
     project = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text(encoding="utf-8"))
     installed = names(project["project"]["dependencies"]) | names(project["dependency-groups"]["dev"])

@@ -123,6 +123,112 @@ def parameters_in_prose(tree: ast.Module) -> Iterator[tuple[int, str]]:
                 yield node.lineno, name
 
 
+IRREGULAR = frozenset(
+    [
+        "begun",
+        "built",
+        "chosen",
+        "drawn",
+        "found",
+        "given",
+        "grown",
+        "held",
+        "kept",
+        "known",
+        "led",
+        "lost",
+        "made",
+        "meant",
+        "met",
+        "said",
+        "seen",
+        "sent",
+        "shown",
+        "sought",
+        "taken",
+        "told",
+        "worn",
+        "written",
+    ]
+)
+NOUNS_IN_ED = frozenset({"bed", "embed", "feed", "field", "head", "need", "seed", "speed"})
+EXCEPTED = (PACKAGE / "models", PACKAGE / "hooks" / "families")
+"""Folders that follow the words of the authors' own code."""
+
+
+def unclear_functions(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Lines and names of functions that are no verb phrase and name no value: `joined`, `_of_row`.
+
+    Not of properties, class methods and exported functions. A public method may be a participle that returns a
+    changed copy of its object, such as `Settings.changed`.
+    """
+
+    def visit(parent: ast.AST, in_class: bool) -> Iterator[tuple[int, str]]:
+        for node in ast.iter_child_nodes(parent):
+            if isinstance(node, FUNCTIONS) and node.name not in PUBLIC_FUNCTIONS:
+                decorators = " ".join(ast.unparse(decorator) for decorator in node.decorator_list)
+                is_private, word = node.name.startswith("_"), node.name.strip("_")
+                is_attribute = "property" in decorators or "classmethod" in decorators
+                is_participle = word in IRREGULAR or (
+                    re.fullmatch(r"[a-z]{3,}ed", word) and word not in NOUNS_IN_ED
+                )
+                begins_with_of = not in_class and word.split("_")[0] == "of"
+                if not is_attribute and (begins_with_of or (is_participle and (is_private or not in_class))):
+                    yield node.lineno, node.name
+            yield from visit(node, isinstance(node, ast.ClassDef))
+
+    yield from visit(tree, False)
+
+
+PUBLIC_FUNCTIONS = frozenset({"scored"})
+"""Functions that users import from a package, whose names change with a line of the changelog."""
+
+
+def test_functions_of_the_package_are_verb_phrases_or_nouns() -> None:
+    wrong = [
+        f"{file.relative_to(PACKAGE.parent)}:{line}: {name}"
+        for file, tree in package_trees().items()
+        if not any(file.is_relative_to(folder) for folder in EXCEPTED)
+        for line, name in unclear_functions(tree)
+    ]
+    assert not wrong, "a function is a verb phrase or the noun that it returns\n" + "\n".join(wrong)
+
+
+@pytest.mark.parametrize(
+    ("text", "is_unclear"),
+    [
+        ("def _joined(): ...", True),
+        ("def of_row(): ...", True),
+        ("def f():\n    def checked(): ...", True),
+        ("class C:\n    def _drawn(self): ...", True),
+        ("class C:\n    def changed(self): ...", False),
+        ("class C:\n    @property\n    def _stored(self): ...", False),
+        ("class C:\n    @classmethod\n    def of_run(cls): ...", False),
+        ("def sorted_rows(): ...", False),
+        ("def seed(): ...", False),
+    ],
+)
+def test_a_bare_participle_is_found_wherever_a_function_is_defined(text: str, is_unclear: bool) -> None:
+    assert bool(list(unclear_functions(ast.parse(text)))) == is_unclear
+
+
+VAGUE_TESTS = re.compile(r"test_what_(is|was|cannot_be|does_not|it|its|no|nobody|never|means|names|needs|only)_")
+
+
+def test_names_of_tests_have_a_subject() -> None:
+    vague = [
+        f"{path.relative_to(ROOT)}: {name}"
+        for path in sorted((ROOT / "tests").rglob("test_*.py"))
+        if not any(path.is_relative_to(ROOT / "tests" / folder) for folder in NOT_RENAMED)
+        for name in re.findall(r"^ *def (test_\w+)", path.read_text(encoding="utf-8"), re.MULTILINE)
+        if VAGUE_TESTS.match(name)
+    ]
+    assert not vague, "say what is refused, stored or shown\n" + "\n".join(vague)
+
+
+NOT_RENAMED = ("acceptance", "models", "hooks/families")
+
+
 RULES = {
     "parameters": "a docstring explains parameters under `Args:` and fields under `Attributes:`",
     "names": "a name says what it holds; these are fillers",

@@ -125,7 +125,7 @@ class RayPool:
         try:
             self._nodes[slot], reports = self._ray.get(call)
         except (self._ray.exceptions.RayActorError, self._ray.exceptions.ObjectLostError) as error:
-            yield slot, self._lost(slot, error)
+            yield slot, self._lose_task(slot, error)
             return
         self._collecting[self._actors[slot].collect.remote()] = slot
         for report in reports:
@@ -147,7 +147,7 @@ class RayPool:
                     stacklevel=2,
                 )
 
-    def _lost(self, slot: int, error: Exception) -> Lost:
+    def _lose_task(self, slot: int, error: Exception) -> Lost:
         self._ray.kill(self._actors[slot])  # it may live on behind a broken network
         node = self._nodes.pop(slot, None)
         where = "of the Ray cluster that had not begun" if node is None else f"on node {node} of the Ray cluster"

@@ -45,7 +45,10 @@ def check_device_name(device: str, present: bool = True) -> None:
     if (match["kind"] == "cuda" and _surely_without_gpu()) or (
         match["kind"] == "mps" and sys.platform != "darwin"
     ):
-        raise UsageError(f"device {device!r} cannot be used: this machine has no such device. {what_is_here()}")
+        raise UsageError(
+            f"device {device!r} cannot be used: this machine has no such device. {what_is_here()}. "
+            "Give one of these, or --device auto"
+        )
 
 
 def device_here(device: str) -> str:

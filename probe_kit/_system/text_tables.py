@@ -189,6 +189,9 @@ def _encoding(path: Path, error: type[ProbeKitError]) -> str:
     try:
         with open_regular(path, MOST_BYTES) as file:
             start = file.read(4)
+    except FileNotFoundError:
+        where = "" if path.is_absolute() else f" in {Path.cwd()}"
+        raise error(f"there is no file {path}{where}; expected a table, as a CSV file in UTF-8") from None
     except OSError as problem:
         raise error(f"{path} cannot be read as a table: {problem.strerror}. {_REMEDY}") from problem
     if other := next((name for beginning, name in _NO_TEXT if start.startswith(beginning)), None):

@@ -34,14 +34,14 @@ def environment(*folders: Path, paths: tuple[str, ...] = ()) -> "Environment":
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup
 
-    def escaped(value: Any) -> Any:
+    def escape_value(value: Any) -> Any:
         if not isinstance(value, str) or isinstance(value, Markup) or value.startswith("data:"):
             return value
         return keep_numbers_whole(without_folders(value, paths))
 
     templates = Environment(
         loader=FileSystemLoader([*folders, _FOLDER]), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
-        lstrip_blocks=True, finalize=escaped,
+        lstrip_blocks=True, finalize=escape_value,
     )  # fmt: skip
     templates.filters |= {"heat": heat_colour, "sort_key": sort_key}
     return templates

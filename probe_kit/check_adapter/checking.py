@@ -76,17 +76,17 @@ def outcomes(subjects: Sequence[Subject]) -> Iterator[CheckOutcome]:
     """Check every subject and yield the outcome of each check; without a loaded model the rest is left out."""
     first, package = subjects[0], package_of(subjects[0].family.loader)
 
-    def checked(name: str, sentence: str, change: str, body: Callable[[], object]) -> CheckOutcome:
+    def check_one(name: str, sentence: str, change: str, body: Callable[[], object]) -> CheckOutcome:
         return try_check(name, sentence, change, body, package)
 
     if (module := entry_module(first.name)) is not None:
-        yield checked(
+        yield check_one(
             "naming_the_family_imports_no_torch",
             "Naming the family imports no torch, so that commands without a model stay fast.",
             "Keep `FAMILY` in a module that does not import the network; `loader` names the one that does.",
             partial(_require_light, module),
         )
-    loaded = checked(
+    loaded = check_one(
         "the_model_loads",
         "The model loads, every tensor from the file.",
         "Correct the loader at the place that is named.",
@@ -98,7 +98,7 @@ def outcomes(subjects: Sequence[Subject]) -> Iterator[CheckOutcome]:
     for subject in subjects:
         subject.share_model(first)
         for contract in CONTRACTS[type(subject)]:
-            yield checked(contract.name, contract.sentence, contract.change, partial(contract, subject))
+            yield check_one(contract.name, contract.sentence, contract.change, partial(contract, subject))
     model = first.model
     mismatch = isinstance(model, Policy) and model.embodiment_mismatch() is not None
     del model
@@ -106,7 +106,7 @@ def outcomes(subjects: Sequence[Subject]) -> Iterator[CheckOutcome]:
         subject.close()  # a run loads its own
     for subject in subjects:
         with subject:
-            yield checked(*_RUNS[subject.acting], _RUN_ADVICE, partial(_run, subject, mismatch))
+            yield check_one(*_RUNS[subject.acting], _RUN_ADVICE, partial(_run, subject, mismatch))
 
 
 def _run(subject: Subject, mismatch: bool) -> None:

@@ -148,13 +148,15 @@ def diagnose(
         raise UsageError(f"--labels {labels} is a table of --target; name the column")
     request = _Request(frames, tuple(require or ()), table, base, task_words, options, inside)
     if _is_run(model_or_run, typed):
-        run, source = _stored(model_or_run, typed, request), True
+        run, source = _open_stored(model_or_run, typed, request), True
         _say_cost(run.model, list(run.streams.values()), _inputs_of(run, task_words), request)
     else:
         source = False
-        extraction, location, most = _prepared(model_or_run, typed, request, out_folder, fetch=not dry_run)
+        extraction, location, most = _prepare_extraction(
+            model_or_run, typed, request, out_folder, fetch=not dry_run
+        )
         if not dry_run:
-            run = _captured(extraction, location, most)
+            run = _capture_frames(extraction, location, most)
     if dry_run:
         return
     with err.status("diagnosing") as status:
@@ -269,7 +271,7 @@ def _is_run(name: str, typed: Mapping[str, Any]) -> bool:
     return True
 
 
-def _stored(name: str, typed: Mapping[str, Any], request: _Request) -> "Run":
+def _open_stored(name: str, typed: Mapping[str, Any], request: _Request) -> "Run":
     """Return a stored run that can be diagnosed as requested; raises what is known without its weights."""
     from probe_kit.diagnose.diagnosis import check_base, check_network
     from probe_kit.diagnose.inputs import cameras_of
@@ -304,7 +306,7 @@ def _frames_of_run(run: "Run", source: "ReplayFiles") -> Collection[tuple[str, i
         frames.close()
 
 
-def _prepared(
+def _prepare_extraction(
     name: str, typed: Mapping[str, Any], request: _Request, out_folder: str | None, *, fetch: bool
 ) -> "tuple[Extraction, Location, int]":
     """Return the extraction of the frames that are used, and its largest cost, after both were printed.
@@ -410,7 +412,7 @@ FEWEST_PACED = 3
 """Captured frames from which the time of an inference is taken."""
 
 
-def _captured(extraction: "Extraction", location: "Location", most: int) -> "Run":
+def _capture_frames(extraction: "Extraction", location: "Location", most: int) -> "Run":
     """Return the run of the planned frames, and say how long `most` inferences take by the pace of these."""
     ended: list[float] = []
     with progress() as bar:

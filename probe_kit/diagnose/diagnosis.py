@@ -36,7 +36,7 @@ from probe_kit.hooks.family import SIZE
 from probe_kit.intervene.further_instructions import check_further_instructions
 from probe_kit.intervene.open_session import check_readable
 from probe_kit.intervene.pairs import Chunk, Given, Pair, PairRow
-from probe_kit.intervene.patching.patch import Cell, patched
+from probe_kit.intervene.patching.patch import Cell, patch_while_inferring
 from probe_kit.intervene.places import ALL, SiteGroup, resolve_sites
 from probe_kit.intervene.settings import key_of
 from probe_kit.intervene.tokens import PairTokens, roles_of_tokens
@@ -100,7 +100,7 @@ def measure_passage(
 ) -> tuple[SitePassage, ...]:
     """Return difference and carried share at every site, over pairs of equally many tokens; see `SitePassage`.
 
-    Takes two inferences per pair, and one per site. Raises as `capture` and `patched`.
+    Takes two inferences per pair, and one per site. Raises as `capture` and `patch_while_inferring`.
 
     Args:
         session: The run's policy and its observations.
@@ -111,8 +111,8 @@ def measure_passage(
     differences = np.zeros((len(pairs), len(groups)))
     moved, squares = np.zeros((len(pairs), len(groups))), np.zeros(len(pairs))
     for row, pair in enumerate(pairs):
-        clean, before = _captured(session, pair.clean, pair.seed, groups)
-        donated, donor = _captured(session, pair.source, pair.seed, groups)
+        clean, before = _capture_inference(session, pair.clean, pair.seed, groups)
+        donated, donor = _capture_inference(session, pair.source, pair.seed, groups)
         change = scale.changes(donated[None], clean[None])[0]
         squares[row] = change @ change
         tokens = PairTokens(model, pair)
@@ -120,7 +120,7 @@ def measure_passage(
             differences[row, column] = _relative_difference(group, before, donor)
             # Elsewhere the patch would put in what is there already: an inference saved, and a share of 0.
             if squares[row] and differences[row, column] > LIKE_NONE:
-                with patched(tokens, [Cell(group, ALL)], donor):
+                with patch_while_inferring(tokens, [Cell(group, ALL)], donor):
                     edited = session.act(pair.clean, pair.seed)
                 moved[row, column] = scale.changes(edited[None], clean[None])[0] @ change
     # Least squares through 0, of the patch's change on the donor's over all pairs. As a ratio of sums it gives
@@ -132,7 +132,7 @@ def measure_passage(
     )
 
 
-def _captured(
+def _capture_inference(
     session: "ReplaySession", observation: Given, seed: int, groups: Sequence[SiteGroup]
 ) -> "tuple[Chunk, ActivationCache]":
     """Return the actions and the activations of one inference.

@@ -74,7 +74,7 @@ def controls_of(frame: Frame, name: str, spread: NDArray[np.float64]) -> list[Ob
     clean = frame.observation
     if name != INSTRUCTION:
         return [hardly_changed(clean, name, spread)]
-    texts = [frame.other_words] if frame.other_words else _retyped(clean.instruction)
+    texts = [frame.other_words] if frame.other_words else _retype(clean.instruction)
     return [replace(clean, instruction=text) for text in texts]
 
 
@@ -84,7 +84,7 @@ def spread_of_states(frames: Sequence[Frame]) -> NDArray[np.float64]:
     return np.asarray(states.std(axis=0), np.float64)
 
 
-def _retyped(words: str) -> list[str]:
+def _retype(words: str) -> list[str]:
     """Return the words with the full stop and the first letter's case both changed, then with one of them."""
     stopped = with_other_stop(words)
     return [text[:1].swapcase() + text[1:] for text in (stopped, words)] + [stopped]
@@ -145,7 +145,9 @@ def frames_of(
     Raises:
         UsageError: For a run with too few groups.
     """
-    listed = _observed(session, count) if isinstance(session, FrameSession) else _drawn(session, count)
+    listed = (
+        _observed_frames(session, count) if isinstance(session, FrameSession) else _draw_frames(session, count)
+    )
     frames = [_read(frame, paraphrases) for frame in listed]
     _check_groups(frames, lambda: f"{session.run.location} has", REMEDY)
     return frames
@@ -220,7 +222,7 @@ def _read(frame: Frame, paraphrases: Mapping[str, str]) -> Frame:
     return replace(frame, observe=lambda _: observation, other_words=other_words)
 
 
-def _observed(session: FrameSession, count: int) -> Iterator[Frame]:
+def _observed_frames(session: FrameSession, count: int) -> Iterator[Frame]:
     """Yield frames of recordings or of an environment, see `spread_over_groups`."""
     index = session.frames.index
     yield from (index[at] for at in spread_over_groups([frame.group for frame in index], count))
@@ -260,7 +262,7 @@ def _spread(frames: list[int], turns: int, phase: float) -> list[int]:
     return [frames[int(len(frames) * (turn + phase) / turns)] for turn in range(turns)]
 
 
-def _drawn(session: "ReplaySession", count: int) -> Iterator[Frame]:
+def _draw_frames(session: "ReplaySession", count: int) -> Iterator[Frame]:
     """Yield first frames of the scene: of every group one of each item, in the same layout; see `count_groups`."""
     episodes = session.run.episodes
     ordered = order_of_first_frames(episodes, count_groups(count))[:count]

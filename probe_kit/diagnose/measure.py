@@ -99,7 +99,9 @@ class InputExchange:
         available = inputs_of(self.frames, camera)
         check_names(names, available)
         measured = map(self._measure, names or available)
-        return tuple(_declared(diagnosed) if diagnosed.name in absent else diagnosed for diagnosed in measured)
+        return tuple(
+            _apply_declaration(diagnosed) if diagnosed.name in absent else diagnosed for diagnosed in measured
+        )
 
     def against(self, base: Infer, inputs: Sequence[InputDiagnosis]) -> tuple[InputDiagnosis, ...]:
         """Return the inputs, the exchanged ones with their comparison with a base checkpoint; raises as `measure`.
@@ -125,7 +127,7 @@ class InputExchange:
         Every call returns the same pairs. Donors of a frame hold different values of the input, as far as there
         are so many. A donor is an index of `candidates`.
         """
-        compared, candidates = self._compared(name), self.candidates(name)
+        compared, candidates = self._compare_values(name), self.candidates(name)
         if self.table:
             return [(index, donor) for index, donor in self.table if compared.differ(index, donor)]
         values = compared.values(len(candidates))
@@ -204,7 +206,7 @@ class InputExchange:
     def _seeds(self) -> list[int]:
         return [frame.seed for frame in self.frames]
 
-    def _compared(self, name: str) -> InputComparison:
+    def _compare_values(self, name: str) -> InputComparison:
         if name not in self._comparisons:
             self._comparisons[name] = InputComparison.of(self.candidates(name), name)
         return self._comparisons[name]
@@ -212,7 +214,7 @@ class InputExchange:
     def _why_not_varied(self, name: str) -> str:
         """Return why no pair differs in an input, and what to do."""
         frames = self.frames
-        values = self._compared(name).values(len(frames))
+        values = self._compare_values(name).values(len(frames))
         if np.unique(values).size > 1:
             of = "pair of the table holds" if self.table else "two groups of frames hold"
             return f"no {of} different values"
@@ -232,26 +234,26 @@ class InputExchange:
         rows = np.array([index for index, _ in pairs])
         seeds = [frames[index].seed for index in rows]
         candidates = self.candidates(name)
-        values = self._compared(name).values(len(candidates))
+        values = self._compare_values(name).values(len(candidates))
         donors = [candidates[donor].observation for _, donor in pairs]
         varied = [with_input(observations[index], name, donor) for index, donor in zip(rows, donors, strict=True)]
         exchanged, every = self.infer(varied, seeds), self.infer(donors, seeds)
-        control = self._controlled(name)
-        blanked = self._blanked(name)
+        control = self._infer_control(name)
+        blanked = self._infer_blank(name)
         self._exchanges[name] = Exchanges(
             exchanged=scale.shares(exchanged, clean[rows]),
             control=None if control is None else scale.shares(control, clean)[rows],
             every=scale.shares(every, clean[rows]),
             groups=np.array([frames[index].group for index in rows]),
             frames=rows,
-            repeated=_repeated(rows, values[[donor for _, donor in pairs]]),
+            repeated=_is_repeated(rows, values[[donor for _, donor in pairs]]),
             largest=np.abs(exchanged - clean[rows]).max(axis=(1, 2)),
             blanked=np.abs(blanked - clean[: len(blanked)]).max(axis=(1, 2), initial=0.0),
             seeded=scale.shares(self._with_other_seeds, clean)[rows],
         )
         return importance_of(name, self._exchanges[name])
 
-    def _controlled(self, name: str) -> Actions | None:
+    def _infer_control(self, name: str) -> Actions | None:
         """Return the actions of all frames after a change without meaning.
 
         None where the model takes no such change of some frame.
@@ -266,7 +268,7 @@ class InputExchange:
                 return None
         return np.stack(chunks)
 
-    def _blanked(self, name: str) -> Actions:
+    def _infer_blank(self, name: str) -> Actions:
         """Return the actions of all frames without one input; none where the family refuses text without words."""
         try:
             return self.infer(
@@ -276,14 +278,14 @@ class InputExchange:
             return np.zeros((0, 1, 1), np.float32)
 
 
-def _repeated(rows: NDArray[np.intp], values: NDArray[np.intp]) -> NDArray[np.bool_]:
+def _is_repeated(rows: NDArray[np.intp], values: NDArray[np.intp]) -> NDArray[np.bool_]:
     """Return whether an earlier pair of the same frame has a donor with the same value, (P,)."""
     repeated = np.ones(rows.size, bool)
     repeated[np.unique(np.stack([rows, values]), axis=1, return_index=True)[1]] = False
     return repeated
 
 
-def _declared(measured: InputDiagnosis) -> InputDiagnosis:
+def _apply_declaration(measured: InputDiagnosis) -> InputDiagnosis:
     """Return the diagnosis of an input that the adapter declares unread: it is no input if nothing arrived.
 
     A measured effect counts more than the declaration.

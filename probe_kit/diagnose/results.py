@@ -256,12 +256,12 @@ class Knowledge:
                 "action part."
             )
         used = "" if decided else ", and not shown to be used: no input decides the action"
-        return f"{self.target} can be read up to the action, at {where}{self._retained()}{used}."
+        return f"{self.target} can be read up to the action, at {where}{self._describe_retention()}{used}."
 
     def _words(self, site: SiteKnowledge) -> str:
         return f"{site.name} ({self.metric} {site.score:z.2f}, chance {site.chance:z.2f})"
 
-    def _retained(self) -> str:
+    def _describe_retention(self) -> str:
         low, high = self.retention_ci
         limits = f" [{low:z.2f}, {high:z.2f}]" if isfinite(low) and isfinite(high) else ""
         return f"; retention {self.retention:z.2f}{limits}" if isfinite(self.retention) and not self.note else ""

@@ -109,7 +109,7 @@ class ScriptedExpert:
     def _follow(self, plan: list[Waypoint]) -> Iterator[Matrix]:
         """Yield actions along the way-points, then no motion forever."""
         for waypoint in plan:
-            while not self._arrived(waypoint):
+            while not self._has_arrived(waypoint):
                 yield self._towards(waypoint)
             while waypoint.gripper == OPEN and self._env.trial.steps < self._env.scene_spec.forced_closed:
                 yield STAY_SHUT
@@ -123,7 +123,7 @@ class ScriptedExpert:
         shift *= min(1.0, MAX_SHIFT / max(float(np.linalg.norm(shift)), 1e-9))
         return np.array([*shift, 0.0, 0.0, np.clip(turn, -MAX_TURN, MAX_TURN), waypoint.gripper])
 
-    def _arrived(self, waypoint: Waypoint) -> bool:
+    def _has_arrived(self, waypoint: Waypoint) -> bool:
         shift, turn = self._remaining(waypoint)
         return bool(np.linalg.norm(shift) < self._tolerance and abs(turn) < 1e-3)
 

@@ -466,7 +466,7 @@ def play_episodes(
     settings, run, row_ids = setup
     prepared = load(settings, rehearsed=True, choose_rows=None if row_ids is None else partial(_rows_of, row_ids))
     writer = prepared.writer(locate(run))
-    with writer.joined():
+    with writer.take_part():
         writer.begin(settings.machine.allow_mixed)
         with prepared.worker(writer, len(writer.remaining())) as worker:
             while True:

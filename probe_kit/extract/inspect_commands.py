@@ -38,7 +38,8 @@ def models(
     words: Annotated[
         bool,
         typer.Option(
-            "--words", help="List the words that the embedded models know, one per line. Others read any text."
+            "--words",
+            help="List the words that the embedded models know, one per line. All other models read any text.",
         ),
     ] = False,
     as_json: AsJson = False,

@@ -73,7 +73,7 @@ def phrases(suite: Suite, query: Query, seed: int = 0) -> dict[str, Phrase]:
     by_category: dict[str, list[Item]] = {}
     for item in suite.complete.items:
         by_category.setdefault(item.category, []).append(item)
-    choose = _distractor if query == "distractor" else _absent
+    choose = _distractor if query == "distractor" else _absent_phrase
     by_item = {item.item_id: choose(item, by_category[item.category], seed) for item in suite.items}
     missing = [item for item in suite.items if by_item[item.item_id] is None]
     if missing:
@@ -104,7 +104,7 @@ def _distractor(item: Item, items: Sequence[Item], _seed: int) -> Phrase | None:
     return None
 
 
-def _absent(item: Item, items: Sequence[Item], seed: int) -> Phrase | None:
+def _absent_phrase(item: Item, items: Sequence[Item], seed: int) -> Phrase | None:
     """Return a phrase of the category whose concept is in neither picture.
 
     Comparisons, such as "less smiling person", hold of some picture of every pair of their kind. Where a category

@@ -81,8 +81,8 @@ def protocol_identity(model: ModelSettings, task: ActTask, source: SourceSetting
         "protocol": {
             "name": task.protocol,
             **({"variant": row.variant} if row is not None and row.variant else {}),
-            "differs_from_default": _different(protocol, default, protocol),
-            "deviations": _different(protocol, used, {**used, **protocol}),
+            "differs_from_default": _list_differences(protocol, default, protocol),
+            "deviations": _list_differences(protocol, used, {**used, **protocol}),
             "unmatched": [] if row is None else list(row.unmatched),
         }
     }
@@ -163,7 +163,7 @@ def _leaves(values: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[str, 
             yield f"{prefix}{name}", value
 
 
-def _different(
+def _list_differences(
     protocol: Mapping[str, str], other: Mapping[str, str], names: Iterable[str]
 ) -> dict[str, list[str | None]]:
     return {

@@ -20,7 +20,10 @@ def verify(
     ] = None,
     keys: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="File of the full-size model's tensor names, to compare with."),
+        typer.Option(
+            metavar="FILE",
+            help="Text file of the full-size checkpoint's tensor names; the adapter's must be the same.",
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:

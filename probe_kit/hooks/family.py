@@ -156,7 +156,7 @@ class Family:
         from probe_kit.hooks.capturing.capture_context import switch_off_fused_encoder
 
         switch_off_fused_encoder()
-        load = self._imported(self.loader)
+        load = self._import_loader(self.loader)
         if weights_seed:
             if "weights_seed" not in inspect.signature(load).parameters:
                 raise UsageError(f"{self.name} has one untrained network only: its loader takes no weights_seed")
@@ -308,10 +308,10 @@ class Family:
         """
         if not self.checkpoints.declared:
             return None
-        location, loader_options = self._located(checkpoint, options)
+        location, loader_options = self._locate(checkpoint, options)
         if (folder := configuration_folder(location)) is None:
             return None  # before the loader is imported, and torch with it
-        load = self._imported(self.loader)
+        load = self._import_loader(self.loader)
         with while_loading(self.name, str(location)):
             values = self._with_defaults(loader_options, location)
             return outline_of(self.name, load, str(location), folder, dtype, values)
@@ -358,10 +358,10 @@ class Family:
             options: The options of the family, by name.
             fetch: Download small files that are not here; without it, nothing is checked then.
         """
-        location, loader_options = self._located(checkpoint, options)
+        location, loader_options = self._locate(checkpoint, options)
         if self.abilities.words is None or (not fetch and location is not None and is_on_hub(location)):
             return
-        check = self._imported(self.abilities.words)
+        check = self._import_loader(self.abilities.words)
         with while_loading(self.name, str(location or "what it brings")):
             check(location, instructions, **loader_options)
 
@@ -379,10 +379,10 @@ class Family:
         Raises:
             UsageError: Where several are there and none was chosen.
         """
-        location, loader_options = self._located(checkpoint, options)
+        location, loader_options = self._locate(checkpoint, options)
         if self.abilities.units is None or location is None or (not fetch and is_on_hub(location)):
             return ""
-        describe_units = self._imported(self.abilities.units)
+        describe_units = self._import_loader(self.abilities.units)
         with while_loading(self.name, location):
             return with_adapters_named(
                 str(describe_units(location, **self._with_defaults(loader_options, location)))
@@ -446,17 +446,17 @@ class Family:
             UsageError: If it has none.
         """
         self.check_purpose(purpose)
-        return self._imported(str(self._function(purpose)))
+        return self._import_loader(str(self._function(purpose)))
 
     def _function(self, purpose: Literal["outputs", "full_size"]) -> str | None:
         return self.abilities.outputs if purpose == "outputs" else self.checkpoints.full_size
 
-    def _imported(self, path: str) -> Callable[..., Any]:
+    def _import_loader(self, path: str) -> Callable[..., Any]:
         with while_loading(self.name, path), one_scan_of_packages():
             function: Callable[..., Any] = import_object(path)
         return function
 
-    def _located(self, checkpoint: str | None, options: Mapping[str, Any]) -> tuple[str | None, dict[str, Any]]:
+    def _locate(self, checkpoint: str | None, options: Mapping[str, Any]) -> tuple[str | None, dict[str, Any]]:
         """The checkpoint, and the options as the loader gets them."""
         loader_options = check_options(self.name, self.options, options)
         return self.location(checkpoint, loader_options.pop(SIZE, None)), loader_options

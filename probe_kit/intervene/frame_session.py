@@ -76,7 +76,7 @@ class Frames:
         self.player = opened.play(Played())()
         self.cameras = tuple(camera if isinstance(camera, str) else camera[0] for camera in inputs["cameras"])
         self._cached = lru_cache(maxsize=CACHED)(self.observe)
-        self.index = list(self._listed())
+        self.index = list(self._list_frames())
         if not self.index:
             raise UsageError(
                 f"{run.location} has no frame that can be shown again: the streams of all its episodes were "
@@ -143,7 +143,7 @@ class Frames:
         """Free the player's resources."""
         self.player.close()
 
-    def _listed(self) -> Iterator[Frame]:
+    def _list_frames(self) -> Iterator[Frame]:
         inputs = self.run.inputs
         assert inputs is not None
         states = inputs.read("state").astype(np.float64) if "state" in inputs.kinds else None
@@ -258,7 +258,7 @@ class FrameSession(ReplaySession):
         for row in (rows[at] for at in np.unique(spaced)):
             # A draw of its own for every frame: items are replayed one by one, and resumed at any of them.
             rng = np.random.default_rng(derive_seed("donor", self.vary, index[row].name))
-            drawn = draw_donors(index, self.vary, rng, of=[row], compared=self._compared())
+            drawn = draw_donors(index, self.vary, rng, of=[row], compared=self._compare_instructions())
             donors += [(index[row], index[donor]) for _, donor in drawn]
         return donors
 
@@ -271,7 +271,7 @@ class FrameSession(ReplaySession):
         spaced = np.unique(np.linspace(0, len(index) - 1, min(REWORDED, len(index))).round().astype(int))
         return [*index, *(index[at].with_instruction(text) for text in self.instructions for at in spaced)]
 
-    def _compared(self) -> InputComparison | None:
+    def _compare_instructions(self) -> InputComparison | None:
         """Return the comparison of instructions, once; that of pictures would keep all of a data set."""
         return self._compared_instructions if self.vary == INSTRUCTION else None
 

@@ -14,7 +14,7 @@ from probe_kit.hooks.contract.sites import Site
 from probe_kit.intervene.edited_cells import NO_CELL, EditedCell, columns_of
 from probe_kit.intervene.outcomes import CLEAN, CONTROL_INPUT, DONOR, IMAGE_SWAP, NOISE, ConditionOutcomes
 from probe_kit.intervene.pairs import Chunk, Given, Pair
-from probe_kit.intervene.patching.patch import Cell, patched
+from probe_kit.intervene.patching.patch import Cell, patch_while_inferring
 from probe_kit.intervene.tokens import PairTokens
 
 if TYPE_CHECKING:
@@ -155,7 +155,7 @@ def patched_run(
         if not patches:
             return ConditionResult(context.act())
         along = None if bases is None else bases.basis(direction, context.pair.episode)
-        with patched(context.tokens, patches, context.source(source_sites), along) as edit_log:
+        with patch_while_inferring(context.tokens, patches, context.source(source_sites), along) as edit_log:
             return ConditionResult(context.act(), edit_log)
 
     places = (cell.site_group.name for together in cells.values() for cell in together)

@@ -117,7 +117,7 @@ class SceneSession(ReplaySession):
                     category=str(record["category"]),
                     side="left" if record["side_correct"] == "left" else "right",
                     tiles=tiles,
-                    stored=self._stored(int(row)),
+                    stored=self._stored_chunk(int(row)),
                 )
             )
         return pairs
@@ -158,7 +158,7 @@ class SceneSession(ReplaySession):
         assert ending.trajectory is not None
         return largest_difference(ending.trajectory, frames)
 
-    def _stored(self, row: int) -> Chunk | None:
+    def _stored_chunk(self, row: int) -> Chunk | None:
         try:
             commanded = self.run.trajectory(row).commanded
         except NoTrajectoryError:

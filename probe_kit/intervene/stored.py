@@ -103,10 +103,12 @@ class Measurement:
         """
         stored = self.arrays(EPISODES, ConditionOutcomes, ConditionOutcomes.AXES)
         if (first := str(stored["conditions"][:1])) != f"[{CLEAN!r}]":
-            raise self._damaged(EPISODES, f"has {first} as its first condition; expected {CLEAN!r}")
+            raise self._damage_error(EPISODES, f"has {first} as its first condition; expected {CLEAN!r}")
         # Runs of version 0.2 have none of these columns.
         if (lost := [name for name in COLUMNS if name not in stored]) and len(lost) < len(COLUMNS):
-            raise self._damaged(EPISODES, f"lacks {', '.join(lost)} beside the other columns of its conditions")
+            raise self._damage_error(
+                EPISODES, f"lacks {', '.join(lost)} beside the other columns of its conditions"
+            )
         return ConditionOutcomes(**stored, seed_text=self.run.seed_text)
 
     def arrays(self, name: str, record: type, axes: Mapping[str, str]) -> dict[str, Any]:
@@ -124,14 +126,14 @@ class Measurement:
         try:
             stored = arrays_from_bytes(content)
         except UNREADABLE as error:
-            raise self._damaged(name, f"cannot be read: {error}") from error
+            raise self._damage_error(name, f"cannot be read: {error}") from error
         if problem := fields_problem(record, stored):
-            raise self._damaged(name, f"{problem}: another version of probe_kit made it")
+            raise self._damage_error(name, f"{problem}: another version of probe_kit made it")
         if problem := axes_problem(axes, stored):
-            raise self._damaged(name, problem)
+            raise self._damage_error(name, problem)
         return stored
 
-    def _damaged(self, name: str, problem: str) -> RunDamagedError:
+    def _damage_error(self, name: str, problem: str) -> RunDamagedError:
         """Return the error about one file."""
         folder = f"{INTERVENTIONS}/{self.key}"
         return RunDamagedError(f"{self.run.location}/{folder}/{name} {problem}. {advice_for(folder)}")

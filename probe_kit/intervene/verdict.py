@@ -155,10 +155,14 @@ class UseVerdict:
             return in_reverse if self.reversed else ("used", "the action follows the answer")
         if self.behaviour in USES:
             direction = "goes against" if self.reversed else "follows"
-            how = f"only where it lies on the {self.side}" if self.side else "in some episodes or part of the way"
+            how = (
+                f"only where the correct picture lies on the {self.side}"
+                if self.side
+                else "in some episodes or part of the way"
+            )
             return "partly used", f"the action {direction} the answer {how}"
         if self.behaviour == "moves with it, does not decide":
-            return "not decisive", "the answer shifts the action without turning it"
+            return "not decisive", "the answer shifts the action, but not to the other picture"
         if self.behaviour == "not used":
             return "not used", "the action does not follow the answer"
         if self.lacks_control:
@@ -192,10 +196,10 @@ def describe_readouts(uses: Iterable[UseVerdict | None]) -> str:
     if not stored:
         return ""
     if len(stored) == 2:
-        return "verdicts are of the first chunk and of the whole episode, and the sentence says of which"
+        return "the sentence says which verdict is of the first chunk of actions and which of the whole episode"
     if PER_STEP in stored:
         return "verdicts are of the whole episode"
-    return "verdicts are of the first chunk; --readout per-step gives those of the whole episode"
+    return "verdicts are of the first chunk of actions; --readout per-step gives those of the whole episode"
 
 
 # -- behaviour -------------------------------------------------------------------------------------------------
@@ -324,20 +328,31 @@ def _open(effect: ImageSwapEffect) -> str:
 
 def more_groups(swap: Any, groups: int) -> str:
     """Return about how many groups of items would decide an effect that is undecided with so many."""
+    needed = _groups_to_decide(swap, groups)
+    number = f"about {ceil(needed)}" if needed <= MANY else f"more than {MANY}"
+    return f"{number} {_WOULD_TELL}"
+
+
+def items_to_decide(swap: Any, items: int, groups: int) -> str:
+    """Return about how many items would decide an effect that is undecided with so many in so many groups."""
+    needed, size = _groups_to_decide(swap, groups), items / groups if groups else 1
+    number = f"about {ceil(ceil(needed) * size)}" if needed <= MANY else f"more than {ceil(MANY * size)}"
+    return f"{number} items would show whether the action follows it"
+
+
+def _groups_to_decide(swap: Any, groups: int) -> float:
     effects = (
         (swap.net_follow_rate or 0.0, _width(swap.net_follow_rate_ci), SMALLEST_EFFECT_OF_INTEREST),
         (swap.reach_share or 0.0, _width(swap.reach_share_ci), SMALLEST_SHARE_OF_INTEREST),
     )
-    needed = groups_to_decide(groups, effects)
-    number = f"about {ceil(needed)}" if needed <= MANY else f"more than {MANY}"
-    return f"{number} {_WOULD_TELL}"
+    return groups_to_decide(groups, effects)
 
 
 _WOULD_TELL = "groups would tell"
 
 
 def size_of_groups(texts: Iterable[str], counts: Iterable[tuple[int, int]]) -> str:
-    """Return how many items a group has where a text says how many groups would tell; else an empty text.
+    """Return how many groups the items are where a text says how many groups would tell; else an empty text.
 
     Tables count items, which are what a user adds.
 
@@ -345,11 +360,13 @@ def size_of_groups(texts: Iterable[str], counts: Iterable[tuple[int, int]]) -> s
         texts: Texts of the verdicts.
         counts: Number of items and groups of each category.
     """
-    sizes = sorted({round(items / groups, 1) for items, groups in counts if groups})
+    counted = {(items, groups) for items, groups in counts if groups}
+    sizes = sorted({round(items / groups, 1) for items, groups in counted})
     if not sizes or not any(_WOULD_TELL in text for text in texts):
         return ""
+    items, groups = max(counted)
     span = f"{sizes[0]:g}" if len(sizes) == 1 else f"{sizes[0]:g} to {sizes[-1]:g}"
-    return f"a group is {span} items that share a picture"
+    return f"{items} items are {groups} independent groups, because {span} items share each picture"
 
 
 def _width(limits: tuple[float | None, float | None] | None) -> float:

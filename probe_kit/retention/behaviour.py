@@ -298,7 +298,7 @@ def success_rate(episodes: "pd.DataFrame") -> SuccessRate:
         share_wrong=share_wrong,
         share_outside=share_outside,
         share_never_moved=_rate(episodes["never_moved"].astype(bool)) if "never_moved" in episodes else None,
-        share_invalid_action=_flagged(episodes),
+        share_invalid_action=_flagged_share(episodes),
         chance_margin_episodes=chance_margin(len(episodes)),
         chance_margin_items=chance_margin(n_items),
         chance_margin=margin,
@@ -309,7 +309,7 @@ def success_rate(episodes: "pd.DataFrame") -> SuccessRate:
     )
 
 
-def _flagged(episodes: "pd.DataFrame") -> float | None:
+def _flagged_share(episodes: "pd.DataFrame") -> float | None:
     """Return the share of inferences that were flagged; every inference counts once, whatever its episode."""
     if not {"flagged_steps", "inferences"} <= set(episodes):
         return None

@@ -191,8 +191,8 @@ LastSteps = Annotated[
     typer.Option(
         "--last-steps",
         min=1,
-        help="Number of control steps at the end of an episode that the rule judges. The released evaluation "
-        "averages 11.",
+        help="Number of control steps at the end of an episode that --rule judges; success is their mean. The "
+        "released evaluation uses 11.",
         rich_help_panel=RULES,
     ),
 ]
@@ -447,8 +447,8 @@ def _keys(paths: list[str], texts: list[str]) -> list[str | None]:
         name, separator, key = text.rpartition("=")
         if not (separator and name and key):
             raise UsageError(f"--probes {text!r} is not RUN=KEY; `probe-kit run show RUN` lists the keys")
-        matches = [at for at, path in enumerate(paths) if _stripped(path) == _stripped(name)]
-        matches = matches or [at for at, path in enumerate(paths) if _stripped(path).rpartition("/")[2] == name]
+        matches = [at for at, path in enumerate(paths) if _strip_name(path) == _strip_name(name)]
+        matches = matches or [at for at, path in enumerate(paths) if _strip_name(path).rpartition("/")[2] == name]
         if len(matches) != 1:
             raise UsageError(
                 f"--probes {text!r}: {name} is {'several' if matches else 'none'} of the runs {', '.join(paths)}"
@@ -459,7 +459,7 @@ def _keys(paths: list[str], texts: list[str]) -> list[str | None]:
     return keys
 
 
-def _stripped(path: str) -> str:
+def _strip_name(path: str) -> str:
     return path.rstrip("/") if "://" in path else str(Path(path).resolve())
 
 
@@ -469,7 +469,7 @@ def _check_doubles(paths: Sequence[str]) -> None:
     The function `retention` also knows copies of a run.
     """
     for at, path in enumerate(paths):
-        if _stripped(path) in map(_stripped, paths[:at]):
+        if _strip_name(path) in map(_strip_name, paths[:at]):
             raise UsageError(f"{path} is given twice; its episodes would count twice. Leave one out")
 
 

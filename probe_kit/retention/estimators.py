@@ -413,13 +413,13 @@ def estimate_retention(
         absent_below: Accuracy below which a backbone without signal counts as absent, see `verdict`.
     """
     if streams is None:
-        published = _published(peaks[ACTION].score, peaks[BACKBONE].score)
+        published = _published_ratio(peaks[ACTION].score, peaks[BACKBONE].score)
         return RetentionEstimate(value=nan, interval=NO_LIMITS, published=published, defined=False, note=NO_SCORES)
     ratio: Ratio = retention(streams.scores)
     return RetentionEstimate(
         value=ratio.value,
         interval=ratio.interval,
-        published=_published(streams.peak(ACTION), streams.peak(BACKBONE)),
+        published=_published_ratio(streams.peak(ACTION), streams.peak(BACKBONE)),
         defined=has_signal(exceeds),
         note=_missing_signal(exceeds, streams, absent_below) if streams.at_most else "",
     )
@@ -556,7 +556,7 @@ def missing_condition(
     return "", ""
 
 
-def _published(action: float, backbone: float) -> float:
+def _published_ratio(action: float, backbone: float) -> float:
     """Return the paper's ratio, of the best sites' accuracies above one half; NaN where the backbone's is 0."""
     return nan if backbone == CHANCE else float((action - CHANCE) / (backbone - CHANCE))
 

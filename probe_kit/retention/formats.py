@@ -29,7 +29,7 @@ def frame_of(rows: Sequence[RetentionRow] | Sequence[Difference]) -> "pd.DataFra
     Floats stay floats, undefined ones are NaN; whole numbers and text are nullable. Intervals become two columns,
     `ci_low` and `ci_high`. A mapping becomes one column per name, such as `controls.baselines.pixels`.
     """
-    return _frame([_flat(_defined(row)) for row in rows])
+    return _frame([_flat(_defined_numbers(row)) for row in rows])
 
 
 def part_frame(rows: Sequence[RetentionRow], part: str, by_view: bool = True) -> "pd.DataFrame":
@@ -41,7 +41,7 @@ def part_frame(rows: Sequence[RetentionRow], part: str, by_view: bool = True) ->
         by_view: Whether the part depends on the view; else every category is listed once.
     """
     of_views = [row for row in rows if row.view is not None] if by_view else once_per_category(rows)
-    return _frame([_key(row, by_view) | _flat(getattr(_defined(row), part)) for row in of_views])
+    return _frame([_key(row, by_view) | _flat(getattr(_defined_numbers(row), part)) for row in of_views])
 
 
 def peak_frame(rows: Sequence[RetentionRow]) -> "pd.DataFrame":
@@ -77,7 +77,7 @@ def _key(row: RetentionRow, by_view: bool) -> _Flat:
     return key | ({"view": ("string", row.view)} if by_view else {})
 
 
-def _defined(row: Any) -> Any:
+def _defined_numbers(row: Any) -> Any:
     """Return the row without numbers of retention where it is not defined."""
     if not isinstance(row, RetentionRow) or row.retention.defined:
         return row
@@ -146,8 +146,8 @@ def table_json(
     lines = [asdict(row) | _in_words(row) | (_json_of_row(row, between_runs) if several else {}) for row in rows]
     records = {
         "differences": [asdict(row) for row in between_groups],
-        "wordings": list(map(_of_wordings, wordings)),
-        "vlm_vla": list(map(_of_vlm_and_policy, vlm_vla)),
+        "wordings": list(map(_name_wordings, wordings)),
+        "vlm_vla": list(map(_name_vlm_and_policy, vlm_vla)),
     }
     filled = {name: lines_of for name, lines_of in records.items() if lines_of}
     content = {"rows": lines, **filled} if filled else lines
@@ -173,14 +173,14 @@ def _json_of_row(row: RetentionRow, differences: Sequence[Difference]) -> dict[s
     return {"differences": differences_of}
 
 
-def _of_wordings(row: Difference) -> dict[str, Any]:
+def _name_wordings(row: Difference) -> dict[str, Any]:
     """Return two wordings of a run by the words of their table."""
     names = {"run": row.run, "category": row.category, "wording": row.group, "other": row.minus}
     rates = {"sr": row.sr_group, "other_sr": row.sr_minus, "difference": row.sr, "difference_ci": row.sr_ci}
     return names | rates | {"only": row.only, "only_other": row.only_minus} | _test(row)
 
 
-def _of_vlm_and_policy(row: Difference) -> dict[str, Any]:
+def _name_vlm_and_policy(row: Difference) -> dict[str, Any]:
     """Return a VLM minus a policy by the words of their table."""
     names = {"asked": row.group, "acted": row.minus, "category": row.category, "paired": row.paired}
     rates = {"accuracy": row.sr_group, "sr": row.sr_minus, "difference": row.sr, "difference_ci": row.sr_ci}

@@ -401,7 +401,7 @@ def retention_table(
     if targets is None:
         # The default itself, and not radii equal to it, means that the caller named none.
         check_epsilons(check_rule(rule), epsilons is not SENSITIVITY_RADII)
-        members, key_of_run = _of_sides(members, key_of_run, score, with_side_words)
+        members, key_of_run = _side_members(members, key_of_run, score, with_side_words)
     every = [run for _, run in members]
     names = distinct_labels(every, labels)
     # Rows of labels show no success rate, so that no rule judges them and no trajectory is read.
@@ -479,7 +479,7 @@ Member = tuple[str | None, RunReader]
 """A run of a group, and the name of the group where there are several."""
 
 
-def _of_sides(
+def _side_members(
     members: Sequence[Member], keys: Sequence[str | None], score: str, with_side_words: bool
 ) -> tuple[list[Member], list[str | None]]:
     """Return runs, read by a score, and their keys, those of VLM runs first.

@@ -28,8 +28,8 @@ _COLUMNS = {
     "step": "step: of the training",
     "success %": "success: the cube ends on the correct picture",
     "backbone %": "backbone: accuracy of probes in the backbone",
-    "action %": "action: the same at the action's sites",
-    "retention": "retention: share of the backbone's signal left in the action",
+    "action %": "action: the same for the layers that produce the action",
+    "retention": "retention: share of the backbone's accuracy above chance that is left in the action",
     "drift of the backbone, points": "drift: the backbone's accuracy minus that of the first step, paired by "
     "items where both ran the same",
 }

@@ -177,7 +177,7 @@ def copy_run(
     keys = [key for key in _copied_keys(run, arrays, pictures, directions) if run.location.exists(key)]
     present = set(target.keys(""))
     if present - {*keys, LEFT_OUT_FILE} or (isinstance(target, Folder) and present):
-        raise UsageError(f"{target} is not empty; choose another place for the copy")
+        raise UsageError(f"{target} is not empty; give a new or empty folder for the copy")
     if isinstance(target, Folder):
         folder = Path(target.address)
         with full_disk_in_words(target.path), draft_of(folder) as draft:

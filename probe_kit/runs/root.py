@@ -314,7 +314,9 @@ def read_root(location: Location) -> Root:
     """
     root = find_root(location)
     if root is None:
-        raise RunNotFoundError(f"{location} is not a run: it has no {RUN_FILE}. {what_to_open(str(location))}")
+        raise RunNotFoundError(
+            f"{location} is not a run: there is no {location}/{RUN_FILE}. {what_to_open(str(location))}"
+        )
     return root
 
 

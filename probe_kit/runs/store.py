@@ -156,16 +156,16 @@ class Bucket:
             yield
         except FileNotFoundError as error:
             if _NO_BUCKET in str(error):
-                raise self._explained(error, key) from error
+                raise self._explain(error, key) from error
             raise
         except BaseError as error:
-            raise self._explained(error, key) from error
+            raise self._explain(error, key) from error
         except BaseException as error:
             if type(error).__module__ != "pyo3_runtime":  # where a bug of obstore arrives, as no `Exception`
                 raise
-            raise self._explained(error, key) from error
+            raise self._explain(error, key) from error
 
-    def _explained(self, error: BaseException, key: str) -> StoreError:
+    def _explain(self, error: BaseException, key: str) -> StoreError:
         """Return the error of the store, with the remedy."""
         why = str(error).split("\n\nDebug source", maxsplit=1)[0].replace("\n", " ")
         advice = (

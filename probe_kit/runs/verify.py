@@ -245,7 +245,7 @@ def _audit(location: Location, deep: bool) -> Audit:
         return Audit(str(location), 0, 0, 0, False, deep, (str(error),))
     problems: list[str] = []
 
-    def checked[T](read: Callable[[], T], otherwise: T) -> T:
+    def check_part[T](read: Callable[[], T], otherwise: T) -> T:
         """Return the part of the run that `read` reads; its error is kept as a problem."""
         try:
             return read()
@@ -255,26 +255,26 @@ def _audit(location: Location, deep: bool) -> Audit:
 
     commits: dict[int, Commit] = {}
     for number, key, raw in numbered_objects(location, COMMITS):
-        if commit := checked(partial(read_commit, root, number, key, raw), None):
+        if commit := check_part(partial(read_commit, root, number, key, raw), None):
             commits[number] = commit
     try:
         left_out = root.left_out
     except RunDamagedError as error:  # whether objects are missing on purpose is not known
         return Audit(str(location), len(commits), planned, 0, False, deep, (*problems, str(error)))
-    checked(lambda: _check_records(root, commits), None)
-    checked(lambda: read_seconds(root, commits), None)
-    failures = checked(lambda: len(read_failures(root)), 0)
-    columns = checked(lambda: find_columns(root, commits), None)
+    check_part(lambda: _check_records(root, commits), None)
+    check_part(lambda: read_seconds(root, commits), None)
+    failures = check_part(lambda: len(read_failures(root)), 0)
+    columns = check_part(lambda: find_columns(root, commits), None)
     for home in BUNDLES:
         for key in bundle_keys(location, home):
-            checked(partial(read_bundle, location, home, key), None)
+            check_part(partial(read_bundle, location, home, key), None)
     objects = list(stored_objects(root, commits, columns))
     sizes = sizes_of(location, objects)
     problems += filter(None, (stored.problem(sizes.get(stored.key)) for stored in objects))
     if deep:
         problems += _content_problems(location, objects)
     for key in root.card.objects:
-        checked(partial(root.read_metadata, key), b"")
+        check_part(partial(root.read_metadata, key), b"")
     if deep and not problems and planned:  # readers of a damaged run would only repeat what is known
         run = Run(location)
         problems += _differences(run) if columns is not None else ()

@@ -168,7 +168,7 @@ class RunWriter:
         self._label = label or str(self.settings["model"])
         if not location.exists(RUN_FILE):
             begin(location, self._beginning(), last=RUN_FILE)
-        self.root = while_growing(location, self._continued)
+        self.root = while_growing(location, self._continue_root)
         self.plan = plan.numbered({row["episode_id"]: row["episode"] for row in self.root.plan})
 
     @property
@@ -199,7 +199,7 @@ class RunWriter:
         label = Label(run=card.hash, label=self._label)
         return {**objects, LABEL_FILE: label.to_bytes(), RUN_FILE: card.to_bytes()}
 
-    def _continued(self) -> Root:
+    def _continue_root(self) -> Root:
         """Return the root of the run that is there, whose plan now holds the one of this writer."""
         root = read_root(self.location)
         root.check_continuable()
@@ -207,7 +207,7 @@ class RunWriter:
         self._check_lengths(root)
         if self._lacks(root):
             with self.location.locked(lambda: None), self.location.take_turns(PLANS):
-                root = self._grown()
+                root = self._grow_root()
         root.check()
         if root.plan:  # an array has no length before its first row arrives
             root.set_lengths()
@@ -219,7 +219,7 @@ class RunWriter:
             return False
         return not root.plan or bool(further_rows(root.plan, self.plan.columns, self.location))
 
-    def _grown(self) -> Root:
+    def _grow_root(self) -> Root:
         """Return the root, once the run plans all of this writer's episodes."""
         root = read_root(self.location)
         while self._lacks(root):
@@ -314,7 +314,7 @@ class RunWriter:
             yield
 
     @contextmanager
-    def joined(self) -> Iterator[None]:
+    def take_part(self) -> Iterator[None]:
         """Work along while the body runs, in a process that the owner started, and may outlive it.
 
         No process then removes its drafts as leftovers. Failures that the owner recorded stay.

@@ -143,11 +143,11 @@ def _dtype(name: Any) -> np.dtype[Any]:
 
 def pack(message: Mapping[str, Any]) -> bytes:
     """Return a message, in which arrays are as openpi's client reads them."""
-    packed: bytes = msgpack.packb(message, default=_packed)
+    packed: bytes = msgpack.packb(message, default=_pack)
     return packed
 
 
-def _packed(value: Any) -> Any:
+def _pack(value: Any) -> Any:
     if isinstance(value, np.ndarray) and value.dtype.kind in NUMBER_KINDS:
         array = np.asarray(value, order="C")
         return {_ARRAY: True, _DATA: array.tobytes(), _DTYPE: array.dtype.str, _SHAPE: list(array.shape)}

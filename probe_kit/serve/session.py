@@ -257,7 +257,7 @@ class Session:
         with self._location.explained_errors():
             writer = RunWriter(self._location, plan, identity, provenance, run_label(settings))
             writer.begin(settings.machine.allow_mixed)
-            self._held.enter_context(writer.joined())
+            self._held.enter_context(writer.take_part())
         return writer
 
     @property

@@ -98,14 +98,14 @@ def sides_table(table: RetentionTable) -> Table:
     note = ["left, right: side of the correct picture", _MEAN]
     title = "Success rate % by side and layout"
 
-    def of_sides(row: RetentionRow) -> Cell:
+    def sides_cell(row: RetentionRow) -> Cell:
         return _two(row.success.sr_left, row.success.sr_right)
 
-    def of_layouts(row: RetentionRow) -> Cell:
+    def layouts_cell(row: RetentionRow) -> Cell:
         return _two(row.success.sr_original, row.success.sr_swapped)
 
-    sides = _pivot(table, title, note, [by_side, *_by_category(table, of_sides)])
-    layouts = _pivot(table, title, note, [by_layout, *_by_category(table, of_layouts)])
+    sides = _pivot(table, title, note, [by_side, *_by_category(table, sides_cell)])
+    layouts = _pivot(table, title, note, [by_layout, *_by_category(table, layouts_cell)])
     rows = tuple(row for both in zip(sides.rows, layouts.rows, strict=True) for row in both)
     return replace(sides, rows=rows, names=2)
 
@@ -253,15 +253,15 @@ def _by_category(
 ) -> Iterator[_Column]:
     """Yield a column per category under its domain, then the mean."""
 
-    def of(category: str) -> Callable[[OfSystem], Cell]:
+    def category_cell(category: str) -> Callable[[OfSystem], Cell]:
         return lambda rows: cell(rows[category]) if category in rows else Cell(None)
 
     for domain, members in _domains(table):
         for name in members:
-            yield _Column(category_of(name).title, domain, of(name))
+            yield _Column(category_of(name).title, domain, category_cell(name))
         if domain_means and domain and len(members) > 1:
             yield _Column(domain, domain, partial(_mean_cell, tuple(members)))
-    yield _Column(MEAN, "", of(MEAN))
+    yield _Column(MEAN, "", category_cell(MEAN))
 
 
 def _mean_cell(categories: Sequence[str], rows: OfSystem) -> Cell:

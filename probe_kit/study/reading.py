@@ -72,8 +72,8 @@ def find_study(name: str) -> Path:
     if name in shipped:
         return shipped[name]
     raise UsageError(
-        f"there is no study file {name!r}, and no study of the package of that name; the package has "
-        f"{', '.join(sorted(shipped))}"
+        f"there is no study file {name!r}, and the package has no study of that name; give the path of a file, or "
+        f"one of {', '.join(sorted(shipped))}"
     )
 
 

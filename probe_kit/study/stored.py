@@ -232,7 +232,7 @@ def open_matching(study: LoadedStudy, cell: PlannedRun, partial: bool) -> "Run":
         SettingsMismatchError: For the run of another cell, which it names.
     """
 
-    def played(any_cell: PlannedRun) -> PlayedModel | None:
+    def find_model(any_cell: PlannedRun) -> PlayedModel | None:
         return None if study.home is None else study.home.played_model(any_cell)
 
     if study.home is not None:
@@ -245,7 +245,7 @@ def open_matching(study: LoadedStudy, cell: PlannedRun, partial: bool) -> "Run":
                 f"{hint}. Give the file a path that is here, or that of a stored run"
             ) from error
         raise
-    problems = list(differences(run, cell, played(cell)))
+    problems = list(differences(run, cell, find_model(cell)))
     packed = None if study.pack is None else study.pack.runs.get(cell.name)
     if not problems and packed is not None and packed.settings_sha256 != run.settings_sha256:
         hashes = f"{run.settings_sha256[:12]}, noted {packed.settings_sha256[:12]}"
@@ -253,7 +253,7 @@ def open_matching(study: LoadedStudy, cell: PlannedRun, partial: bool) -> "Run":
     if not problems:
         return run
     cells = (other for other in study.cells if other.name != cell.name)
-    owners = (other.name for other in cells if not any(differences(run, other, played(other))))
+    owners = (other.name for other in cells if not any(differences(run, other, find_model(other))))
     owner = next((f" It is a run of {name}." for name in owners), "")
     more = f" and {len(problems) - _MOST_PRINTED} more" if len(problems) > _MOST_PRINTED else ""
     raise SettingsMismatchError(

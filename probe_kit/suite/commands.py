@@ -80,8 +80,9 @@ def from_csv(
 
     if license_name is None:
         raise UsageError(
-            "--license is missing: a suite says what others may do with its pictures. Of your own pictures it is "
-            "yours to choose: --license CC0-1.0 (anything), CC-BY-4.0 (name you) or LicenseRef-not-for-others"
+            "--license is missing; a suite stores what others may do with its pictures. For your own pictures "
+            "choose one: --license CC0-1.0 (they may do anything), CC-BY-4.0 (they must name you) or "
+            "LicenseRef-not-for-others. For pictures of others give the licence under which you got them"
         )
     terms = Terms(license_name, attribution, contains_real_face=real_faces)
     suite = suite_from_csv(table, out_folder, name=name, category=category, terms=terms)

@@ -174,7 +174,10 @@ def read_suite(folder: Path) -> tuple[Suite | None, list[Finding]]:
 def _read_card(folder: Path) -> dict[str, Any] | list[Finding]:
     path = folder / CARD
     if not path.is_file():
-        raise UsageError(f"{folder} is not a suite: it holds no {CARD}. Name the folder a suite was written to.")
+        raise UsageError(
+            f"{folder} is not a suite: it holds no {CARD}. Give the folder that `probe-kit suite build`, "
+            "`suite from-csv` or `suite convert` wrote."
+        )
     try:
         card = parse_line(read_regular(path), CARD)
     except OSError as problem:

@@ -143,7 +143,7 @@ class BuiltinColumns:
             return BuiltinColumn(SIM_COLUMNS[name][0], episodes, inferences, self._sim[name])
         if name.startswith(ITEM) and name.removeprefix(ITEM) in ITEM_COLUMNS:
             ids = tuple(run.episodes[EPISODE].astype(str))
-            return BuiltinColumn("classes", ids, None, tuple(_of_item(run, name.removeprefix(ITEM))))
+            return BuiltinColumn("classes", ids, None, tuple(_item_cells(run, name.removeprefix(ITEM))))
         if name == OUTCOME and OUTCOME in outcome_column(run):
             outcomes = tuple(run.episodes["outcome"].astype(str))
             return BuiltinColumn("binary", tuple(run.episodes[EPISODE].astype(str)), None, outcomes)
@@ -296,8 +296,8 @@ def label_frame(run: RunReader) -> "pd.DataFrame":
         table[name] = run.episodes[name].iloc[rows].tolist()
     table |= sim
     for name in ITEM_COLUMNS if run.inputs is None else ():
-        if set(_needed(name)) <= set(run.episodes):
-            cells = list(_of_item(run, name))
+        if set(_needed_columns(name)) <= set(run.episodes):
+            cells = list(_item_cells(run, name))
             table[ITEM + name] = [cells[row] for row in rows]
     return pd.DataFrame(table)
 
@@ -354,21 +354,21 @@ def _finite(value: Cell) -> Cell:
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
-def _needed(name: str) -> tuple[str, ...]:
+def _needed_columns(name: str) -> tuple[str, ...]:
     """Return the columns of the episodes that an `item.*` column is made of."""
     if name == "category":
         return ("category",)
     return "target_concept", "distractor_concept", "side_correct"
 
 
-def _of_item(run: RunReader, name: str) -> Iterator[Cell]:
-    if lacking := [column for column in _needed(name) if column not in run.episodes]:
+def _item_cells(run: RunReader, name: str) -> Iterator[Cell]:
+    if lacking := [column for column in _needed_columns(name) if column not in run.episodes]:
         raise UsageError(f"the episodes of {run.location} lack the column {lacking[0]!r} of {ITEM}{name}")
-    for row in run.episodes[list(_needed(name))].astype(str).to_dict("records"):
+    for row in run.episodes[list(_needed_columns(name))].astype(str).to_dict("records"):
         if name == "category":
             yield row["category"]
             continue
-        correct, wrong, side = (row[column] for column in _needed(name))
+        correct, wrong, side = (row[column] for column in _needed_columns(name))
         left_concept = correct if side == "left" else wrong
         pair = " / ".join(sorted((correct, wrong)))
         yield {"named": correct, "other": wrong, "left": left_concept, "pair": pair}[name]

@@ -147,7 +147,7 @@ Controls = Annotated[
         metavar=f"{choices(CONTROLS)},…",
         help="Control features that do not come from the model, comma-separated, or none. Default for a side: "
         "random-features and pixels, if the pictures of the suite are available. Default for other targets: "
-        "all but action and position. pixels takes as long as one or two sites.",
+        "all that the run allows, but action and position. pixels takes as long as one or two sites.",
     ),
 ]
 Untrained = Annotated[

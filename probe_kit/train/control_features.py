@@ -58,7 +58,7 @@ class ControlInputs:
             "position": self._layout,
             "step": lambda: step_features(self.samples, self._frames()),
             "state": self._state,
-            "action": lambda: self._recorded("action")[:, 0].astype(np.float32),
+            "action": lambda: self._recorded_inputs("action")[:, 0].astype(np.float32),
             "pixels": lambda: self._pixels(THUMBNAIL),
         }
         return makers[name]()
@@ -94,7 +94,7 @@ class ControlInputs:
 
     def _state(self) -> Features:
         if self.recorded is not None:
-            return self._recorded("state").astype(np.float32)
+            return self._recorded_inputs("state").astype(np.float32)
         return state_features(self.run, self.samples)
 
     @cached_property
@@ -103,7 +103,7 @@ class ControlInputs:
         inputs: StoredInputs | None = self.run.inputs
         return inputs
 
-    def _recorded(self, kind: str) -> NDArray[Any]:
+    def _recorded_inputs(self, kind: str) -> NDArray[Any]:
         """Return the stored inputs (n, …) of the samples, of one kind."""
         assert self.recorded is not None
         values: NDArray[Any] = self.recorded.read(kind)[self.samples.rows, self.samples.inferences]
@@ -121,7 +121,7 @@ class ControlInputs:
 
     def _pixels(self, side: int) -> Features:
         if self.recorded is not None:
-            return small_pictures(self._recorded("pixels"), side)
+            return small_pictures(self._recorded_inputs("pixels"), side)
         assert self.suite is not None, "a control that needs pictures is given the suite"
         rows, row_number = np.unique(self.samples.rows, return_inverse=True)
         return tile_pixels(self.run.episodes.iloc[rows], self.suite, side)[row_number]

@@ -180,7 +180,9 @@ def add_controls(
                     comparison
                     for (curve_category, view), curve in results.curves.items()
                     for stream in (curve.streams if curve_category == category else ())
-                    for comparison in _compared(results, name, (category, view), stream, references[stream].scores)
+                    for comparison in _compare_sites(
+                        results, name, (category, view), stream, references[stream].scores
+                    )
                 ]
             controls = controls.with_scores(scores, compared)
     return replace(results, controls=controls)
@@ -237,7 +239,7 @@ def control_score(name: str, category: str, curve: ProbeCurve, stream: str = "",
     )
 
 
-def _compared(
+def _compare_sites(
     results: ProbeResults, name: str, key: tuple[str, str], stream: str, references: Matrix
 ) -> Iterator[ControlComparison]:
     """Yield every site of a stream against the mean of a control's scores, or the best untrained site.
@@ -407,7 +409,7 @@ def add_untrained(results: ProbeResults, untrained: ProbeResults) -> ProbeResult
             if not curve.balanced:
                 best = other.only(other.best(stream))
                 scores.append(replace(control_score(UNTRAINED, key[0], best, stream, key[1]), chance=None, p=None))
-            compared += _compared(results, UNTRAINED, key, stream, other.scores[other_rows])
+            compared += _compare_sites(results, UNTRAINED, key, stream, other.scores[other_rows])
     controls = results.controls.with_untrained(gains, untrained.settings.key).with_scores(scores, compared)
     return replace(results, controls=controls)
 

@@ -63,14 +63,14 @@ def read_table(
         headings = tuple(str(name) for name in frame.columns)
         position_of = _places(headings, requested, "DataFrame")
         cells = {name: frame.iloc[:, number].tolist() for name, number in position_of.items()}
-        return _of_cells(cells, headings, len(frame), "DataFrame", names)
+        return _build_table(cells, headings, len(frame), "DataFrame", names)
     path = Path(table)
     if path.suffix.lower() in (".parquet", ".pq"):
         try:
             check_regular(path, MOST_BYTES)
         except OSError as error:
             raise UsageError(f"{path} cannot be read: {error.strerror}. Give a CSV or Parquet file") from error
-        return _of_parquet(path, requested, names)
+        return _read_parquet(path, requested, names)
     opened = open_table(path, (EPISODE, *SOURCES))
     read = list(_places(opened.names, requested, str(path), opened.line))
     return LabelTable.of_lines(opened, opened.rows(read), read)
@@ -114,7 +114,7 @@ def _other_delimiter(names: Sequence[str]) -> str:
     return ""
 
 
-def _of_parquet(path: Path, requested: Sequence[str], names: Sequence[str]) -> LabelTable:
+def _read_parquet(path: Path, requested: Sequence[str], names: Sequence[str]) -> LabelTable:
     """Read the cells by arrow, because pandas rounds large integers beside empty cells."""
     require("pyarrow.parquet", "export")
     try:
@@ -131,10 +131,10 @@ def _of_parquet(path: Path, requested: Sequence[str], names: Sequence[str]) -> L
         reason = str(error).rstrip(".")
         raise UsageError(f"{path} is no Parquet file: {reason}. Write it again, or give a CSV file") from error
     cells = {name: read.column(name).to_pylist() for name in position_of}
-    return _of_cells(cells, tuple(headings), len(read), str(path), names)
+    return _build_table(cells, tuple(headings), len(read), str(path), names)
 
 
-def _of_cells(
+def _build_table(
     cells: dict[str, list[Any]], headings: tuple[str, ...], count: int, source: str, names: Sequence[str]
 ) -> LabelTable:
     table = LabelTable(source, "row", headings, {}, list(range(1, count + 1)))

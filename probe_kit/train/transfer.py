@@ -215,7 +215,7 @@ def transfer_probes(
             f"the label of {run.location} is {side.target.described}, that of {other.location} is "
             f"{other_side.target.described}; expected one definition. Give both the same column and task"
         )
-    samples, shared = _unshared(run, train.samples, other, other_side.samples, side.target.group_by)
+    samples, shared = _unshared_samples(run, train.samples, other, other_side.samples, side.target.group_by)
     test = make_problem(other, other_side.target, samples, EVERYWHERE, other_side.settings)
     code = _codes(train.classes, test.classes)
     keys = [(view, site) for view in views for site in sites_of(other, view)]
@@ -329,7 +329,7 @@ def _same_weights(run: RunReader, other: RunReader) -> bool:
     return run.weights_sha256 is not None and run.weights_sha256 == other.weights_sha256
 
 
-def _unshared(
+def _unshared_samples(
     run: RunReader, samples: TargetSamples, other: RunReader, other_samples: TargetSamples, group_by: str | None
 ) -> tuple[TargetSamples, int]:
     """Return the samples in groups that `run` does not have, and how many groups are left out.
@@ -373,7 +373,7 @@ def _transfer(
     train: Problem, run_samples: Samples, test: Problem, other_samples: Samples, code: Matrix | None
 ) -> _Transferred:
     count, other_count = run_samples.counts.size, other_samples.counts.size
-    samples = Samples.joined([run_samples, other_samples, _recentred(other_samples, run_samples)])
+    samples = Samples.joined([run_samples, other_samples, _recentre(other_samples, run_samples)])
     fold = NestedFold(
         Fold(np.arange(count), np.arange(count, count + 2 * other_count)), [fold.outer for fold in train.folds]
     )
@@ -384,12 +384,13 @@ def _transfer(
         predicted = code[predicted.astype(np.intp)]
     truth = np.column_stack([test.labels, test.permuted_for(other_samples)]).astype(np.float64)
     fitted, recentred = (
-        _scored(predictions, truth, test.task, strength) for predictions in np.split(predicted, [other_count])
+        _score_predictions(predictions, truth, test.task, strength)
+        for predictions in np.split(predicted, [other_count])
     )
     return (fitted, recentred), probe_site(other_samples, truth[:, 0], truth[:, 1:1], test.folds, test.task).scores
 
 
-def _recentred(samples_to_move: Samples, run_samples: Samples) -> Samples:
+def _recentre(samples_to_move: Samples, run_samples: Samples) -> Samples:
     """Return the samples of the other run, moved to the mean of the first run's."""
     means, run_means = (np.asarray(samples.means) for samples in (samples_to_move, run_samples))
     shift = run_means.mean(axis=0, dtype=np.float64) - means.mean(axis=0, dtype=np.float64)
@@ -400,7 +401,7 @@ def _recentred(samples_to_move: Samples, run_samples: Samples) -> Samples:
     return Samples(RowSubset.all(moved), samples_to_move.counts, means + shift)
 
 
-def _scored(predicted: Matrix, truth: Matrix, task: Task, strength: float) -> SiteProbe:
+def _score_predictions(predicted: Matrix, truth: Matrix, task: Task, strength: float) -> SiteProbe:
     """Return the probe with (m,) predictions for the other run, from (m, 1 + P) real and permuted labels.
 
     R² compares with the mean of the other run's labels, as scikit-learn's `r2_score` does.

@@ -81,14 +81,14 @@ class FrozenProbes:
         """
         row = self.run.episodes.iloc[position]
         if self._readings is None:
-            return self._stored(str(row["episode_id"]), str(row["side_correct"]))
+            return self._stored_matrix(str(row["episode_id"]), str(row["side_correct"]))
         number = int(row["episode"])
         if number not in self._readings:
             values, _ = self.log_odds(position)
             self._readings[number] = values[0] if len(values) else np.full(len(self.sites), np.nan)
         return self._readings[number]
 
-    def _stored(self, episode: str, side_correct: str) -> Matrix:
+    def _stored_matrix(self, episode: str, side_correct: str) -> Matrix:
         column = self._place_of.get(episode)
         if column is None:
             return np.full(len(self.sites), np.nan)
@@ -109,7 +109,7 @@ class FrozenProbes:
         fold = self._fold_of.get(item)
         if not self._reads_activations:
             if self._readings is None:
-                log_odds[:1] = self._stored(str(row["episode_id"]), side)
+                log_odds[:1] = self._stored_matrix(str(row["episode_id"]), side)
             return log_odds, fold is not None
         for stream, probes in self._streams.items():
             features = self._features(stream, probes, position, calls)

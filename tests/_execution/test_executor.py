@@ -146,7 +146,7 @@ def test_failures_before_an_advance_count_no_longer_and_nor_does_the_loss_of_a_n
     assert not queue.retry(0, 0)
 
 
-def test_what_is_left_of_a_task_is_what_comes_back() -> None:
+def test_a_retried_task_returns_only_what_is_left_of_it() -> None:
     queue = TaskQueue([("a", "ab"), ("b", "c")], "model")
     queue.take(0)
     queue.replace(0, "a", "b")

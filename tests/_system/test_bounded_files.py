@@ -58,7 +58,7 @@ READERS = [check_regular, open_regular, read_regular, load_json, load_gzipped_js
 
 @pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.__name__)
 @pytest.mark.parametrize(("make", "reason"), IRREGULAR, ids=lambda value: getattr(value, "__name__", ""))
-def test_what_is_no_regular_file_is_refused_by_name_and_never_waited_for(
+def test_a_pipe_or_device_file_is_refused_by_name_and_never_waited_for(
     tmp_path: Path, make: Callable[[Path], None], reason: str, reader: Callable[[Path], object]
 ) -> None:
     make(tmp_path / "x")

@@ -328,5 +328,5 @@ def test_of_a_path_the_last_part_is_kept(text: str, expected: str) -> None:
         "/",
     ],
 )
-def test_what_is_no_path_of_a_machine_stays(text: str) -> None:
+def test_a_text_that_is_no_path_keeps_its_folders(text: str) -> None:
     assert without_folders(text) == text

@@ -16,7 +16,7 @@ from probe_kit.errors import UsageError
 
 
 @pytest.mark.parametrize("device", ["nonsense", "cpu:", "cuda:x", "", "meta", "CUDA"])
-def test_what_is_no_device_is_refused_with_what_there_is(device: str) -> None:
+def test_an_unknown_device_is_refused_with_the_devices_of_the_machine(device: str) -> None:
     with pytest.raises(UsageError, match=r"none of cpu, cuda.*This machine has cpu \(\d+ cores?\)"):
         check_device_name(device)
 

@@ -62,7 +62,9 @@ def test_what_can_be_foreseen_has_its_message_and_code(error: BaseException, cod
     "error",
     [KeyError("x"), ValueError("one\ntwo"), RecursionError("deep"), OSError(5, "I/O error")],
 )
-def test_what_nobody_foresaw_is_one_line_and_a_file(error: Exception, tmp_path: Path, monkeypatch) -> None:
+def test_an_unexpected_error_prints_one_line_and_writes_a_file(
+    error: Exception, tmp_path: Path, monkeypatch
+) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     code, message = ended(error)
     assert code == 1

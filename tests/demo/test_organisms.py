@@ -75,7 +75,7 @@ def test_absent_is_said_only_where_the_best_site_is_below_the_bound() -> None:
 
 
 @pytest.mark.parametrize("control", ["random-features", "untrained"])
-def test_what_does_not_exceed_a_control_is_not_shown(control: str) -> None:
+def test_an_accuracy_that_does_not_exceed_a_control_is_not_shown(control: str) -> None:
     """Color of the untrained network had p = 0.005 against chance, and knew nothing."""
     assert verdict(row(0.5, 0.005, **{control: False})) == "not shown"
     assert verdict(row(0.5, 0.005, **{control: True})) == "shown, success not shown"

@@ -117,7 +117,7 @@ def test_the_page_has_the_table_the_sentences_and_the_figure(folder: Path) -> No
     assert "https:" not in page
 
 
-def test_what_is_required_decides_the_exit_code(folder: Path) -> None:
+def test_the_inputs_of_require_decide_the_exit_code(folder: Path) -> None:
     assert run_command(folder / "run", *FRAMES, "--require", "instruction,picture").exit_code == 0
     assert run_command(folder / "run", *FRAMES, "--require", "state").exit_code == 1, "it was not varied"
     answer = run_command(folder / "run", *FRAMES, "--require", "wrist")
@@ -142,7 +142,7 @@ def test_an_input_that_no_model_has_is_refused_before_anything_is_played(tmp_pat
     ],
 )
 @pytest.mark.parametrize("plan", [(), ("--dry-run",)], ids=["run", "plan"])
-def test_what_no_weights_can_change_is_refused_before_them_and_by_the_plan(
+def test_diagnose_refuses_what_needs_no_weights_before_they_are_loaded_and_in_the_plan(
     options: tuple[object, ...],
     mention: str,
     plan: tuple[str, ...],
@@ -172,7 +172,7 @@ def never(*_: object, **__: object) -> Policy:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("option", [("--require", "picture.wrist"), ("--base", "nowhere"), ("--pairs", "{pairs}")])
-def test_what_is_wrong_with_a_new_run_is_said_before_it_is_played(
+def test_diagnose_refuses_bad_settings_of_a_new_run_before_it_plays(
     option: tuple[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pairs = tmp_path / "pairs.csv"
@@ -341,7 +341,9 @@ def test_a_target_is_probed_at_the_sites_that_are_patched(run_of_many: Run) -> N
 
 
 @pytest.mark.slow
-def test_what_no_site_knows_is_told_from_what_is_lost(run_of_many: Run, tmp_path: Path) -> None:
+def test_diagnose_separates_an_answer_that_no_site_encodes_from_one_that_is_lost(
+    run_of_many: Run, tmp_path: Path
+) -> None:
     episodes = run_of_many.episodes
     # Heads and tails in turn: no site comes near to signal (p 0.9), where a drawn coin came to p 0.04.
     groups = {group: number % 2 for number, group in enumerate(sorted(set(episodes["group_id"])))}

@@ -369,7 +369,7 @@ def test_a_text_of_which_the_length_alone_arrives_is_told_from_one_of_which_noth
 
 
 @pytest.mark.parametrize(("every", "is_named"), [(0.05, True), (0.5, False)])
-def test_what_the_seed_decides_is_said(every: float, is_named: bool) -> None:
+def test_diagnose_says_that_the_seed_decides_the_action(every: float, is_named: bool) -> None:
     inputs = (
         InputDiagnosis("instruction", "moves", "", share=every, every=every),
         InputDiagnosis("state", "not varied", ""),

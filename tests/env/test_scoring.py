@@ -61,7 +61,7 @@ def test_a_trajectory_says_where_everything_was_and_who_touched_whom(shared_env)
     np.testing.assert_allclose(motion.executed, motion.commanded, atol=1e-6)
 
 
-def test_what_was_executed_differs_from_what_was_commanded_where_a_limit_stood_in_the_way(shared_env):
+def test_executed_actions_differ_from_commanded_ones_where_a_limit_acted(shared_env):
     shared_env.reset(seed=0)
     largest = shared_env.scene_spec.limits.translation
     motion = recorded(shared_env, [np.array([0, 0.5, 0, 0, 0, 0, 0.7]), np.array([0, -0.02, 0, 0, 0, 0.1, 0.2])])
@@ -204,7 +204,7 @@ def test_reaching_sideways_for_the_cube_is_no_choice_of_a_side(side: int) -> Non
     assert Events.of(trajectory(places, held_frames=[])).first_lateral_move is None
 
 
-def test_what_never_happened_has_no_frame() -> None:
+def test_an_event_that_never_happened_has_no_frame() -> None:
     assert Events.of(trajectory(np.zeros((FRAMES, 3)), held_frames=[])) == Events(None, None, None, None)
 
 

@@ -176,7 +176,7 @@ def test_outcomes_are_right_wrong_or_unread() -> None:
     ]
 
 
-def test_where_the_asked_object_lies() -> None:
+def test_the_expected_side_depends_on_the_object_that_is_asked_for() -> None:
     assert [side_expected(asked_object, "left") for asked_object in ("target", "distractor", "absent")] == [
         "left",
         "right",

@@ -243,7 +243,7 @@ def test_of_an_absent_object_right_is_no(settings: AskSettings) -> None:
     [
         (
             {"model": "pi0-tiny", "checkpoint": None, "options": {}},
-            "acts and does not answer questions; those that do",
+            "acts and does not answer questions; choose among",
         ),
         ({"model": "expert", "checkpoint": None, "options": {}}, "acts and does not answer"),
         ({"query": "absent"}, "p1 does not ask for yes or no"),
@@ -252,7 +252,7 @@ def test_of_an_absent_object_right_is_no(settings: AskSettings) -> None:
         ({"tokens": "some"}, "expected one of none, pooled, all"),
     ],
 )
-def test_what_cannot_be_asked_is_refused_before_a_model_is_loaded(
+def test_ask_refuses_impossible_questions_before_a_model_is_loaded(
     settings: AskSettings, change: dict, match: str
 ) -> None:
     with pytest.raises(UsageError, match=match):
@@ -317,7 +317,7 @@ def test_it_says_how_answers_came_and_what_to_do_next(small_suite: Suite, folder
         (("--batch", "0"), "batch is 0; expected at least 1"),
     ],
 )
-def test_what_is_wrong_with_the_question_is_said_at_once(
+def test_ask_refuses_a_faulty_prompt_at_once(
     small_suite: Suite, folder: Path, arguments: tuple[str, ...], words: str
 ) -> None:
     result = ask(small_suite, folder, *arguments)

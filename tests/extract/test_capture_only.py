@@ -50,7 +50,9 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_what_is_heard_is_what_the_acting_model_thought_first(capture_run: Run, recorded_run: Run) -> None:
+def test_capture_without_acting_equals_the_first_inference_of_an_acting_run(
+    capture_run: Run, recorded_run: Run
+) -> None:
     """The same scenes, seeds and weights: bit for bit the first inference of the run that acted."""
     alike = (recorded_run.episodes["category"] == "color").to_numpy()
     acted = capture_run.episodes["episode_id"].isin(recorded_run.episodes["episode_id"]).to_numpy()

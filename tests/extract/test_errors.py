@@ -170,7 +170,7 @@ def test_the_certificate_holds_what_was_measured_in_every_process(suite: Suite, 
         {"options": {"bits": 8}},
     ],
 )
-def test_what_means_nothing_to_a_scripted_policy_is_refused(suite: Suite, change: dict[str, object]) -> None:
+def test_an_option_without_effect_on_a_scripted_policy_is_refused(suite: Suite, change: dict[str, object]) -> None:
     with pytest.raises(UsageError, match="is scripted"):
         prepare(ExtractSettings("expert", suite=suite.folder, **change))
 
@@ -274,9 +274,9 @@ def test_a_worker_that_joins_forgets_no_failure(settings: ExtractSettings, tmp_p
     writer = prepare(settings).writer(Folder(tmp_path / "run"))
     with writer.claim():
         writer.give_up(3, "it fell over")
-        with writer.joined():
+        with writer.take_part():
             pass
-    with writer.joined():
+    with writer.take_part():
         assert list(writer.location.read_all("failed", ".json"))
     with writer.claim():
         assert not list(writer.location.read_all("failed", ".json"))

@@ -183,7 +183,7 @@ def test_a_machine_path_is_in_no_stored_setting(recorded_run) -> None:
         ({"model": "expert", "items": 1000}, UsageError, "1000"),
     ],
 )
-def test_what_cannot_be_run_is_refused_before_anything_is_written(
+def test_extract_refuses_impossible_settings_before_it_writes(
     small_suite: Suite, tmp_path: Path, settings: dict, error: type[Exception], message: str
 ) -> None:
     with pytest.raises(error, match=message):
@@ -447,7 +447,7 @@ def test_a_label_is_changed_and_stored_probes_are_found_under_the_new_one(
 
 
 @pytest.mark.parametrize("label", ["", "two\nlines", "x" * 201])
-def test_what_no_table_can_print_is_no_label(recorded_run: Run, label: str) -> None:
+def test_a_label_that_no_table_can_print_is_refused(recorded_run: Run, label: str) -> None:
     with pytest.raises(UsageError, match="expected 1 to 200 printable characters"):
         label_run(recorded_run.path, label)
 

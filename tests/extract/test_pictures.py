@@ -244,7 +244,7 @@ def test_a_picture_that_changes_after_the_plan_is_not_shown(
     assert "was changed after the run was planned" in failed.value.__notes__[0]
 
 
-def test_what_pictures_do_not_have_is_refused_by_its_option(folder: Path) -> None:
+def test_pictures_refuse_by_name_the_options_that_they_cannot_use(folder: Path) -> None:
     refused: list[dict[str, Any]] = [{"execute": 2}, {"video": "all"}, {"batch": "auto"}]
     for values in refused:
         with pytest.raises(UsageError, match="does not apply with --pictures"):

@@ -109,7 +109,7 @@ def test_a_row_and_its_options_are_those_of_the_checkpoint_at_any_revision(name:
 
 
 @pytest.mark.parametrize("name", RELEASED)
-def test_what_is_not_given_is_as_released(name: str) -> None:
+def test_options_that_are_not_typed_are_as_in_the_release(name: str) -> None:
     settings = ExtractSettings(name, protocol="act2answer").followed()
     assert settings.scene == SceneSpec.preset("act2answer")
     assert deviations(settings) == {}
@@ -117,7 +117,7 @@ def test_what_is_not_given_is_as_released(name: str) -> None:
     assert settings.followed() == settings
 
 
-def test_what_is_given_wins_and_is_recorded_as_a_deviation() -> None:
+def test_a_typed_option_overrides_the_protocol_and_is_recorded_as_a_deviation() -> None:
     magma_settings = ExtractSettings(
         "magma", options={"temperature": "0", "tokenizer": "words"}, execute=1, dtype="float32",
         protocol="act2answer", scene=protocol_scene("act2answer", tile_side=0.2033),
@@ -134,7 +134,7 @@ def test_what_is_given_wins_and_is_recorded_as_a_deviation() -> None:
     assert "scene tile_side=0.2033" in run_label(settings)
 
 
-def test_what_cannot_be_matched_of_pi0_is_its_picture_path_and_not_its_statistics() -> None:
+def test_the_protocol_of_pi0_deviates_in_its_pictures_and_not_in_its_statistics() -> None:
     unmatched = protocol_identity(ExtractSettings("pi0", protocol="act2answer").followed())["protocol"][
         "unmatched"
     ]

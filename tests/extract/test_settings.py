@@ -231,7 +231,7 @@ def test_a_scene_value_of_zero_is_chosen_and_therefore_checked() -> None:
         ExtractSettings("expert", max_steps=0)
 
 
-def test_what_is_not_chosen_is_that_of_the_protocol_the_model_or_the_class() -> None:
+def test_settings_that_are_not_typed_come_from_protocol_model_or_class() -> None:
     assert ExtractSettings("expert", scene=None, arm=None, early_stop=False, items=None) == ExtractSettings(
         "expert"
     )
@@ -263,7 +263,7 @@ def test_sources_share_the_options_that_mean_the_same() -> None:
         (ExtractSettings("pi0", source=EnvironmentSettings("kitchen:Kitchen")), "pi0 · in kitchen:Kitchen"),
     ],
 )
-def test_what_sets_a_run_apart_is_in_its_label(settings: ExtractSettings, label: str) -> None:
+def test_the_label_of_a_run_names_the_options_that_set_it_apart(settings: ExtractSettings, label: str) -> None:
     assert run_label(settings) == label
 
 

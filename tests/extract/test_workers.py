@@ -244,7 +244,7 @@ def test_a_policy_that_takes_one_observation_is_calibrated_to_the_same_bytes(
 
 
 @pytest.mark.slow
-def test_what_it_chooses_is_refused_beside_it(small_suite: Suite) -> None:
+def test_an_option_that_batch_auto_chooses_is_refused_beside_it(small_suite: Suite) -> None:
     command = [
         "extract",
         "--model",

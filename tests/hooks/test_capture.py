@@ -67,7 +67,7 @@ def test_layers_and_iterations_stack_into_one_tensor(activations: ActivationCach
         activations.stack("expert", "mlp")
 
 
-def test_what_has_no_rectangular_shape_is_not_stacked(pi0_tiny: Pi0, observation: Observation) -> None:
+def test_activations_of_unequal_shapes_are_not_stacked(pi0_tiny: Pi0, observation: Observation) -> None:
     with capture(pi0_tiny, [Site("expert", 0, iteration=0), *pi0_tiny.streams["expert"].sites()[1:]]) as tape:
         pi0_tiny.act([observation], [0])
     del tape._kept[Site("expert", 1, iteration=4)]
@@ -157,7 +157,7 @@ def test_a_network_that_writes_its_stream_in_place_is_captured_as_it_passed(
         assert not torch.equal(fired["backbone.01.residual"] + 1, fired["backbone.02.residual"])
 
 
-def test_what_passed_can_be_read_while_the_model_runs_and_shares_no_memory(
+def test_captured_activations_can_be_read_while_the_model_runs_and_share_no_memory(
     pi0_tiny: Pi0, observation: Observation
 ) -> None:
     first, clones = Site("backbone", 0), list[torch.Tensor]()
@@ -415,7 +415,7 @@ def test_a_donor_replaces_token_by_token(pi0_tiny: Pi0, observation: Observation
         ({"kind": "zero", "sites": (SITE,), "strength": float("nan")}, "finite"),
     ],
 )
-def test_what_means_nothing_is_refused(arguments: dict, message: str) -> None:
+def test_an_edit_with_meaningless_fields_is_refused(arguments: dict, message: str) -> None:
     with pytest.raises(UsageError, match=message):
         Edit(**arguments)
 

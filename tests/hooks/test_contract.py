@@ -220,7 +220,7 @@ def test_a_quantity_that_was_not_declared_is_refused_by_name() -> None:
         Guided().tap(Site("expert", 0, "mlp", 0))
 
 
-def test_what_the_card_rules_out_is_refused() -> None:
+def test_observations_that_the_card_rules_out_are_refused() -> None:
     model, observations = Guided(), example_observations(["one", "two"])
     model.check(observations, [0, 1])
     with pytest.raises(ObservationError, match="2 observations but 1 seeds"):
@@ -277,7 +277,7 @@ def test_values_that_have_the_kind_already_pass_and_whole_numbers_are_numbers() 
         ({"prompt": 3}, "expected text"),
     ],
 )
-def test_what_was_not_declared_is_refused(options: dict, message: str) -> None:
+def test_a_model_option_that_was_not_declared_is_refused(options: dict, message: str) -> None:
     with pytest.raises(UsageError, match=message):
         check_options("mine", DECLARED, options)
 

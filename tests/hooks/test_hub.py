@@ -56,9 +56,9 @@ def test_a_relative_folder_that_is_not_here_is_named_with_the_folder_it_was_look
     name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(CheckpointError, match=f"folder '{name}' does not exist in {tmp_path}$"):
+    with pytest.raises(CheckpointError, match=f"folder '{name}' does not exist in {tmp_path}. Give the folder"):
         checkpoint_folder(name)
-    with pytest.raises(CheckpointError, match=f"folder '{tmp_path}/nothing' does not exist$"):
+    with pytest.raises(CheckpointError, match=f"folder '{tmp_path}/nothing' does not exist. Give the folder"):
         checkpoint_folder(str(tmp_path / "nothing"))
 
 

@@ -386,7 +386,9 @@ def test_without_ids_the_likeliest_tokens_of_every_layer_come_first(
     assert (np.take_along_axis(every, lens.ids, axis=-1) == lens.logits).all()
 
 
-def test_what_cannot_be_is_refused(vlm: AnswerModel, read: tuple[ActivationCache, Reading], pi0_tiny: Pi0) -> None:
+def test_an_impossible_readout_is_refused(
+    vlm: AnswerModel, read: tuple[ActivationCache, Reading], pi0_tiny: Pi0
+) -> None:
     cache, _ = read
     with pytest.raises(UsageError, match=r"ids are \[-1\]; expected one or more from 0 to"):
         logit_lens(vlm, cache, [-1])

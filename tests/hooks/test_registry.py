@@ -56,7 +56,7 @@ def test_a_family_that_cannot_be_verified_says_so() -> None:
         known_families()["pi0-tiny"].function("full_size")
 
 
-def test_what_must_be_downloaded_is_said_before_it_is_tried(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_family_names_the_checkpoint_that_must_be_downloaded(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HF_HOME", str(tmp_path))
     assert known_families()["pi0-tiny"].missing() == ""
     assert "juexzz/INTACT-pi0-finetune-bridge" in known_families()["pi0"].missing()
@@ -109,7 +109,7 @@ def test_a_third_partys_family_that_breaks_is_named_and_takes_no_other_with_it(
         load_policy("broken")
 
 
-def test_what_is_no_family_is_refused_by_its_type(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_entry_point_that_is_no_family_is_refused_by_its_type(monkeypatch: pytest.MonkeyPatch) -> None:
     entry = SimpleNamespace(load=lambda: "pi0", name="text", value="theirs:NAME", dist=None)
     monkeypatch.setattr(registry, "family_entries", lambda: [entry])
     with pytest.warns(registry.BrokenFamilyWarning, match="it is a str, not a probe_kit.hooks.Family"):

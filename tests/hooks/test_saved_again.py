@@ -338,7 +338,7 @@ def test_an_embedding_of_another_base_beside_the_factors_replaces_the_bases_and_
         ({"target_modules": [], "target_parameters": ["q_proj.weight"]}, "target_parameters"),
     ],
 )
-def test_what_no_merge_can_hold_is_refused_by_name(
+def test_an_adapter_that_no_merge_can_hold_is_refused_by_name(
     settings: dict[str, Any], complaint: str, tmp_path: Path
 ) -> None:
     base = written("paligemma", tmp_path)

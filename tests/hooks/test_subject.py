@@ -54,7 +54,7 @@ def test_a_checkpoint_that_is_too_large_to_copy_is_skipped(
         _ = of().checkpoint
 
 
-def test_what_was_written_is_removed() -> None:
+def test_check_adapter_removes_the_files_that_it_wrote() -> None:
     with of() as written_subject:
         first, second = written_subject.folder, written_subject.folder
         assert first != second

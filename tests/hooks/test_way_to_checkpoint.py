@@ -88,4 +88,6 @@ def test_a_folder_of_openpi_is_named_as_such(files: dict[str, Any], layout: str,
 )
 def test_of_a_folder_without_any_sign_nothing_is_guessed(files: dict[str, Any], tmp_path: Path) -> None:
     folder = write(tmp_path / "folder", files)
-    assert said_of(folder).endswith("is not a checkpoint of pi0")
+    message = said_of(folder)
+    assert "is not a checkpoint of pi0. Give the folder that holds config.json and the weights" in message
+    assert "pass --checkpoint" not in message

@@ -428,7 +428,9 @@ REFUSED: dict[str, tuple[Callable[[Path, Path], Any], str]] = {
 
 
 @pytest.mark.parametrize("kind", list(REFUSED))
-def test_what_cannot_be_merged_exactly_is_refused_by_name(folders: tuple[Path, Path], kind: str) -> None:
+def test_an_adapter_that_cannot_be_merged_exactly_is_refused_by_name(
+    folders: tuple[Path, Path], kind: str
+) -> None:
     base, tuned = folders
     write_adapter(tuned, factors(PLACE, weights_of(base)[f"{PLACE}.weight"]), "../base")
     damage, message = REFUSED[kind]

@@ -42,7 +42,7 @@ def test_the_table_says_what_follows(run: Run) -> None:
 
 
 @pytest.mark.slow
-def test_what_was_stored_is_said_to_be_read_back_whatever_policy_was_named(run: Run) -> None:
+def test_intervene_says_that_it_loads_stored_results_whatever_policy_is_named(run: Run) -> None:
     code, _, message = ask(run, "--checkpoint", "/nowhere", "--suite", "/nowhere")
     assert code == 0
     assert "loaded the stored result; no model was run" in " ".join(message.split())
@@ -75,7 +75,7 @@ def test_csv_is_what_is_stored_with_the_verdict(run: Run) -> None:
         (("--items", "3", "--suite", "nowhere"), 2, "is not a suite"),
     ],
 )
-def test_what_cannot_be_is_refused(run: Run, options: tuple[str, ...], code: int, words: str) -> None:
+def test_intervene_refuses_impossible_options(run: Run, options: tuple[str, ...], code: int, words: str) -> None:
     ended, _, message = ask(run, *options)
     assert ended == code
     assert words in message

@@ -214,7 +214,7 @@ def test_rows_that_depend_on_each_other_span_no_further_direction(
     assert bool(direction.note) == bool(extra)
 
 
-def test_what_is_no_file_of_directions_is_refused(tmp_path: Path) -> None:
+def test_a_file_that_holds_no_directions_is_refused(tmp_path: Path) -> None:
     for ending in ("npz", "safetensors"):
         path = tmp_path / f"broken.{ending}"
         path.write_bytes(b"no such format")
@@ -225,7 +225,7 @@ def test_what_is_no_file_of_directions_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("entry", ["[]", '{"a": 1}', '{"a": {}, "a": {}}', "{"])
-def test_what_is_said_of_directions_must_be_an_object_by_name(tmp_path: Path, entry: str) -> None:
+def test_descriptions_of_directions_must_be_an_object_with_their_names(tmp_path: Path, entry: str) -> None:
     np.savez(tmp_path / "some.npz", allow_pickle=False, a=np.ones(3), directions=np.array(entry))
     with pytest.raises(UsageError, match="holds no directions"):
         read_direction(str(tmp_path / "some.npz"))

@@ -84,7 +84,7 @@ def test_a_pattern_names_places_whose_names_survive_parsing(
         ("kv.00.heads.0", "the stream kv has no quantity 'heads'"),
     ],
 )
-def test_what_is_no_place_is_refused_with_what_there_is(pi0_tiny: Pi0, pattern: str, reason: str) -> None:
+def test_an_unknown_site_is_refused_with_the_sites_of_the_model(pi0_tiny: Pi0, pattern: str, reason: str) -> None:
     with pytest.raises(UnknownSiteError, match=reason):
         resolve_sites(pattern, pi0_tiny)
 
@@ -352,7 +352,7 @@ def test_families_that_cannot_say_are_refused_by_name(family: str) -> None:
             list(map(find_family(family).check_intervention, intervention.required_capabilities))
 
 
-def test_what_needs_positions_or_means_is_not_asked_of_tiles() -> None:
+def test_tiles_are_refused_where_positions_or_means_are_needed() -> None:
     with pytest.raises(UsageError, match=r"image\.left is of other patches"):
         ConceptErasure(sites=("backbone.02",), roles=("image.left",))
     with pytest.raises(UsageError, match=r"image\.left has no mean"):

@@ -122,7 +122,7 @@ def test_another_policy_is_noticed_by_what_it_does(session: ReplaySession, copy:
 # -- storing -------------------------------------------------------------------------------------------------
 
 
-def test_what_is_stored_is_read_back_and_not_played_again(copy: Run, effects: InterventionResult) -> None:
+def test_a_stored_intervention_is_loaded_and_not_played_again(copy: Run, effects: InterventionResult) -> None:
     def load(*_: object) -> "Policy":
         raise AssertionError("it is stored")
 
@@ -232,7 +232,7 @@ def test_no_table_is_made_of_a_changed_intervention(mine: Run, effects: Interven
         retention_table([open_run(mine.path)])
 
 
-def test_what_is_of_other_episodes_is_passed_over(mine: Run) -> None:
+def test_a_stored_result_of_other_episodes_is_not_used(mine: Run) -> None:
     (mine.path / "commits/00000003.json").unlink()
     shutil.rmtree(mine.path / "sealed")  # else it is a run that lost an episode
     fewer = open_run(mine.path, allow_partial=True)

@@ -289,7 +289,7 @@ def test_roles_that_no_token_plays_are_refused(session: ReplaySession, copy: Run
         lambda: Steering(sites=("backbone.02",), role="image", target_side="up"),
     ],
 )
-def test_what_cannot_be_asked_is_refused(intervention: object) -> None:
+def test_a_map_of_sites_refuses_impossible_settings(intervention: object) -> None:
     with pytest.raises(UsageError):
         intervention()  # type: ignore[operator]
 

@@ -108,7 +108,7 @@ def test_reasons_name_what_was_measured(verdicts: Verdicts) -> None:
     assert "positive control: " in verdicts["constant"].reason
 
 
-def test_what_is_decided_after_the_first_chunk_shows_in_the_episode(wired: WiredSession) -> None:
+def test_a_decision_after_the_first_chunk_shows_in_the_whole_episode(wired: WiredSession) -> None:
     """The first chunk approaches; *not used* of it was said of the policy."""
     names = ["late", "constant", "copied"]
     outcomes = outcomes_of(wired, names, calls=3)

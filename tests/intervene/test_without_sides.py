@@ -138,7 +138,7 @@ def not_loaded(*_: object) -> "Policy":
         (("--kind", "steer", "--sites", "backbone.02", "--roles", "image"), "no direction there"),
     ],
 )
-def test_what_needs_sides_or_another_input_is_refused_by_name(
+def test_kinds_that_need_sides_are_refused_by_name_for_a_run_without_sides(
     shown_run: Run, words: tuple[str, ...], mention: str
 ) -> None:
     answer = CliRunner().invoke(app, ["intervene", str(shown_run.path), *words], env={"COLUMNS": "200"})

@@ -49,7 +49,7 @@ def test_a_run_goes_by_its_path_or_by_the_name_of_its_folder(choices: list[str],
         (["pi0=abc", "runs/pi0=def"], "twice"),
     ],
 )
-def test_what_names_no_run_or_two_keys_is_refused(choices: list[str], message: str) -> None:
+def test_a_choice_of_probes_for_no_run_or_twice_for_one_is_refused(choices: list[str], message: str) -> None:
     with pytest.raises(UsageError, match=message):
         _keys(PATHS, choices)
 

@@ -260,7 +260,7 @@ def test_sections_are_folded_and_open_for_links_for_the_button_and_for_print(rep
     assert unfolded
 
 
-def test_what_has_the_focus_shows_it_and_the_first_of_all_skips_the_contents(report: Path) -> None:
+def test_focused_elements_are_marked_and_the_first_link_skips_the_contents(report: Path) -> None:
     first, hidden, visible, outlines = read(
         report,
         """

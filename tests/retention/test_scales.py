@@ -104,7 +104,7 @@ def test_depth_and_knowledge_have_fixed_axes(
         assert axes.get_xlim() == axes.get_ylim() == (-2, 102)
 
 
-def test_what_the_axis_does_not_reach_is_marked_with_its_number(probed_run: ProbedRun) -> None:
+def test_a_value_outside_of_the_axis_is_marked_with_its_number(probed_run: ProbedRun) -> None:
     figure = layer_curve(load_results(probed_run({"color": BELOW})))
     marks = [line for axes in figure.axes for line in axes.lines if line.get_gid() == "below"]
     assert len(marks) == 2

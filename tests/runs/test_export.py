@@ -154,7 +154,7 @@ def test_a_value_beyond_float16_is_refused_by_site(little_runs: Path, tmp_path: 
     assert not list(tmp_path.iterdir())
 
 
-def test_what_is_not_stored_is_refused_with_what_is(labelled_run: Path, tmp_path: Path) -> None:
+def test_exporting_an_array_that_is_not_stored_lists_those_that_are(labelled_run: Path, tmp_path: Path) -> None:
     def export(style: str, **options: object) -> None:
         export_run(labelled_run, style, tmp_path / "out", **options)
 
@@ -268,7 +268,7 @@ def test_every_number_of_a_table_is_that_of_the_run(copies: tuple[Run, Run]) -> 
     assert (copy.trajectory(0).tool == run.trajectory(0).tool).all() if run.has_trajectories else True
 
 
-def test_what_it_lacks_is_refused_by_name(copies: tuple[Run, Run]) -> None:
+def test_an_export_refuses_by_name_the_parts_that_a_run_lacks(copies: tuple[Run, Run]) -> None:
     _, copy = copies
     site = copy.sites("backbone")[0]
     with pytest.raises(ActivationsLeftOutError, match=str(site)):

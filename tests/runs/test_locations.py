@@ -82,13 +82,13 @@ class LocationContract:
         assert not location.create("commits/1.json", b"second")
         assert location.read("commits/1.json") == b"first"
 
-    def test_writing_replaces(self, location: Location) -> None:
+    def test_writing_an_object_replaces_the_former_one(self, location: Location) -> None:
         location.write("probes/a/settings.json", b"one")
         location.write("probes/a/settings.json", b"another")
         assert location.read("probes/a/settings.json") == b"another"
         assert location.keys("probes") == ["probes/a/settings.json"]
 
-    def test_what_is_not_there_is_said_to_be_missing(self, location: Location) -> None:
+    def test_reading_a_missing_object_says_that_it_is_missing(self, location: Location) -> None:
         assert not location.exists("run.json")
         assert location.keys("commits") == []
         assert location.read_all("commits", ".json") == {}
@@ -229,7 +229,7 @@ class TestOtherStores(LocationContract):
         monkeypatch.setattr(buckets.Bucket, "_objects", stored)
         return locate(f"{request.param}://bucket/prefix/run")
 
-    def test_what_is_gone_is_removed(self, location: Location) -> None:
+    def test_removing_a_missing_object_is_no_error(self, location: Location) -> None:
         for key in ("c/1.json", "c/3.json"):
             location.write(key, b"")
         location._delete(["c/1.json", "c/2.json", "c/3.json"])
@@ -237,7 +237,7 @@ class TestOtherStores(LocationContract):
         assert location.keys("") == []
 
 
-def test_what_is_no_location_is_refused_and_says_why() -> None:
+def test_an_invalid_address_of_a_run_is_refused_with_the_reason() -> None:
     for where, why in {
         "https://host/run": "s3://",
         "s3://bucket": "names no run",

@@ -161,7 +161,7 @@ def test_the_labelled_dataset_selects_by_name(recorded_run: Run) -> None:
     ("site", "view"),
     [(Site("backbone", 5), "mean"), (Site("vision", 0), "mean"), (Site("backbone", 0), "mean:state")],
 )
-def test_what_is_not_stored_is_named(recorded_run: Run, site: Site, view: str) -> None:
+def test_reading_an_array_that_is_not_stored_names_it(recorded_run: Run, site: Site, view: str) -> None:
     with pytest.raises(UnknownSiteError):
         recorded_run.column(site, view)
 
@@ -470,7 +470,7 @@ def test_it_grows_by_further_episodes_and_keeps_those_it_has(tmp_path: Path) -> 
         ("probe of the side .side.correct.", train_probes),
     ],
 )
-def test_what_needs_a_scene_or_an_outcome_is_refused_by_name(
+def test_a_run_without_scene_or_outcome_refuses_by_name_what_needs_them(
     shown_run: Run, requirement: str, refused: object
 ) -> None:
     assert callable(refused)

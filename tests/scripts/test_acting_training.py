@@ -146,7 +146,7 @@ def test_the_backbone_begins_as_the_vlm_weight_by_weight(actor: Actor) -> None:
 
 
 @pytest.mark.slow
-def test_what_is_said_behind_an_instruction_is_where_the_vlm_would_put_the_cube(actor: Actor) -> None:
+def test_the_words_after_an_instruction_name_the_side_that_the_vlm_answers(actor: Actor) -> None:
     """The VLM knew it before any training of the policy: a wrong position or prompt would leave chance."""
     torch.manual_seed(0)
     with torch.no_grad():

@@ -43,6 +43,6 @@ def test_a_mark_names_an_episode_or_its_end(sent: dict[str, Any], mark: Mark) ->
         ({"end": True, "facts": {f"f{number}": 0 for number in range(65)}}, "at most 64"),
     ],
 )
-def test_what_is_no_mark_is_refused_with_what_was_seen(sent: object, complaint: str) -> None:
+def test_an_invalid_mark_is_refused_with_the_value_that_was_seen(sent: object, complaint: str) -> None:
     with pytest.raises(ObservationError, match=complaint):
         read_mark(sent)

@@ -134,7 +134,7 @@ def test_an_id_that_comes_again_is_another_trial_and_a_connection_ends_its_episo
     assert run.episodes["policy_seed"].nunique() == 4
 
 
-def test_what_cannot_be_shown_is_refused_by_name_and_the_episode_goes_on(opened: Opens) -> None:
+def test_a_faulty_observation_is_refused_by_name_and_the_episode_continues(opened: Opens) -> None:
     server = opened(captured_calls=1)
     client = server.session.connect()
     small = observation(0, side=8)

@@ -229,7 +229,7 @@ asyncio.run(play())
 
 
 @pytest.mark.slow
-def test_what_lies_outside_of_an_episode_is_an_error_and_the_connection_stays(
+def test_a_request_outside_of_an_episode_is_an_error_and_the_connection_stays(
     harness: Path, tmp_path: Path
 ) -> None:
     with served(harness, tmp_path / "run") as (server, url):

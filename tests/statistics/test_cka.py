@@ -44,7 +44,7 @@ def test_independent_features_are_not_alike_however_wide_they_are() -> None:
     assert np.std(similarities) < 0.1
 
 
-def test_what_does_not_vary_has_no_likeness_and_too_few_episodes_are_refused() -> None:
+def test_cka_of_constant_features_is_undefined_and_too_few_episodes_are_refused() -> None:
     features = np.random.default_rng(0).normal(size=(10, 3))
     assert np.isnan(unbiased_cka(features, np.ones((10, 3))))
     with pytest.raises(UsageError, match="expected those of the same 4 or more"):

@@ -546,7 +546,7 @@ def test_the_bound_can_be_set_and_is_not_reached_by_itself() -> None:
     assert verdict(False, ABSENT_BELOW, 0.6) == "not shown"
 
 
-def test_what_the_experiment_could_not_have_found_is_not_absent() -> None:
+def test_an_answer_that_too_few_items_could_not_show_is_not_absent() -> None:
     assert is_absent(0.62, ABSENT_BELOW)
     assert not is_absent(0.62, ABSENT_BELOW + 0.01)
     assert verdict(False, 0.62, np.inf) == "not shown"

@@ -113,7 +113,7 @@ def test_how_many_are_unlike_most() -> None:
     assert unlike(each).tolist() == [0, 3, 3]
 
 
-def test_what_was_not_seen_lies_within_the_bounds_and_about_the_value() -> None:
+def test_limits_hold_the_unseen_value_and_are_centred_near_it() -> None:
     for bounds, value in product((SHARES, GAINS), (0.0, 0.4, 1.0)):
         each = np.full((10, 1), value)
         percentiles = unseen_quantiles(np.array([value]), each, bounds=bounds)[:, 0]

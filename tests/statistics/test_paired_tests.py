@@ -46,7 +46,7 @@ def test_all_positive_is_as_likely_as_that_many_heads() -> None:
     assert greater_p(np.full(24, -0.1)) == 1.0
 
 
-def test_zeros_take_no_part() -> None:
+def test_differences_of_zero_take_no_part_in_the_sign_flips() -> None:
     assert greater_p(np.array([0.1] * 5 + [0.0] * 100)) == 2.0**-5
     assert greater_p(np.array([0.1] * 5 + [1e-12, -1e-12])) == 2.0**-5
     assert greater_p(np.zeros(4)) == 1.0

@@ -175,7 +175,7 @@ def test_every_scene_is_built_before_the_first_run_is_played(file: Path, tmp_pat
 
 
 @pytest.mark.slow
-def test_what_fails_while_it_plays_is_kept_with_its_traceback_and_tried_again_on_request(
+def test_a_run_that_fails_is_stored_with_its_traceback_and_played_again_on_request(
     file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     text = file.read_text(encoding="utf-8").replace(str(load_study(file).study.folder), str(tmp_path / "out"))

@@ -146,7 +146,7 @@ def test_a_large_file_is_read_once_and_that_is_announced(
     assert {*contents, content_of(folder)} == {contents[0]}
 
 
-def test_what_is_not_there_has_no_content(tmp_path: Path) -> None:
+def test_a_missing_checkpoint_has_no_content_hash(tmp_path: Path) -> None:
     (tmp_path / "mount").mkdir()
     (tmp_path / "mount" / ".hidden").touch()
     assert [content_of(tmp_path / name) for name in ("mount", "nothing")] == [None, None]

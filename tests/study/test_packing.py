@@ -92,7 +92,7 @@ def test_an_archive_without_trajectories_judges_by_their_absence_and_with_them_a
 
 
 @pytest.mark.slow
-def test_what_was_changed_or_lost_is_named(played: LoadedStudy, tmp_path: Path) -> None:
+def test_a_pack_names_files_that_were_changed_added_or_lost(played: LoadedStudy, tmp_path: Path) -> None:
     folder = tmp_path / "pack"
     pack_study(played, folder)
     changed = copytree(folder, tmp_path / "changed")
@@ -207,7 +207,7 @@ def test_an_upload_sends_every_file_once_and_tags_the_version(folder: Path, serv
 
 @pytest.mark.slow
 @pytest.mark.parametrize("failures", [[429], [0, 503]], ids=["too many requests", "cut connection"])
-def test_what_fails_for_now_is_tried_again(folder: Path, server: Hub, failures: list[int]) -> None:
+def test_an_upload_that_fails_for_now_is_tried_again(folder: Path, server: Hub, failures: list[int]) -> None:
     server.failures = list(failures)
     publish_data_set(folder, "lab/study", pause=0.01)
     assert (server.failures, server.commits) == ([], 1)

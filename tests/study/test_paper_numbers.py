@@ -189,7 +189,9 @@ def test_without_magma_the_difference_is_half(rows: dict[str, RetentionTable]) -
 
 
 @pytest.mark.slow
-def test_what_fine_tuning_changes(runs: dict[str, SaidRun], derived: dict[str, Any]) -> None:
+def test_the_differences_of_fine_tuning_equal_the_printed_ones(
+    runs: dict[str, SaidRun], derived: dict[str, Any]
+) -> None:
     names = ["OpenVLA (SFT)", "OpenVLA (RL)", "OpenVLA"]
     table = retention_table([runs[name] for name in names], against="OpenVLA")
     texts = difference_table(table, "tuning").texts

@@ -88,7 +88,7 @@ def test_wrong_names_are_said_together_in_the_order_of_the_file(tmp_path: Path) 
     assert [mistake.field for mistake in caught.value.mistakes] == fields_at(text, "# here")
 
 
-def test_what_does_not_fit_together_is_said_together_in_the_order_of_the_file(tmp_path: Path) -> None:
+def test_contradictions_of_a_study_file_are_listed_together_in_the_files_order(tmp_path: Path) -> None:
     text = changed(
         ("items = 24", "items = 200  # here"),
         ("light_level = 0.7", "light_level = -1.0  # here"),
@@ -128,7 +128,7 @@ def test_wrong_values_are_said_together_before_names_are_looked_at(tmp_path: Pat
     ],
     ids=["no value", "a key twice", "an open list", "nothing", "deep"],
 )
-def test_what_is_no_toml_or_says_nothing_is_refused(tmp_path: Path, text: str, reason: str) -> None:
+def test_a_study_file_that_is_empty_or_no_toml_is_refused(tmp_path: Path, text: str, reason: str) -> None:
     with pytest.raises(UsageError, match=reason):
         load_study(written(tmp_path, text))
     with pytest.raises(UsageError, match="the package has embedded, paper"):

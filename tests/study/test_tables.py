@@ -348,7 +348,7 @@ def test_figures_are_drawn_by_name_from_stored_runs(played: LoadedStudy, tmp_pat
         ("overveiw", "unknown figure 'overveiw'; known: overview, .* Did you mean 'overview'"),
     ],
 )
-def test_what_no_run_has_is_named_with_the_command_that_makes_it(
+def test_a_table_names_missing_results_with_the_command_that_makes_them(
     played: LoadedStudy, name: str, reason: str
 ) -> None:
     with pytest.raises(UsageError, match=reason):

@@ -135,7 +135,7 @@ def square(side: int) -> Any:
         (square(19), "shows something only "),
     ],
 )
-def test_what_cannot_be_seen_on_the_screen_is_warned_of(
+def test_validation_warns_of_pictures_that_are_not_legible_in_a_frame(
     copied: Path, edit_records: EditRecords, pixels: Any, problem: str
 ) -> None:
     (copied / "items" / "faint.png").write_bytes(encode_png(Image.fromarray(pixels)))
@@ -259,13 +259,13 @@ def test_fields_of_a_later_minor_schema_are_left_out(small_suite: Suite, tmp_pat
 
 
 @pytest.mark.parametrize("field", ["schema_version", "pair_id"])
-def test_what_stands_in_the_hash_cannot_be_changed_unseen(field: str, edit_records: EditRecords) -> None:
+def test_a_change_of_anything_in_the_content_hash_is_detected(field: str, edit_records: EditRecords) -> None:
     with pytest.raises(SuiteError, match=r"E13 suite\.json: content hash differs"):
         load_suite(edit_records(set_field(field, "1.7")))
 
 
 @pytest.mark.parametrize(("field", "value"), [("name", "mine"), ("version", "9.9.9"), ("schema_version", "1.7")])
-def test_what_the_card_names_cannot_be_changed_unseen(field: str, value: str, edit_records: EditRecords) -> None:
+def test_a_changed_entry_of_the_card_is_detected(field: str, value: str, edit_records: EditRecords) -> None:
     folder = edit_records(lambda _: None)
     card = json.loads((folder / "suite.json").read_text(encoding="utf-8"))
     (folder / "suite.json").write_text(json.dumps(card | {field: value}), encoding="utf-8")

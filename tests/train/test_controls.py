@@ -237,7 +237,7 @@ FAILURES = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("options", FAILURES.values(), ids=FAILURES)
-def test_what_is_wrong_is_said_before_any_work_and_leaves_what_retention_reads(
+def test_train_refuses_bad_controls_before_any_work_and_keeps_stored_results(
     planted_run: PlantedRun, options: dict[str, object]
 ) -> None:
     run = planted_run(n_items=12)

@@ -71,7 +71,7 @@ def test_without_a_control_that_explains_it_a_planted_quantity_is_a_signal(run: 
 
 
 @pytest.mark.slow
-def test_what_is_stored_is_loaded_and_controls_are_added_without_a_second_fit(
+def test_stored_probes_are_loaded_and_controls_are_added_without_a_second_fit(
     run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     labels = Target.of_run(run, "sim.tool_y")
@@ -350,7 +350,7 @@ def test_episodes_that_end_too_soon_behind_the_event_are_left_out(events_run: Ru
     assert np.bincount(samples.rows)[np.unique(samples.rows)].tolist() == [3] * np.unique(samples.rows).size
 
 
-def test_what_is_no_event_is_refused(events_run: Run) -> None:
+def test_an_alignment_to_a_column_that_is_no_event_is_refused(events_run: Run) -> None:
     table = table_of(events_run)
     labels = Target.read(table, "since", "continuous")
     with pytest.raises(UsageError, match=r"'since' .*aligned to .*sim.phase.*expected .* true and false"):

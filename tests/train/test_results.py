@@ -315,7 +315,7 @@ def test_categories_do_not_mix(results_of: ProbeResults) -> None:
         (200, "not testable in the backbone and the action expert: extract more items"),
     ],
 )
-def test_what_no_p_can_show_says_whether_permutations_or_groups_are_too_few(
+def test_a_p_that_cannot_be_small_names_too_few_permutations_or_groups(
     results_of: ProbeResults, permutations: int, sentence: str
 ) -> None:
     """The null of these probes has nine columns: of as many as were asked for, or of all that the groups allow."""

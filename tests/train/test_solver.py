@@ -175,7 +175,7 @@ def test_steps_that_are_not_looked_back_at_never_go_in_circles(seed: int) -> Non
         assert (np.linalg.norm(gradient, axis=0) < 1e-6 * np.linalg.norm(weights, axis=0)).all()
 
 
-def test_what_float32_gets_wrong_never_moves_the_optimum(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rounding_in_float32_never_moves_the_optimum(monkeypatch: pytest.MonkeyPatch) -> None:
     draw = np.random.default_rng(1)  # labels do not depend on the tests that ran before
     samples = Projection.fit(NOISE[:, :40]).train
     labels = draw.random((90, 5)) < 0.5

@@ -476,7 +476,7 @@ def test_a_run_of_recordings_opens_with_the_views_that_need_no_side(source_catal
         assert read_payload(source_catalogue.script(name))[0] == name
 
 
-def test_what_is_stored_is_shown_as_the_tables_of_the_commands(source_catalogue: Catalogue) -> None:
+def test_the_viewer_shows_stored_results_as_the_tables_of_the_commands(source_catalogue: Catalogue) -> None:
     _, results = read_payload(source_catalogue.script("run/results"))
     kinds = {table["kind"]: table for table in results["tables"]}
     assert list(kinds) == [

@@ -104,7 +104,7 @@ class AnswerController(ModelController["AnswerModel", "Prompt"]):
             questions = self._questions(observations, phrases_asked, order)
             reading = self._read(questions, buffers if order == "original" else {})
             spoken.append(self.model.speak(reading, self.template.tokens))
-            forced.append(self._forced(questions, reading, order))
+            forced.append(self._force_choices(questions, reading, order))
             # Of one order alone: an episode has one captured inference.
             if buffers and order == "original":
                 self._record_lens(turns, reading)
@@ -183,7 +183,7 @@ class AnswerController(ModelController["AnswerModel", "Prompt"]):
             buffers,
         )
 
-    def _forced(self, questions: Sequence["Prompt"], reading: "Reading", order: Order) -> list[Forced]:
+    def _force_choices(self, questions: Sequence["Prompt"], reading: "Reading", order: Order) -> list[Forced]:
         """Return the choice between the admissible answers; one in words takes a prefill of its own."""
         meaning: Mapping[str, Said] = self._spoken_options(order)
         if self._form is not None:

@@ -445,17 +445,17 @@ class PolicyController(ModelController["Policy", Observation]):
             # After the check, which draws too. Adapters draw from the seeds they are given; this one is for global
             # generators that an author's code may use.
             begin_randomness(derive_seed("global", *(turn.derived_seed("call") for turn in turns)))
-            chunks = self._captured(turns)
+            chunks = self._capture_chunks(turns)
         flags = _own_flags(self.model.flagged, len(turns))
         return [
-            Inference(self._executed(turn, chunk), None if flags is None else bool(flags[row]))
+            Inference(self._executed_actions(turn, chunk), None if flags is None else bool(flags[row]))
             for row, (turn, chunk) in enumerate(zip(turns, chunks, strict=True))
         ]
 
-    def _captured(self, turns: Sequence[Turn]) -> NDArray[np.float32]:
+    def _capture_chunks(self, turns: Sequence[Turn]) -> NDArray[np.float32]:
         """Return the chunks (B, chunk, D) of one call, with activations kept for the turns that are captured."""
         observations = copy_observations([turn.observation for turn in turns])
-        edited = partial(self._edited, observations, turns[0].condition)
+        edited = partial(self._apply_edits, observations, turns[0].condition)
         assert {turn.condition for turn in turns} == {turns[0].condition}, (
             "one call makes the edits of one condition"
         )
@@ -482,7 +482,7 @@ class PolicyController(ModelController["Policy", Observation]):
         with self._acting():
             begin_randomness(derive_seed("global", turn.derived_seed("call")))
             observations = copy_observations([turn.observation])
-            with self._edited(observations, turn.condition):
+            with self._apply_edits(observations, turn.condition):
                 chunk: NDArray[np.float32] = self._chunks(observations, [turn.derived_seed("inference")])[0]
         return chunk
 
@@ -509,14 +509,14 @@ class PolicyController(ModelController["Policy", Observation]):
 
         (observation,) = copy_observations([turn.observation])
         variants = vary_observation(observation, self._source.instructions, self._ids_of, self.model.absent_inputs)
-        self._check_inputs(infer, observation, variants, lambda changed: self._edited([changed]))
+        self._check_inputs(infer, observation, variants, lambda changed: self._apply_edits([changed]))
 
     def run_preflight(self, observations: Sequence[Observation], seeds: Sequence[int]) -> None:
         """Make one inference of which nothing is kept, to measure what another one will take."""
         with self._acting():
             self._chunks(observations, seeds)
 
-    def _executed(self, turn: Turn, chunk: NDArray[np.float32]) -> NDArray[np.float32] | None:
+    def _executed_actions(self, turn: Turn, chunk: NDArray[np.float32]) -> NDArray[np.float32] | None:
         if self.capture_only:
             return None
         if self._source.own_units:
@@ -538,7 +538,7 @@ class PolicyController(ModelController["Policy", Observation]):
         return {**super().certificate(), **rotation, **logs}
 
     @contextmanager
-    def _edited(self, observations: Sequence[Observation], condition: str = "") -> Iterator[None]:
+    def _apply_edits(self, observations: Sequence[Observation], condition: str = "") -> Iterator[None]:
         """Apply the edits of this run or of a condition for one inference.
 
         The certificate shows what the last one did.

@@ -318,7 +318,7 @@ class Ask:
 
             reads = [name for name, candidate in known_families().items() if candidate.abilities.reads]
             raise UsageError(
-                f"{settings.model.family} acts and does not answer questions; those that do: {', '.join(reads)}"
+                f"{settings.model.family} acts and does not answer questions; choose among {', '.join(reads)}"
             )
 
     def view_of(self, source: Source[Any]) -> Source[Any]:

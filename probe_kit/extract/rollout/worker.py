@@ -315,10 +315,10 @@ class Worker:
                 yield played
             else:
                 self._pending.append(self._thread.submit(self._write, *played))
-            yield from self._written(wait=False)
-        yield from self._written(wait=True)
+            yield from self._write_episodes(wait=False)
+        yield from self._write_episodes(wait=True)
 
-    def _written(self, wait: bool) -> Iterator[Done]:
+    def _write_episodes(self, wait: bool) -> Iterator[Done]:
         while self._pending and (wait or self._pending[0].done()):
             yield self._pending.popleft().result()
 

@@ -178,7 +178,7 @@ class RotatedEnvironment:
     def reset(self, episode: EnvEpisode) -> Observation | Step:
         """Set an episode up, and return its beginning with rotated pictures."""
         answer = self._environment.reset(episode)
-        return self._rotated(answer) if isinstance(answer, Observation) else self._rotated_step(answer)
+        return self._rotate(answer) if isinstance(answer, Observation) else self._rotated_step(answer)
 
     def step(self, action: NDArray[np.float32]) -> Step:
         """Execute one action, and return the state after it with rotated pictures."""
@@ -186,9 +186,9 @@ class RotatedEnvironment:
 
     def _rotated_step(self, step: Step) -> Step:
         is_step = isinstance(step, Step) and isinstance(step.observation, Observation)
-        return replace(step, observation=self._rotated(step.observation)) if is_step else step
+        return replace(step, observation=self._rotate(step.observation)) if is_step else step
 
-    def _rotated(self, observation: Observation) -> Observation:
+    def _rotate(self, observation: Observation) -> Observation:
         further_cameras = observation.cameras
         first = next(
             (camera for camera, _ in self._rotations if camera not in (*further_cameras, EVERY_CAMERA)), ""
@@ -606,19 +606,19 @@ class EnvironmentSource(Source[EnvironmentSettings]):
 
     def for_cameras(self, cameras: Sequence[str]) -> Self:
         """Set up the first chosen episode; no action is executed, so that facts are those of `reset`."""
-        return self._begun(DeclaredInputs(tuple(cameras[:1])), False)
+        return self._begin(DeclaredInputs(tuple(cameras[:1])), False)
 
-    def _begun(self, inputs: DeclaredInputs, by_name: bool) -> Self:
+    def _begin(self, inputs: DeclaredInputs, by_name: bool) -> Self:
         typed = self.settings.cameras
         environment = open_environment(self.settings)
         try:
             first = start_episode(environment, self.episodes[0][1], self.name)
-            first = self._mapped(environment, first, inputs, by_name)
+            first = self._map_cameras(environment, first, inputs, by_name)
         finally:
             environment.close()
         if self.settings.rotations and self.settings.cameras != typed:
             # Cameras of the model are rotated, and only now it is known which pictures they get.
-            return self._begun(inputs, by_name)
+            return self._begin(inputs, by_name)
         self.seen, self.cameras = first.observation, [*inputs.cameras[:1], *first.observation.cameras]
         self._frames = [frames_of_steps(self.episodes[0][1].id, [first])]
         self._note_facts(first)
@@ -629,7 +629,7 @@ class EnvironmentSource(Source[EnvironmentSettings]):
         names = self.cameras or ["picture"]
         return tuple(content_notes(self._frames, names))
 
-    def _mapped(
+    def _map_cameras(
         self, environment: OwnEnvironment, step: Step, inputs: DeclaredInputs, by_name: bool = True
     ) -> Step:
         """Decide which picture a camera of the model gets, and return the step with its pictures so."""
@@ -637,11 +637,11 @@ class EnvironmentSource(Source[EnvironmentSettings]):
         by_name = by_name and hasattr(environment, "first_camera")
         typed = self.settings.cameras
         pairs = mapped_pictures(typed, inputs, pictures, by_name, self.name)
-        self.renamed = self._renamed(inputs, pictures)
+        self.renamed = self._describe_renames(inputs, pictures)
         self.settings = self.settings.changed(cameras=pairs)
         return arrange_pictures(step, pairs, pictures[0], self.name)
 
-    def _renamed(self, inputs: DeclaredInputs, pictures: Sequence[str]) -> str:
+    def _describe_renames(self, inputs: DeclaredInputs, pictures: Sequence[str]) -> str:
         """Return the checkpoint's own map in words, and where `--camera` contradicts it; empty without one."""
         sources = renamed_features(map(full_name, pictures), inputs.renames)
         unlike = [
@@ -674,10 +674,10 @@ class EnvironmentSource(Source[EnvironmentSettings]):
         environment, name = open_environment(self.settings), self.name
         try:
             first = start_episode(environment, self.episodes[0][1], name)
-            first = self._mapped(environment, first, policy.card.inputs(policy.state_numbers))
+            first = self._map_cameras(environment, first, policy.card.inputs(policy.state_numbers))
             policy = self._with_cameras(policy, first.observation)
             self._check_state(policy, first.observation)
-            chunk = self._predicted(policy, first.observation)
+            chunk = self._check_prediction(policy, first.observation)
             with naming_environment(name, "step()"):
                 second = environment.step(np.array(chunk[0]))
             second = checked_step(second, self.episodes[0][1], f"{name}, step() 1")
@@ -708,7 +708,7 @@ class EnvironmentSource(Source[EnvironmentSettings]):
         The first episode is set up for this if no model was checked and `declared` has the cameras of one.
         """
         if not self.cameras and declared is not None:
-            self._begun(declared, True)
+            self._begin(declared, True)
         return tuple(self.cameras) or None
 
     def _with_cameras(self, policy: "Policy", observation: Observation) -> "Policy":
@@ -734,7 +734,7 @@ class EnvironmentSource(Source[EnvironmentSettings]):
                 f"{expected}. Take a checkpoint of this environment"
             )
 
-    def _predicted(self, policy: "Policy", observation: Observation) -> NDArray[np.float32]:
+    def _check_prediction(self, policy: "Policy", observation: Observation) -> NDArray[np.float32]:
         """Return the actions (chunk, D) of one prediction. Raises OwnEnvironmentError if width or order differ."""
         predicted = predicted_once(policy, observation)
         if predicted.shape[1] != len(self.actions):
@@ -903,7 +903,7 @@ class EnvironmentPlayer(InputsPlayer):
                 "was prepared, in the process that plays it. Take all randomness from the episode's seed, or play "
                 "it with --accept-nondeterminism"
             )
-        step = self._arranged(step)
+        step = self._arrange(step)
         self._first = _pictures(step)
         return self._see(step)
 
@@ -915,7 +915,7 @@ class EnvironmentPlayer(InputsPlayer):
             with naming_environment(name, "step()"):
                 answer = self._environment.step(action.copy())
             self._steps += 1
-            step = self._arranged(checked_step(answer, self.row.content, f"{name}, step() {self._steps}"))
+            step = self._arrange(checked_step(answer, self.row.content, f"{name}, step() {self._steps}"))
             self._succeeded |= _succeeds(step)
             if step.done or self._steps >= most:
                 return self._end(step)
@@ -926,7 +926,7 @@ class EnvironmentPlayer(InputsPlayer):
         with naming_environment(self._settings.name, "close()"):
             self._environment.close()
 
-    def _arranged(self, step: Step) -> Step:
+    def _arrange(self, step: Step) -> Step:
         return arrange_pictures(
             step, self._settings.cameras, first_picture(self._environment), self._settings.name
         )

@@ -52,7 +52,7 @@ class LeRobotEnvironment:
         self._typed = tuple(options)
         self._config = _configuration(kind, {name: _value(value) for name, value in options.items()})
         self._before, self._after = self._config.get_env_processors()
-        self._tasks = self._created()
+        self._tasks = self._create()
         self._environment: Any = None
         first = next(iter(self._tasks.values()))
         self.action_names = tuple(str(position) for position in range(int(first.action_space.shape[-1])))
@@ -60,7 +60,7 @@ class LeRobotEnvironment:
             kind
         )
 
-    def _created(self) -> dict[str, Any]:
+    def _create(self) -> dict[str, Any]:
         """Return the only environment of every task, not vectorized."""
         try:
             with _naming_simulator(self._kind):
@@ -107,7 +107,7 @@ class LeRobotEnvironment:
             inner.init_state_id = episode.seed
         with _naming_simulator(self._kind):  # some are imported at the first reset
             observation, _ = self._environment.reset(seed=episode.seed)
-        return Step(self._observed(observation))
+        return Step(self._observe(observation))
 
     def step(self, action: NDArray[np.float32]) -> Step:
         """Execute an action that lerobot's processor of actions has converted."""
@@ -118,14 +118,14 @@ class LeRobotEnvironment:
             np.asarray(passed[0], np.float32)
         )
         facts = {"reward": float(reward), SUCCESS: bool(info.get("is_success", False))}
-        return Step(self._observed(observation), bool(terminated or truncated), facts)
+        return Step(self._observe(observation), bool(terminated or truncated), facts)
 
     def close(self) -> None:
         """Close every task."""
         for environment in self._tasks.values():
             environment.close()
 
-    def _observed(self, observation: Mapping[str, Any]) -> Observation:
+    def _observe(self, observation: Mapping[str, Any]) -> Observation:
         """Return an observation as lerobot's policies get it: its names, order of states and turned pictures."""
         from lerobot.envs.utils import preprocess_observation
 

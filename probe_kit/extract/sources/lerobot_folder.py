@@ -229,8 +229,8 @@ def resolved_commit(repo: str, revision: str) -> str:
         return revision
     if reason := unreachable():
         raise UsageError(
-            f"{repo}{'@' + revision if revision else ''} names no commit, and the hub cannot be asked for one: "
-            f"{reason}. Give {repo}@COMMIT with 40 digits, or a folder that exists"
+            f"there is no folder {repo}, and the commit of this data set cannot be looked up on the hub: "
+            f"{reason}. Give the folder of a data set, or {repo}@COMMIT with 40 digits of a cached one"
         )
     from huggingface_hub import HfApi
     from huggingface_hub.errors import HfHubHTTPError
@@ -242,7 +242,9 @@ def resolved_commit(repo: str, revision: str) -> str:
             f"the hub gives no data set {repo} at {revision or 'main'} ({hub_reason(error)}). {way_out(error)}"
         ) from error
     if commit is None:
-        raise UsageError(f"the hub names no commit of {repo}; give {repo}@COMMIT with 40 digits")
+        raise UsageError(
+            f"the hub's answer names no commit of {repo}; give {repo}@COMMIT with the 40 digits of the commit"
+        )
     return str(commit)
 
 
@@ -312,7 +314,7 @@ class LeRobotFrames:
     def __init__(self, folder: LeRobotFolder) -> None:
         self.folder = folder
         self.largest_drift: Drift | None = None
-        self._data_file = lru_cache(maxsize=2)(self._scanned)
+        self._data_file = lru_cache(maxsize=2)(self._scan)
         self._video = lru_cache(maxsize=_MOST_VIDEOS)(self._opened_video)
         self._video_times = lru_cache(maxsize=_MOST_VIDEOS)(self._named_times)
         self._regular: set[int] = set()
@@ -393,7 +395,7 @@ class LeRobotFrames:
             table = read_parquet(parquet, columns, groups.tolist()).select(columns)
             return table.rename_columns(list(names)), int((ends - sizes)[groups[0]])
 
-    def _scanned(self, path: Path) -> _DataFile:
+    def _scan(self, path: Path) -> _DataFile:
         """Return a data file whose rows are those that meta says. Raises RecordingError for others."""
         with self.folder.opened.parquet(path) as parquet:
             if missing := [name for name in (_EPISODE, _INDEX) if name not in parquet.schema_arrow.names]:

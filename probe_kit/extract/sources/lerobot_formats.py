@@ -30,8 +30,10 @@ def check_is_data_set(root: Path) -> None:
         return
     if (root / _OLD_INFO).is_file():
         raise RecordingError(f"{root.name} {_older('v1.x')}")
+    problem = f"it has no {INFO}" if root.is_dir() else "there is no such folder"
     raise RecordingError(
-        f"{root} is no LeRobotDataset: it has no {INFO}. Give the folder that holds meta, data and videos"
+        f"{root} is no LeRobotDataset: {problem}. Give the folder that holds meta, data and videos, or the hub's "
+        "USER/NAME"
     )
 
 

@@ -51,7 +51,7 @@ class RecordedVideo:
         self.rate = float(stream.average_rate or 0)
         packets = [
             (packet.pts, packet.is_keyframe)
-            for packet in self._demuxed()
+            for packet in self._demux()
             if packet.pts is not None and not packet.is_discard
         ]
         if not packets:
@@ -61,7 +61,7 @@ class RecordedVideo:
         self.times = tuple(sorted(time for time, _ in packets))
         self._starts = tuple(sorted({self.times[0], *(time for time, is_start in packets if is_start)}))
 
-    def _demuxed(self) -> Iterator[Any]:
+    def _demux(self) -> Iterator[Any]:
         """Yield the packets up to the end of the file, or to the place where it is cut off."""
         import av
 
@@ -105,10 +105,10 @@ class RecordedVideo:
         if self._last is not None and starts[-1] <= self._last < time:
             yield self._decoding
         for start in (*reversed(starts), None):
-            self._decoding = self._decoded(start)
+            self._decoding = self._decode(start)
             yield self._decoding
 
-    def _decoded(self, start: int | None) -> Iterator[Any]:
+    def _decode(self, start: int | None) -> Iterator[Any]:
         """Yield the frames from a time on, or of the file opened again for None: not every format can seek."""
         import av
 

@@ -71,7 +71,7 @@ Episodes = Annotated[
         "--episodes",
         parser=str,
         metavar="START:STOP",
-        help="Episodes of the data set or environment, such as 0:5. Default: all.",
+        help="Episodes of the data set or environment, such as 0:5 for the first five. Default: all.",
     ),
 ]
 Pixels = Annotated[

@@ -235,7 +235,7 @@ class RecordingSource(Source[LeRobotSource]):
         renamed = self.with_renamed(inputs.renames)
         settings = renamed.settings.changed(cameras=pairs, rotations=turns)
         mapped = type(self)(settings, renamed.folder, self.stretch)
-        mapped.renamed = self._renamed(inputs)
+        mapped.renamed = self._describe_renames(inputs)
         return mapped
 
     def with_renamed(self, renames: Mapping[str, str]) -> Self:
@@ -261,7 +261,7 @@ class RecordingSource(Source[LeRobotSource]):
         pairs = (*self.settings.features, (STATE, sources[0]))
         return type(self)(self.settings.changed(features=pairs), self.folder.with_features(pairs), self.stretch)
 
-    def _renamed(self, inputs: DeclaredInputs) -> str:
+    def _describe_renames(self, inputs: DeclaredInputs) -> str:
         """Return the checkpoint's own map in words, and where the settings contradict it; empty without one."""
         renames, typed = inputs.renames, {f"{IMAGES}{camera}": name for camera, name in self.settings.cameras}
         typed |= dict(self.settings.features)
@@ -498,7 +498,7 @@ class RecordingSource(Source[LeRobotSource]):
         """Return data set, cameras and frames of a plan."""
         planned = self.mapped(self.declared) if self.declared and not self.settings.cameras else self
         settings, folder, turned = planned.settings, self.folder, dict(self.settings.rotations)
-        renamed = planned.renamed or (self._renamed(self.declared) if self.declared else "")
+        renamed = planned.renamed or (self._describe_renames(self.declared) if self.declared else "")
         cameras = [
             f"{camera} from {feature} ({folder.encoding(feature)})"
             + (f", rotated by {turned[camera]}°" if camera in turned else "")

@@ -60,7 +60,9 @@ class SceneOptions(Part):
     ] = None
     rendering: Annotated[
         Rendering | None,
-        _option("--rendering", help="visual-matching: draw robot, cube and tiles over a photo."),
+        _option(
+            "--rendering", help="How the scene is drawn. visual-matching: robot, cube and tiles over a photo."
+        ),
     ] = None
     background: Annotated[
         Path | None,
@@ -83,7 +85,9 @@ class SceneOptions(Part):
         _option("--epsilon", help="Radius of the target zone in metres. Default: half a tile plus 0.01 m."),
     ] = None
     arm: Annotated[ArmName | None, _option("--arm", help="Robot arm.")] = None
-    arm_urdf: Annotated[Path | None, _option("--arm-urdf", help="Your own URDF file of this arm.")] = None
+    arm_urdf: Annotated[
+        Path | None, _option("--arm-urdf", help="URDF file to load instead of the built-in one of --arm.")
+    ] = None
     start_grasped: Annotated[bool, _option("--start-grasped", help="Start with the cube in the gripper.")] = False
     early_stop: Annotated[
         bool, _option("--early-stop", help="End an episode when the released cube is at rest.")

@@ -63,7 +63,7 @@ class ScenePlayer(Player):
     def look_swapped(self) -> tuple[Observation, dict[str, Any]]:
         """Show the item's other layout in the state that this episode is in, with its hash."""
         observation, frame = self._env.observe_exchanged()
-        return self._observed(observation), {FIRST_FRAME: frame_sha256(frame)}
+        return self._observe(observation), {FIRST_FRAME: frame_sha256(frame)}
 
     def _set_up(self, row: Row) -> None:
         options = {"item": row.content.item, "layout": row.content.layout}
@@ -102,7 +102,7 @@ class ScenePlayer(Player):
         for step, action in enumerate(actions):
             if step:
                 inference, is_between = divmod(step, execute)
-                observation = self._observed(self._env.observe(None if is_between else inference))
+                observation = self._observe(self._env.observe(None if is_between else inference))
             yield observation, str(facts[FIRST_FRAME])
             self._env.advance(action)
 
@@ -143,9 +143,9 @@ class ScenePlayer(Player):
             self._small_frames.append(self._env.render_small(FILM_HEIGHT) if every else shrink(self._env.render()))
 
     def _see(self) -> Observation:
-        return self._observed(self._env.observe())
+        return self._observe(self._env.observe())
 
-    def _observed(self, observation: Mapping[str, Any]) -> Observation:
+    def _observe(self, observation: Mapping[str, Any]) -> Observation:
         instruction = self.row.content.item.instruction
         return Observation(observation["pixels"]["image"], observation["agent_pos"], instruction, self._intrinsics)
 
@@ -230,7 +230,7 @@ class SceneSource(Source[SceneSettings]):
             )
             for index, episode in enumerate(self._episodes())
         )  # fmt: skip
-        self._skipped(rows)
+        self._count_skipped(rows)
         return rows
 
     def _episodes(self) -> Iterator[Episode]:
@@ -240,7 +240,7 @@ class SceneSource(Source[SceneSettings]):
                 None, [episode] if wordings is None else (in_words(episode, wording) for wording in wordings)
             )
 
-    def _skipped(self, rows: Sequence[Row]) -> dict[Wording, int]:
+    def _count_skipped(self, rows: Sequence[Row]) -> dict[Wording, int]:
         """Count the items that lack a wording, by wording. Raises UsageError for a wording that no item has."""
         skipped = {}
         for wording in self.settings.wordings or ():
@@ -287,7 +287,7 @@ class SceneSource(Source[SceneSettings]):
             "items": len(suite.items),
         }
         if self.settings.wordings is not None:
-            texts, skipped = [[row.episode_id, row.instruction] for row in rows], self._skipped(rows)
+            texts, skipped = [[row.episode_id, row.instruction] for row in rows], self._count_skipped(rows)
             selected["wordings"] = {
                 "names": list(skipped),
                 "skipped": skipped,
@@ -297,7 +297,7 @@ class SceneSource(Source[SceneSettings]):
 
     def describe(self, rows: Sequence[Row]) -> dict[str, str]:
         """Return suite, categories, scene, episodes and wordings."""
-        scene, skipped = self.settings.scene, self._skipped(rows)
+        scene, skipped = self.settings.scene, self._count_skipped(rows)
         early = ", less once the cube was released and rests" if scene.early_stop else ""
         wordings = ", ".join(
             f"{name} ({count} items have none: skipped)" if count else name for name, count in skipped.items()

@@ -236,7 +236,7 @@ class ServedSource(Source[ServedSettings]):
         Raises:
             ObservationError: For a picture, state or instruction that is missing or has another size or type.
         """
-        cameras = self.cameras or self._guessed(sent)
+        cameras = self.cameras or self._guess_cameras(sent)
         pictures = {camera: self._picture(sent, camera, key) for camera, key in cameras}
         state = self._state(sent)
         instruction = self.settings.instruction or _words(sent, self.settings.words_key)
@@ -271,7 +271,7 @@ class ServedSource(Source[ServedSettings]):
         words = set() if self.settings.instruction is not None else {self.settings.words_key}
         return {key for _, key in self.cameras} | set(self.settings.state) | words
 
-    def _guessed(self, sent: Mapping[str, Any]) -> Pairs:
+    def _guess_cameras(self, sent: Mapping[str, Any]) -> Pairs:
         """Return the cameras whose name is a key, else the first one with the only picture."""
         by_name = {
             camera: key

@@ -229,9 +229,9 @@ class _Comparison:
 
     def misfits(self) -> Iterator[Misfit]:
         """Yield the numbers that do not fit, each under one explanation."""
-        explained = [] if self.begins else list(self._matched())
+        explained = [] if self.begins else list(self._match())
         explained_numbers = {number for misfit in explained for number in misfit.numbers}
-        explained += self._located(explained_numbers)
+        explained += self._locate(explained_numbers)
         explained_numbers |= {number for misfit in explained for number in misfit.numbers}
         yield from explained
         for number in np.flatnonzero(self.is_outside).tolist():
@@ -244,7 +244,7 @@ class _Comparison:
             if number not in explained_numbers
         ]
         if far:
-            worst = f"{self._listed(far)} beyond the least and largest value of training in up to "
+            worst = f"{self._list_names(far)} beyond the least and largest value of training in up to "
             yield Misfit(
                 "outside", tuple(far), False, f"{worst}{self.beyond_extremes[far].max():.0%} of the frames"
             )
@@ -253,7 +253,7 @@ class _Comparison:
 
     # -- explanations by all statistics ------------------------------------------------------------------
 
-    def _matched(self) -> Iterator[Misfit]:
+    def _match(self) -> Iterator[Misfit]:
         """Yield numbers that fit once they are exchanged, mirrored or multiplied."""
         after, groups = self.before.copy(), list[Misfit]()
         free = self.moves.copy()
@@ -378,7 +378,7 @@ class _Comparison:
 
     # -- explanations by the place alone -----------------------------------------------------------------
 
-    def _located(self, explained_numbers: set[int]) -> list[Misfit]:
+    def _locate(self, explained_numbers: set[int]) -> list[Misfit]:
         """Return the factor that explains the place of numbers whose spread shows nothing.
 
         These are the beginnings of episodes, and numbers that never move and lie outside.
@@ -428,7 +428,7 @@ class _Comparison:
         if numbers and 2 * len(numbers) >= self.moves.sum():
             times = float(1 / np.nanmedian(ratio[numbers]))
             words = (
-                f"{self._listed(numbers)} vary {times:.0f} times less than in training: a narrow part of its "
+                f"{self._list_names(numbers)} vary {times:.0f} times less than in training: a narrow part of its "
                 "workspace, or other units"
             )
             yield Misfit("narrow", tuple(numbers), False, words)
@@ -439,7 +439,7 @@ class _Comparison:
         name = self.names[number]
         return f"number {name}" if name.isdecimal() else f"{name} (number {number})"
 
-    def _listed(self, numbers: Sequence[int]) -> str:
+    def _list_names(self, numbers: Sequence[int]) -> str:
         names = [self._name(number) for number in numbers[:_LISTED]]
         more = [f"{len(numbers) - _LISTED} more"] if len(numbers) > _LISTED else []
         *first, last = [*names, *more]
@@ -458,8 +458,8 @@ class _Comparison:
         small, large = next(units for value, units in FACTORS.items() if np.isclose(value, times))
         size, had, due = ("larger", small, large) if factor > 1 else ("smaller", large, small)
         return (
-            f"{self._listed(numbers)} about {_figures(times)} times {size} than in training, as {had} for {due} "
-            f"({self._ranges(numbers[0])})"
+            f"{self._list_names(numbers)} about {_figures(times)} times {size} than in training, as {had} for "
+            f"{due} ({self._ranges(numbers[0])})"
         )
 
     def _mirror_words(self, kind: Kind, number: int, offset: Numbers) -> str:

@@ -262,7 +262,7 @@ def _without(
     if hidden is None:
         return read
     with torch._C.DisableTorchFunction():  # what is computed here is no attention of the model
-        without = _renormalised(site, weights, hidden) @ values
+        without = _renormalise(site, weights, hidden) @ values
         by_token = without.transpose(1, 2).to(read.dtype)
         if cut.queries is None and cut.heads is None:
             return by_token.flatten(2)
@@ -280,7 +280,7 @@ def _without(
         return new.flatten(2)
 
 
-def _renormalised(site: Site, weights: Tensor, hidden: _HiddenTokens) -> Tensor:
+def _renormalise(site: Site, weights: Tensor, hidden: _HiddenTokens) -> Tensor:
     """Return weights (B, H, S, T) that are 0 on the cut tokens and sum to 1 over the others."""
     left = weights.masked_fill(hidden.mask(site, weights.shape[3], weights.device), 0.0)
     total = left.sum(dim=-1, keepdim=True)

@@ -445,10 +445,10 @@ class ActiveEdits:
                 raise CaptureError(f"{site} passes as {tuple(shape)}; expected {tokens.count} tokens in all")
             flat = activation if shape[0] == 1 else activation.reshape(1, tokens.count, shape[2])
             # What an earlier edit gave is measured later, so that the next one must not write into it.
-            activation = self._changed(site, flat.clone() if number else flat, tokens.where, change)
+            activation = self._change(site, flat.clone() if number else flat, tokens.where, change)
         return activation if activation.shape == shape else activation.reshape(shape)
 
-    def _changed(self, site: Site, activation: "Tensor", where: TokenIndex, change: TokenEdit) -> "Tensor":
+    def _change(self, site: Site, activation: "Tensor", where: TokenIndex, change: TokenEdit) -> "Tensor":
         before = select_positions(activation, where)
         after = change(site, before.float(), where)
         if after.dtype != activation.dtype:

@@ -306,7 +306,7 @@ def _fetch_folder(checkpoint: str, patterns: Sequence[str]) -> Path:
     """
     parts = hub_name(checkpoint)
     if parts is None:
-        raise CheckpointError(_not_here(checkpoint))
+        raise CheckpointError(f"{_not_here(checkpoint)}. Give the folder of a checkpoint, or a hub id OWNER/NAME")
     parts = _with_pin(parts)
     why = unreachable()
     snapshot = _snapshot(parts) if why else _download_commit(checkpoint, parts, patterns)

@@ -343,7 +343,10 @@ def check_files(
     adapter = adapter_in(folder) if weights else None
     if not file.is_file():
         way_out = _way_to_checkpoint(folder, types)
-        raise CheckpointError(f"{file} is missing; {folder} is not a checkpoint of {' or '.join(types)}{way_out}")
+        advice = way_out or (
+            f". Give the folder that holds {CONFIG_FILE} and the weights; lerobot-train calls it pretrained_model"
+        )
+        raise CheckpointError(f"{file} is missing; {folder} is not a checkpoint of {' or '.join(types)}{advice}")
     config = read_json(file, CheckpointError, "Download the checkpoint again")
     model_type = _type_of(config)
     if not isinstance(model_type, str) or model_type not in types:

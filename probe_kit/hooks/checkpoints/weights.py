@@ -70,20 +70,20 @@ class Adapter:
                 factors.
             MissingExtraError: Without peft.
         """
-        parts = self._sorted()
+        parts = self._sort_tensors()
         merged, notes = dict(tensors), []
         tied = {double: original for double, original in doubles(module).items() if original in merged}
         for double, original in tied.items():
             merged.setdefault(double, merged[original])
         for name, tensor in parts.bases.items():
-            target, stored = self._placed(name, tensor, merged, name_in_module)
+            target, stored = self._rename_whole(name, tensor, merged, name_in_module)
             if not torch.equal(stored, merged[target]):
                 largest = float((stored.float() - merged[target].float()).abs().max())
                 notes.append(f"its own {name} replaces the base's, from which it differs by up to {largest:.3g}")
             for partner in _tied_to(target, tied):
                 merged[partner] = stored
         for name, tensor in parts.copies.items():
-            target, stored = self._placed(name, tensor, merged, name_in_module)
+            target, stored = self._rename_whole(name, tensor, merged, name_in_module)
             merged[target] = stored
         for path, layer_factors in parts.factors.items():
             weight = self._target(f"{path}.weight", merged, name_in_module)
@@ -100,7 +100,7 @@ class Adapter:
                 notes.append(f"{double} is no longer tied to {original}")
         return MergedTensors(merged, tuple(notes))
 
-    def _placed(
+    def _rename_whole(
         self, name: str, tensor: Tensor, tensors: Mapping[str, Tensor], name_in_module: Callable[[str], str]
     ) -> tuple[str, Tensor]:
         """The network's name of a whole tensor, and the tensor in the dtype that the weight has there."""
@@ -112,7 +112,7 @@ class Adapter:
             )
         return target, tensor.to(tensors[target].dtype)
 
-    def _sorted(self) -> "_AdapterParts":
+    def _sort_tensors(self) -> "_AdapterParts":
         """Return low-rank factors, copies of the base's own tensors, and whole tensors that replace the base's.
 
         Raises:

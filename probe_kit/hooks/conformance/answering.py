@@ -136,15 +136,15 @@ def the_positions_of_policies_add_at_most_the_last_one(subject: AnswerSubject) -
     model, questions = subject.answer_model, subject.led(subject.questions_of_batch[:1])
     site = model.streams["backbone"].sites()[-1]
 
-    def captured() -> tuple[torch.Tensor, Roles]:
+    def capture_prompt() -> tuple[torch.Tensor, Roles]:
         with capture(model, [site]) as cache:
             model.read(questions)
         return cache[site], model.asked_roles(questions)["backbone"][0]
 
-    activation, own_roles = captured()
+    activation, own_roles = capture_prompt()
     model.match_policies(True)
     try:
-        (matched, roles), added = captured(), int(model.whole_prompt)
+        (matched, roles), added = capture_prompt(), int(model.whole_prompt)
     finally:
         model.match_policies(False)
     require(len(roles) == matched.shape[1], f"{len(roles)} roles", f"{matched.shape[1]}, one per position")

@@ -155,16 +155,16 @@ def what_blocks_add_makes_the_next_residual(subject: Subject) -> None:
 def capturing_changes_no_output_bit_for_bit(subject: Subject) -> None:
     observations = subject.batch
 
-    def captured() -> NDArray[np.float32]:
+    def capture_site() -> NDArray[np.float32]:
         with capture(subject.model, subject.model.sites()):
             return subject.run(observations)
 
-    plain, hooked = subject.run(observations), captured()
+    plain, hooked = subject.run(observations), capture_site()
     if not same_bits(plain, hooked):
         raise CheckFailedError(
             f"the outputs with and without hooks differ by up to {np.abs(plain - hooked).max():.3g}",
             "no difference, bit for bit",
-            reason_of_change(lambda: subject.run(observations), plain, captured),
+            reason_of_change(lambda: subject.run(observations), plain, capture_site),
         )
 
 

@@ -209,7 +209,9 @@ class ClosedLoop(AlongDirection):
             return f"confirmed: the cube turns to the other picture after {share_of_edits(confirmed, len(edits))}"
         if edits and all(row.disrupted for row in edits):
             return "task disrupted: after every edit the cube stays away from both pictures"
-        return f"not confirmed: no edit of {len(edits)} turns the cube to the other picture beyond its controls"
+        return (
+            f"not confirmed: none of {len(edits)} edits turns the cube to the other picture more than its controls"
+        )
 
     @staticmethod
     def notes(rows: "Sequence[ClosedLoopEffect]") -> list[str]:

@@ -209,7 +209,9 @@ class ConceptErasure(Intervention):
             return "nothing to lose: the unedited action does not go to the correct picture"
         lost = sorted((row for row in tried if row.finding == "effect"), key=lambda row: row.share_left or 0.0)
         if not lost:
-            return f"not lost: no erasure of {len(tried)} takes the answer from the action beyond its controls"
+            return (
+                f"not lost: none of {len(tried)} erasures takes the answer from the action more than its controls"
+            )
         return (
             f"lost: the action no longer follows the answer after {share_of_edits(lost, len(tried), 'erasures')}"
         )

@@ -151,12 +151,12 @@ class InstructionSwap(Swap):
             return super().effects(measurement)
         reach = Reach.of(measurement.outcomes.of(CLEAN), measurement.tiles_apart)
 
-        def of_category(part: ConditionOutcomes) -> list[InstructionSwapEffect]:
+        def category_effects(part: ConditionOutcomes) -> list[InstructionSwapEffect]:
             columns = swap_columns(part, INSTRUCTION_SWAP, reach)
             sensitivity = input_sensitivity(part)
             return [InstructionSwapEffect(**columns, readout=measurement.readout, sensitivity=sensitivity)]
 
-        return measurement.rows(of_category)
+        return measurement.rows(category_effects)
 
     @classmethod
     def table(cls, rows: Sequence[Any], context: Measurement) -> "Table":

@@ -519,9 +519,9 @@ class PatchKind(AlongDirection):
             )
             return f"{what} {share_of_edits(localised, tried)}"
         if not tried:
-            return "not located: every edit lies where the whole effect must pass, which shows no place"
+            return "not located: all edits lie where the whole effect must pass, so that no place is shown"
         verdict = "not steered" if steered else "not located"
-        return f"{verdict}: no edit of {tried} has half of the {context.exchange}'s effect"
+        return f"{verdict}: none of {tried} edits has half of the {context.exchange}'s effect"
 
     @staticmethod
     def keys_in_use(run: RunReader) -> set[str]:

@@ -226,12 +226,12 @@ def patch_cells(
     """
     together = as_tuple(cells)
     _, source = run_with_cache(model, pair.source, pair.seed, [cell.site_group.name for cell in together])
-    with patched(PairTokens(model, pair), together, source, along, complement):
+    with patch_while_inferring(PairTokens(model, pair), together, source, along, complement):
         return infer(model, pair.clean, pair.seed)
 
 
 @contextmanager
-def patched(
+def patch_while_inferring(
     tokens: PairTokens,
     cells: Sequence[Cell],
     source: "ActivationCache",

@@ -19,7 +19,7 @@ from probe_kit.intervene.patching.patch import (
     all_but,
     as_tuple,
     infer,
-    patched,
+    patch_while_inferring,
     run_with_cache,
 )
 from probe_kit.intervene.places import PlaceName
@@ -195,7 +195,7 @@ def sweep_cells(
         clean[column] = metric(infer(model, pair.clean, pair.seed), pair.clean)
         tokens = PairTokens(model, pair)
         for row, together in enumerate(sets):
-            with patched(tokens, together, source, along, complement):
+            with patch_while_inferring(tokens, together, source, along, complement):
                 output = infer(model, pair.clean, pair.seed)
             of_sets[row, column] = metric(output, pair.clean)
     groups, items = groups_and_items(pairs)

@@ -148,7 +148,7 @@ def p_value(key: str, heading: str, meaning: str, **more: Any) -> Column:
     return replace(column, **more)
 
 
-def _judged(column: Column) -> Column:
+def _judged_column(column: Column) -> Column:
     """Return the column, empty for a run that keeps no trajectories; `sr_idle` is known wherever they are."""
     cell = column.cell
     return replace(column, cell=lambda row: Cell(None) if row.rules.sr_idle is None else cell(row))
@@ -221,15 +221,19 @@ PAPER_MARGIN = share(
 REGIME = Column(
     key="success.regime",
     heading="regime",
-    help="Knowledge: further above 50 % than guessing leads with this many questions. Not reliable: not so far. "
-    "Failure: as far below; the policy misses both pictures or prefers the wrong one. In a mean the normalised "
+    help="Knowledge: further above 50 % than guessing leads with this many questions. Not "
+    "reliable: nearer to 50 %. "
+    "Failure: further below 50 % than guessing leads; the policy misses both "
+    "pictures or prefers the wrong one. In a mean the normalised "
     "score: the success rate on a scale where guessing is 0 and perfection 100.",
     cell=lambda row: Cell(regime_value(row)),
     sort=lambda row: row.success.sr,
     answers=(
         "regime",
-        "Knowledge: further above 50 % than guessing leads with this many questions. Not reliable: not so far. "
-        "Failure: as far below; the answers cannot be read, or the wrong one is preferred. In a mean the "
+        "Knowledge: further above 50 % than guessing leads with this many questions. Not "
+        "reliable: nearer to 50 %. "
+        "Failure: further below 50 % than guessing leads; the answers cannot be read, or "
+        "the wrong one is preferred. In a mean the "
         "normalised score: the accuracy on a scale where guessing is 0 and perfection 100.",
     ),
 )
@@ -368,14 +372,19 @@ SIZES = Column(
 
 RULES = tuple(
     map(
-        _judged,
+        _judged_column,
         (
-            share("rules.share_answered", "answered %", "Share of episodes that ended in a zone."),
+            share(
+                "rules.share_answered",
+                "answered %",
+                "Share of episodes in which the cube ended in the zone of either picture, right or wrong.",
+            ),
             interval(
                 "rules.sr_answered",
                 "rules.sr_answered_ci",
                 "SR of answered % [95 %]",
-                "Success among episodes that ended in a zone: an episode without an answer is not a wrong answer.",
+                "Success among episodes in which the cube ended in a zone: an episode without an "
+                "answer is not a wrong answer.",
             ),
             interval(
                 "rules.sr_grasped",
@@ -386,7 +395,7 @@ RULES = tuple(
             share(
                 "rules.share_unmoved_answers",
                 "unmoved answers %",
-                "Share of answers whose cube never left its start.",
+                "Share of answered episodes in which the cube was never more than 3 cm from its start.",
             ),
             share("rules.sr_idle", "doing nothing scores %", "Success rate of a policy that does nothing."),
             share(
@@ -500,7 +509,7 @@ PUBLISHED = Column(
 PROBE_MINUS_SR = share(
     "controls.probe_minus_sr",
     "probe − SR %",
-    "Backbone score minus success rate, in points: what can be read beyond success.",
+    "Backbone score minus success rate, in percentage points: how much more can be read than the policy acts on.",
     answers=(
         "probe − accuracy %",
         "Backbone score minus the accuracy of the answers, in points: what can be read but is not said.",
@@ -513,8 +522,8 @@ _P = (
 )
 _PEAK = "Accuracy of the best site on the same questions by which it was chosen. It is therefore too high."
 _CHANCE = (
-    "Chance at that site: the mean score of a label with labels that are exchanged between groups. The site is "
-    "the one with the largest score above chance."
+    "Chance at the site with the largest score above chance: the mean score of probes whose labels were exchanged "
+    "between groups."
 )
 _LABEL_PEAK = (
     "Held-out score of a label at the site with the largest score above chance: accuracy balanced between "
@@ -679,10 +688,12 @@ def _baseline(name: str) -> Column:
 
 _LEAK = " Red: the suite gives the answer away without a model."
 _BASELINES = {
-    "position": f"The same probe on the layout alone.{_LEAK}",
-    "instruction": f"The same probe on the words alone.{_LEAK}",
-    "pixels": f"The same probe on the two pictures alone.{_LEAK}",
-    "random-features": "The same probe on random features of pictures and words, which the backbone must exceed.",
+    "position": f"Accuracy of the same probe if it sees the layout alone, not the model.{_LEAK}",
+    "instruction": f"Accuracy of the same probe if it sees the words alone, not the model.{_LEAK}",
+    "pixels": f"Accuracy of the same probe if it sees the two pictures alone, not the model.{_LEAK}",
+    "random-features": (
+        "Accuracy of the same probe on random features of pictures and words. The backbone must exceed it."
+    ),
 }
 BASELINES = tuple(map(_baseline, _BASELINES))
 _SELECTIVITY = "Accuracy above that of the same probe on random labels, at the best site"

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from probe_kit._system.escaping import as_argument
 from probe_kit._tables.numbers import Limits, points, whole_percent, with_sign
 from probe_kit._tables.table import Cell, Heading, Table, TableRow, absent
-from probe_kit.intervene.verdict import UseVerdict, describe_readouts, more_groups, size_of_groups
+from probe_kit.intervene.verdict import UseVerdict, describe_readouts, items_to_decide, more_groups, size_of_groups
 from probe_kit.retention.behaviour import Regime
 from probe_kit.retention.columns.text import (
     P_DECIDES,
@@ -26,8 +26,8 @@ from probe_kit.retention.columns.text import (
     name_of,
     retention_value,
     title_of,
-    unprobed,
     verdict,
+    why_unprobed,
 )
 from probe_kit.retention.compare.compare import Difference
 from probe_kit.retention.rows.row import MEAN, RetentionRow, StreamPart
@@ -35,8 +35,8 @@ from probe_kit.statistics.label_permutations import permutations_for
 from probe_kit.statistics.sufficiency import probe_command
 from probe_kit.train.results.control_scores import RANDOM_FEATURES, UNTRAINED
 
-MOST_WORDS = 25
-"""Largest number of words of a sentence with the name of its category, as in all texts of the package.
+MOST_WORDS = 30
+"""Largest number of words of a sentence with the name of its category.
 
 A number is a word.
 """
@@ -55,13 +55,19 @@ def finding(row: RetentionRow, vlm: RetentionRow | None = None) -> str:
     if row.label:
         return label_finding(row)
     if is_vlm(row):
-        return _of_vlm(row)
+        return _vlm_sentence(row)
     use = row.image_swap.use
     if use is None:
         return _without_swap(row, vlm)
     if use.is_bounded and is_probed(row) and not _is_encoded(row):
-        return f"{_without_signal(row, vlm)}: {_unread(row)}; the action does not follow it."
-    return _of_use(row, vlm, use)
+        return (
+            f"{_missing_signal(row)}: {_list_clauses(_knows(vlm), _unread(row))}; the action does not follow it."
+        )
+    return _use_sentence(row, vlm, use)
+
+
+def _list_clauses(*clauses: str) -> str:
+    return "; ".join(filter(None, clauses))
 
 
 def count_words(sentence: str) -> int:
@@ -72,7 +78,7 @@ def count_words(sentence: str) -> int:
 # -- VLMs ----------------------------------------------------------------------------------------------------
 
 
-def _of_vlm(row: RetentionRow) -> str:
+def _vlm_sentence(row: RetentionRow) -> str:
     rate = f"{whole_percent(row.success.sr)} %"
     if knows(row):
         inside = ", and probes read it in the backbone" if _is_encoded(row) else ""
@@ -92,24 +98,57 @@ def _against_guessing(row: RetentionRow) -> str:
 # -- policies ----------------------------------------------------------------------------------------------------
 
 
-def _sentence(head: str, *clauses: str, row: RetentionRow) -> str:
-    """Return head and clauses, with the action stream and the rate of guessing where there is room for them."""
-    *before, success = [*clauses, _success(row)]
-    guessing = "" if row.success.sr is None else _beside_guessing(row)
-    stream = _in_action(row)
+_MOST_WORDS_OF_CLAUSES = 25
+"""Largest number of words of a sentence to which the success rate is added."""
+_READ = "probes read the answer in the backbone"
+
+
+def _sentence(verdict: str, *clauses: str, row: RetentionRow, stages: str = "") -> str:
+    """Return verdict and clauses, the stages, and the success rate; what is long is a sentence of its own.
+
+    Args:
+        verdict: The verdict in a word or two.
+        clauses: Its reasons; empty ones are left out.
+        row: The row of one category of a policy.
+        stages: Clause on where the answer can be read; empty if it is among the clauses.
+    """
+    text = ". ".join(filter(None, (f"{verdict}: {_list_clauses(*clauses)}", f"{stages[:1].upper()}{stages[1:]}")))
+    if row.success.sr is None or knows(row):
+        success = _success(row) + _compare_with_guessing(row)
+        if len(re.findall(r"\d+", text + success)) > MOST_NUMBERS:
+            success = _success(row)
+        is_short = count_words(text) + count_words(success) < _MOST_WORDS_OF_CLAUSES
+        return f"{text}; {success}." if is_short else f"{text}. {success[0].upper()}{success[1:]}."
+    is_below = row.success.regime == Regime.FAILURE
+    against = "lower than guessing gives" if is_below else "compatible with guessing"
+    return f"{text}. The success rate of {whole_percent(row.success.sr)} % is {against}."
+
+
+def _open_sentence(head: str, row: RetentionRow, vlm: RetentionRow | None, needed: str = "") -> str:
+    """Return the sentence of an answer that probes read and whose use is open.
+
+    It has the evidence of the action stream and the rate of guessing where there is room for them.
+
+    Args:
+        head: What is open.
+        row: The row of one category of a policy.
+        vlm: The row of a VLM that answered the same questions; None without one.
+        needed: How much data would decide; empty if that is not the question.
+    """
+    knowledge = _knows(vlm)
+    read = "probes read it in the backbone" if knowledge else _READ
+    guessing = _compare_with_guessing(row)
+    stream = _action_evidence(row)
     # From most to least said: the first that is short enough.
     for in_action, guess in ((stream, guessing), (stream, ""), ("", guessing), ("", "")):
-        clauses_of = [clause.replace(_READ, f"{_READ}{in_action}") for clause in before]
-        sentence = f"{head}: {'; '.join([*clauses_of, success])}{guess}."
-        if count_words(sentence) < MOST_WORDS and len(re.findall(r"\d+", sentence)) <= MOST_NUMBERS:
+        stages = f"{knowledge} and {read}{in_action}" if knowledge else f"{read}{in_action}"
+        sentence = f"{head}: {_list_clauses(stages, needed, _success(row))}{guess}."
+        if count_words(sentence) < _MOST_WORDS_OF_CLAUSES and len(re.findall(r"\d+", sentence)) <= MOST_NUMBERS:
             break
     return sentence
 
 
-_READ = "probes read the answer in the backbone"
-
-
-def _in_action(row: RetentionRow) -> str:
+def _action_evidence(row: RetentionRow) -> str:
     """Return the evidence of probes in the action stream by its verdict; *not shown* claims no absence."""
     if row.action.verdict is None:
         return ""
@@ -117,30 +156,51 @@ def _in_action(row: RetentionRow) -> str:
     return f"{words} the {row.run.action_name}"
 
 
-def _head(row: RetentionRow, vlm: RetentionRow | None, used: str) -> str:
-    """Return the verdict: whether the VLM knows the answer, the policy encodes it, and the action uses it."""
-    stages = {"known": vlm is not None and knows(vlm), "encoded": _is_encoded(row)}
-    reached = " and ".join(stage for stage, is_reached in stages.items() if is_reached)
-    return ", ".join(filter(None, (reached, used)))
+def _knows(vlm: RetentionRow | None) -> str:
+    """Return a clause on what the VLM knows; empty without one, or if its answers do not show that."""
+    return "the VLM knows the answer" if vlm is not None and knows(vlm) else ""
 
 
-def _of_use(row: RetentionRow, vlm: RetentionRow | None, use: UseVerdict) -> str:
+def _stages(row: RetentionRow, vlm: RetentionRow | None) -> str:
+    """Return a clause: whether the VLM knows the answer, and in which streams of the policy probes read it."""
+    knowledge = _knows(vlm)
+    if not _is_encoded(row):
+        return knowledge
+    stream = f"the {row.run.action_name}"
+    if row.action.verdict is None:
+        in_action = ""
+    elif _holds(row.action):
+        in_action = f" and {stream}"
+    else:
+        in_action = f" but {'not' if row.action.verdict == 'absent' else 'do not show it'} in {stream}"
+    return f"{knowledge} and probes read it in the backbone{in_action}" if knowledge else f"{_READ}{in_action}"
+
+
+def _use_sentence(row: RetentionRow, vlm: RetentionRow | None, use: UseVerdict) -> str:
     """Return the sentence of a row whose pictures were swapped."""
     verdict, what = use.finding
     if verdict == "used":
-        return _sentence(verdict, *_read_and(row, "the action follows"), row=row)
+        if not _is_encoded(row):
+            return _sentence(verdict, what, *_missing(row), row=row)
+        yet = "" if row.action.verdict is None or _holds(row.action) else "yet "
+        return _sentence(verdict, f"{_stages(row, None)}, {yet}the action follows it", row=row)
     if verdict == "not used" and use.is_of_first_chunk and knows(row):
         what = "the first actions do not follow the answer, later ones may"
-        return _sentence(_head(row, vlm, "not used at first"), what, *_missing(row), row=row)
+        return _sentence("not used at first", what, *_missing(row), row=row, stages=_stages(row, vlm))
     if verdict == "not used":
-        return _sentence(_head(row, vlm, verdict), *_read_and(row, "the action does not follow"), row=row)
+        stages = _stages(row, vlm)
+        is_lost = row.action.verdict is not None and not _holds(row.action) and _is_encoded(row)
+        text = f"{stages}{';' if is_lost else ', but'} {what.replace('the answer', 'it')}" if stages else what
+        return _sentence(verdict, text, *_missing(row), row=row)
     if use.behaviour == "undecided" and not use.lacks_control:
-        read = [_READ] if _is_encoded(row) else _missing(row, "the answer")
-        return _sentence(
-            _head(row, vlm, verdict), *read, more_groups(row.image_swap, row.success.n_groups or 0), row=row
-        )
+        if _is_encoded(row):
+            needed = more_groups(row.image_swap, row.success.n_groups or 0)
+            return _open_sentence(f"encoded, {verdict}", row, vlm, needed)
+        needed = items_to_decide(row.image_swap, row.success.n_items or 0, row.success.n_groups or 0)
+        knowledge = _knows(vlm)
+        return _sentence(verdict, knowledge, *_missing(row, "it" if knowledge else "the answer"), needed, row=row)
     if verdict in ("not decisive", "use undecided"):
-        return _sentence(_head(row, vlm, verdict), what, *_missing(row), row=row)
+        return _sentence(verdict, what, *_missing(row), row=row, stages=_stages(row, vlm))
     return _sentence(verdict, what, row=row)
 
 
@@ -153,22 +213,10 @@ def _is_encoded(row: RetentionRow) -> bool:
     return _holds(row.backbone)
 
 
-def _read_and(row: RetentionRow, action: str) -> list[str]:
-    """Return clauses: probes read the answer and whether the action follows it; else the missing evidence.
-
-    Args:
-        row: The row of one category of a policy.
-        action: Clause on whether the action follows, without its object.
-    """
-    if _is_encoded(row):
-        return [f"{_READ}, {action} it"]
-    return [f"{action} the answer", *_missing(row)]
-
-
 def _missing(row: RetentionRow, answer: str = "it") -> list[str]:
     """Return the reason why the answer is not known to be in the backbone; nothing where it is."""
     if not is_probed(row):
-        return [unprobed(row)]
+        return [why_unprobed(row)]
     if _is_encoded(row):
         return []
     return [f"probes do not show {answer} in the backbone"]
@@ -190,7 +238,10 @@ def _unread(row: RetentionRow) -> str:
     return more_items(row) or f"{items} items are too few to tell what the backbone holds"
 
 
-def _beside_guessing(row: RetentionRow) -> str:
+def _compare_with_guessing(row: RetentionRow) -> str:
+    """Return a clause that follows the success rate; empty without one."""
+    if row.success.sr is None:
+        return ""
     if knows(row):
         return ", guessing 50 %"
     return ", less than guessing" if row.success.regime == Regime.FAILURE else ", guessing possible"
@@ -203,24 +254,25 @@ def _success(row: RetentionRow) -> str:
     return f"success {whole_percent(row.success.sr)} %"
 
 
-def _without_signal(row: RetentionRow, vlm: RetentionRow | None) -> str:
-    missing = "absent" if row.backbone.verdict == "absent" else "not shown"
-    return f"known, {missing} in the backbone" if vlm is not None and knows(vlm) else missing
+def _missing_signal(row: RetentionRow) -> str:
+    return "absent" if row.backbone.verdict == "absent" else "not shown"
 
 
 def _without_swap(row: RetentionRow, vlm: RetentionRow | None) -> str:
     """Return the sentence of a row whose pictures were not swapped."""
     if is_probed(row) and _is_encoded(row):
-        tested = "use not tested" if row.success.sr is not None else ""
-        return _sentence(_head(row, vlm, tested), _READ, row=row)
+        tested = ", use not tested" if row.success.sr is not None else ""
+        return _open_sentence(f"encoded{tested}", row, vlm)
     if is_probed(row):
-        return _sentence(_without_signal(row, vlm), _unread(row), row=row)
+        return _sentence(_missing_signal(row), _knows(vlm), _unread(row), row=row)
     if row.success.sr is None:
-        return f"not measured: {_success(row)}, and {unprobed(row)}."
+        return f"not measured: {_success(row)}, and {why_unprobed(row)}."
     words = {Regime.KNOWLEDGE: "success", Regime.FAILURE: "failure"}
     head = words.get(row.success.regime or Regime.NO_RELIABLE_KNOWLEDGE, "success not shown")
     against_guessing = "" if head == "success" else f", {_against_guessing(row)}"
-    return f"{head}: the cube ends right in {whole_percent(row.success.sr)} %{against_guessing}; {unprobed(row)}."
+    return (
+        f"{head}: the cube ends right in {whole_percent(row.success.sr)} %{against_guessing}; {why_unprobed(row)}."
+    )
 
 
 # -- what to do next ----------------------------------------------------------------------------------------------
@@ -254,19 +306,21 @@ _TERMS = {
     "metric": ("Metric", "of a label, balanced accuracy of classes, R² of quantities"),
     "backbone above chance": (
         "Above chance",
-        "score of sites that other groups chose minus its mean score with permuted labels, 95 % intervals over "
-        "groups",
+        "score minus the mean score with permuted labels, with 95 % intervals over groups; other groups chose "
+        "the layer",
     ),
     "VLM %": (
         "VLM",
-        "share of its answers that are right; its name ends on the prompt and the size of the picture",
+        "share of its answers that are right. A name such as vlm-tiny · p2 · 640×480 ends with the prompt, p2, "
+        "and the picture's size in pixels",
     ),
-    "backbone %": ("Backbone", "accuracy of probes in the backbone, at sites that other questions chose"),
-    "action %": ("Action", "the same at the action's sites"),
+    "backbone %": ("Backbone", "accuracy of probes of the backbone; its layer was chosen on other questions"),
+    "action %": ("Action", "the same for the layers that produce the action"),
     "success %": ("Success", "the cube ends on the correct picture"),
     "retention": (
         "Retention",
-        "share of the backbone's signal left in the action; a mean is of the scores, not of these shares",
+        "share of the backbone's accuracy above chance that is left in the action: 1 is all, 0 is none. The mean "
+        "row is computed from the mean accuracies",
     ),
     "p (Holm)": (
         "p",
@@ -427,9 +481,14 @@ def summary_table(summaries: Sequence[RunSummary], differences: Sequence[Differe
     table = table.only([at for at, name in enumerate(headings) if is_needed.get(name, True)]).filled()
     legend = [": ".join(_TERMS[name]) for name in table.columns if name in _TERMS]
     readouts = describe_readouts(summary.row.image_swap.use for run in summaries for summary in run.categories)
-    counts = [(summary.row.success.n_items, summary.row.success.n_groups) for summary in every]
+    counts = [
+        (summary.row.success.n_items, summary.row.success.n_groups)
+        for summary in every
+        if summary.row.category != MEAN
+    ]
     size = size_of_groups(
-        (summary.finding for summary in every), [(items or 0, groups or 0) for items, groups in counts]
+        (f"{summary.finding} {summary.details}" for summary in every if summary.row.category != MEAN),
+        [(items or 0, groups or 0) for items, groups in counts],
     )
     return replace(table, notes=(*legend, *filter(None, [readouts, size]), *_marks(summaries, table)))
 

@@ -127,7 +127,7 @@ def _table(
     why_unpaired: Sequence[str],
 ) -> Table:
     modes, labels = modes_of(rows), labels_of(rows)
-    lines = _ordered(rows, differences)
+    lines = _order_lines(rows, differences)
     columns = [
         (column.worded(modes, labels), group)
         for group in groups
@@ -156,7 +156,7 @@ def _table(
     )
 
 
-def _ordered(rows: Sequence[RetentionRow], differences: Sequence[Difference]) -> list[RowOrDifference]:
+def _order_lines(rows: Sequence[RetentionRow], differences: Sequence[Difference]) -> list[RowOrDifference]:
     """Return the lines by category, means last; in each the runs of a view, followed by their differences."""
     categories = list(dict.fromkeys(row.category for row in rows))
     views = list(dict.fromkeys(row.view for row in rows))
@@ -257,14 +257,14 @@ def _legend(title: str, rows: Sequence[RetentionRow]) -> list[str]:
     calls = sorted({row.run.call for row in rows if row.run.call is not None})
     of_call = [call_words(calls[0])] if len(calls) == 1 else []
     if any(row.label for row in rows):
-        return [_ABOVE, *_undefined(rows)]
+        return [_ABOVE, *_list_undefined(rows)]
     if title == "Retention":
         sites = _ANSWER_SITES if modes_of(rows) == "answers" else _SITES
-        return [sites, *_undefined(rows), chance_only(rows), *of_call]
+        return [sites, *_list_undefined(rows), chance_only(rows), *of_call]
     return [_controls(rows), *of_call]
 
 
-def _undefined(rows: Sequence[RetentionRow]) -> list[str]:
+def _list_undefined(rows: Sequence[RetentionRow]) -> list[str]:
     """Return the reasons why categories have no retention, each once with its categories."""
     reasons: dict[str, list[str]] = {}
     for row in rows:

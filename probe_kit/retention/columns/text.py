@@ -316,7 +316,7 @@ Readable = Literal[
 ]
 """The backbone's evidence, then success, where no image swap is stored: these never say *used*."""
 _EVIDENCE = {
-    "shown": "The probes find the answer in the backbone, beyond every control that was run",
+    "shown": "The probes read the answer in the backbone better than chance and every control that was run allow",
     "absent": "No linear probe of so many items reaches a stated accuracy in the backbone, 65 % by default, and "
     "so many items would have shown it",
     "not shown": "Neither shown nor absent: the items are too few to tell",
@@ -415,15 +415,15 @@ def conclusion(row: RetentionRow) -> str:
         return "The VLM knows the answer." if knows(row) else "Not shown that the VLM knows the answer."
     use = row.image_swap.use
     is_later = use is not None and use.is_bounded and use.is_of_first_chunk and knows(row)
-    parts = [_finding(row) if use is None else _used(row, use), _LATER * is_later]
+    parts = [_finding(row) if use is None else _use_sentence(row, use), _LATER * is_later]
     if not is_probed(row):
         has_activations = row.run.action_stream is not None
         can_be_probed = has_activations and (row.success.n_groups or 0) >= GROUPS_FOR_PROBES
-        parts.append(f"{_capital(unprobed(row))}{': run `probe-kit train`' * can_be_probed}.")
+        parts.append(f"{_capital(why_unprobed(row))}{': run `probe-kit train`' * can_be_probed}.")
     return " ".join(filter(None, parts))
 
 
-def _used(row: RetentionRow, use: UseVerdict) -> str:
+def _use_sentence(row: RetentionRow, use: UseVerdict) -> str:
     """Return the sentence of a row with a stored image swap: behaviour; place; tie."""
     if _is_neither_used_nor_found(row, use):
         return f"{_nothing_shown(row)} {use.sentence}"
@@ -434,7 +434,7 @@ def _finding(row: RetentionRow) -> str:
     """Return the sentence of a row without a stored image swap."""
     reading = readable(row)
     if not is_probed(row):
-        return _unprobed(row)
+        return _behaviour_sentence(row)
     if reading == "shown":
         return "Shown in the backbone."
     if reading.startswith("shown, "):
@@ -444,7 +444,7 @@ def _finding(row: RetentionRow) -> str:
     return f"The policy succeeds; the answer is {_backbone(row)}; {_UNTESTED}."
 
 
-def _unprobed(row: RetentionRow) -> str:
+def _behaviour_sentence(row: RetentionRow) -> str:
     """Return the sentence of behaviour alone; empty where the model did not act."""
     if row.success.sr is None:
         return ""
@@ -476,7 +476,11 @@ def more_items(row: RetentionRow) -> str:
     if not success.n_items or not success.n_groups or not success.n_episodes:
         return ""
     needed = items_for_absence(success.n_items, success.n_groups, success.n_episodes)
-    return f"fewer than {needed} items cannot tell what the backbone lacks" if needed > success.n_items else ""
+    return (
+        f"with fewer than {needed} items, probes cannot show that the backbone lacks it"
+        if needed > success.n_items
+        else ""
+    )
 
 
 def _items_for_success(success: SuccessRate) -> str:
@@ -515,7 +519,7 @@ def is_probed(row: RetentionRow) -> bool:
     return bool(row.backbone.exceeds)
 
 
-def unprobed(row: RetentionRow) -> str:
+def why_unprobed(row: RetentionRow) -> str:
     """Return the reason why the backbone has no numbers: no probes are stored, or only of other categories."""
     return "the backbone was not probed" if row.run.probes is None else "the probes are not of this category"
 
@@ -544,7 +548,7 @@ def warnings_of(mean: RetentionRow, rows: Sequence[RetentionRow]) -> list[str]:
     sentences = []
     if mean.run.random_weights:
         sentences.append("The weights are random: the model is untrained. Read every number as “knows nothing”.")
-    sentences += _unread(mean) if is_vlm(mean) else _unmoved(mean)
+    sentences += _vlm_warnings(mean) if is_vlm(mean) else _policy_warnings(mean)
     biased = [
         row
         for row in rows
@@ -552,7 +556,7 @@ def warnings_of(mean: RetentionRow, rows: Sequence[RetentionRow]) -> list[str]:
     ]
     if biased:
         habit = "The answers have a habit of naming" if is_vlm(mean) else "The policy has a habit of going to"
-        sentences.append(f"{habit} one side in {_of(biased, rows)}.")
+        sentences.append(f"{habit} one side in {_count_categories(biased, rows)}.")
     if uncontrolled := chance_only(rows):
         sentences.append(f"{uncontrolled}.")
     if mean.controls.leaks:
@@ -563,7 +567,7 @@ def warnings_of(mean: RetentionRow, rows: Sequence[RetentionRow]) -> list[str]:
     return sentences
 
 
-def _unread(mean: RetentionRow) -> list[str]:
+def _vlm_warnings(mean: RetentionRow) -> list[str]:
     """Return warnings about a model that was asked."""
     if (mean.success.share_outside or 0) <= _MOSTLY:
         return []
@@ -571,7 +575,7 @@ def _unread(mean: RetentionRow) -> list[str]:
     return [f"No answer could be read in {unread} % of episodes: it may know more than it says."]
 
 
-def _unmoved(mean: RetentionRow) -> list[str]:
+def _policy_warnings(mean: RetentionRow) -> list[str]:
     """Return warnings about a policy."""
     sentences = []
     if (mean.success.share_never_moved or 0) > _MOSTLY:
@@ -598,7 +602,7 @@ def _names(part: Sequence[RetentionRow], rows: Sequence[RetentionRow]) -> str:
     return prefix + ", ".join(title_of(row.category) for row in listed)
 
 
-def _of(part: Sequence[RetentionRow], rows: Sequence[RetentionRow]) -> str:
+def _count_categories(part: Sequence[RetentionRow], rows: Sequence[RetentionRow]) -> str:
     """Return how many of the categories are in `part`, and their names if not all are."""
     noun = "category" if len(rows) == 1 else "categories"
     if len(part) == len(rows):

@@ -143,7 +143,7 @@ def gains(first: "Sequence[pd.DataFrame]", second: "Sequence[pd.DataFrame]") -> 
         first: Tables of episodes, each of one run and category; runs of a side count by their mean.
         second: Tables of the other side.
     """
-    sides = [_of_side(tables) for tables in (first, second)]
+    sides = [_side_shares(tables) for tables in (first, second)]
     if None in sides:
         return {}
     (mine, units), (theirs, _) = (side for side in sides if side is not None)
@@ -162,7 +162,7 @@ def gains(first: "Sequence[pd.DataFrame]", second: "Sequence[pd.DataFrame]") -> 
     }
 
 
-def _of_side(tables: "Sequence[pd.DataFrame]") -> tuple[dict[str, Fraction], dict[str, str]] | None:
+def _side_shares(tables: "Sequence[pd.DataFrame]") -> tuple[dict[str, Fraction], dict[str, str]] | None:
     """Return by episode the share that was right, averaged over runs, and its group.
 
     None if runs differ in episodes.
@@ -420,7 +420,7 @@ class _Gap:
     def of(cls, minuends: Sequence[RowWithEstimates], subtrahends: Sequence[RowWithEstimates]) -> "_Gap":
         """Return the means over the runs of either side; a number that a run lacks is left out."""
         rates = mine, theirs = _rate(minuends), _rate(subtrahends)
-        first, second = _pooled(minuends), _pooled(subtrahends)
+        first, second = _pool_scores(minuends), _pool_scores(subtrahends)
         sr = None if mine is None or theirs is None else mine.minus(theirs)
         if first is None or second is None:
             return cls(mine is not None and theirs is not None and mine.paired_with(theirs), rates, sr)
@@ -441,7 +441,7 @@ def _rate(rows: Sequence[RowWithEstimates]) -> Rate | None:
     return Rate.pooled(shares) if shares and len(shares) == len(rows) else None
 
 
-def _pooled(rows: Sequence[RowWithEstimates]) -> PooledScores | None:
+def _pool_scores(rows: Sequence[RowWithEstimates]) -> PooledScores | None:
     streams = [row.streams for row in rows if row.streams is not None]
     return PooledScores.of(streams) if streams and len(streams) == len(rows) else None
 

@@ -179,15 +179,15 @@ def match_runs(
     answered, acted_on = ((pairs[column] == "correct").to_numpy(bool) for column in ("outcome_asked", "outcome"))
     encoded, signals = None, dict[str, bool]()
     if results is not None and probed_view is not None:
-        encoded, signals = _encoded(pairs, results, probed_view), _signals(results, probed_view)
+        encoded, signals = _right_decisions(pairs, results, probed_view), _signals(results, probed_view)
     items, unprobed = _only_probed(_items(pairs, answered, acted_on, encoded))
     rows = [
-        _joined(str(name), of_category, signals.get(str(name)))
+        _count_items(str(name), of_category, signals.get(str(name)))
         for name, of_category in items.groupby("category", sort=False)
     ]
     if len(rows) > 1:
         rows.append(_over_all(items, rows, seed))
-    notes = [*unprobed, *_missing(pairs, vlm, policy), *_of_picture(vlm), *without_signal(rows)]
+    notes = [*unprobed, *_missing(pairs, vlm, policy), *_describe_picture(vlm), *without_signal(rows)]
     score = str(getattr(vlm, "score", "text"))
     joined = KnownUsedTable(vlm.label, policy.label, score, probed_view, tuple(rows), tuple(notes))
     return correct_joins([joined])[0]
@@ -235,12 +235,12 @@ def correct_joins(joins: Sequence[KnownUsedTable]) -> list[KnownUsedTable]:
     tests = [test for join in joins for row in join.rows if row.category != OVERALL for test in row.comparisons]
     p_holm = iter(holm_corrected(tests, lambda test: test.p))
 
-    def of_row(row: CategoryCounts) -> CategoryCounts:
+    def row_counts(row: CategoryCounts) -> CategoryCounts:
         if row.category == OVERALL:
             return row
         return replace(row, comparisons=tuple(replace(test, p_holm=next(p_holm)) for test in row.comparisons))
 
-    return [replace(join, rows=tuple(of_row(row) for row in join.rows)) for join in joins]
+    return [replace(join, rows=tuple(row_counts(row) for row in join.rows)) for join in joins]
 
 
 # -- the same questions ----------------------------------------------------------------------------------
@@ -283,7 +283,7 @@ def _same_questions(vlm: RunReader, policy: RunReader) -> "pd.DataFrame":
 # -- encoded ---------------------------------------------------------------------------------------------
 
 
-def _encoded(pairs: "pd.DataFrame", results: ProbeResults, view: str) -> NDArray[np.float64]:
+def _right_decisions(pairs: "pd.DataFrame", results: ProbeResults, view: str) -> NDArray[np.float64]:
     """Return whether the probe's decision is right (E,), NaN where nothing was probed."""
     is_right: dict[str, bool] = {}
     for (_, name), curve in results.curves.items():
@@ -364,7 +364,7 @@ def _mark(answered: bool, encoded: float, used: bool) -> str:
     return f"{int(answered)}{middle}{int(used)}"
 
 
-def _joined(category: str, items: "pd.DataFrame", clear: bool | None) -> CategoryCounts:
+def _count_items(category: str, items: "pd.DataFrame", clear: bool | None) -> CategoryCounts:
     answered, used = items["answered"].to_numpy(bool), items["used"].to_numpy(bool)
     values = items["encoded"].to_numpy(float)
     probed = bool(len(values)) and not np.isnan(values).any()
@@ -423,7 +423,7 @@ def _readable_sites(answered: Bools, encoded: Bools | None, used: Bools) -> dict
 
 def _over_all(items: "pd.DataFrame", rows: Sequence[CategoryCounts], seed: int) -> CategoryCounts:
     signals = {row.has_signal for row in rows}
-    overall = _joined(OVERALL, items, signals.pop() if len(signals) == 1 else None)
+    overall = _count_items(OVERALL, items, signals.pop() if len(signals) == 1 else None)
     if overall.encoded is None or overall.has_signal is False:
         return overall
     items = items[items["category"].isin([row.category for row in rows if row.has_signal])]
@@ -446,7 +446,7 @@ def _missing(pairs: "pd.DataFrame", vlm: RunReader, policy: RunReader) -> list[s
     ]
 
 
-def _of_picture(vlm: RunReader) -> list[str]:
+def _describe_picture(vlm: RunReader) -> list[str]:
     ask = vlm.ask or {}
     notes = []
     if ask.get("picture") != "frame":

@@ -87,8 +87,8 @@ def origins_of(runs: Sequence[RunReader], declared: Mapping[str, str] | None = N
     places = {str(run.location): run for run in runs}
     if strange := [location for location in declared or {} if location not in places]:
         raise UsageError(f"an origin is declared of {strange[0]}; expected one of the runs {', '.join(places)}")
-    firsts = {location: first_checkpoint(_released(run)) for location, run in places.items()}
-    with_sisters = {first for location, first in firsts.items() if first != _released(places[location])}
+    firsts = {location: first_checkpoint(_released_checkpoint(run)) for location, run in places.items()}
+    with_sisters = {first for location, first in firsts.items() if first != _released_checkpoint(places[location])}
     return {
         location: (declared or {}).get(location)
         or (firsts[location] if firsts[location] in with_sisters else _origin(run))
@@ -96,7 +96,7 @@ def origins_of(runs: Sequence[RunReader], declared: Mapping[str, str] | None = N
     }
 
 
-def _released(run: RunReader) -> str:
+def _released_checkpoint(run: RunReader) -> str:
     """Return the checkpoint of a run without its revision; empty for untrained weights, which grew from none."""
     return "" if card_of(run).get("random_weights") else checkpoint_of(run).partition("@")[0]
 

@@ -398,10 +398,12 @@ def call_figures(source: FigureSource) -> Iterator[ReportFigure]:
     for drawn in source.runs:
         # Only where a later inference was probed as well.
         if drawn.results is not None and len(calls := load_results_by_call(drawn.run, drawn.results)) > 1:
-            yield from _of_run(drawn, drawn.results, calls)
+            yield from _run_figures(drawn, drawn.results, calls)
 
 
-def _of_run(drawn: DrawnRun, results: ProbeResults, calls: Mapping[int, ProbeResults]) -> Iterator[ReportFigure]:
+def _run_figures(
+    drawn: DrawnRun, results: ProbeResults, calls: Mapping[int, ProbeResults]
+) -> Iterator[ReportFigure]:
     views, events = results.settings.views, event_calls(drawn.run)
     for view in views:
         yield ReportFigure(

@@ -69,7 +69,7 @@ def place_labels(
         width = _CHARACTER * len(name)
         boxes = [(reach, _box(x, y, width, reach, side)) for reach, side in product(_REACHES, _SIDES)]
         # The least covered area; of equal ones the nearest. Names that were placed before stay where they are.
-        reach, box = min(boxes, key=lambda of: (_covered(of[1], occupied) + _outside(of[1], frame), of[0]))
+        reach, box = min(boxes, key=lambda of: (_covered_area(of[1], occupied) + _outside(of[1], frame), of[0]))
         occupied.append(box)
         start, bottom = in_data(box[0], box[1] + 0.22 * _HEIGHT)
         axes.text(start, bottom, name, fontsize=_SIZE, color=ink, zorder=4)
@@ -91,10 +91,10 @@ def _box(x: float, y: float, width: float, reach: float, side: tuple[int, int]) 
 
 def _outside(box: Box, frame: Box) -> float:
     """Return the area of `box` that is not in `frame`, in square points."""
-    return (box[2] - box[0]) * (box[3] - box[1]) - _covered(box, [frame])
+    return (box[2] - box[0]) * (box[3] - box[1]) - _covered_area(box, [frame])
 
 
-def _covered(box: Box, boxes: Sequence[Box]) -> float:
+def _covered_area(box: Box, boxes: Sequence[Box]) -> float:
     """Return the area that `box` shares with others, in square points."""
     return sum(
         max(0.0, min(box[2], other[2]) - max(box[0], other[0]))

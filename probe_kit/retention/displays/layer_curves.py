@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from matplotlib.lines import Line2D
 
 
-def of_iterations(scores: "pd.DataFrame", iterations: Iterations) -> "pd.DataFrame":
+def select_iterations(scores: "pd.DataFrame", iterations: Iterations) -> "pd.DataFrame":
     """Return the rows of one stream that take part; all of a stream that runs once.
 
     Args:
@@ -129,7 +129,7 @@ class StreamCurve(LayerLine):
         Raises:
             UsageError: If the stream has no such iteration.
         """
-        scores = of_iterations(scores, iterations)
+        scores = select_iterations(scores, iterations)
         excess = scores["score"] - (0.0 if scores["target"].iloc[0] in SIDES else scores["chance"].fillna(0.0))
         best_rows = scores.loc[excess.groupby(scores["layer"]).idxmax()].sort_values("layer")
         best = LayerLine.of(best_rows)

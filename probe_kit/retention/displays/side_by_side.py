@@ -28,7 +28,7 @@ from probe_kit.retention.displays.display import (
     significance_handles,
 )
 from probe_kit.retention.displays.iteration_maps import IterationMapDisplay
-from probe_kit.retention.displays.layer_curves import StreamCurve, draw_line, of_iterations
+from probe_kit.retention.displays.layer_curves import StreamCurve, draw_line, select_iterations
 from probe_kit.retention.displays.report_figure import (
     DOTS,
     ONLY_FILLED,
@@ -327,7 +327,7 @@ def _depth_curve(results: ProbeResults, stream: str, view: str, iterations: Iter
     for category in results.settings.categories:
         scores = scores_of(results, category, view, stream)
         if not scores.empty:
-            scores = of_iterations(scores, iterations)
+            scores = select_iterations(scores, iterations)
             curves.append(scores.groupby("layer")["accuracy"].max() - scores["chance"].iloc[0])
     layers = curves[0].index.to_numpy(dtype=np.int64)
     depth = layers / max(1, layers.max())
@@ -386,7 +386,7 @@ def curves_side_by_side(
     displays = []
     for category in categories or _categories(probed.values()):
         for part, where in PARTS.items():
-            tables = {name: _of_part(probes, category, view, part) for name, probes in probed.items()}
+            tables = {name: _part_scores(probes, category, view, part) for name, probes in probed.items()}
             if curves := _curves(tables, iterations):
                 title, looks = f"{title_of(category)}: {where}", tuple(names)
                 displays.append(
@@ -401,7 +401,7 @@ def _categories(results: Iterable[ProbeResults]) -> list[str]:
     return list(dict.fromkeys(name for probes in results for name in probes.settings.categories))
 
 
-def _of_part(results: ProbeResults, category: str, view: str, part: str) -> "pd.DataFrame":
+def _part_scores(results: ProbeResults, category: str, view: str, part: str) -> "pd.DataFrame":
     """Return the scores of the first stream of a part of the model; none if none was probed."""
     scores = scores_of(results, category, view)
     scores = scores[scores["part"] == part]

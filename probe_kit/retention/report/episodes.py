@@ -74,7 +74,9 @@ def episode_grid(
     """
     total = sum(len(run.episodes) for run in runs)
     stride = max(1, -(-total // pictures))
-    listed = [episode for name, run in zip(names, runs, strict=True) for episode in _listed(name, run, stride)]
+    listed = [
+        episode for name, run in zip(names, runs, strict=True) for episode in _list_episodes(name, run, stride)
+    ]
     stride = _fitting(listed, stride, picture_bytes)
     with_picture = _with_pictures(listed, stride)
     picture_of = _without_repeats(with_picture)
@@ -108,7 +110,7 @@ def _without_repeats(listed: Sequence[_Listed]) -> dict[tuple[str, str], tuple[b
     return picture_of
 
 
-def _listed(name: str, run: RunReader, stride: int) -> Iterator[_Listed]:
+def _list_episodes(name: str, run: RunReader, stride: int) -> Iterator[_Listed]:
     episodes = run.episodes
     ranks = {item: rank for rank, item in enumerate(dict.fromkeys(episodes["item_id"]))}
     for position, row in enumerate(episodes.to_dict("records")):

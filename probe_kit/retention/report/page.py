@@ -135,7 +135,7 @@ def report_html(
     paths = tuple(path for run in runs for path in (run.location.address, str(run.location)))
     names = [without_folders(run.name, paths) for run in source.table_runs]
     opening = None if table.labels else opening_row(source)
-    pictures_of = arranged([*source.figures(), *_opening_curves(opening, table.iterations)], names, paths)
+    pictures_of = arrange_figures([*source.figures(), *_opening_curves(opening, table.iterations)], names, paths)
     sides: dict[str, Any] = {}
     tables = [table.summary_table]
     if not table.labels:
@@ -290,7 +290,7 @@ def _labels(
         table: A retention table of labels.
         runs: Runs of the table.
         names: The name of each run.
-        pictures_of: Figures by subject, see `arranged`.
+        pictures_of: Figures by subject, see `arrange_figures`.
         of_run: Name of the run where sections are of a single one.
     """
     sections: list[dict[str, Any]] = []
@@ -301,7 +301,7 @@ def _labels(
         section = {
             "target": target,
             "run": of_run,
-            "measured": _measured(next(iter(probes.values()))),
+            "measured": _describe_metric(next(iter(probes.values()))),
             "retention": of_target.tables()["Retention"],
             "sentences": [category.details for run in of_target.summary for category in run.categories],
             "pictures": pictures_of.get(target, []),
@@ -327,12 +327,12 @@ def _stored_labels(
     for run, name in zip(runs, names, strict=True):
         if targets := list(stored_targets(run)):
             table = retention_table([run], target=targets)
-            pictures_of = arranged(FigureSource.of([run], table).figures(), [name], paths)
+            pictures_of = arrange_figures(FigureSource.of([run], table).figures(), [name], paths)
             sections += _labels(table, [run], [name], pictures_of, name if len(runs) > 1 else "")
     return sections
 
 
-def _measured(results: ProbeResults) -> str:
+def _describe_metric(results: ProbeResults) -> str:
     settings, curve = results.settings, next(iter(results.curves.values()))
     classes = f" of {len(curve.classes)} classes" if settings.task == "classes" else ""
     return f"A {_TASKS[settings.task]} label{classes}; the score is {METRICS[settings.task]}."
@@ -366,7 +366,7 @@ _IN_URI = " !$'()*+,-./:;=?@[]_`{|}~"
 """Characters that a URI in double quotes may hold as they are."""
 
 
-def arranged(
+def arrange_figures(
     figures: Sequence[ReportFigure], names: Sequence[str], paths: tuple[str, ...] = ()
 ) -> PicturesBySubject:
     """Draw figures, by subject and kind.
@@ -447,13 +447,13 @@ def compact_svg(svg: bytes) -> bytes:
             element.attrib.pop("id", None)
         for name in _ROUNDED:
             if name in element.attrib:
-                element.set(name, _rounded(element.attrib[name]))
+                element.set(name, _round_path(element.attrib[name]))
         if "style" in element.attrib:
             element.set("style", _FONTS.sub("sans-serif", element.attrib["style"]))
     return ElementTree.tostring(root)
 
 
-def _rounded(numbers: str) -> str:
+def _round_path(numbers: str) -> str:
     """Return the numbers and letters of a path, of two decimals each and without needless spaces."""
     short = re.sub(r"-?\d+\.\d+(?!e)", lambda match: f"{float(match[0]):.2f}".rstrip("0").rstrip("."), numbers)
     return re.sub(r"\s*([A-Za-z])\s*", r"\1", re.sub(r"\s+", " ", short)).strip()
@@ -485,11 +485,11 @@ def provenance(name: str, run: RunReader, results: Sequence[ProbeResults]) -> di
             certificate.get("hooks_on_equals_hooks_off"), "no"
         ),
         "mixed": ", ".join(run.mixed),
-        **({f"probes{_of_target(probes)}": probes.key for probes in results} or {"probes": "none"}),
+        **({f"probes{_describe_target(probes)}": probes.key for probes in results} or {"probes": "none"}),
     }
     documents = {"run settings": settings, "certificate": certificate}
     documents |= {
-        f"probe settings{_of_target(probes)}": {
+        f"probe settings{_describe_target(probes)}": {
             "key": probes.key,
             "created": probes.created,
             **asdict(probes.settings),
@@ -513,15 +513,15 @@ def _protocol(settings: Mapping[str, Any]) -> dict[str, str]:
         return {}
     return {
         "protocol": protocol["name"],
-        "deviates from it in": _listed(protocol["deviations"]) or "nothing",
-        "it differs from the default in": _listed(
+        "deviates from it in": _list_pairs(protocol["deviations"]) or "nothing",
+        "it differs from the default in": _list_pairs(
             {name: pair[::-1] for name, pair in protocol["differs_from_default"].items()}
         ),
         "of it cannot be matched": "; ".join(protocol["unmatched"]),
     }
 
 
-def _listed(pairs: Mapping[str, Sequence[str | None]]) -> str:
+def _list_pairs(pairs: Mapping[str, Sequence[str | None]]) -> str:
     changes = (f"{name} {now or 'nothing'} instead of {was or 'nothing'}" for name, (was, now) in pairs.items())
     return "; ".join(changes)
 
@@ -556,7 +556,7 @@ def _stream(run: RunReader, name: str) -> str:
     return f"{name} {stream.layers} layers{steps}, width {stream.width}"
 
 
-def _of_target(probes: ProbeResults) -> str:
+def _describe_target(probes: ProbeResults) -> str:
     return "" if probes.settings.balanced else f" of {probes.settings.target}"
 
 

@@ -353,7 +353,7 @@ class _Assets:
         Raises:
             SuiteError: For a tile that is not described, cannot be read, or is equal to the other one.
         """
-        left, right = (self._stored(name, pair) for name in (pair.left, pair.right))
+        left, right = (self._store_picture(name, pair) for name in (pair.left, pair.right))
         if left.pixels_sha256 == right.pixels_sha256:
             raise SuiteError(
                 f"{SOURCE}: question {pair.index}: tiles {pair.left!r} and {pair.right!r} show the same picture."
@@ -401,7 +401,7 @@ class _Assets:
             side_word=bool(side_words(pair.question)),
         )
 
-    def _stored(self, name: str, pair: SetQuestion) -> Picture:
+    def _store_picture(self, name: str, pair: SetQuestion) -> Picture:
         if name not in self._tiles:
             if name not in self._records:
                 raise SuiteError(

@@ -183,13 +183,13 @@ def emit(
     """
     store: dict[str, Picture] = {}
 
-    def stored(picture: SourcePicture) -> Picture:
+    def store_picture(picture: SourcePicture) -> Picture:
         if picture.image_id not in store:
             store[picture.image_id] = squared_picture(picture.image_id, render(picture), picture.operation)
         return store[picture.image_id]
 
     items = [
-        _item(source, proposal, side, stored(proposal.target), stored(proposal.distractor), reading)
+        _item(source, proposal, side, store_picture(proposal.target), store_picture(proposal.distractor), reading)
         for proposal, side in _with_sides(bundles, rng)
     ]
     return items, {entry.file_name: entry.png for entry in store.values()}

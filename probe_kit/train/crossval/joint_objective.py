@@ -100,7 +100,7 @@ class JointSite:
 
         It takes the memory of their copy in float32, of some (D, D) matrices, and of a block in float64.
         """
-        features, blocks = _sorted(samples, folds)
+        features, blocks = _sort_rows(samples, folds)
         xp = array_namespace(features.matrix)
         mean, scale, rounding = Moments.of(features)
         unclear = bool(((scale > 0.25 * rounding) & (scale < 4 * rounding)).any())
@@ -155,7 +155,7 @@ def training_sets(folds: Sequence[NestedFold]) -> list[NDArray[np.intp]]:
     return [inner.train for fold in folds for inner in fold.inner] + [fold.outer.train for fold in folds]
 
 
-def _sorted(samples: Samples, folds: Sequence[NestedFold]) -> tuple[RowSubset, tuple[Block, ...]]:
+def _sort_rows(samples: Samples, folds: Sequence[NestedFold]) -> tuple[RowSubset, tuple[Block, ...]]:
     """Return rows and blocks, in which the episodes that an outer fold tests are together."""
     rows = samples.features if isinstance(samples.features, RowSubset) else RowSubset.all(samples.features)
     order = np.concatenate([fold.outer.test for fold in folds])
@@ -475,7 +475,7 @@ class _NewtonSolver:
                 return solved
             rows, weights, point, step = rows[~near], weights[~near], point.only(~near), step[~near]
             slope = (point.gradient * step).sum(axis=1)
-            weights, point = self._moved(weights, point, rows, step, slope, exact=False)
+            weights, point = self._move(weights, point, rows, step, slope, exact=False)
             solved[rows] = weights
         return solved
 
@@ -492,7 +492,7 @@ class _NewtonSolver:
             rows, weights, point = rows[open_], weights[open_], point.only(open_)
             step = self._newton_step(point, rows)
             slope = (point.gradient * step).sum(axis=1)
-            weights, point = self._moved(weights, point, rows, self.problems.turned_back(step), slope, exact=True)
+            weights, point = self._move(weights, point, rows, self.problems.turned_back(step), slope, exact=True)
         strength = self.problems.strength[rows]
         raise ProbeNotConvergedError(
             f"{len(rows)} of {len(self.problems)} logistic problems (C from {strength.min():g} to "
@@ -501,7 +501,7 @@ class _NewtonSolver:
             "feature values."
         )
 
-    def _moved(
+    def _move(
         self, weights: Array, point: NewtonState, rows: Rows, step: Array, slope: Array, *, exact: bool
     ) -> tuple[Array, NewtonState]:
         """Return weights and state after one step, halved per problem until the objective falls enough.

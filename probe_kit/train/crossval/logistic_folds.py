@@ -387,7 +387,7 @@ def cross_validate_jointly(
         _SharedColumns(site, samples, labels[:, first : first + step], folds).fitted()
         for first in range(0, labels.shape[1], step)
     ]
-    return [_joined(fold) for fold in zip(*parts, strict=True)]
+    return [_join_parts(fold) for fold in zip(*parts, strict=True)]
 
 
 def labels_at_once(site: JointSite, folds: Sequence[NestedFold]) -> int:
@@ -498,7 +498,7 @@ def _raw_probes(
     }
 
 
-def _joined(parts: Sequence[FittedFold]) -> FittedFold:
+def _join_parts(parts: Sequence[FittedFold]) -> FittedFold:
     """Return one outer fold's probes, found in parts of the columns."""
     decisions = np.concatenate([part.decisions for part in parts], axis=1)
     strengths = np.concatenate([part.strengths for part in parts])

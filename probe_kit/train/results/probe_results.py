@@ -294,7 +294,7 @@ def score_rows(
             "smallest_p": curve.least_p,
             **{exceeds_column(name): better for name, better in exceeds.items() if name != "chance"},
             "signal": has_signal(exceeds),
-            **(_of_side(curve, row, score[row]) if curve.balanced else _of_label(controls, key, curve, row)),
+            **(_side_row(curve, row, score[row]) if curve.balanced else _label_row(controls, key, curve, row)),
             "n": curve.labels.size,
             "episodes": np.unique(curve.episodes).size,
             "items": np.unique(curve.items).size,
@@ -317,7 +317,7 @@ def _estimates(curve: ProbeCurve) -> tuple[Matrix, Matrix, Matrix]:
     return curve.metric, limits[:, 0], limits[:, 1]
 
 
-def _of_side(curve: ProbeCurve, row: int, accuracy: float) -> dict[str, Any]:
+def _side_row(curve: ProbeCurve, row: int, accuracy: float) -> dict[str, Any]:
     correct, control = curve.correct[row], curve.control_accuracy[row]
     return {
         "accuracy": accuracy,
@@ -330,7 +330,7 @@ def _of_side(curve: ProbeCurve, row: int, accuracy: float) -> dict[str, Any]:
     }
 
 
-def _of_label(controls: Controls, key: tuple[str, str], curve: ProbeCurve, row: int) -> dict[str, Any]:
+def _label_row(controls: Controls, key: tuple[str, str], curve: ProbeCurve, row: int) -> dict[str, Any]:
     quantity = curve.task == "continuous"
     return {
         "spearman": fold_spearman(curve.decisions[row], curve.labels, curve.folds()) if quantity else float("nan"),

@@ -175,7 +175,7 @@ def load_results(run: RunReader, key: str | None = None, target: str | None = No
     location = run.location
     if key is not None:
         complete = complete_key(key, bundle_keys(location, PROBES), location, "probe results")
-        bundle = _checked(read_bundle(location, PROBES, complete))
+        bundle = _check_bundle(read_bundle(location, PROBES, complete))
         if target not in (None, probed := settings_of(bundle).target):
             raise UsageError(
                 f"{location}: the probes {bundle.key} are of {probed!r}, not of {target!r}. Give their key with "
@@ -332,10 +332,10 @@ def read_probes(run: Location) -> dict[str, Bundle]:
     Raises:
         RunDamagedError: For a changed result or another format.
     """
-    return {key: _checked(bundle) for key, bundle in read_bundles(run, PROBES).items()}
+    return {key: _check_bundle(bundle) for key, bundle in read_bundles(run, PROBES).items()}
 
 
-def _checked(bundle: Bundle) -> Bundle:
+def _check_bundle(bundle: Bundle) -> Bundle:
     if (settings_key := sha256_json(bundle.head["settings"])[:12]) != bundle.key:
         raise bundle.head_damaged(f"has the settings of {settings_key}")
     bundle.check_format(FORMAT)

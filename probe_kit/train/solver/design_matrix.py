@@ -272,7 +272,7 @@ class StreamedDesign(_OfAllColumns):
 
     def __matmul__(self, weights: Array) -> Array:
         turned = self.axes @ weights[:-1]
-        return self._joined([self.standardise(block) @ turned for block in self.features.blocks()]) + weights[-1]
+        return self._join([self.standardise(block) @ turned for block in self.features.blocks()]) + weights[-1]
 
     def gather(self, values: Array) -> Array:
         """Return Zᵀ · values, (R, K) for (N, K)."""
@@ -280,7 +280,7 @@ class StreamedDesign(_OfAllColumns):
         for block in self.features.blocks():
             total = total + self.standardise(block).T @ values[start : start + len(block)]
             start += len(block)
-        return self._joined([self.axes.T @ total, values.sum(axis=0)[None]])
+        return self._join([self.axes.T @ total, values.sum(axis=0)[None]])
 
     def moments(self, weights: Array) -> Array:
         """Return Zᵀ · diag(column) · Z per column of weights, (K, R, R) for (N, K)."""
@@ -299,7 +299,7 @@ class StreamedDesign(_OfAllColumns):
         corner = weights.sum()[None, None]
         return xp.vstack([xp.hstack([turned, edge]), xp.hstack([edge.T, corner])])
 
-    def _joined(self, parts: list[Any]) -> Array:
+    def _join(self, parts: list[Any]) -> Array:
         return array_namespace(self.axes).concatenate(parts)
 
 
@@ -342,11 +342,11 @@ class Projection:
             return cls(standardise, axes, StreamedDesign(features, standardise, axes, variances.clip(0.0)))
         samples = standardise(features.read() if isinstance(features, RowSubset) else features)
         axes = principal_axes(samples)
-        return cls(standardise, axes, DenseDesign(_turned(samples, axes)))
+        return cls(standardise, axes, DenseDesign(_turn(samples, axes)))
 
     def __call__(self, features: Array) -> Array:
         """Return other samples (N, D) as (N, R + 1)."""
-        return _turned(self.standardise(features), self.axes)
+        return _turn(self.standardise(features), self.axes)
 
     def raw_weights(self, weights: Array) -> tuple[NDArray[np.float64], float]:
         """Return weights (D,) and intercept on the raw features that decide like `weights` (R + 1,) do here."""
@@ -386,7 +386,7 @@ def _stay(features: RowSubset) -> bool:
     return count >= width and 8 * count * width > IN_MEMORY
 
 
-def _turned(samples: Array, axes: Array) -> Array:
+def _turn(samples: Array, axes: Array) -> Array:
     """Return the samples along axes, with a column of ones for the intercept, (N, R + 1)."""
     xp = array_namespace(samples)
     turned = xp.ones((samples.shape[0], axes.shape[1] + 1), dtype=xp.float64, device=samples.device)

@@ -221,10 +221,10 @@ class LogisticSolver:
         weights = self.xp.zeros(shape, dtype=signs.dtype, device=signs.device)
         at = self._point(self.samples, signs, weights, self.xp.zeros_like(signs))
         for strength in strengths:
-            at = self._solved(signs, strength, at)
+            at = self._solve(signs, strength, at)
             yield at.weights
 
-    def _solved(self, signs: Array, strength: float | Array, start: _Point) -> _Point:
+    def _solve(self, signs: Array, strength: float | Array, start: _Point) -> _Point:
         """Return the optima of labels −1/+1 (N, K), found from points `start` that are known exactly."""
         xp = self.xp
         solved = start.like()
@@ -240,9 +240,9 @@ class LogisticSolver:
                 return solved
             todo, gradient, relative = todo.only(open_), gradient[:, open_], relative[open_]
             if self._narrow is self.samples:
-                todo = replace(todo, at=self._stepped(todo, gradient, relative))
+                todo = replace(todo, at=self._step(todo, gradient, relative))
             else:
-                todo = replace(todo, at=self._led(todo, gradient, relative))
+                todo = replace(todo, at=self._lead(todo, gradient, relative))
         raise ProbeNotConvergedError(
             f"{len(todo.columns)} of {signs.shape[1]} logistic problems (N={len(signs)}, "
             f"C={todo.strength[0]:g}) are not at their optimum after {MAX_NEWTON_STEPS} Newton steps: worst "
@@ -250,7 +250,7 @@ class LogisticSolver:
             "Look for extreme feature values."
         )
 
-    def _led(self, todo: _Problems, gradient: Array, relative: Array) -> _Point:
+    def _lead(self, todo: _Problems, gradient: Array, relative: Array) -> _Point:
         """Return the exact points after steps in float32.
 
         Where those lead astray, it is the point after a single step that was checked.
@@ -260,15 +260,15 @@ class LogisticSolver:
         before, after = self._objective(todo.strength, todo.at), self._objective(todo.strength, led)
         astray = ~(after <= before + EXACT * abs(before))
         if astray.any():
-            led.put(astray, self._stepped(todo.only(astray), gradient[:, astray], relative[astray]))
+            led.put(astray, self._step(todo.only(astray), gradient[:, astray], relative[astray]))
         return led
 
-    def _stepped(self, todo: _Problems, gradient: Array, relative: Array) -> _Point:
+    def _step(self, todo: _Problems, gradient: Array, relative: Array) -> _Point:
         """Return the exact points after one Newton step."""
         step, change = self._newton_steps(todo, gradient, relative, SAFETY * self.tolerance)
         if self._narrow is not self.samples:
             change = todo.samples @ step
-        return self._moved(todo, gradient, step, change, is_exact=True)
+        return self._move(todo, gradient, step, change, is_exact=True)
 
     def _led_nearer(self, todo: _Problems, gradient: Array, relative: Array) -> Array:
         """Return weights (R, K) nearer to the optimum, by products in float32 that add to the exact point.
@@ -287,7 +287,7 @@ class LogisticSolver:
             todo, goal = todo.only(far), goal[far]
             if not far.all():
                 gradient, step, change = gradient[:, far], step[:, far], change[:, far]
-            todo = replace(todo, at=self._moved(todo, gradient, step, change, is_exact=False))
+            todo = replace(todo, at=self._move(todo, gradient, step, change, is_exact=False))
             gradient, _, relative = self._gradient(todo)
         weights[:, todo.columns] = todo.at.weights
         return weights
@@ -332,7 +332,7 @@ class LogisticSolver:
         hessians[:, diagonal, diagonal] += self.penalty[:, 0]
         return self.xp.linalg.solve(hessians, -gradient.T[..., None])[..., 0].T
 
-    def _moved(self, todo: _Problems, gradient: Array, step: Array, change: Array, *, is_exact: bool) -> _Point:
+    def _move(self, todo: _Problems, gradient: Array, step: Array, change: Array, *, is_exact: bool) -> _Point:
         """Return the points along `step`, which is halved per column until the objective falls enough.
 
         Args:

@@ -223,7 +223,7 @@ def test_an_environment_is_played_in_child_processes_with_the_same_numbers(
     check_equal(some, played, [1, 3])
 
 
-def test_what_does_not_fit_the_model_is_refused_before_anything_is_written(pi0_tiny: Pi0) -> None:
+def test_extract_refuses_an_environment_that_does_not_fit_the_model_before_it_writes(pi0_tiny: Pi0) -> None:
     with pytest.raises(OwnEnvironmentError, match=r"takes 8 numbers as an action .* embedded predicts 7"):
         prepare(settings("Wide"), model=pi0_tiny)
     with pytest.raises(UsageError, match="--execute 17: pi0-tiny gives 16 actions"):

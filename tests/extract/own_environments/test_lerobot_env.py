@@ -74,7 +74,7 @@ def test_fields_of_the_configuration_are_options() -> None:
         ("lerobot:probe_kit_reach", {"per_task": "0"}, UsageError, "per_task=0; expected a number of episodes"),
     ],
 )
-def test_what_cannot_be_played_is_named(
+def test_a_lerobot_environment_that_cannot_be_played_is_refused_by_name(
     name: str, options: dict[str, Any], error: type[Exception], message: str
 ) -> None:
     with pytest.raises(error, match=message):

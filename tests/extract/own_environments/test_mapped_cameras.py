@@ -131,7 +131,7 @@ def test_a_rotation_of_a_camera_turns_the_picture_that_it_is_given(
     source = EnvironmentSettings(NAMED, cameras=typed, rotations=rotations).open()
     assert isinstance(source, EnvironmentSource)
     inputs = DeclaredInputs(tuple(pairs), renames={name: to for name, to in renames.items() if name != to})
-    decided = source._begun(inputs, True)
+    decided = source._begin(inputs, True)
     assert decided.seen is not None
     plain = open_environment(EnvironmentSettings(NAMED))
     observation = plain.reset(next(iter(plain.episodes()))).observation  # type: ignore[union-attr]

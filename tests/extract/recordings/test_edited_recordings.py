@@ -140,7 +140,7 @@ def test_merged_data_sets(source: Path, tmp_path: Path, together: bool) -> None:
 
 
 @pytest.mark.parametrize("camera", [TOP, WRIST])
-def test_a_camera_that_was_removed(source: Path, tmp_path: Path, camera: str) -> None:
+def test_recordings_are_read_after_lerobot_removed_a_camera(source: Path, tmp_path: Path, camera: str) -> None:
     from lerobot.datasets import remove_feature
 
     remove_feature(opened(source), camera, tmp_path / "single", "local/single")

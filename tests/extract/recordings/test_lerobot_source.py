@@ -166,7 +166,9 @@ def test_trap_8_without_the_extra_it_is_named_with_its_command(
 def test_a_hub_name_without_a_commit_is_refused_without_network(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
     for revision in ("", "main", COMMIT[:-1]):
-        with pytest.raises(UsageError, match="names no commit, and the hub cannot be asked for one: offline mode"):
+        with pytest.raises(
+            UsageError, match="the commit of this data set cannot be looked up on the hub: offline mode"
+        ):
             resolved_commit("someone/kitchen", revision)
     assert resolved_commit("someone/kitchen", COMMIT) == COMMIT
 
@@ -300,7 +302,9 @@ def test_yes_and_no_are_read_where_the_prompt_asks_for_them(home: Path) -> None:
         (("--items", "2"), "--items does not apply with --pictures"),
     ],
 )
-def test_what_only_a_suite_has_is_refused_by_name(words: tuple[str, ...], message: str, home: Path) -> None:
+def test_recordings_refuse_by_name_the_options_of_a_suite(
+    words: tuple[str, ...], message: str, home: Path
+) -> None:
     del home
     options, _ = ASKED["pictures"]
     refused = ask(*options, *words, "--dry-run")

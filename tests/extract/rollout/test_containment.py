@@ -237,7 +237,7 @@ def generator_exit(_: Any) -> Any:
     ],
 )
 @pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")
-def test_what_is_no_action_costs_its_own_episode_by_name_and_no_other(
+def test_an_invalid_action_fails_its_own_episode_by_name_and_no_other(
     spoil: Any, words: str, settings: ExtractSettings, plain: dict[str, str], tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip

@@ -177,7 +177,7 @@ def test_the_words_behind_a_cut_are_counted(lost: int, framed: bool) -> None:
         assert count_lost_words(pack, " ".join(WORDS)) == lost
 
 
-def test_what_is_whole_or_unknown_has_lost_nothing() -> None:
+def test_an_instruction_that_is_whole_or_of_unknown_length_loses_no_words() -> None:
     full_tokenizer = tokenizer(None)
     texts = []
 

@@ -127,7 +127,7 @@ def test_a_stage_asks_for_nothing_between_the_inferences_of_two_episodes() -> No
 
 
 @pytest.mark.parametrize("batch", [1, 2])
-def test_what_was_to_follow_a_failed_episode_is_played_all_the_same(batch: int) -> None:
+def test_episodes_after_a_failed_one_are_played(batch: int) -> None:
     results, _ = played(12, batch, bad={0, 3, 4, 11})
     failed = [result.number for result in results if isinstance(result, Failed)]
     completed = [result[0].planned.index for result in results if isinstance(result, tuple)]

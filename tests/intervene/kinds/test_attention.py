@@ -223,7 +223,9 @@ def headings(shares: AttentionShares) -> tuple[str, ...]:
     return AttentionReadout.table([], said_of(measurement)).columns[2:]
 
 
-def test_what_nobody_plays_is_left_out_and_a_hidden_tile_counts_where_it_is_seen(weighed: AttentionShares) -> None:
+def test_unplayed_episodes_are_left_out_and_a_hidden_tile_counts_where_it_is_visible(
+    weighed: AttentionShares,
+) -> None:
     mass, at = weighed.mass.copy(), {role: weighed.roles.index(role) for role in ("special", "image.left")}
     mass[..., at["special"]] = np.nan
     mass[0, ..., at["image.left"]] = np.nan
@@ -304,7 +306,7 @@ def test_killed_and_resumed_gives_the_same_bytes_and_damage_is_found(
 
 
 @pytest.mark.slow
-def test_what_cannot_be_told_is_refused_by_name(session: ReplaySession) -> None:
+def test_attention_refuses_by_name_the_models_that_it_cannot_read(session: ReplaySession) -> None:
     for intervention, family, missing in (
         (AttentionReadout(), "internvla-m1", "attention"),
         (AttentionReadout(roles=("image.left",)), "magma", "tiles"),

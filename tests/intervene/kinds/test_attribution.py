@@ -50,7 +50,7 @@ def by_name(rows: list[AttributionEffect]) -> dict[str, AttributionEffect]:
     return {row.name: row for row in rows}
 
 
-def test_what_is_read_linearly_is_ranked_first_and_its_estimate_is_the_effect(wired: WiredSession) -> None:
+def test_attribution_ranks_a_linearly_read_cell_first_and_estimates_its_effect(wired: WiredSession) -> None:
     screen = screened(wired, "copied")
     rows = by_name(AttributionPatching.effects(screen))
     first, anchor = rows["kv.01 language"], rows["kv.* all"]
@@ -128,7 +128,7 @@ def test_a_gradient_at_kv_is_of_what_the_acting_part_reads_alone(wired: WiredSes
     assert slopes[backbone_sites[0]].any()
 
 
-def test_what_cannot_be_screened_is_refused_with_what_to_do() -> None:
+def test_attribution_refuses_cells_that_it_cannot_screen_and_says_what_to_do() -> None:
     with pytest.raises(UsageError, match="share no token"):
         AttributionPatching(roles=("all",))
     with pytest.raises(UsageError, match="leave --readout out"):

@@ -85,7 +85,7 @@ def test_a_choice_that_turns_beyond_its_control_is_confirmed() -> None:
     assert rows["clean"].p is None
 
 
-def test_what_its_control_does_as_well_is_not_confirmed() -> None:
+def test_an_edit_whose_control_does_as_well_is_not_confirmed() -> None:
     rows = effects_by_name([[RIGHT] * 16, [WRONG] * 16, [RIGHT] * 16, [WRONG] * 16, [WRONG] * 16])
     assert rows["backbone.02 image mean-difference"].finding == "not confirmed"
     assert rows["backbone.02 image"].finding == "not confirmed"
@@ -311,7 +311,7 @@ def test_every_inference_has_its_own_state_and_the_pictures_exchanged(
         lambda: ClosedLoop(targets=("backbone.02|all",), direction="none"),
     ],
 )
-def test_what_cannot_be_asked_is_refused(intervention: object) -> None:
+def test_closed_loop_refuses_impossible_settings(intervention: object) -> None:
     with pytest.raises(UsageError):
         intervention()  # type: ignore[operator]
 

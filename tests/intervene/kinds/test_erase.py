@@ -65,7 +65,9 @@ def test_writing_back_what_is_there_changes_no_action_bit_for_bit(effects: Inter
 
 
 @pytest.mark.slow
-def test_what_is_erased_is_moved_and_what_nothing_reads_is_not_missed(effects: InterventionResult) -> None:
+def test_erasing_a_read_answer_changes_the_action_and_erasing_an_unread_one_does_not(
+    effects: InterventionResult,
+) -> None:
     for name in ("leace", "control-1"):
         read, unread = (row_of(effects, site, name) for site in ("backbone.02", "backbone.03"))
         assert read.fires == unread.fires == EPISODES
@@ -149,7 +151,7 @@ def erased_answers(erasure_share: float, control_share: float, base: str = "foll
         (0.1, 0.95, "habit", "no baseline effect"),
     ],
 )
-def test_what_is_lost_is_lost_beyond_the_controls(
+def test_an_answer_counts_as_lost_only_beyond_the_controls(
     erasure_share: float, control_share: float, base: str, finding: str
 ) -> None:
     row, *controls = ConceptErasure.effects(measured(erased_answers(erasure_share, control_share, base), "suite"))
@@ -187,7 +189,7 @@ def test_a_loss_in_one_group_is_no_evidence() -> None:
         lambda: ConceptErasure(sites=("backbone.02",), method="leace:3"),
     ],
 )
-def test_what_cannot_be_asked_is_refused(intervention: object) -> None:
+def test_erase_refuses_impossible_settings(intervention: object) -> None:
     with pytest.raises(UsageError):
         intervention()  # type: ignore[operator]
 

@@ -77,7 +77,7 @@ def test_five_groups_that_always_follow_are_not_used_in_part() -> None:
     assert classify_behaviour(swap, None).verdict == "used"
 
 
-def test_what_goes_against_in_half_of_the_episodes_is_not_called_unused() -> None:
+def test_an_action_that_goes_against_the_picture_in_half_of_the_episodes_is_not_called_unused() -> None:
     """Only the upper end of the interval counted: [-0.58, 0.08] was *encoded, unused*."""
     plain, swapped = follower(48)
     lot = np.random.default_rng(3).choice([-1.0, 1.0], 24, p=[0.6, 0.4]).repeat(2)
@@ -102,11 +102,16 @@ def test_not_used_needs_as_many_groups_as_are_said_beforehand() -> None:
     assert f"about {needed} groups would tell, there are {needed - 1}" in too_few.reason
 
 
-def test_where_groups_would_tell_it_is_said_how_many_items_a_group_is() -> None:
+def test_a_legend_says_how_many_groups_the_items_are_where_a_verdict_counts_groups() -> None:
     open_ = classify_behaviour(of(habit(40), groups=10), "shape").reason
     assert "groups would tell" in open_
-    assert size_of_groups(["", open_], [(20, 10), (12, 6)]) == "a group is 2 items that share a picture"
-    assert size_of_groups([open_], [(20, 10), (15, 10)]) == "a group is 1.5 to 2 items that share a picture"
+    assert (
+        size_of_groups(["", open_], [(20, 10), (12, 6)])
+        == "20 items are 10 independent groups, because 2 items share each picture"
+    )
+    assert size_of_groups([open_], [(20, 10), (15, 10)]) == (
+        "20 items are 10 independent groups, because 1.5 to 2 items share each picture"
+    )
     assert size_of_groups(["used"], [(20, 10)]) == ""
 
 

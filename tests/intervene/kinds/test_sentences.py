@@ -246,12 +246,12 @@ FINDINGS: list[tuple[type[Intervention], Sequence[Any], str]] = [
     (
         Interchange,
         [patch("backbone.01", 0.2, 0.001)],
-        "not located: no edit of 1 has half of the image swap's effect.",
+        "not located: none of 1 edits has half of the image swap's effect.",
     ),
     (
         Interchange,
         [patch("expert.01", 1.0, 0.001)],
-        "not located: every edit lies where the whole effect must pass, which shows no place.",
+        "not located: all edits lie where the whole effect must pass, so that no place is shown.",
     ),
     (
         Interchange,
@@ -271,7 +271,7 @@ FINDINGS: list[tuple[type[Intervention], Sequence[Any], str]] = [
     (
         Steering,
         [replace(patch("backbone.02", 0.1, 0.001), coefficient="2")],
-        "not steered: no edit of 1 has half of the image swap's effect.",
+        "not steered: none of 1 edits has half of the image swap's effect.",
     ),
     (
         ClosedLoop,
@@ -281,7 +281,7 @@ FINDINGS: list[tuple[type[Intervention], Sequence[Any], str]] = [
     (
         ClosedLoop,
         [closed_loop("backbone.02", 0.1, 0.5)],
-        "not confirmed: no edit of 1 turns the cube to the other picture beyond its controls.",
+        "not confirmed: none of 1 edits turns the cube to the other picture more than its controls.",
     ),
     (
         ClosedLoop,
@@ -296,7 +296,7 @@ FINDINGS: list[tuple[type[Intervention], Sequence[Any], str]] = [
     (
         ConceptErasure,
         [erasure(0.8, 0.3)],
-        "not lost: no erasure of 1 takes the answer from the action beyond its controls.",
+        "not lost: none of 1 erasures takes the answer from the action more than its controls.",
     ),
     (
         ConceptErasure,

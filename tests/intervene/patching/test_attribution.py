@@ -30,7 +30,7 @@ def copied(wired: WiredSession) -> pt.Screen:
     return screened(wired, "copied")
 
 
-def test_what_is_read_is_ranked_first_and_the_anchor_holds(copied: pt.Screen) -> None:
+def test_gradients_rank_the_read_cell_first_and_agree_with_the_anchor(copied: pt.Screen) -> None:
     table = copied.table.set_index("cells")
     assert copied.finding == "anchored"
     assert table["rank"]["kv.01 language"] == 1

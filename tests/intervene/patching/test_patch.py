@@ -106,7 +106,7 @@ def test_a_model_that_answers_is_given_questions(vlm: AnswerModel, question: Pro
     assert (changed.option_logits != reading.option_logits).any()
 
 
-def test_what_does_not_fit_the_model_is_refused(
+def test_a_patch_that_does_not_fit_the_model_is_refused(
     pi0_tiny: Pi0, vlm: AnswerModel, observation: Observation, question: Prompt
 ) -> None:
     with pytest.raises(UsageError, match="pi0-tiny answers no questions: give it an observation"):
@@ -284,7 +284,7 @@ def test_a_cell_that_is_not_there_is_refused(
         pt.find_cells(pi0_tiny, pattern)
 
 
-def test_what_cannot_be_patched_is_refused(pi0_tiny: Pi0, pair: pt.Pair) -> None:
+def test_an_impossible_patch_is_refused(pi0_tiny: Pi0, pair: pt.Pair) -> None:
     (cell,) = pt.find_cells(pi0_tiny, "backbone.02|image")
     (beyond,) = pt.find_cells(pi0_tiny, "backbone.02|50-60")
     with pytest.raises(EmptyRoleError, match="backbone has no positions 50-60; it has 0 to 51"):

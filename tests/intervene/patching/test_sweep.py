@@ -104,7 +104,7 @@ def test_pairs_are_both_layouts_of_an_item_and_lead_to_the_other_side(wired: Wir
         pt.find_pairs(wired, "copied", 0)
 
 
-def test_what_cannot_be_swept_is_refused(wired: WiredSession) -> None:
+def test_a_sweep_refuses_cells_that_it_cannot_patch(wired: WiredSession) -> None:
     cells = pt.find_cells(wired.policy, "kv.01|language")
     with pytest.raises(UsageError, match="a sweep of 1 sets of cells in 0 pairs"):
         pt.sweep_cells(wired.policy, [], cells, wired.lateral_displacement)

@@ -82,6 +82,6 @@ def test_it_is_another_key_than_the_first_inference(copy: Run) -> None:
         lambda: ImageSwap(readout="glance"),  # type: ignore[arg-type]
     ],
 )
-def test_what_is_read_elsewhere_has_no_shadow(intervention: object) -> None:
+def test_an_answer_that_is_read_at_another_step_leaves_no_effect_here(intervention: object) -> None:
     with pytest.raises(UsageError):
         intervention()  # type: ignore[operator]

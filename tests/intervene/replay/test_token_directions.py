@@ -156,7 +156,7 @@ def test_tokens_are_taken_over_along_them_and_along_controls(
         lambda direction: Steering(sites=("backbone.02",), role="image", direction=direction),
     ],
 )
-def test_what_is_no_direction_is_refused_before_anything_is_loaded(intervention: object, direction: str) -> None:
+def test_an_invalid_direction_is_refused_before_anything_is_loaded(intervention: object, direction: str) -> None:
     with pytest.raises(UsageError, match="direction"):
         intervention(direction)  # type: ignore[operator]
 

@@ -52,7 +52,7 @@ def test_interventions_are_listed_oldest_first_with_what_was_asked(run: Run) -> 
     assert listed[2]["parameters"]["method"] == "leace"
 
 
-def test_what_is_of_other_episodes_or_unfinished_is_said(run: Run) -> None:
+def test_the_inventory_marks_results_that_are_unfinished_or_of_other_episodes(run: Run) -> None:
     (first,) = listed_interventions(run)
     partial = run.path / "interventions" / ".0123456789ab.partial"
     partial.mkdir()

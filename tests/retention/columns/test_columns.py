@@ -89,7 +89,7 @@ def test_a_column_names_a_field_of_a_row_and_explains_itself(column: Column) -> 
 
 
 @pytest.mark.parametrize("path", averaged_fields())
-def test_what_is_averaged_is_a_number(path: str) -> None:
+def test_every_averaged_column_holds_numbers(path: str) -> None:
     kind = field_of(path)
     assert float in (kind, *get_args(kind))
 

@@ -156,13 +156,19 @@ def test_the_terminal_shows_one_table_at_any_width_and_ends_on_the_sentences(wid
     assert text.count("category") == 1, "one header: one table, and it is not split"
     assert "[40, 100]" in text.split("Counting  ")[0], "a narrow table has intervals below their values"
     assert " ".join(text.split()).endswith("next: probe-kit power how many items would show what is open")
-    assert "State     known and encoded, not used: " in text
+    assert "State     not used: the VLM knows the answer and probes read it in the backbone" in text
 
 
 @pytest.mark.parametrize(
     ("first", "second", "readouts", "expected", "legend"),
     [
-        ("used", None, "first-chunk", "used in the first chunk", "of the first chunk; --readout per-step gives"),
+        (
+            "used",
+            None,
+            "first-chunk",
+            "used in the first chunk",
+            "of the first chunk of actions; --readout per-step gives",
+        ),
         ("used", None, "per-step", "used over the whole episode", "of the whole episode"),
         (
             "not used",
@@ -172,7 +178,13 @@ def test_the_terminal_shows_one_table_at_any_width_and_ends_on_the_sentences(wid
             "of the first",
         ),
         ("used", "not used", "per-step", "chunk: by the swap; it is used over the whole episode", "of the first"),
-        ("used", "used", "first-chunk", "used in the first chunk and over the whole episode", "and of the whole"),
+        (
+            "used",
+            "used",
+            "first-chunk",
+            "used in the first chunk and over the whole episode",
+            "and which of the whole",
+        ),
     ],
 )
 def test_terminal_markdown_and_json_say_the_same_of_first_chunk_and_whole_episode(

@@ -225,7 +225,7 @@ def test_runs_of_the_wrong_kind_or_of_other_questions_are_refused(runs: tuple[Sa
         match_runs(vlm, policy, probes(policy, {"color": [0.9], "shape": [0.9]}), "last")
 
 
-def test_what_is_left_out_is_said(runs: tuple[SaidRun, SaidRun]) -> None:
+def test_a_comparison_notes_the_episodes_that_it_leaves_out(runs: tuple[SaidRun, SaidRun]) -> None:
     vlm, policy = runs
     fewer = replace(vlm, episodes=vlm.episodes[vlm.episodes["category"] == "color"])
     join = match_runs(fewer, policy, probes(policy, {"color": [0.9]}))

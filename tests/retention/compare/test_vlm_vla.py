@@ -252,7 +252,7 @@ def test_another_size_of_the_same_family_is_not_the_source(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("name", OTHERS)
-def test_what_cannot_be_told_is_unknown(tmp_path: Path, name: str) -> None:
+def test_the_origin_of_a_policy_is_unknown_if_no_hash_or_id_matches(tmp_path: Path, name: str) -> None:
     asked_card, expected = OTHERS[name]
     assert grew_from(policy(tmp_path / "p", xiaomi()), vlm(tmp_path, asked_card)) == expected
 

@@ -189,7 +189,7 @@ def trained(labelled_run: Path, tmp_path: Path) -> Run:
 
 
 @pytest.mark.slow
-def test_what_was_planted_in_the_backbone_alone_does_not_reach_the_action(trained: Run) -> None:
+def test_a_label_that_only_the_backbone_encodes_does_not_reach_the_action(trained: Run) -> None:
     table = retention_table([trained], target="sim.tool_y")
     (row,) = table.rows
     assert row.retention.defined

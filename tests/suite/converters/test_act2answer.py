@@ -230,7 +230,7 @@ def _forget(name: str) -> Callable[[Path], None]:
         ),
     ],
 )
-def test_what_the_release_would_misread_is_refused(
+def test_a_set_that_the_release_would_misread_is_refused(
     folder: Path, tmp_path: Path, change: Callable[[Path], None], complaint: str
 ) -> None:
     change(folder)
