@@ -17,6 +17,7 @@ from probe_kit.hooks.contract.observation import Observation
 from probe_kit.intervene.frame_session import Frames
 from probe_kit.intervene.sessions import ReplayFiles
 from probe_kit.runs import Run, open_run
+from probe_kit.runs.environment_success import bounds_of
 from probe_kit.runs.verify import verify_run
 from probe_kit.serve import session as sessions
 from probe_kit.serve.marks import Mark
@@ -284,30 +285,36 @@ def test_rows_of_a_client_without_marks_are_split_and_its_group_is_not(
 ) -> None:
     clock = [0.0]
     monkeypatch.setattr(sessions, "monotonic", lambda: clock[0])
-    server = opened(captured_calls=1, pause=30.0)
+    lines: list[Line] = []
+    server = opened(lines=lines, captured_calls=1, pause=30.0)
     client = server.session.connect("arm-1")
 
     def send(number: float, words: str = WORDS, wait: float = 1.0) -> None:
         clock[0] += wait
-        state = np.array([0.36 + 0.01 * number, 0.02, 0.08, 0, 0.05, 0, 0, 0.64])
+        state = np.array([0.36, 0.02, 0.08, 0, 0.05, 0, 0, 0.64]) + 0.002 * number * np.arange(1, 9)
         server.session.answer(
             client, {**observation(int(number)), "observation/state": state, "prompt": words}, None
         )
 
-    for number in (0, 1, 2, 3):
+    for number in (0, 1, 2, 3, 4, 5):
         send(number)
-    send(0.2)  # back at the beginning
+    send(0.1)  # back at the beginning
     send(1.2)
     send(2.2, OTHER)
     send(3.2, OTHER, wait=31)
+    for number in (4.2, 5.2, 4.2, 3.2, 2.2, 1.2, 0.2):  # home, in steps as small as all others
+        send(number, OTHER)
     server.session.leave(client)
     run = written(server)
-    assert run.episodes[["episode_id", "began", "ended", "inferences"]].to_numpy().tolist() == [
-        ["arm-1/000001", "connection", "state", 4],
-        ["arm-1/000002", "state", "words", 2],
-        ["arm-1/000003", "words", "pause", 1],
-        ["arm-1/000004", "pause", "connection", 1],
+    columns = ["episode_id", "began", "ended", "inferences", "possible_starts"]
+    assert run.episodes[columns].to_numpy().tolist() == [
+        ["arm-1/000001", "connection", "state", 6, 0],
+        ["arm-1/000002", "state", "words", 2, 0],
+        ["arm-1/000003", "words", "pause", 1, 0],
+        ["arm-1/000004", "pause", "connection", 8, 1],
     ]
+    assert "1 of 4 rows may hold more than one episode" in bounds_of(run.episodes)
+    assert [line.possible_starts for line in lines] == [0, 0, 0, 1]
     assert set(run.episodes["group_id"]) == {"arm-1"}
 
 
