@@ -129,6 +129,16 @@ def _by_condition(episodes: "pd.DataFrame") -> tuple[ConditionSuccess, ...]:
     return tuple(rates)
 
 
+def condition_counts(episodes: "pd.DataFrame") -> dict[str, int]:
+    """Count episodes by condition, the one without edits first; empty for a run without conditions."""
+    if CONDITION not in episodes:
+        return {}
+    counts = episodes[CONDITION].value_counts()
+    return {
+        str(name): int(counts[name]) for name in sorted(counts.index, key=lambda name: (name != UNEDITED, name))
+    }
+
+
 MARKED = "marked"
 """The column of episodes that says whether the client of a policy server said where they begin."""
 

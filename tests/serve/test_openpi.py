@@ -1,47 +1,23 @@
 """The wire of openpi, spoken by a client of the package websockets."""
 
-import asyncio
 import http.client
+import resource
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
-from websockets.exceptions import ConnectionClosedError, InvalidStatus
+from websockets.exceptions import ConnectionClosed, ConnectionClosedError, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from probe_kit.hooks import Policy
 from probe_kit.serve.codec import pack, unpack
-from probe_kit.serve.server import Server
-from tests.support.served_sessions import WORDS, Opens, observation
+from tests.support.served_sessions import WORDS, Opens, observation, serving
 
 MARK = "probe_kit/episode"
-
-
-@contextmanager
-def serving(server: Server, stop_after: int | None = None) -> Iterator[str]:
-    """Serve on a thread until the body ends."""
-    ready = threading.Event()
-    loops: list[asyncio.AbstractEventLoop] = []
-
-    def began() -> None:
-        loops.append(asyncio.get_running_loop())
-        ready.set()
-
-    thread = threading.Thread(target=server.serve, args=(stop_after, began, lambda _: None))
-    thread.start()
-    assert ready.wait(20)
-    try:
-        yield server.address
-    finally:
-        if stop_after is None:
-            loops[0].call_soon_threadsafe(server.stop.set)
-        thread.join(30)
-    assert not thread.is_alive()
 
 
 def ask(connection: ClientConnection, message: dict[str, Any]) -> Any:
@@ -149,4 +125,40 @@ def test_only_a_client_with_the_token_is_served_and_no_browser(opened: Opens) ->
         question.request("GET", "/healthz")
         assert question.getresponse().read() == b"OK\n"
         question.close()
+    server.close()
+
+
+@pytest.mark.slow
+def test_changed_requests_cost_a_line_each_and_neither_memory_nor_threads_grow(opened: Opens) -> None:
+    server, rng = opened(captured_calls=1), np.random.default_rng(0)
+    request = pack({**observation(0, side=8), MARK: {"id": "a"}})
+    lines, codes, threads, memory = list[str](), list[int | None](), list[int](), list[int]()
+    with serving(server) as address:
+        client = connect(address, compression=None)
+        client.recv(20)
+        client.send(request)
+        assert not isinstance(client.recv(60), str)
+        for _ in range(200):
+            content = bytearray(request)
+            for at in rng.integers(0, len(content), 4):
+                content[at] = rng.integers(0, 256)
+            try:
+                client.send(bytes(content))
+                answer = client.recv(60)
+                lines += [answer] if isinstance(answer, str) else []
+            except ConnectionClosed as error:
+                codes.append(error.rcvd and error.rcvd.code)
+                lines.append(error.rcvd.reason if error.rcvd else "")
+                client = connect(address, compression=None)
+                client.recv(20)
+            threads.append(threading.active_count())
+            memory.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+        client.send(pack({**observation(0, side=8), MARK: {"id": "last"}}))
+        assert not isinstance(client.recv(60), str)
+        client.close()
+    assert set(codes) == {1007}
+    assert len(codes) < len(lines) < 200, "some are refused, some close their connection, and some are answered"
+    assert all(len(line.splitlines()) == 1 and "Traceback" not in line for line in lines)
+    assert max(threads[50:]) <= max(threads[:50])
+    assert memory[-1] - memory[49] < 64 * 1024, "kibibytes"
     server.close()
