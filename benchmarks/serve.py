@@ -59,7 +59,7 @@ def serving(server: Server) -> Iterator[str]:
 
 
 def ask(client: ClientConnection, message: dict[str, Any]) -> tuple[float, float]:
-    """Return the milliseconds of a request, of the clock and of the processor of server and client, one process."""
+    """Return the milliseconds of a request, of the clock and of the processor of client and server."""
     content, began, worked = pack(message), perf_counter(), process_time()
     client.send(content)
     answer = client.recv()

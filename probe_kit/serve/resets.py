@@ -63,8 +63,8 @@ class Resets:
     def __init__(self) -> None:
         self._first: NDArray[np.float64] | None = None
         self._last: NDArray[np.float64] | None = None
-        self._states = np.zeros((MOST_STEPS, 0))
-        self._steps = np.zeros((MOST_STEPS, 2, 0))
+        self._states: NDArray[np.float64] = np.zeros((MOST_STEPS, 0))
+        self._steps: NDArray[np.float64] = np.zeros((MOST_STEPS, 2, 0))
         self._n_states = self._n_steps = 0
         self._values: list[set[float]] = []
         self._was_away = False

@@ -86,31 +86,48 @@ def test_answers_are_those_of_the_policy_and_the_run_shows_them_again(opened: Op
 
 @pytest.mark.slow
 def test_episodes_are_the_same_whoever_else_asks(opened: Opens) -> None:
-    one_by_one, together = opened("a"), opened("b")
-    client = one_by_one.session.connect()
-    for name, numbers in (("x", [0, 1]), ("y", [2, 3])):
-        play(one_by_one, client, name, numbers)
-    first, second = together.session.connect(), together.session.connect("other")
-    for call in range(2):
-        together.session.answer(second, observation(2 + call), Mark("y", step=5 * call))
-        together.session.answer(first, observation(call), Mark("x", step=5 * call))
-    for each in (first, second):
-        together.session.end(each, Mark(end=True))
-    runs = [server.close() for server in (one_by_one, together)]
+    """Six episodes by one client, by three at once, and by two in the opposite order of arrival."""
+    names = [f"task/{number}" for number in range(6)]
+
+    def ask(server: Server, client: Client, name: str, call: int) -> None:
+        number = 2 * int(name[-1]) + call
+        server.session.answer(client, observation(number), Mark(name, step=5 * call))
+
+    def end(server: Server, client: Client) -> None:
+        server.session.end(client, Mark(end=True))
+
+    alone, at_once, opposite = opened("alone"), opened("at-once"), opened("opposite")
+    client = alone.session.connect()
+    for name in names:
+        for call in range(2):
+            ask(alone, client, name, call)
+        end(alone, client)
+    three = [at_once.session.connect() for _ in range(3)]
+    for at in (0, 3):
+        for call in range(2):
+            for client, name in zip(three, names[at : at + 3], strict=True):
+                ask(at_once, client, name, call)
+        for client in three:
+            end(at_once, client)
+    two = [opposite.session.connect(f"arm-{number}") for number in range(2)]
+    for at in (4, 2, 0):
+        for call in range(2):
+            for client, name in zip(two, names[at : at + 2][::-1], strict=True):
+                ask(opposite, client, name, call)
+        for client in two:
+            end(opposite, client)
+
     bytes_of = []
-    for run in runs:
-        assert run is not None
+    for server in (alone, at_once, opposite):
+        run = written(server)
         assert run.inputs is not None
         by_id = {name: row for row, name in enumerate(run.episodes["episode_id"])}
-        kinds = [run.rows("expert"), run.rows("backbone")]
-        bytes_of.append(
-            [
-                (kind[by_id[name]].tobytes(), run.inputs.row("prediction", by_id[name]).tobytes())
-                for name in "xy"
-                for kind in kinds
-            ]
-        )
-    assert bytes_of[0] == bytes_of[1]
+        assert by_id.keys() == set(names)
+        activations = [run.rows(stream) for stream in run.streams]
+        of_ids = [[array[by_id[name]].tobytes() for array in activations] for name in names]
+        predictions = [run.inputs.row("prediction", by_id[name]).tobytes() for name in names]
+        bytes_of.append((of_ids, predictions))
+    assert bytes_of[0] == bytes_of[1] == bytes_of[2]
 
 
 @pytest.mark.slow
