@@ -1,4 +1,4 @@
-"""Resets of a robot between episodes that nobody names: what the states of one connection say about them."""
+"""Resets of a robot between episodes of a client that names none: the evidence in the states of one connection."""
 
 import math
 from dataclasses import dataclass
@@ -24,8 +24,8 @@ SMALLEST_RATIO = 1e-3
 
 
 @dataclass(frozen=True)
-class Judgement:
-    """What a state says.
+class ResetEvidence:
+    """The evidence of a state for a reset.
 
     Attributes:
         resets: Whether it begins another episode.
@@ -69,15 +69,15 @@ class Resets:
         self._values: list[set[float]] = []
         self._was_away = False
 
-    def judge(self, state: NDArray[np.float32]) -> Judgement:
-        """Return what a state (D,) says; it is not counted until `add`."""
+    def judge(self, state: NDArray[np.float32]) -> ResetEvidence:
+        """Return the evidence of a state (D,), which is not counted until `add`."""
         if self._first is None or self._last is None or not self._n_steps:
-            return Judgement()
+            return ResetEvidence()
         off = np.abs(self._states[: self._n_states] - self._first)
         scale = np.quantile(off, 0.9, axis=0)
         moving = (scale > 0) & np.array([len(values) >= FEWEST_VALUES for values in self._values])
         if not moving.any():
-            return Judgement()
+            return ResetEvidence()
         first, scale = self._first[moving], scale[moving]
         before = np.abs(self._last[moving] - first) / scale
         now = np.abs(state[moving] - first) / scale
@@ -93,7 +93,7 @@ class Resets:
         is_return = chance <= POSSIBLE_CHANCE and returned <= RETURN_CHANCE
         is_near = bool((now <= BACK).all())
         far = jump > FAR * largest and len(lengths) >= FEWEST_STEPS
-        return Judgement(
+        return ResetEvidence(
             resets,
             not resets and (far or is_return or (is_near and self._was_away)),
             is_return,
@@ -101,7 +101,7 @@ class Resets:
             bool((before >= AWAY).mean() > 0.5),
         )
 
-    def add(self, state: NDArray[np.float32], judged: Judgement, begins: bool) -> None:
+    def add(self, state: NDArray[np.float32], judged: ResetEvidence, begins: bool) -> None:
         """Count a state, which begins an episode or not."""
         new = state.astype(np.float64)
         if self._first is None or self._last is None:

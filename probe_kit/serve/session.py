@@ -51,7 +51,7 @@ from probe_kit.runs.store import Location
 from probe_kit.runs.verify import seal
 from probe_kit.runs.writer import RunWriter
 from probe_kit.serve.marks import SUCCESS, Facts, Mark
-from probe_kit.serve.resets import Judgement, Resets
+from probe_kit.serve.resets import ResetEvidence, Resets
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
@@ -91,7 +91,7 @@ class OpenEpisode:
         record: The inputs that are shown again later.
         inferences: The number of inferences so far, captured or not.
         steps: The number of actions executed before each captured inference, as far as it is said.
-        possible_starts: The number of its observations that may begin another episode, which nobody said.
+        possible_starts: The number of its observations that may begin another episode, without marks.
         failure: Why it is given up, with the traceback; None while nothing failed.
         is_marked: Whether the client said that it began.
         condition: The condition whose edits it gets; empty where the run has no conditions.
@@ -130,7 +130,7 @@ class Client:
         answered: When its last observation was answered; None before.
         longest: The longest interval between two observations so far, in seconds.
         resets: The states so far, where the client does not say its episodes.
-        judged: What the state of the observation that is answered says.
+        judged: The evidence of the state that is answered, for a reset.
     """
 
     name: str
@@ -140,7 +140,7 @@ class Client:
     answered: float | None = None
     longest: float = 0.0
     resets: Resets = field(default_factory=Resets)
-    judged: Judgement = field(default_factory=Judgement)
+    judged: ResetEvidence = field(default_factory=ResetEvidence)
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,7 @@ class Line:
         number: Its number in the run; None for one that was given up before it had any.
         outcome: Its outcome in a word.
         failure: Why it was given up; empty for one that is committed.
-        possible_starts: The number of its observations that may begin another episode, which nobody said.
+        possible_starts: The number of its observations that may begin another episode, without marks.
     """
 
     number: int | None
@@ -497,7 +497,7 @@ class Session:
     def _reason_to_split(self, client: Client, received: Received, arrived: float) -> str | None:
         """Return why an observation without a mark begins a row; None if it does not."""
         episode, settings = client.episode, self._source.settings
-        client.judged = Judgement()
+        client.judged = ResetEvidence()
         if episode is None:
             return None
         if episode.is_marked:

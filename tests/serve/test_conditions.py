@@ -113,7 +113,9 @@ def test_conditions_are_balanced_in_each_group_and_none_changes_no_bit(
     labels = tmp_path / "unedited.csv"
     unedited = after.episodes[after.episodes["condition"] == "none"]
     unedited[["episode_id", "env.success"]].rename(columns={"env.success": "solved"}).to_csv(labels, index=False)
-    assert "episodes by condition" not in command(*trained, "--labels", str(labels), "--target", "solved")
+    with pytest.warns(UserWarning, match="its groups allow no p below"):
+        unedited_only = command(*trained, "--labels", str(labels), "--target", "solved")
+    assert "episodes by condition" not in unedited_only
     assert load_results(after, target="env.success").conditions == {"none": 12, "steer": 12}
     table = command("retention", where, "--target", "env.success")
     assert "success rate by condition, of 24 episodes: none" in table

@@ -76,7 +76,7 @@ class Served:
 
     @property
     def sends(self) -> str:
-        """What the client is told to send."""
+        """The arguments of the client: what it sends."""
         parts = {"state": self.state, "spread": self.spread, "words": self.words}
         return json.dumps({**parts, "pictures": list(self.cameras.values())})
 
@@ -224,7 +224,7 @@ def test_every_fault_of_an_observation_is_a_line_and_the_next_one_is_answered(cl
     expected = {
         "units": "other units or another robot", "camera": "no picture", "state": "no state", "words": "no words",
         "size": "the run stores pictures", "dtype": "float32 (48, 48, 3)", "finite": "NaN or infinity",
-        "unmarked": "says no episode", "mark": "has the entry", "end": "beside an observation", "text": "dtype",
+        "unmarked": "says no episode", "mark": "has the entry", "end": "beside an observation", "text": "has the type",
         "16 MiB": "1009",
     }  # fmt: skip
     assert lines.keys() == expected.keys()

@@ -80,8 +80,8 @@ def lattice(start: State, steps: int, rng: np.random.Generator) -> list[State]:
 
 def going_home(start: State, steps: int, rng: np.random.Generator) -> list[State]:
     """A reach and the way back: the reset that follows moves nothing."""
-    there = smooth(start, HOME + RANGE * rng.normal(size=NUMBERS), steps // 2)
-    return [start, *there, *smooth(there[-1], HOME, steps - steps // 2)]
+    reach = smooth(start, HOME + RANGE * rng.normal(size=NUMBERS), steps // 2)
+    return [start, *reach, *smooth(reach[-1], HOME, steps - steps // 2)]
 
 
 Motion = Callable[[State, int, np.random.Generator], list[State]]
