@@ -224,8 +224,8 @@ def test_every_fault_of_an_observation_is_a_line_and_the_next_one_is_answered(cl
     expected = {
         "units": "other units or another robot", "camera": "no picture", "state": "no state", "words": "no words",
         "size": "the run stores pictures", "dtype": "float32 (48, 48, 3)", "finite": "NaN or infinity",
-        "unmarked": "says no episode", "mark": "has the entry", "end": "beside an observation", "text": "has the type",
-        "16 MiB": "1009",
+        "unmarked": "says no episode", "mark": "has the entry", "end": "beside an observation",
+        "text": "has the type", "16 MiB": "1009",
     }  # fmt: skip
     assert lines.keys() == expected.keys()
     for name, complaint in expected.items():
