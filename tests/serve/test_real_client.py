@@ -115,7 +115,7 @@ def probe_kit(*words: str, codes: tuple[int, ...] = (0,)) -> str:
         capture_output=True,
         encoding="utf-8",
         check=False,
-        timeout=600,
+        timeout=1800,
     )
     assert ended.returncode in codes, ended.stderr
     return ended.stdout
