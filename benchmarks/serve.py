@@ -1,9 +1,9 @@
 """What serving costs: requests with and without capture, adding an episode, and opening a long run.
 
-    python benchmarks/serve.py [--requests 200] [--episodes 2000] [--wide LAYERS]
+    python benchmarks/serve.py [--requests 200] [--episodes 2000] [--wide LAYERS] [--only adding requests clients]
 
 Requests alternate between captured and plain ones of one process, behind one socket; the median of their ratios is
-printed. A quiet machine is assumed.
+printed, of wall time and of the processor time of the process, which other jobs of the machine change less.
 """
 
 import argparse
@@ -34,6 +34,7 @@ from probe_kit.serve.codec import pack, unpack
 from probe_kit.serve.server import Server, open_server
 
 MARK = "probe_kit/episode"
+PARTS, KEPT = ("adding", "requests", "clients"), ("small", "full")
 WORDS = "put the cube on the red shape"
 
 
@@ -57,12 +58,12 @@ def serving(server: Server) -> Iterator[str]:
         thread.join()
 
 
-def ask(client: ClientConnection, message: dict[str, Any]) -> float:
-    """Return the milliseconds of a request."""
-    content, began = pack(message), perf_counter()
+def ask(client: ClientConnection, message: dict[str, Any]) -> tuple[float, float]:
+    """Return the milliseconds of a request, of the clock and of the processor of client and server."""
+    content, began, worked = pack(message), perf_counter(), process_time()
     client.send(content)
     answer = client.recv()
-    took = 1000 * (perf_counter() - began)
+    took = 1000 * (perf_counter() - began), 1000 * (process_time() - worked)
     assert not isinstance(answer, str), answer
     assert "actions" in unpack(answer)
     return took
@@ -118,7 +119,7 @@ def wide(folder: Path, layers: int) -> Served:
     return Served(policy.card.cameras, np.zeros(policy.state_numbers), policy, {"model": "pi0", **requested})
 
 
-def play(client: ClientConnection, served: Served, name: str, inferences: int = 16) -> list[float]:
+def play(client: ClientConnection, served: Served, name: str, inferences: int = 16) -> list[tuple[float, float]]:
     """Return the milliseconds of the requests of one episode, with that of its end."""
     number = int(name.rpartition("/")[2])
     took = [ask(client, {**served.observation(number), MARK: {"id": name}}) for _ in range(inferences)]
@@ -128,19 +129,25 @@ def play(client: ClientConnection, served: Served, name: str, inferences: int = 
 def requests(folder: Path, served: Served, count: int, keep: str) -> None:
     """Print the ratio of captured to plain requests: inferences 0, 2, 4 … of an episode are captured."""
     server = served.server(folder / f"requests-{keep}", keep=keep)
-    pairs, ends, after_end = list[tuple[float, float]](), list[float](), list[float]()
+    pairs = list[tuple[tuple[float, float], tuple[float, float]]]()
+    ends, after_end = list[float](), list[float]()
     with serving(server) as address, connect(address, compression=None, max_size=None) as client:
         client.recv()
         for episode in range(-(-count // 8) + 1):
             *took, end = play(client, served, f"e/{episode}")
             if episode:  # the first one is checked and proved
                 pairs += list(zip(took[::2], took[1::2], strict=True))
-                ends.append(end)
-                after_end.append(took[0] - statistics.median(took[2::2]))
+                ends.append(end[0])
+                after_end.append(took[0][0] - statistics.median(wall for wall, _ in took[2::2]))
     server.close()
-    ratio = statistics.median(captured / plain for captured, plain in pairs)
-    plain = statistics.median(plain for _, plain in pairs)
-    print(f"--keep {keep}: {len(pairs)} pairs, plain {plain:.1f} ms, captured / plain {ratio:.3f}")
+    wall, processor = (
+        statistics.median(captured[clock] / plain[clock] for captured, plain in pairs) for clock in (0, 1)
+    )
+    plain_wall, plain_processor = (statistics.median(plain[clock] for _, plain in pairs) for clock in (0, 1))
+    print(
+        f"--keep {keep}: {len(pairs)} pairs, plain {plain_wall:.1f} ms, captured / plain {wall:.3f}; of the "
+        f"processor {plain_processor:.1f} ms, {processor:.3f}"
+    )
     print(
         f"  an end (socket, codec and queue without the model) {statistics.median(ends):.2f} ms; the first "
         f"request after one, while it is written, {statistics.median(after_end):+.2f} ms"
@@ -149,7 +156,7 @@ def requests(folder: Path, served: Served, count: int, keep: str) -> None:
 
 def clients(folder: Path, served: Served, count: int) -> None:
     """Print the ratio of the time of three clients at once to that of the same episodes one after another."""
-    ratios = []
+    ratios, worked = list[float](), list[float]()
     for block in range(max(3, count // 48)):
         server = served.server(folder / f"clients-{block}")
         with serving(server) as address, ExitStack() as stack:
@@ -157,10 +164,11 @@ def clients(folder: Path, served: Served, count: int) -> None:
             for client in three:
                 client.recv()
             play(three[0], served, "first/0", 2)
-            began = perf_counter()
+            began, before = perf_counter(), process_time()
             for number, client in enumerate(three):
                 play(client, served, f"one-by-one/{number}")
             alone, began = perf_counter() - began, perf_counter()
+            alone_work, before = process_time() - before, process_time()
             threads = [
                 threading.Thread(target=play, args=(client, served, f"at-once/{number}"))
                 for number, client in enumerate(three)
@@ -170,8 +178,12 @@ def clients(folder: Path, served: Served, count: int) -> None:
             for thread in threads:
                 thread.join()
             ratios.append((perf_counter() - began) / alone)
+            worked.append((process_time() - before) / alone_work)
         server.close()
-    print(f"three clients at once / one after another: {statistics.median(ratios):.3f} ({len(ratios)} blocks)")
+    print(
+        f"three clients at once / one after another: {statistics.median(ratios):.3f}, of the processor "
+        f"{statistics.median(worked):.3f} ({len(ratios)} blocks)"
+    )
 
 
 def adding(folder: Path, episodes: int) -> None:
@@ -190,26 +202,34 @@ def adding(folder: Path, episodes: int) -> None:
     writer = RunWriter(location, Plan((), (), 0, {}, selection), settings)
     writer.begin()
     values = {"prediction": np.zeros((8, 16, 7), np.float32), "state": np.zeros((8, 8), np.float32)}
-    took = []
+    took, worked = list[float](), list[float]()
     for number in range(episodes):
         columns = {
             "episode_id": f"task/{number}", "item_id": f"task/{number}", "category": "all", "group_id": "task",
             "instruction": "put it there", "content_blake2b": "0" * 32, "source_episode": number, "first_frame": 0,
             "frame_step": 1, "frames": 8, "policy_seed": number, "recorded_frames": 8,
         }  # fmt: skip
-        began = perf_counter()
+        began, before = perf_counter(), process_time()
         row = writer.add(Row(-1, columns))
         took.append(perf_counter() - began)
+        worked.append(process_time() - before)
         record = EpisodeRecord(row, {"outcome": "success"}, {}, [{}] * 8, control_steps=range(8), inputs=values)
         writer.write(replace(record))
     tail = max(1, min(200, episodes // 4))
-    early, late = (1000 * statistics.median(part) for part in (took[:tail], took[-tail:]))
-    began, worked = perf_counter(), process_time()
+    parts = [
+        1000 * statistics.median(times)
+        for all_times in (took, worked)
+        for times in (all_times[:tail], all_times[-tail:])
+    ]
+    began, before = perf_counter(), process_time()
     opened = open_run(location)
     print(
-        f"adding an episode: {early:.2f} ms at the first {tail}, {late:.2f} ms at the last of {episodes}; "
+        "adding an episode: {:.2f} ms at the first {tail}, {:.2f} ms at the last of {episodes}; of the processor "
+        "{:.2f} and {:.2f} ms".format(*parts, tail=tail, episodes=episodes)
+    )
+    print(
         f"opening {len(opened.episodes)} episodes: {perf_counter() - began:.2f} s, "
-        f"{process_time() - worked:.2f} s of the processor"
+        f"{process_time() - before:.2f} s of the processor"
     )
 
 
@@ -224,16 +244,21 @@ def main() -> None:
         metavar="LAYERS",
         help="serve π0's shapes at real width, with so many layers",
     )
+    parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS, help="parts that are run")
+    parser.add_argument("--keep", nargs="+", choices=KEPT, default=KEPT, help="how pictures are stored")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        if arguments.episodes:
+        if "adding" in arguments.only and arguments.episodes:
             adding(folder, arguments.episodes)
+        if not {"requests", "clients"} & set(arguments.only):
+            return
         served = tiny() if arguments.wide is None else wide(folder, arguments.wide)
         print(f"{served.policy.card.family}: {served.policy.card.parameters / 1e6:.1f} M parameters")
-        for keep in ("small", "full"):
+        for keep in arguments.keep if "requests" in arguments.only else ():
             requests(folder, served, arguments.requests, keep)
-        clients(folder, served, arguments.requests)
+        if "clients" in arguments.only:
+            clients(folder, served, arguments.requests)
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, Self
 
 from probe_kit._system.counting import describe_range, plural
-from probe_kit.runs.layout import AT_END, CONDITION, LIMIT, ONCE, UNEDITED
+from probe_kit.runs.layout import AT_END, CONDITION, LIMIT, ONCE, POSSIBLE_STARTS, UNEDITED
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -129,6 +129,16 @@ def _by_condition(episodes: "pd.DataFrame") -> tuple[ConditionSuccess, ...]:
     return tuple(rates)
 
 
+def condition_counts(episodes: "pd.DataFrame") -> dict[str, int]:
+    """Count episodes by condition, the one without edits first; empty for a run without conditions."""
+    if CONDITION not in episodes:
+        return {}
+    counts = episodes[CONDITION].value_counts()
+    return {
+        str(name): int(counts[name]) for name in sorted(counts.index, key=lambda name: (name != UNEDITED, name))
+    }
+
+
 MARKED = "marked"
 """The column of episodes that says whether the client of a policy server said where they begin."""
 
@@ -152,7 +162,18 @@ def bounds_of(episodes: "pd.DataFrame") -> str:
     listed = {
         name: ", ".join(f"{word} {count}" for word, count in words.items()) for name, words in counts.items()
     }
-    return "; ".join(f"{name}: {words}" for name, words in listed.items())
+    bounds = "; ".join(f"{name}: {words}" for name, words in listed.items())
+    return f"{bounds}; {note}" if (note := possible_starts_of(episodes)) else bounds
+
+
+def possible_starts_of(episodes: "pd.DataFrame") -> str:
+    """Return how many rows may hold more than one episode, in words; empty where none is known to be such."""
+    if POSSIBLE_STARTS not in episodes or not (count := int((episodes[POSSIBLE_STARTS] > 0).sum())):
+        return ""
+    return (
+        f"{count} of {plural(len(episodes), 'row')} may hold more than one episode: they have states that may be "
+        "resets"
+    )
 
 
 def counted_steps(steps: tuple[int, ...]) -> str:

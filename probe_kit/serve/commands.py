@@ -132,6 +132,8 @@ def _say_line(line: "Line") -> None:
     style = "[red]{}[/]" if line.failure else "[green]{}[/]" if line.outcome == "success" else "{}"
     outcome = "captured" if line.outcome == "capture_only" else line.outcome
     end = f": {line.failure}" if line.failure else ""
+    if line.possible_starts:
+        end = f"{end}; may be more than one episode: {plural(line.possible_starts, 'state')} may be a reset"
     template = f"episode {{}}[bold]{{}}[/] of {{}}: {{}}, {{}} s, {style}{{}}"
     seconds = f"{line.seconds:.1f}"
     say(markup(template, number, line.episode, line.client, counts, seconds, outcome, end))
@@ -210,6 +212,7 @@ def _wire_rows(settings: ExtractSettings, chunk: tuple[str, ...]) -> dict[str, s
 
 def _print_end(run: "Run | None", session: "Session") -> None:
     from probe_kit.extract.commands import print_input_notes
+    from probe_kit.runs.environment_success import possible_starts_of
 
     if run is None:
         say("no episode was played; nothing is stored")
@@ -218,6 +221,8 @@ def _print_end(run: "Run | None", session: "Session") -> None:
     say(f"{plural(session.committed, 'episode')} committed{refused}; the run has {len(run.episodes)}")
     if len(run.episodes):
         print_input_notes(run)
+        if note := possible_starts_of(run.episodes):
+            say(markup("[yellow]{}[/]. --pause SECONDS or marks of the client bound them", note))
         partial = " --partial" if len(run.episodes) < run.planned else ""
         say(markup("next: [bold]probe-kit targets {}{}[/]", as_argument(run.location), partial))
     out.print(str(run.location), soft_wrap=True)

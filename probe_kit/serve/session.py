@@ -35,7 +35,15 @@ from probe_kit.extract.sources.player import EPISODE_ERRORS, traceback_of
 from probe_kit.extract.sources.served_source import Received, ServedEpisode, ServedSource, flat_keys
 from probe_kit.hashing import derive_seed
 from probe_kit.runs.commits import failure_key, read_commits
-from probe_kit.runs.layout import AT_END, CAPTURE_ONLY, CONDITION, DATASET, UNITS, StoredStream
+from probe_kit.runs.layout import (
+    AT_END,
+    CAPTURE_ONLY,
+    CONDITION,
+    DATASET,
+    POSSIBLE_STARTS,
+    UNITS,
+    StoredStream,
+)
 from probe_kit.runs.plan import Plan, Row
 from probe_kit.runs.provenance import provenance_here
 from probe_kit.runs.run import Run
@@ -43,6 +51,7 @@ from probe_kit.runs.store import Location
 from probe_kit.runs.verify import seal
 from probe_kit.runs.writer import RunWriter
 from probe_kit.serve.marks import SUCCESS, Facts, Mark
+from probe_kit.serve.resets import ResetEvidence, Resets
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
@@ -82,6 +91,7 @@ class OpenEpisode:
         record: The inputs that are shown again later.
         inferences: The number of inferences so far, captured or not.
         steps: The number of actions executed before each captured inference, as far as it is said.
+        possible_starts: The number of its observations that may begin another episode, without marks.
         failure: Why it is given up, with the traceback; None while nothing failed.
         is_marked: Whether the client said that it began.
         condition: The condition whose edits it gets; empty where the run has no conditions.
@@ -104,6 +114,7 @@ class OpenEpisode:
     last_step: int = -1
     columns: Mapping[str, str] = field(default_factory=dict)
     actions: int | None = None
+    possible_starts: int = 0
     failure: tuple[str, str] | None = None
 
 
@@ -118,9 +129,8 @@ class Client:
         episode: Its episode now.
         answered: When its last observation was answered; None before.
         longest: The longest interval between two observations so far, in seconds.
-        first: The first state.
-        last: The state before.
-        largest: The largest step between two states of one episode so far.
+        resets: The states so far, where the client does not say its episodes.
+        judged: The evidence of the state that is answered, for a reset.
     """
 
     name: str
@@ -129,9 +139,8 @@ class Client:
     episode: OpenEpisode | None = None
     answered: float | None = None
     longest: float = 0.0
-    first: NDArray[np.float32] | None = None
-    last: NDArray[np.float32] | None = None
-    largest: float = 0.0
+    resets: Resets = field(default_factory=Resets)
+    judged: ResetEvidence = field(default_factory=ResetEvidence)
 
 
 @dataclass(frozen=True)
@@ -142,6 +151,7 @@ class Line:
         number: Its number in the run; None for one that was given up before it had any.
         outcome: Its outcome in a word.
         failure: Why it was given up; empty for one that is committed.
+        possible_starts: The number of its observations that may begin another episode, without marks.
     """
 
     number: int | None
@@ -152,6 +162,7 @@ class Line:
     outcome: str
     seconds: float
     failure: str = ""
+    possible_starts: int = 0
 
 
 class Session:
@@ -421,13 +432,14 @@ class Session:
         return stored
 
     def _note_state(self, client: Client, received: Received, arrived: float) -> None:
-        state = received.observation.state
         if client.answered is not None:
             client.longest = max(client.longest, arrived - client.answered)
-        if client.last is not None and client.episode is not None and client.episode.inferences > 1:
-            client.largest = max(client.largest, float(np.linalg.norm(state - client.last)))
-        client.first = state if client.first is None else client.first
-        client.last, client.answered = state, monotonic()
+        client.answered = monotonic()
+        episode = client.episode
+        if episode is not None and not episode.is_marked:
+            begins = episode.inferences == 1
+            client.resets.add(received.observation.state, client.judged, begins)
+            episode.possible_starts += client.judged.may_reset and not begins
 
     # -- episodes ------------------------------------------------------------------------------------
 
@@ -485,6 +497,7 @@ class Session:
     def _reason_to_split(self, client: Client, received: Received, arrived: float) -> str | None:
         """Return why an observation without a mark begins a row; None if it does not."""
         episode, settings = client.episode, self._source.settings
+        client.judged = ResetEvidence()
         if episode is None:
             return None
         if episode.is_marked:
@@ -496,10 +509,9 @@ class Session:
         pause = settings.pause or max(LEAST_PAUSE, LONGEST_INTERVALS * client.longest)
         if arrived - client.answered > pause:
             return "pause"
-        if settings.state and client.first is not None and client.last is not None:
-            state = received.observation.state
-            nearer = float(np.linalg.norm(state - client.last) - np.linalg.norm(state - client.first))
-            if nearer > client.largest > 0:
+        if settings.state:
+            client.judged = client.resets.judge(received.observation.state)
+            if client.judged.resets:
                 return "state"
         return None
 
@@ -710,6 +722,7 @@ class Session:
             "marked": episode.is_marked,
             "began": episode.began,
             "ended": ended,
+            POSSIBLE_STARTS: episode.possible_starts,
             "source_episode": 0,
             "first_frame": 0,
             "frame_step": self._source.settings.every,
@@ -811,6 +824,7 @@ class Session:
                 outcome,
                 episode.playing.seconds,
                 failure,
+                episode.possible_starts,
             )
         )
 

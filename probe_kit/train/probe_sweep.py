@@ -14,6 +14,7 @@ from probe_kit._terminal.notebook import notebook_progress
 from probe_kit.errors import NoProbesError, RunIncompleteError, UnknownCategoryError, UsageError, WorkerDiedError
 from probe_kit.hashing import sha256_json
 from probe_kit.hooks.contract.sites import Site
+from probe_kit.runs.environment_success import condition_counts
 from probe_kit.runs.reader import RunReader, check_several_wordings
 from probe_kit.statistics.folds import FoldUnit
 from probe_kit.train.choices import CORRECT, EVERYWHERE, Incomplete
@@ -417,8 +418,16 @@ class ProbeSweep:
             for category, probe in of_site.items()
             if self.target.balanced
         }
-        run, left_out = self.run, self.samples.left_out
-        return ProbeResults(self.settings, curves, directions, stamp=run.stamp, label=run.label, left_out=left_out)
+        run, samples = self.run, self.samples
+        return ProbeResults(
+            self.settings,
+            curves,
+            directions,
+            stamp=run.stamp,
+            label=run.label,
+            left_out=samples.left_out,
+            conditions=condition_counts(run.episodes.iloc[sorted(set(samples.rows.tolist()))]),
+        )
 
     def _probe_all(self, progress: Progress | None, workers: Mapping[str, Any]) -> dict[Key, Probed]:
         """Return every view and site, in order, for every category; columns of an interrupted sweep are loaded."""

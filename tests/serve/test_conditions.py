@@ -24,6 +24,7 @@ from probe_kit.runs.direction_files import write_directions
 from probe_kit.runs.environment_success import EnvironmentSuccess
 from probe_kit.serve.marks import Mark, read_mark
 from probe_kit.serve.server import Server
+from probe_kit.train import load_results
 from tests.support.served_sessions import WORDS, Opens, observation
 
 SITE = "backbone.02.residual"
@@ -67,7 +68,7 @@ def steered(tmp_path: Path, policy: Policy) -> dict[str, Any]:
 
 @pytest.mark.slow
 def test_conditions_are_balanced_in_each_group_and_none_changes_no_bit(
-    opened: Opens, steered: dict[str, Any]
+    opened: Opens, steered: dict[str, Any], tmp_path: Path
 ) -> None:
     plain, server = opened("plain", captured_calls=1, rule="said"), opened("steered", **steered)
     names = [(f"task{number // 4}/{number}", number, f"task{number // 4}") for number in range(24)]
@@ -105,7 +106,17 @@ def test_conditions_are_balanced_in_each_group_and_none_changes_no_bit(
     assert rates is not None
     assert [(rate.name, rate.n_episodes) for rate in rates.conditions] == [("none", 12), ("steer", 12)]
     where = str(after.location)
-    command("train", where, "--target", "env.success", "--permutations", "20", "--controls", "none")
+    trained = ("train", where, "--permutations", "20", "--controls", "none")
+    line = "episodes by condition: none 12, steer 12. The probes read all of them, with the edits of steer"
+    assert line in command(*trained, "--target", "env.success")
+    assert line in command(*trained, "--target", "env.success"), "stored probes say it too"
+    labels = tmp_path / "unedited.csv"
+    unedited = after.episodes[after.episodes["condition"] == "none"]
+    unedited[["episode_id", "env.success"]].rename(columns={"env.success": "solved"}).to_csv(labels, index=False)
+    with pytest.warns(UserWarning, match="its groups allow no p below"):
+        unedited_only = command(*trained, "--labels", str(labels), "--target", "solved")
+    assert "episodes by condition" not in unedited_only
+    assert load_results(after, target="env.success").conditions == {"none": 12, "steer": 12}
     table = command("retention", where, "--target", "env.success")
     assert "success rate by condition, of 24 episodes: none" in table
     assert "condition steer against none: p " in table

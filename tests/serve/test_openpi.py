@@ -1,59 +1,37 @@
 """The wire of openpi, spoken by a client of the package websockets."""
 
-import asyncio
 import http.client
+import resource
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
-from websockets.exceptions import ConnectionClosedError, InvalidStatus
+from websockets.exceptions import ConnectionClosed, ConnectionClosedError, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from probe_kit.hooks import Policy
 from probe_kit.serve.codec import pack, unpack
-from probe_kit.serve.server import Server
-from tests.support.served_sessions import WORDS, Opens, observation
+from tests.support.served_sessions import WORDS, Opens, observation, serving
 
 MARK = "probe_kit/episode"
-
-
-@contextmanager
-def serving(server: Server, stop_after: int | None = None) -> Iterator[str]:
-    """Serve on a thread until the body ends."""
-    ready = threading.Event()
-    loops: list[asyncio.AbstractEventLoop] = []
-
-    def began() -> None:
-        loops.append(asyncio.get_running_loop())
-        ready.set()
-
-    thread = threading.Thread(target=server.serve, args=(stop_after, began, lambda _: None))
-    thread.start()
-    assert ready.wait(20)
-    try:
-        yield server.address
-    finally:
-        if stop_after is None:
-            loops[0].call_soon_threadsafe(server.stop.set)
-        thread.join(30)
-    assert not thread.is_alive()
+PATIENCE = 120
+"""The seconds that an answer may take: the machine of a test may be busy."""
 
 
 def ask(connection: ClientConnection, message: dict[str, Any]) -> Any:
     connection.send(pack(message))
-    answer = connection.recv(20)
+    answer = connection.recv(PATIENCE)
     return answer if isinstance(answer, str) else unpack(answer)
 
 
 def test_a_client_plays_an_episode_and_an_error_leaves_its_connection_open(opened: Opens) -> None:
     server = opened(captured_calls=1)
     with serving(server, stop_after=1) as address, connect(f"{address}/arm-1", compression=None) as client:
-        assert unpack(client.recv(20))["probe_kit"]["mark"] == MARK
+        assert unpack(client.recv(PATIENCE))["probe_kit"]["mark"] == MARK
         first = ask(client, {**observation(0), MARK: {"id": "a"}})
         assert first["actions"].dtype == np.float32
         assert first["actions"].ndim == 2
@@ -84,12 +62,12 @@ def test_a_client_is_greeted_while_the_model_infers_for_one_that_vanishes(
 
     monkeypatch.setattr(type(policy), "predict", slow)
     with serving(server) as address, connect(address) as first:
-        first.recv(20)
+        first.recv(PATIENCE)
         first.send(pack({**observation(0), MARK: {"id": "a"}}))
-        assert begun.wait(20)
+        assert begun.wait(PATIENCE)
         began = time.monotonic()
         with connect(address) as second:
-            second.recv(20)
+            second.recv(PATIENCE)
             assert time.monotonic() - began < 1
             first.close_socket()
             assert "actions" in ask(second, {**observation(1), MARK: {"id": "b"}})
@@ -123,14 +101,14 @@ def test_a_message_that_cannot_be_read_closes_its_own_connection(
 ) -> None:
     server = opened()
     with serving(server) as address, connect(address, max_size=None) as client:
-        client.recv(20)
+        client.recv(PATIENCE)
         send(client)
         with pytest.raises(ConnectionClosedError) as closed:
-            client.recv(20)
+            client.recv(PATIENCE)
         assert closed.value.rcvd is not None
         assert closed.value.rcvd.code == code
         with connect(address) as other:
-            assert unpack(other.recv(20))
+            assert unpack(other.recv(PATIENCE))
     assert server.close() is None
 
 
@@ -143,10 +121,46 @@ def test_only_a_client_with_the_token_is_served_and_no_browser(opened: Opens) ->
         with pytest.raises(InvalidStatus, match="403"):
             connect(address, origin="http://localhost:1", additional_headers={"Authorization": "Api-Key secret-1"})  # type: ignore[arg-type]
         with connect(address, additional_headers={"Authorization": "Api-Key secret-1"}) as client:
-            assert unpack(client.recv(20))
+            assert unpack(client.recv(PATIENCE))
         split = urlsplit(address)
         question = http.client.HTTPConnection(str(split.hostname), split.port, timeout=20)
         question.request("GET", "/healthz")
         assert question.getresponse().read() == b"OK\n"
         question.close()
+    server.close()
+
+
+@pytest.mark.slow
+def test_changed_requests_cost_a_line_each_and_neither_memory_nor_threads_grow(opened: Opens) -> None:
+    server, rng = opened(captured_calls=1), np.random.default_rng(0)
+    request = pack({**observation(0, side=8), MARK: {"id": "a"}})
+    lines, codes, threads, memory = list[str](), list[int | None](), list[int](), list[int]()
+    with serving(server) as address:
+        client = connect(address, compression=None)
+        client.recv(PATIENCE)
+        client.send(request)
+        assert not isinstance(client.recv(PATIENCE), str)
+        for _ in range(200):
+            content = bytearray(request)
+            for at in rng.integers(0, len(content), 4):
+                content[at] = rng.integers(0, 256)
+            try:
+                client.send(bytes(content))
+                answer = client.recv(PATIENCE)
+                lines += [answer] if isinstance(answer, str) else []
+            except ConnectionClosed as error:
+                codes.append(error.rcvd and error.rcvd.code)
+                lines.append(error.rcvd.reason if error.rcvd else "")
+                client = connect(address, compression=None)
+                client.recv(PATIENCE)
+            threads.append(threading.active_count())
+            memory.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+        client.send(pack({**observation(0, side=8), MARK: {"id": "last"}}))
+        assert not isinstance(client.recv(PATIENCE), str)
+        client.close()
+    assert set(codes) == {1007}
+    assert len(codes) < len(lines) < 200, "some are refused, some close their connection, and some are answered"
+    assert all(len(line.splitlines()) == 1 and "Traceback" not in line for line in lines)
+    assert max(threads[50:]) <= max(threads[:50])
+    assert memory[-1] - memory[49] < 64 * 1024, "kibibytes"
     server.close()

@@ -17,6 +17,7 @@ from probe_kit.hooks.contract.observation import Observation
 from probe_kit.intervene.frame_session import Frames
 from probe_kit.intervene.sessions import ReplayFiles
 from probe_kit.runs import Run, open_run
+from probe_kit.runs.environment_success import bounds_of
 from probe_kit.runs.verify import verify_run
 from probe_kit.serve import session as sessions
 from probe_kit.serve.marks import Mark
@@ -85,31 +86,48 @@ def test_answers_are_those_of_the_policy_and_the_run_shows_them_again(opened: Op
 
 @pytest.mark.slow
 def test_episodes_are_the_same_whoever_else_asks(opened: Opens) -> None:
-    one_by_one, together = opened("a"), opened("b")
-    client = one_by_one.session.connect()
-    for name, numbers in (("x", [0, 1]), ("y", [2, 3])):
-        play(one_by_one, client, name, numbers)
-    first, second = together.session.connect(), together.session.connect("other")
-    for call in range(2):
-        together.session.answer(second, observation(2 + call), Mark("y", step=5 * call))
-        together.session.answer(first, observation(call), Mark("x", step=5 * call))
-    for each in (first, second):
-        together.session.end(each, Mark(end=True))
-    runs = [server.close() for server in (one_by_one, together)]
+    """Six episodes by one client, by three at once, and by two in the opposite order of arrival."""
+    names = [f"task/{number}" for number in range(6)]
+
+    def ask(server: Server, client: Client, name: str, call: int) -> None:
+        number = 2 * int(name[-1]) + call
+        server.session.answer(client, observation(number), Mark(name, step=5 * call))
+
+    def end(server: Server, client: Client) -> None:
+        server.session.end(client, Mark(end=True))
+
+    alone, at_once, opposite = opened("alone"), opened("at-once"), opened("opposite")
+    client = alone.session.connect()
+    for name in names:
+        for call in range(2):
+            ask(alone, client, name, call)
+        end(alone, client)
+    three = [at_once.session.connect() for _ in range(3)]
+    for at in (0, 3):
+        for call in range(2):
+            for client, name in zip(three, names[at : at + 3], strict=True):
+                ask(at_once, client, name, call)
+        for client in three:
+            end(at_once, client)
+    two = [opposite.session.connect(f"arm-{number}") for number in range(2)]
+    for at in (4, 2, 0):
+        for call in range(2):
+            for client, name in zip(two, names[at : at + 2][::-1], strict=True):
+                ask(opposite, client, name, call)
+        for client in two:
+            end(opposite, client)
+
     bytes_of = []
-    for run in runs:
-        assert run is not None
+    for server in (alone, at_once, opposite):
+        run = written(server)
         assert run.inputs is not None
         by_id = {name: row for row, name in enumerate(run.episodes["episode_id"])}
-        kinds = [run.rows("expert"), run.rows("backbone")]
-        bytes_of.append(
-            [
-                (kind[by_id[name]].tobytes(), run.inputs.row("prediction", by_id[name]).tobytes())
-                for name in "xy"
-                for kind in kinds
-            ]
-        )
-    assert bytes_of[0] == bytes_of[1]
+        assert by_id.keys() == set(names)
+        activations = [run.rows(stream) for stream in run.streams]
+        of_ids = [[array[by_id[name]].tobytes() for array in activations] for name in names]
+        predictions = [run.inputs.row("prediction", by_id[name]).tobytes() for name in names]
+        bytes_of.append((of_ids, predictions))
+    assert bytes_of[0] == bytes_of[1] == bytes_of[2]
 
 
 @pytest.mark.slow
@@ -284,30 +302,36 @@ def test_rows_of_a_client_without_marks_are_split_and_its_group_is_not(
 ) -> None:
     clock = [0.0]
     monkeypatch.setattr(sessions, "monotonic", lambda: clock[0])
-    server = opened(captured_calls=1, pause=30.0)
+    lines: list[Line] = []
+    server = opened(lines=lines, captured_calls=1, pause=30.0)
     client = server.session.connect("arm-1")
 
     def send(number: float, words: str = WORDS, wait: float = 1.0) -> None:
         clock[0] += wait
-        state = np.array([0.36 + 0.01 * number, 0.02, 0.08, 0, 0.05, 0, 0, 0.64])
+        state = np.array([0.36, 0.02, 0.08, 0, 0.05, 0, 0, 0.64]) + 0.002 * number * np.arange(1, 9)
         server.session.answer(
             client, {**observation(int(number)), "observation/state": state, "prompt": words}, None
         )
 
-    for number in (0, 1, 2, 3):
+    for number in (0, 1, 2, 3, 4, 5):
         send(number)
-    send(0.2)  # back at the beginning
+    send(0.1)  # back at the beginning
     send(1.2)
     send(2.2, OTHER)
     send(3.2, OTHER, wait=31)
+    for number in (4.2, 5.2, 4.2, 3.2, 2.2, 1.2, 0.2):  # home, in steps as small as all others
+        send(number, OTHER)
     server.session.leave(client)
     run = written(server)
-    assert run.episodes[["episode_id", "began", "ended", "inferences"]].to_numpy().tolist() == [
-        ["arm-1/000001", "connection", "state", 4],
-        ["arm-1/000002", "state", "words", 2],
-        ["arm-1/000003", "words", "pause", 1],
-        ["arm-1/000004", "pause", "connection", 1],
+    columns = ["episode_id", "began", "ended", "inferences", "possible_starts"]
+    assert run.episodes[columns].to_numpy().tolist() == [
+        ["arm-1/000001", "connection", "state", 6, 0],
+        ["arm-1/000002", "state", "words", 2, 0],
+        ["arm-1/000003", "words", "pause", 1, 0],
+        ["arm-1/000004", "pause", "connection", 8, 1],
     ]
+    assert "1 of 4 rows may hold more than one episode" in bounds_of(run.episodes)
+    assert [line.possible_starts for line in lines] == [0, 0, 0, 1]
     assert set(run.episodes["group_id"]) == {"arm-1"}
 
 

@@ -31,13 +31,14 @@ for episode in range(int(sys.argv[2])):
         words = "put the cube on the red shape"
         sent = {"observation/image": picture, "observation/state": seen["agent_pos"][:8], "prompt": words}
         try:
-            policy.infer(sent)
+            actions = policy.infer(sent)["actions"]
         except RuntimeError as error:
             assert "says no episode" in str(error), error
             refused += 1
             break
-        # A replayed reach, smooth as a demonstration: a policy without training would jump.
-        target = start + 0.12 * (moved + 1) * way / np.linalg.norm(way[:6])
+        target = start + 0.12 * (moved + 1) * way / np.linalg.norm(way[:6])  # smooth, as a replayed reach
+        if sys.argv[3] == "jerky":  # the actions of a policy that knows nothing of this robot, times five
+            target[:7] = 5 * actions[0][:7]
         seen = env.step(np.clip(target, -1, 1).astype(np.float32))[0]
 print(json.dumps([counts, refused]))
 """
@@ -51,11 +52,11 @@ def aloha(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return client_python(tmp_path_factory, "unmarked-aloha", PACKAGES, draws)
 
 
-def play(python: Path, out: Path, episodes: int, *options: str) -> tuple[list[int], int]:
+def play(python: Path, out: Path, episodes: int, motion: str, *options: str) -> tuple[list[int], int]:
     keys = ("--camera", "base=observation/image", "--state", "observation/state", "--accept-units")
     with server_process(out, "--port", "0", *keys, "--captured-calls", "1", *options) as (server, address):
         played = subprocess.run(
-            [str(python), "-c", PLAYS, address, str(episodes)],
+            [str(python), "-c", PLAYS, address, str(episodes), motion],
             env=drawing(), capture_output=True, check=False, timeout=560,
         )  # fmt: skip
     assert played.returncode == 0, played.stderr.decode()
@@ -64,18 +65,21 @@ def play(python: Path, out: Path, episodes: int, *options: str) -> tuple[list[in
     return counts, refused
 
 
-def test_no_row_holds_two_episodes_and_all_rows_are_one_group(aloha: Path, tmp_path: Path) -> None:
-    counts, refused = play(aloha, tmp_path / "run", EPISODES)
+@pytest.mark.parametrize("motion", ["smooth", "jerky"])
+def test_no_row_holds_two_episodes_and_all_rows_are_one_group(aloha: Path, tmp_path: Path, motion: str) -> None:
+    counts, refused = play(aloha, tmp_path / "run", EPISODES, motion)
     assert (len(counts), refused) == (EPISODES, 0)
     run = open_run(tmp_path / "run")
     ends = np.cumsum(run.episodes["inferences"]).tolist()
     assert ends[-1] == sum(counts)
-    assert set(np.cumsum(counts).tolist()) <= set(ends), "every end of an episode is the end of a row"
+    missed = set(np.cumsum(counts).tolist()) - set(ends)
+    extra = set(ends) - set(np.cumsum(counts).tolist())
+    assert (missed, extra) == (set(), set()), "every end of an episode is the end of a row, and nothing else is"
     assert set(run.episodes["group_id"]) == {"aloha"}
     assert not run.episodes["marked"].any()
 
 
 def test_with_said_episodes_nothing_of_such_a_client_is_stored(aloha: Path, tmp_path: Path) -> None:
-    counts, refused = play(aloha, tmp_path / "run", 3, "--episodes", "said")
+    counts, refused = play(aloha, tmp_path / "run", 3, "smooth", "--episodes", "said")
     assert refused == len(counts) == 3
     assert not (tmp_path / "run" / "commits").exists()

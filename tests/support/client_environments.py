@@ -59,8 +59,9 @@ def drawing(variables: Mapping[str, str] | None = None) -> dict[str, str]:
 
 @contextmanager
 def server_process(out: Path, *options: str, python: Path | None = None) -> Iterator[tuple["Process", str]]:
-    """A server of its own process, which ended when the body is left, and its address."""
-    command = [str(python or sys.executable), "-m", "probe_kit", "serve", "--model", "pi0-tiny", "--out", str(out)]
+    """A server of its own process, which ended when the body is left, and its address; of pi0-tiny by default."""
+    model = () if "--model" in options else ("--model", "pi0-tiny")
+    command = [str(python or sys.executable), "-m", "probe_kit", "serve", *model, "--out", str(out)]
     server = Process([*command, *options], stdout=subprocess.PIPE, text=True, encoding="utf-8", env=drawing())
     assert server.stdout is not None
     try:

@@ -1,6 +1,9 @@
 """Settings and observations of small served sessions."""
 
-from collections.abc import Callable
+import asyncio
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -33,3 +36,25 @@ def observation(number: int, side: int = 48, words: str | None = WORDS) -> dict[
         "observation/state": usual + spread * rng.normal(size=8),
     }
     return sent if words is None else {**sent, "prompt": words}
+
+
+@contextmanager
+def serving(server: Server, stop_after: int | None = None) -> Iterator[str]:
+    """Serve on a thread until the body ends."""
+    ready = threading.Event()
+    loops: list[asyncio.AbstractEventLoop] = []
+
+    def began() -> None:
+        loops.append(asyncio.get_running_loop())
+        ready.set()
+
+    thread = threading.Thread(target=server.serve, args=(stop_after, began, lambda _: None))
+    thread.start()
+    assert ready.wait(20)
+    try:
+        yield server.address
+    finally:
+        if stop_after is None:
+            loops[0].call_soon_threadsafe(server.stop.set)
+        thread.join(30)
+    assert not thread.is_alive()

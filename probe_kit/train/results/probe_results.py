@@ -390,6 +390,7 @@ class ProbeResults:
         stamp: Hash of the commits they were fitted to, empty for arrays in memory.
         label: Name of the run in tables, by default its model; not part of the key either.
         left_out: Number of episodes and inferences that have no part in any category, by reason.
+        conditions: Number of probed episodes by condition of a served run; empty for a run without conditions.
     """
 
     settings: ProbeSettings
@@ -400,6 +401,7 @@ class ProbeResults:
     stamp: str = ""
     label: str = ""
     left_out: Mapping[str, int] = field(default_factory=dict)
+    conditions: Mapping[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "label", self.label or self.settings.model)

@@ -129,6 +129,7 @@ def save_results(results: ProbeResults, run: Path | Location, *, requested: bool
             DIRECTIONS: _npz(lambda file: save_directions(results.directions, file)),
         }
         head = {"settings": asdict(results.settings), "stamp": results.stamp, "left_out": dict(results.left_out)}
+        head |= {"conditions": dict(results.conditions)} if results.conditions else {}
         times = {"created": results.created, "requested": _now() if requested else ""}
         write_bundle(location, PROBES, results.key, head, files | controls, times)
         return
@@ -397,4 +398,5 @@ def _read(run: RunReader, bundle: Bundle) -> ProbeResults:
         stamp,
         run.label,
         dict(bundle.head.get("left_out", {})),
+        dict(bundle.head.get("conditions", {})),
     )

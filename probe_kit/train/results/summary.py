@@ -4,7 +4,9 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from probe_kit._system.counting import list_names
+from probe_kit._system.escaping import terminal_safe
 from probe_kit.hooks.contract.sites import label_of
+from probe_kit.runs.layout import UNEDITED
 from probe_kit.suite.categories import category_of
 from probe_kit.train.choices import EVERYWHERE
 from probe_kit.train.results.probe_results import ProbeResults, best_sites, exceeded_controls
@@ -15,6 +17,8 @@ if TYPE_CHECKING:
 
 def best_sites_findings(results: ProbeResults) -> list[str]:
     """Return a line per reason for leaving out samples or a control, then a line per category and view.
+
+    Between them stands how many episodes come from which condition of a policy server, if it had any.
 
     The latter lines say where the target can be decoded. For a side they cover the first view alone, and whether
     the pictures alone decode it: no model has to know it then.
@@ -31,7 +35,11 @@ def best_sites_findings(results: ProbeResults) -> list[str]:
             )
         lines.append((name, "; ".join([*_findings(results, rows), *by_pictures])))
     width = max((len(name) for name, _ in lines), default=0)
-    return [*_left_out(results), *(f"{name.ljust(width)}  {finding}." for name, finding in lines)]
+    return [
+        *_left_out(results),
+        *_conditions(results),
+        *(f"{name.ljust(width)}  {finding}." for name, finding in lines),
+    ]
 
 
 def _places(results: ProbeResults) -> "Iterator[tuple[str, str, list[pd.Series]]]":
@@ -46,6 +54,18 @@ def _left_out(results: ProbeResults) -> list[str]:
     return [
         *(f"left out: {count} {reason}" for reason, count in results.left_out.items()),
         *(f"control {name} was not run: {reason}" for name, reason in results.controls.left_out.items()),
+    ]
+
+
+def _conditions(results: ProbeResults) -> list[str]:
+    """Return a line that says how many probed episodes were edited; none without edits."""
+    edited = [name for name in results.conditions if name != UNEDITED]
+    if not edited:
+        return []
+    counts = ", ".join(f"{terminal_safe(name)} {count}" for name, count in results.conditions.items())
+    return [
+        f"episodes by condition: {counts}. The probes read all of them, with the edits of {list_names(edited)}; "
+        f"a table of labels of the episodes of {UNEDITED} alone (--labels) leaves the others out"
     ]
 
 
