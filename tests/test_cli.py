@@ -114,8 +114,8 @@ def test_a_dry_run_prints_the_plan_and_writes_nothing(small_suite: Suite, tmp_pa
         (["suite", "build", "out", "--n", "7"], 2, "7"),
         (["train", "nowhere", "--permutations", "-3"], 2, "--permutations"),
         (["train", "nowhere", "--jobs", "0"], 2, "--jobs"),
-        (["retention", "nowhere", "./nowhere/"], 2, "given twice"),
-        (["retention", "a=one", "a=two", "--compare", "groups"], 2, "given twice"),
+        (["compare", "nowhere", "./nowhere/"], 2, "given twice"),
+        (["compare", "a=one", "a=two", "--kind", "groups"], 2, "given twice"),
         (["retention", "nowhere", "--format", "csv", "--epsilons", "-1"], 2, "positive"),
         (["verify", "pi00", "nowhere"], 2, "Did you mean 'pi0'"),
         (["extract", "--model", "pi0-tiny", "--device", "nonsense"], 2, "cannot be used"),
@@ -187,7 +187,7 @@ def test_help_groups_all_commands_by_what_one_wants_to_do() -> None:
         assert all(places[f"─ {panel} ─"] < places[f"│ {name} "] < end for name in commands)
 
 
-def test_there_are_at_most_thirty_three_commands_with_those_of_groups() -> None:
+def test_there_are_at_most_thirty_four_commands_with_those_of_groups() -> None:
     import typer
 
     paths = [path for path, _ in commands_of(typer.main.get_command(app), None)]
@@ -219,9 +219,9 @@ def test_the_version_is_that_of_the_package() -> None:
 @pytest.mark.parametrize(
     ("arguments", "home"),
     [
-        (["train", "x", "--html", "y"], "probe-kit diagnose`, `probe-kit retention"),
+        (["train", "x", "--html", "y"], "probe-kit diagnose`, `probe-kit retention`, `probe-kit compare"),
         (["--model", "pi0"], "probe-kit extract"),
-        (["suite", "build", "x", "--epsilons", "1"], "probe-kit retention"),
+        (["suite", "build", "x", "--epsilons", "1"], "probe-kit retention`, `probe-kit compare"),
         (["retention", "x", "--deep"], "probe-kit run verify"),
     ],
 )
