@@ -111,7 +111,7 @@ class Commands(typer.core.TyperGroup):
         # Only of an option that is unknown: one without its value carries its name too.
         option = error.option_name if hasattr(error, "possibilities") else None
         homes = [path for path, command in commands_of(self, ctx) if option in _options(command)]
-        if moved := MOVED.get((error.ctx.info_name if error.ctx else None, str(error.message))):
+        if moved := MOVED.get((str(error.ctx and error.ctx.info_name), str(error.message))):
             error.message, error.possibilities = f"{str(error.message).rstrip('.')}. {moved}", None
         elif homes:
             listed = ", ".join(f"`probe-kit {path}`" for path in homes)

@@ -138,4 +138,7 @@ def _decisions(
 def _scale(origin: Matrix, goal: Matrix) -> Matrix:
     """Return what each feature's deviation must be multiplied by; 0 for a constant one, which becomes the mean."""
     spread = origin.std(axis=0)
-    return np.divide(goal.std(axis=0), spread, out=np.zeros_like(spread), where=spread > _CONSTANT * spread.max())
+    scale: Matrix = np.divide(
+        goal.std(axis=0), spread, out=np.zeros_like(spread), where=spread > _CONSTANT * spread.max()
+    )
+    return scale

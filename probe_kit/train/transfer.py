@@ -400,17 +400,20 @@ def _recentred(samples_to_move: Samples, run_samples: Samples) -> Samples:
     return Samples(RowSubset.all(moved), samples_to_move.counts, move_features(means, origin, goal))
 
 
-def move_features(features: Matrix, origin: Matrix, goal: Matrix, scale: Matrix | float = 1.0) -> Matrix:
+def move_features(
+    features: NDArray[Any], origin: Matrix, goal: Matrix, scale: Matrix | None = None
+) -> NDArray[Any]:
     """Return features (E, D) of a run, recentred: moved from one mean (D,) to another, without labels.
 
     Args:
         features: Features to move.
         origin: Mean of the run they are of.
         goal: Mean of the run that the probe was fitted on.
-        scale: Multiple of every deviation from the mean, (D,) or one for all.
+        scale: Multiple (D,) of the deviations from the mean; None leaves them as they are.
     """
-    moved: Matrix = features * scale + (goal - origin * scale)
-    return moved
+    if scale is None:
+        return features + (goal - origin)
+    return features * scale + (goal - origin * scale)
 
 
 def _scored(predicted: Matrix, truth: Matrix, task: Task, strength: float) -> SiteProbe:
