@@ -27,9 +27,9 @@ from probe_kit.doctor_command import doctor
 from probe_kit.extract.commands import ask, extract
 from probe_kit.extract.inspect_commands import check_environment, dataset_app, models, run_app
 from probe_kit.hooks.commands import new_adapter, verify
-from probe_kit.intervene.commands import KindHelp, intervene, list_runs, show
+from probe_kit.intervene.commands import KindHelp, intervene, show
 from probe_kit.intervene.words_command import words
-from probe_kit.retention.commands import retention
+from probe_kit.retention.commands import compare, retention
 from probe_kit.serve.commands import serve
 from probe_kit.study.commands import app as study_app
 from probe_kit.suite.commands import app as suite_app
@@ -46,12 +46,21 @@ PANELS = {
     "Make runs": ("suite", "extract", "ask", "serve", "dataset", "run"),
     "Probe": ("power", "targets", "train", "labels"),
     "Is it used?": ("diagnose", "intervene", "words"),
-    "Read results": ("retention", "view"),
+    "Read results": ("retention", "compare", "view"),
     "A whole study from one file": ("study",),
     "Your own model or environment": ("new-adapter", "check-adapter", "check-environment", "verify"),
 }
 """Commands and groups by the user's aim, in the order in which help lists them."""
 _PANEL_OF = {name: panel for panel, names in PANELS.items() for name in names}
+
+MOVED = {
+    (
+        "retention",
+        "No such option: --compare",
+    ): "`probe-kit compare RUN…` compares runs, by --kind and --reference.",
+    ("run", "No such command 'list'."): "`probe-kit run show FOLDER` lists the runs of a folder.",
+}
+"""What took the place of an old spelling, by the command and the complaint about it."""
 
 PARSE_ERROR: type[Exception] = typer.BadParameter.__mro__[1]
 """The `UsageError` of click, from the copy of click that typer uses, whichever that is."""
@@ -99,11 +108,13 @@ class Commands(typer.core.TyperGroup):
             raise self._told_where(error, ctx) from None
 
     def _told_where(self, error: Any, ctx: Any) -> Exception:
-        """Return the same error; for an option that only other commands have, it names them."""
+        """Return the same error; it says where an old spelling, or an option of other commands, belongs."""
         # Only of an option that is unknown: one without its value carries its name too.
         option = error.option_name if hasattr(error, "possibilities") else None
         homes = [path for path, command in commands_of(self, ctx) if option in _options(command)]
-        if homes:
+        if moved := MOVED.get((str(error.ctx and error.ctx.info_name), str(error.message))):
+            error.message, error.possibilities = f"{str(error.message).rstrip('.')}. {moved}", None
+        elif homes:
             listed = ", ".join(f"`probe-kit {path}`" for path in homes)
             error.message, error.possibilities = (
                 f"{option} is not an option of this command, but of {listed}.",
@@ -188,9 +199,24 @@ def _stored_runs_of_study(name: str) -> "list[Run] | None":
 for name, commands in (("suite", suite_app), ("run", run_app), ("study", study_app), ("dataset", dataset_app)):
     app.add_typer(commands, name=name, rich_help_panel=_PANEL_OF[name])
 run_app.command()(show)
-run_app.command("list")(list_runs)
 for command in (
-    *(demo, doctor, models, extract, ask, serve, power, targets, train, labels, diagnose, words, retention, view),
+    *(
+        demo,
+        doctor,
+        models,
+        extract,
+        ask,
+        serve,
+        power,
+        targets,
+        train,
+        labels,
+        diagnose,
+        words,
+        retention,
+        compare,
+        view,
+    ),
     *(new_adapter, check_adapter, check_environment, verify),
 ):
     app.command(rich_help_panel=_PANEL_OF[command.__name__.replace("_", "-")])(command)

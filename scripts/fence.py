@@ -194,9 +194,9 @@ def add_probes(fence: Fence, name: str, title: str, results: Any) -> None:
     fence.add(name, title, results.scores.to_dict("records"))
 
 
-def add_retention(fence: Fence, name: str, title: str, *arguments: object) -> None:
+def add_retention(fence: Fence, name: str, title: str, *arguments: object, command: str = "retention") -> None:
     """Store every list of the command's JSON as a table."""
-    printed = table("retention", *arguments)
+    printed = table(command, *arguments)
     if isinstance(printed, list):
         printed = {"rows": printed}
     for part, records in printed.items():
@@ -269,11 +269,12 @@ def decode_labels(fence: Fence) -> None:
 
 def compare_answers_and_actions(fence: Fence) -> None:
     """Compare the VLM's answers, the policy's probes and its actions."""
-    add_retention(fence, "comparison", "VLM and VLA", ASKED, "acting", "--compare", "vlm-vla", "--details", "all")
+    of_vlms = ("--kind", "vlm-vla", "--details", "all")
+    add_retention(fence, "comparison", "VLM and VLA", ASKED, "acting", *of_vlms, command="compare")
     # Cubes end within 1 cm of the middle, so that only small zones tell a radius from another.
     small_zones = ("--epsilons", "0.004,0.006,0.008", "--last-steps", 2)
     add_retention(fence, "acting", "retention in small zones", "acting", *small_zones)
-    printed = table("retention", ASKED, "acting", "--compare", "stages")
+    printed = table("compare", ASKED, "acting", "--kind", "stages")
     fence.add("comparison", "stages", printed if isinstance(printed, list) else [printed])
 
 
@@ -408,15 +409,14 @@ def compare_two_policies(fence: Fence) -> None:
         add_episodes(fence, model, run)
         add_activations(fence, model, run, tokens=True)
         add_probes(fence, model, "sides, folds of concepts", pk.load_results(run))
-    add_retention(fence, "two policies", "retention", "two/pi0-tiny", "two/pi0-tiny-state", "--details", "all")
+    policies = ("two/pi0-tiny", "two/pi0-tiny-state")
+    add_retention(fence, "two policies", "retention", *policies, "--details", "all", command="compare")
     call("ask", "--model", "vlm-tiny", *TWO, "--prompt", "p1,seen", *SMALL, "--out", "two/asked")
     for folder in sorted(Path("two/asked").iterdir()):
         add_episodes(fence, f"asked {folder.name}", pk.open_run(folder))
     for score in ("text", "logits", "order-balanced"):
-        run_folders = [*sorted(map(str, Path("two/asked").iterdir())), "two/pi0-tiny", "two/pi0-tiny-state"]
-        add_retention(
-            fence, "two policies", f"answers by {score}", *run_folders, "--compare", "vlm-vla", "--score", score
-        )
+        typed = [*sorted(map(str, Path("two/asked").iterdir())), *policies, "--kind", "vlm-vla", "--score", score]
+        add_retention(fence, "two policies", f"answers by {score}", *typed, command="compare")
 
 
 STUDY = """

@@ -115,8 +115,8 @@ def test_a_dry_run_prints_the_plan_and_writes_nothing(small_suite: Suite, tmp_pa
         (["train", "nowhere", "--permutations", "-3"], 2, "'--permutations': expected at least 0"),
         (["power", "--sites", "x"], 2, "Invalid value for '--sites': expected a whole number"),
         (["train", "nowhere", "--jobs", "0"], 2, "--jobs"),
-        (["retention", "nowhere", "./nowhere/"], 2, "given twice"),
-        (["retention", "a=one", "a=two", "--compare", "groups"], 2, "given twice"),
+        (["compare", "nowhere", "./nowhere/"], 2, "given twice"),
+        (["compare", "a=one", "a=two", "--kind", "groups"], 2, "given twice"),
         (["retention", "nowhere", "--format", "csv", "--epsilons", "-1"], 2, "positive"),
         (["verify", "pi00", "nowhere"], 2, "Did you mean 'pi0'"),
         (["extract", "--model", "pi0-tiny", "--device", "nonsense"], 2, "cannot be used"),
@@ -188,7 +188,7 @@ def test_help_groups_all_commands_by_what_one_wants_to_do() -> None:
         assert all(places[f"─ {panel} ─"] < places[f"│ {name} "] < end for name in commands)
 
 
-def test_there_are_at_most_thirty_three_commands_with_those_of_groups() -> None:
+def test_there_are_at_most_thirty_four_commands_with_those_of_groups() -> None:
     import typer
 
     paths = [path for path, _ in commands_of(typer.main.get_command(app), None)]
@@ -220,9 +220,9 @@ def test_the_version_is_that_of_the_package() -> None:
 @pytest.mark.parametrize(
     ("arguments", "home"),
     [
-        (["train", "x", "--html", "y"], "probe-kit diagnose`, `probe-kit retention"),
+        (["train", "x", "--html", "y"], "probe-kit diagnose`, `probe-kit retention`, `probe-kit compare"),
         (["--model", "pi0"], "probe-kit extract"),
-        (["suite", "build", "x", "--epsilons", "1"], "probe-kit retention"),
+        (["suite", "build", "x", "--epsilons", "1"], "probe-kit retention`, `probe-kit compare"),
         (["retention", "x", "--deep"], "probe-kit run verify"),
     ],
 )

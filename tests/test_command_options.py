@@ -27,7 +27,7 @@ from probe_kit.hooks.contract.declared import ROTATIONS, ProtocolName, Readout
 from probe_kit.hooks.family import Dtype
 from probe_kit.intervene.kinds import kind_names
 from probe_kit.retention.behaviour import SCORES
-from probe_kit.retention.choices import AnswerScore, Family, Section
+from probe_kit.retention.choices import AnswerScore, ComparisonKind, Family, Section
 from probe_kit.runs.export import FORMATS
 from probe_kit.runs.layout import (
     AskTokens,
@@ -82,6 +82,12 @@ CLOSED: dict[tuple[str, str], Collection[object]] = {
     ("retention", "--family"): get_args(Family),
     ("retention", "--rule"): RULES,
     ("retention", "--score"): SCORES,
+    ("compare", "--kind"): get_args(ComparisonKind),
+    ("compare", "--format"): STYLES,
+    ("compare", "--details"): (*get_args(Section), "all"),
+    ("compare", "--family"): get_args(Family),
+    ("compare", "--rule"): RULES,
+    ("compare", "--score"): SCORES,
     ("suite convert", "SOURCE"): EVERY_SOURCE,
 }
 """Command and option, and what the library accepts for it."""
@@ -93,6 +99,7 @@ REQUIRED = {
     "targets": ["RUN"],
     "run export": ["RUN", "--format", "sae"],
     "retention": ["RUN"],
+    "compare": ["RUN", "RUN"],
     "suite build": ["FOLDER"],
     "suite convert": ["--root", "ROOT", "--out", "OUT"],
 }

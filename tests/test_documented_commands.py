@@ -167,6 +167,7 @@ LOOKED_FOR = {
     "train": "Make one with|AWS_ACCESS_KEY_ID",
     "intervene": "Make one with",
     "retention": "Make one with",
+    "compare": "Make one with|is not a run",
     "export": "Make one with",
     "from-csv": "questions.csv",
     "convert": "no such|not a folder|does not exist|holds no|missing",

@@ -104,10 +104,10 @@ def test_pages_and_tables_are_utf_8_under_a_locale_that_is_not(
 ) -> None:
     label = "Modèle π — 模型"
     run, other = (str(little_runs / name) for name in ("run", "other"))
-    groups = ["--compare", "groups", f"{label}={run}", f"other={other}"]
+    groups = ["--kind", "groups", f"{label}={run}", f"other={other}"]
     commands = [
-        ["retention", *groups, "--html", str(tmp_path / "report.html"), "--format", "json"],
-        ["retention", *groups, "--format", "csv"],
+        ["compare", *groups, "--html", str(tmp_path / "report.html"), "--format", "json"],
+        ["compare", *groups, "--format", "csv"],
         ["suite", "validate", str(small_suite.folder)],
         ["suite", "build", str(tmp_path / "built"), "--categories", "color", "--n", "2"],
         ["run", "export", other, "--format", "h5", "--out", str(tmp_path / "run.h5")],

@@ -341,8 +341,8 @@ def ask(
 
     Makes one run per prompt and picture size. Use the --suite, --protocol, --scene and --seed of the policy runs
     to compare with. Every question is asked in both orders of the options. Answers are read from the text and from
-    the logits of the options. Compare with policies by `probe-kit retention ASKED… ACTED…`, also with
-    --compare stages. Recordings, environments and pictures have no objects: their instruction is the question, and
+    the logits of the options. Compare with policies by `probe-kit compare ASKED… ACTED…`, also with
+    --kind stages. Recordings, environments and pictures have no objects: their instruction is the question, and
     stored activations are probed for their labels.
 
     The same command resumes interrupted runs. With more items or categories they grow and keep what they have.
@@ -393,4 +393,4 @@ def _print_answers(runs: "Sequence[Run]") -> None:
         say(markup(f"next: [bold]probe-kit {step}[/]", as_argument(runs[0].location)))
         return
     locations = " ".join(as_argument(run.location) for run in runs)
-    say(markup("next: [bold]probe-kit retention {}[/]  add policy runs of the suite", locations))
+    say(markup("next: [bold]probe-kit compare {}[/]  add policy runs of the suite", locations))

@@ -60,6 +60,7 @@ class Extraction:
     """A prepared extraction, ready to run: the source is open, the model is loaded and the plan is made.
 
     Attributes:
+        settings: The settings, fitted to the model, see `Settings`.
         source: The source as the model is shown it.
         card: The part of the identity that the loaded model decides.
         controller: The controller of the loaded model. None: workers elsewhere load the model again.
@@ -198,7 +199,7 @@ def load(
     """Open the source, load the model and plan the rows.
 
     Args:
-        settings: The settings of the run.
+        settings: The settings as they are requested.
         rehearsed: Whether the source was tried before.
         location: The place of the run, if it is known, so that it is checked before the model is loaded.
         model: The policy or answer model of these settings, if it is loaded already. It may be one of your own,
@@ -219,34 +220,34 @@ def load(
         WeightsError: For weights that do not fit.
         ProbeKitError: For any other fault of settings, source or model.
     """
-    settings, source = open_checked(settings, location, model is not None, fetch)
-    task = task_of(settings)
-    rows = _select_rows(task.rows(settings, source), choose_rows)
+    decided, source = open_checked(settings, location, model is not None, fetch)
+    task = task_of(decided)
+    rows = _select_rows(task.rows(decided, source), choose_rows)
     if not rehearsed:
         source.rehearse(rows)
     if model is not None:
-        task.check_loaded(settings, model)
+        task.check_loaded(decided, model)
     else:
-        raise_together(task.early_checks(settings, source, fetch))
-    if check_cameras is not None and (early := source.shown_cameras(task.declared_inputs(settings))) is not None:
+        raise_together(task.early_checks(decided, source, fetch))
+    if check_cameras is not None and (early := source.shown_cameras(task.declared_inputs(decided))) is not None:
         check_cameras(early)
-    if not fetch and (sizes := planned_sizes(settings, source.instructions)) is not None:
-        settings = task.planned(settings, sizes)
-        plan = _plan(settings, source, rows, sizes.streams, settings.task.execute or sizes.execute)
-        requested = settings.model
+    if not fetch and (sizes := planned_sizes(decided, source.instructions)) is not None:
+        counted = task.planned(decided, sizes)
+        plan = _plan(counted, source, rows, sizes.streams, counted.task.execute or sizes.execute)
+        requested = counted.model
         card = {"model": requested.family, "random_weights": requested.random_weights, "weights_sha256": None}
-        declared = {"dtype": requested.dtype, "execute": settings.task.execute}
+        declared = {"dtype": requested.dtype, "execute": counted.task.execute}
         card |= {name: value for name, value in declared.items() if value is not None}
-        return Extraction(settings, source, plan, card, None, None, sizes.source, _ids(rows, choose_rows))
-    settings, source, controller, calibration = task.fit(
-        settings, source, task.load(settings) if model is None else model
+        return Extraction(counted, source, plan, card, None, None, sizes.source, _ids(rows, choose_rows))
+    fitted, source, controller, calibration = task.fit(
+        decided, source, task.load(decided) if model is None else model
     )
     if check_cameras is not None and (cameras := source.shown_cameras()) is not None:
         check_cameras(cameras)
-    rows = _select_rows(task.rows(settings, source), choose_rows)  # of the source as the model is shown it
-    plan = _plan(settings, source, rows, controller.streams, controller.execute)
+    rows = _select_rows(task.rows(fitted, source), choose_rows)  # of the source as the model is shown it
+    plan = _plan(fitted, source, rows, controller.streams, controller.execute)
     row_ids = _ids(rows, choose_rows)
-    return Extraction(settings, source, plan, controller.identity, controller, calibration, row_ids=row_ids)
+    return Extraction(fitted, source, plan, controller.identity, controller, calibration, row_ids=row_ids)
 
 
 def _select_rows(rows: tuple[Row, ...], choose: ChooseRows | None) -> tuple[Row, ...]:
@@ -274,28 +275,28 @@ def open_checked(
     All is checked that needs no model.
 
     Args:
-        settings: The settings of the run.
+        settings: The settings as they are requested.
         location: The place of the run, if it is known.
         loaded: Whether the model is loaded already; it may be one that no name leads to.
         fetch: Whether a checkpoint of the hub is downloaded and its weights are looked up; else only files on this
             machine are read, see `Family.check`.
     """
-    task = task_of(settings)
     check_meaningless(settings)
-    settings = settings.followed()
+    decided = settings.followed()
+    task = task_of(decided)
     if not loaded:
-        check_model(settings, fetch)
+        check_model(decided, fetch)
     if location is not None:
         _check_writable(location)
-    source = task.view_of(settings.source.open(not fetch and _selects_only(settings, location)))
-    if decided := {name: value for name, value in source.decided().items() if name in settings.names()}:
-        settings = settings.changed(**decided)
-    if not loaded and settings.model.family not in SCRIPTED:
-        family = find_family(settings.model.family, tuple(SCRIPTED))
-        family.check_words(task.texts(settings, source), settings.model.checkpoint)
+    source = task.view_of(decided.source.open(not fetch and _selects_only(decided, location)))
+    if by_source := {name: value for name, value in source.decided().items() if name in decided.names()}:
+        decided = decided.changed(**by_source)
+    if not loaded and decided.model.family not in SCRIPTED:
+        family = find_family(decided.model.family, tuple(SCRIPTED))
+        family.check_words(task.texts(decided, source), decided.model.checkpoint)
     if location is not None:
-        _check_other_run(settings, source, location)
-    return settings, source
+        _check_other_run(decided, source, location)
+    return decided, source
 
 
 # -- checks that need no model --------------------------------------------------------------------------------

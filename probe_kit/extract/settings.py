@@ -84,6 +84,11 @@ def _model_of(settings: "type[Settings]", part: str) -> Any:
 class Settings(Part):
     """Settings of a run of any kind; the defaults are the command line's.
 
+    They have three states, and `load` in `extraction.py` names which it holds. *Requested* is what a user typed.
+    *Decided* adds what the protocol and the open source decide (`open_checked`). *Fitted* adds what the loaded
+    model decides: the numbers of captured inferences and of observations per call (`Task.fit`). The settings of an
+    `Extraction` are fitted.
+
     Attributes:
         asks: Whether the model answers questions, and does not act.
         seed: The seed from which the seeds of all rows derive.

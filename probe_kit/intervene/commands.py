@@ -1,4 +1,4 @@
-"""The commands `probe-kit intervene`, `run list` and `run show`.
+"""The commands `probe-kit intervene` and `run show`.
 
 The meaning of an option for a kind is in the kind's file.
 """
@@ -22,7 +22,16 @@ from probe_kit._tables.table import Cell, Table
 from probe_kit._terminal import options as common
 from probe_kit._terminal.console import counter, markup, out, print_json, progress, say, say_note, split
 from probe_kit._terminal.field_options import PanelledHelp, command_with
-from probe_kit._terminal.options import LISTED, AsJson, Names, Partial, RunFolder, choices, further_option, one_of
+from probe_kit._terminal.options import (
+    LISTED,
+    AsJson,
+    Names,
+    Partial,
+    check_no_others,
+    choices,
+    further_option,
+    one_of,
+)
 from probe_kit.errors import ProbeKitError, UsageError
 from probe_kit.extract.config_files import MovedOptions, moved_of
 from probe_kit.hooks.contract.declared import Readout
@@ -377,25 +386,18 @@ _COLUMNS = ("run", "model", "suite", "episodes", "correct", "probes", "intervent
 """Names of the facts that are shown."""
 
 
-def list_runs(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="A folder that holds runs, at any depth.")],
-    style: Format = "table",
-) -> None:
-    """List the runs below a folder: model, suite, episodes, and how many probes and interventions each has.
-
-    `probe-kit view FOLDER` opens them all. A run that cannot be read is named with the reason.
-    """
+def _list_runs(folder: Path, paths: Sequence[Path], as_json: bool) -> None:
+    """Print the runs below a folder. A run that cannot be read is named with the reason."""
     from probe_kit.runs import open_run
-    from probe_kit.runs.run_folders import find_runs
 
     lines: list[dict[str, Any]] = []
-    for path in find_runs(folder):
-        name = "." if path == folder else str(path.relative_to(folder))
+    for path in paths:
+        name = str(path.relative_to(folder))
         try:
             lines.append({"run": name, **_facts(open_run(path, allow_partial=True))})
         except ProbeKitError as error:
             lines.append({"run": name, "error": f"{type(error).__name__}: {error}"})
-    print_table(_table(lines, folder), style)
+    print_table(_table(lines, folder), "json" if as_json else "table")
     for line in lines:
         if "error" in line:
             say(markup("[yellow]{} cannot be read: {}[/]", line["run"], line["error"]))
@@ -432,7 +434,9 @@ def _table(lines: list[dict[str, Any]], folder: Path) -> Table:
 
 
 def show(
-    run: RunFolder,
+    run: Annotated[
+        str, typer.Argument(help="Run folder or URL, or a folder that holds runs at any depth.", metavar="RUN")
+    ],
     label: Annotated[
         str | None,
         typer.Option(
@@ -454,6 +458,9 @@ def show(
 ) -> None:
     """List the episodes, streams, probes and interventions of a run; the last two by key.
 
+    Of a folder that holds runs it lists these: model, suite, episodes, and how many probes and interventions each
+    has. `probe-kit view FOLDER` opens them all.
+
     With --action-errors, errors are in standard deviations of the recorded actions at the shown frames: the mean
     recorded action has an error of 1. `--json` prints every episode too; `probe-kit labels RUN` writes the
     error of every frame. An unfinished run needs --partial for it.
@@ -462,11 +469,17 @@ def show(
     from probe_kit.runs import label_run, open_run
     from probe_kit.runs.layout import INTERVENTIONS
     from probe_kit.runs.results import unfinished_bundles
+    from probe_kit.runs.run_folders import runs_below
     from probe_kit.runs.run_inputs import notes_of_inputs
     from probe_kit.train.commands import facts_table
     from probe_kit.train.results.inventory import inventory
     from probe_kit.train.results.store import how_to_probe
 
+    if below := runs_below(run):
+        options = {"--label": label is not None, "--action-errors": action_errors, "--partial": partial}
+        check_no_others(options, "a folder of runs")
+        _list_runs(Path(run).expanduser(), below, as_json)
+        return
     if partial and not action_errors:
         raise UsageError("--partial is for --action-errors; `run show` lists unfinished runs too. Leave it out")
     if label is not None:

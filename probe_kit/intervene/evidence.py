@@ -25,7 +25,7 @@ from probe_kit.intervene.kinds.joint import (
     EVERY,
     JointEffect,
     describe_joint_places,
-    describe_remainder,
+    describe_remainders,
     is_read_jointly,
     stored_joint_places,
 )
@@ -91,9 +91,9 @@ class StoredEvidence:
             if every.finding != "past it" or every.cells == KV_STREAM:
                 searched[name] = rows
         jointly = {name: describe_joint_places(rows) for name, rows in searched.items()}
-        remainders = {name: describe_remainder(rows) for name, rows in searched.items()}
+        remainders = {name: describe_remainders(rows) for name, rows in searched.items()}
         return {
-            name: Places(located.get(name), carried.get(name, ()), jointly.get(name, ""), remainders.get(name, ""))
+            name: Places(located.get(name), carried.get(name, ()), jointly.get(name, ""), remainders.get(name, ()))
             for name in dict.fromkeys((*located, *carried, *jointly))
         }
 
@@ -292,7 +292,7 @@ def which_layer(
             passes = f"passes at {list_places(located)}" if located else none
         if cell is not None and is_backbone_layer(cell):
             passes += f"; steer at {cell.sites} {cell.role} with --direction {ALONG}"
-        read = [part for part in str(category_places).split("; ") if part.startswith("read ") or KV_STREAM in part]
+        read = [part for part in category_places.parts if part.startswith("read ") or KV_STREAM in part]
         reads = ("; ".join(read) or "--kind joint tests where it is read") * has_kv
         best = _best_site(evidence.run, results, name, rows, evidence.along.get(name, []))
         lines[name] = [part for part in (passes, reads, best) if part]

@@ -388,25 +388,29 @@ class Places:
     Attributes:
         located: Places that carry half of the effect, see `localised_sites`; None if an interchange did not search
             for them.
-        carried: Places and the directions along which half of it passes there.
+        carried: Directions along which half of it passes, each with its place.
         jointly: Finding of joint places, in words. They distinguish tokens where an interchange has those of a
             block together, and they have sets of places.
-        remainder: Part of the effect that these places leave out, in words.
+        remainders: Parts of the effect that these places leave out, in words.
     """
 
     located: tuple[str, ...] | None = None
-    carried: tuple[str, ...] = ()
+    carried: tuple[tuple[str, str], ...] = ()
     jointly: str = ""
-    remainder: str = ""
+    remainders: tuple[str, ...] = ()
 
-    def __str__(self) -> str:
+    @property
+    def parts(self) -> list[str]:
+        """The findings in words: where the answer passes, is read and is carried, and what is left."""
         read = [site for site in self.located or () if site.partition(".")[0] == KV_STREAM]
         names_tokens = any(" " in site for site in read)
         is_finer = "read jointly" in self.jointly or (not names_tokens and "read" in self.jointly)
         located = [site for site in self.located or () if not (is_finer and site in read)]
         jointly = self.jointly if is_finer or not read else ""
-        text = "; ".join(filter(None, (describe_sites(located, self.carried), jointly, self.remainder)))
-        return text or NOT_LOCATED * (self.located is not None)
+        return [*describe_sites(located, self.carried), *([jointly] if jointly else []), *self.remainders]
+
+    def __str__(self) -> str:
+        return "; ".join(self.parts) or (NOT_LOCATED if self.located is not None else "")
 
 
 def classify_use(
@@ -436,7 +440,7 @@ def classify_use(
     return replace(use, where=str(places or ""), tie=tie_text)
 
 
-def describe_sites(located: Sequence[str], carried: Sequence[str] = ()) -> str:
+def describe_sites(located: Sequence[str], carried: Sequence[tuple[str, str]] = ()) -> list[str]:
     """Return where the answer passes, where the acting stream reads it, and along which directions, in words.
 
     A patch in the backbone shows that something downstream depends on that place. One in `kv`, which only the
@@ -444,14 +448,13 @@ def describe_sites(located: Sequence[str], carried: Sequence[str] = ()) -> str:
     """
     read = [site for site in located if site.partition(".")[0] == KV_STREAM]
     passes = [site for site in located if site not in read]
-    parts = [f"passes at {list_places(passes)}"] * bool(passes) + [f"read at {list_places(read)}"] * bool(read)
     along: dict[str, list[str]] = {}
-    for entry in carried:
-        direction, _, site = entry.partition(" at ")
+    for direction, site in carried:
         along.setdefault(direction, []).append(site)
-    directions = [f"{direction} at {list_places(places)}" for direction, places in along.items()]
-    parts += [f"carried by {'; '.join(directions)}"] * bool(carried)
-    return "; ".join(parts)
+    parts = [f"{verb} at {list_places(sites)}" for verb, sites in (("passes", passes), ("read", read)) if sites]
+    for number, (direction, places) in enumerate(along.items()):
+        parts.append(f"{'' if number else 'carried by '}{direction} at {list_places(places)}")
+    return parts
 
 
 def control_for(category: str, effects: Mapping[str, ImageSwapEffect]) -> str | None:

@@ -18,3 +18,6 @@ Iterations = Literal["all", "best", "last"] | int
 Where one number is made of all of them it is the best one's, so that `best` is another word for `all`. A layer
 curve draws a line for each of `all`, and one line for the `best` of every layer.
 """
+ComparisonKind = Literal["runs", "groups", "vlm-vla", "stages", "steps"]
+"""What `probe-kit compare` compares: runs, groups of models, VLMs with policies, a VLM and a policy question by
+question, or checkpoints of one training."""

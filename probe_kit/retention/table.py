@@ -451,7 +451,7 @@ def retention_table(
         vlm_differences = compare_with_vlms(table_runs, estimated, vlm_pairs)
     if vlm_vla is True and not vlm_differences:
         raise UsageError(
-            "--compare vlm-vla compares VLM runs with policy runs in the same categories, and these runs have no "
+            "--kind vlm-vla compares VLM runs with policy runs in the same categories, and these runs have no "
             "such pair. Make the missing ones with `probe-kit ask` or `probe-kit extract`"
         )
     captured_only = [

@@ -51,38 +51,38 @@ def training_step(run: RunReader) -> int:
     raise UsageError(
         f"the training step of {run.location} is unknown: its checkpoint is {checkpoint or 'not stored'!r}; "
         "expected a folder such as checkpoints/020000 or checkpoint-500. Give the steps in the order of the runs, "
-        "such as --compare steps=1000,2000"
+        "such as --steps 1000,2000"
     )
 
 
-def read_steps(text: str | None, runs: Sequence[RunReader]) -> dict[str, int]:
+def read_steps(texts: Sequence[str] | None, runs: Sequence[RunReader]) -> dict[str, int]:
     """Return the training step of every run by its location.
 
     Args:
-        text: Comma-separated steps in the order of the runs; None reads them from the folders.
+        texts: Steps in the order of the runs; None reads them from the folders.
         runs: Runs of policies.
 
     Raises:
-        UsageError: For another text, a number of steps that is not that of the runs, runs of one step, or VLM
-            runs, which have no retention.
+        UsageError: For a text that is no count, a number of steps that is not that of the runs, runs of one step,
+            or VLM runs, which have no retention.
     """
     if vlms := [str(run.location) for run in runs if run.ask is not None]:
-        raise UsageError(f"--compare steps is for policy runs; {vlms[0]} is a VLM run. Leave it out")
-    if text is None:
+        raise UsageError(f"--kind steps is for policy runs; {vlms[0]} is a VLM run. Leave it out")
+    if texts is None:
         steps = [training_step(run) for run in runs]
     else:
-        parts = [part.strip() for part in text.split(",")]
-        if not all(map(is_count, parts)):
-            raise UsageError(f"--compare steps={text}; expected a training step per run, such as steps=1000,2000")
-        steps = [int(part) for part in parts]
+        if not all(map(is_count, texts)):
+            raise UsageError(
+                f"--steps {','.join(texts)}; expected a training step per run, such as --steps 1000,2000"
+            )
+        steps = list(map(int, texts))
     if len(steps) != len(runs):
         raise UsageError(
-            f"--compare steps has {plural(len(steps), 'step')} for {plural(len(runs), 'run')}; give one per "
-            "run, in order"
+            f"--steps has {plural(len(steps), 'step')} for {plural(len(runs), 'run')}; give one per run, in order"
         )
     if len(runs) < 2 or len(set(steps)) < len(steps):
         raise UsageError(
-            "--compare steps needs several runs of different training steps; these are of "
+            "--kind steps needs several runs of different training steps; these are of "
             f"{', '.join(map(str, steps))}"
         )
     return {str(run.location): step for run, step in zip(runs, steps, strict=True)}

@@ -45,6 +45,12 @@ def find_runs(folder: Path) -> list[Path]:
     return runs
 
 
+def runs_below(address: str) -> list[Path]:
+    """Return the runs inside a folder of this machine that is no run itself; none for a run or another address."""
+    folder = Path(address).expanduser()
+    return [] if "://" in address or is_run(folder) else runs_in(folder)
+
+
 MOST = 12
 """The most runs of a folder that a message names."""
 

@@ -296,8 +296,8 @@ def figure(
     partial: Partial = False,
 ) -> None:
     """Draw a figure of a study, or all, from its stored runs. Loads no model."""
-    from probe_kit.retention.commands import check_file
     from probe_kit.retention.displays import save_figures
+    from probe_kit.retention.table_options import check_file
     from probe_kit.study import load_study, make_figures
 
     check_file(out_folder)

@@ -1,6 +1,7 @@
 """Drift of every category from one run to another: transfer, own probes, directions, likeness, verdict and table.
 
-Stored probes are used on the activations of another run of the same episodes. Nothing is fitted.
+Stored probes are used on the activations of another run of the same episodes (`train/stored_transfer.py`). Nothing
+is fitted.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,9 +17,7 @@ from probe_kit._system.types import Matrix
 from probe_kit._tables.content import Number, group_headings
 from probe_kit._tables.numbers import number, p_text, percent, points
 from probe_kit._tables.table import Cell, Cells, Table
-from probe_kit.errors import UsageError
 from probe_kit.extract.rollout.answers import side_expected
-from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.sites import PADDING, Site
 from probe_kit.retention.compare.compare import Difference, common_items, wording_of
 from probe_kit.retention.rows.row import RetentionRow
@@ -26,99 +25,13 @@ from probe_kit.retention.table import retention_table
 from probe_kit.runs.layout import FIRST_FRAME
 from probe_kit.runs.reader import RunReader
 from probe_kit.statistics.cka import unbiased_cka
-from probe_kit.statistics.label_permutations import flip_groups, max_statistic_p
 from probe_kit.statistics.share_limits import effective_episodes, group_shares
 from probe_kit.statistics.significance import SIGNIFICANCE
-from probe_kit.statistics.sufficiency import permuted_threshold
 from probe_kit.suite.categories import category_of
-from probe_kit.train.crossval.task_scores import correctness
 from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_results import Direction, ProbeResults
 from probe_kit.train.results.store import load_results
-
-PERMUTATIONS = 999
-"""Number of permutations of the labels of whole groups, for the p of a transfer.
-
-With the observed order, p comes in steps of 1/1000.
-"""
-_CONSTANT = 1e-9
-"""Share of the largest deviation below which a feature does not vary."""
-
-
-Side = tuple[RunReader, ProbeResults]
-"""A run of one wording, with its probes."""
-
-
-def _features(side: Side, site: Site, view: str, episodes: NDArray[np.str_]) -> Matrix:
-    """Return the features (E, D) of these episodes, in this order."""
-    at = {name: row for row, name in enumerate(side[0].episodes["episode_id"].astype(str))}
-    return np.asarray(side[0].column(site, view)[[at[name] for name in episodes]], np.float64)
-
-
-def _transfer(
-    probed: Side, other: Side, category: str, view: str, sites: Sequence[Site], common: NDArray[np.str_]
-) -> tuple[Matrix, float]:
-    """Return accuracies of the probes of one run on the activations of another, as shares, and p: (3, S).
-
-    The first accuracies are of decisions as they are. For the second ones features are centred and scaled as in
-    the other run's own training folds, without labels. p is of these, against the best site under label
-    permutations of whole groups. Each of the `common` episodes is judged by the probe that was trained without its
-    fold. The second value is the accuracy that the best site exceeds in 5 % of the permutations.
-
-    Args:
-        probed: The run whose probes are used.
-        other: The run whose activations they are used on.
-        category: Category of the probes.
-        view: View of the probes.
-        sites: The S sites, which both runs have.
-        common: Ids of episodes that both runs have.
-
-    Raises:
-        UnknownSiteError: For a site without a stored direction.
-    """
-    curve = probed[1].curves[category, view]
-    rows = np.flatnonzero(np.isin(curve.episodes, common))
-    episodes, labels, fold_of = curve.episodes[rows], curve.labels[rows], curve.fold_of[rows]
-    folds = np.unique(curve.fold_of)
-    raw, recentred = np.empty((2, len(sites), rows.size))
-    for at, site in enumerate(sites):
-        direction = probed[1].direction(category, view, site)
-        of_probed, of_other = (_features(side, site, view, episodes) for side in (probed, other))
-        raw[at] = _decisions(direction, of_other, None, fold_of, folds)
-        recentred[at] = _decisions(direction, of_other, of_probed, fold_of, folds)
-    null = flip_groups(labels, curve.groups[rows], PERMUTATIONS, derive_seed("transfer", category, view))
-    right = np.array([correctness(run[:, None], null).mean(axis=0) for run in recentred])
-    accuracy, aligned = (correctness(run, labels[None, :]).mean(axis=1) for run in (raw, recentred))
-    return np.stack([accuracy, aligned, max_statistic_p(aligned, right)]), permuted_threshold(right)
-
-
-def _decisions(
-    direction: Direction,
-    features: Matrix,
-    like: Matrix | None,
-    fold_of: NDArray[np.int64],
-    folds: NDArray[np.int64],
-) -> Matrix:
-    """Return decisions (E,) on features (E, D), moved and scaled from their own training folds to `like`'s."""
-    decisions = np.empty(len(features))
-    for position, fold in enumerate(folds):
-        tested = fold_of == fold
-        moved = features[tested]
-        if like is not None:
-            moved = _move_features(moved, features[~tested], like[~tested])
-        decisions[tested] = moved @ direction.weights[position].astype(np.float64) + direction.intercepts[position]
-    return decisions
-
-
-def _move_features(features: Matrix, origin: Matrix, like: Matrix) -> Matrix:
-    """Return features with means and deviations of `like` instead of those of `origin`.
-
-    Constant features become means.
-    """
-    spread = origin.std(axis=0)
-    scale = np.divide(like.std(axis=0), spread, out=np.zeros_like(spread), where=spread > _CONSTANT * spread.max())
-    moved: Matrix = (features - origin.mean(axis=0)) * scale + like.mean(axis=0)
-    return moved
+from probe_kit.train.stored_transfer import ProbedRun, common_sites, features_of, transfer_stored_probes
 
 
 def _cosines(first: Direction, second: Direction, features: Matrix) -> tuple[float, float, float]:
@@ -330,7 +243,7 @@ def _delivered_tokens(run: Any, view: str) -> dict[str, tuple[Any, list[int]]]:
 
 def _category(
     name: str,
-    sides: tuple[Side, Side],
+    sides: tuple[ProbedRun, ProbedRun],
     view: str,
     rows: tuple[RetentionRow, RetentionRow],
     difference: Difference | None,
@@ -343,25 +256,26 @@ def _category(
         return CategoryDrift(name, *rows, difference, (), 0, 0, why or "no item in common")
     if why:
         return CategoryDrift(name, *rows, difference, (), 0, episodes.size, why)
-    sites = _common_sites(sides, name, view)
-    (forth, threshold), (back, _) = (
-        _transfer(probed, other, name, view, sites, episodes) for probed, other in (sides, (sides[1], sides[0]))
+    sites = common_sites(sides, name, view)
+    forth, back = (
+        transfer_stored_probes(probed, other, name, view, sites, episodes)
+        for probed, other in (sides, (sides[1], sides[0]))
     )
     lenses = [lens_accuracy(run, episodes) for run, _ in sides]
     drifts = []
     for at, site in enumerate(sites):
-        before, after = (_features(side, site, view, episodes) for side in sides)
+        before, after = (features_of(run, site, view, episodes) for run, _ in sides)
         cosines: tuple[float | None, float | None, float | None] = (None, None, None)
         if all(_has_signal(results, name, view, site) for _, results in sides):
             first, second = (results.direction(name, view, site) for _, results in sides)
             cosines = _cosines(first, second, after)
-        raw, recentred, p_fwe = forth[:, at].tolist()
-        raw_back, recentred_back, p_fwe_back = back[:, at].tolist()
+        raw, recentred, p_fwe = forth.at(at)
+        raw_back, recentred_back, p_fwe_back = back.at(at)
         likeness = (unbiased_cka(before, after), *cosines, _at_layer(lenses, site.layer))
         drifts.append(SiteDrift(site, raw, recentred, p_fwe, raw_back, recentred_back, p_fwe_back, *likeness))
     accuracies = [curves[0].correct[curves[0].sites.index(site)].mean() for site in sites]
     best = int(np.argmax(accuracies))
-    power = min(_power(curve, sites[best], threshold) for curve in curves)
+    power = min(_power(curve, sites[best], forth.threshold) for curve in curves)
     return CategoryDrift(name, *rows, difference, tuple(drifts), best, episodes.size, power=power)
 
 
@@ -397,22 +311,6 @@ def lens_accuracy(run: RunReader, episodes: NDArray[np.str_]) -> NDArray[np.floa
 def _at_layer(lenses: list[NDArray[np.float64] | None], layer: int) -> tuple[float, float] | None:
     before, after = (None if lens is None or layer >= lens.size else float(lens[layer]) for lens in lenses)
     return None if before is None or after is None else (before, after)
-
-
-def _common_sites(sides: tuple[Side, Side], category: str, view: str) -> list[Site]:
-    """Return the sites of both backbones, by name, where these are equally wide."""
-    widths = []
-    for run, results in sides:
-        curve = results.curves[category, view]
-        width = {name: stream.width for name, stream in run.streams.items()}
-        widths.append({site: width[site.stream] for site in curve.sites if site.stream == curve.backbone_stream})
-    shared = [site for site in widths[0] if widths[0][site] == widths[1].get(site)]
-    if not shared:
-        raise UsageError(
-            f"{sides[0][0].location} and {sides[1][0].location} have no site of the backbone with one name and "
-            "width in common: probes of one cannot be used on the other"
-        )
-    return shared
 
 
 def _has_signal(results: ProbeResults, category: str, view: str, site: Site) -> bool:

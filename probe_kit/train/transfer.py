@@ -344,7 +344,7 @@ def _unshared_samples(
         raise TooFewGroupsError(
             f"{shared.size} of the {np.unique(other_samples.groups).size} groups of {other.location} are in "
             f"{run.location} too, which leaves {remaining}; expected at least {OUTER_FOLDS} to score "
-            "on. Give a run of other items or episodes"
+            "on. Give a run of other items or episodes. A study's [drift] compares probes on the same items"
         )
     return other_samples.of(unshared), int(shared.size)
 
@@ -393,12 +393,28 @@ def _transfer(
 def _recentre(samples_to_move: Samples, run_samples: Samples) -> Samples:
     """Return the samples of the other run, moved to the mean of the first run's."""
     means, run_means = (np.asarray(samples.means) for samples in (samples_to_move, run_samples))
-    shift = run_means.mean(axis=0, dtype=np.float64) - means.mean(axis=0, dtype=np.float64)
+    origin, goal = (values.mean(axis=0, dtype=np.float64) for values in (means, run_means))
     features = samples_to_move.read()
-    moved = (features + shift).astype(features.dtype)
+    moved = move_features(features, origin, goal).astype(features.dtype)
     if samples_to_move.pools:
         return Samples.pooled(moved)
-    return Samples(RowSubset.all(moved), samples_to_move.counts, means + shift)
+    return Samples(RowSubset.all(moved), samples_to_move.counts, move_features(means, origin, goal))
+
+
+def move_features(
+    features: NDArray[Any], origin: Matrix, goal: Matrix, scale: Matrix | None = None
+) -> NDArray[Any]:
+    """Return features (E, D) of a run, recentred: moved from one mean (D,) to another, without labels.
+
+    Args:
+        features: Features to move.
+        origin: Mean of the run they are of.
+        goal: Mean of the run that the probe was fitted on.
+        scale: Multiple (D,) of the deviations from the mean; None leaves them as they are.
+    """
+    if scale is None:
+        return features + (goal - origin)
+    return features * scale + (goal - origin * scale)
 
 
 def _score_predictions(predicted: Matrix, truth: Matrix, task: Task, strength: float) -> SiteProbe:

@@ -304,7 +304,7 @@ def test_it_says_how_answers_came_and_what_to_do_next(small_suite: Suite, folder
     message = " ".join(result.stderr.split())
     assert "p1 · no picture: " in message
     assert "option mass 0." in message
-    assert "next: probe-kit retention" in message
+    assert "next: probe-kit compare" in message
 
 
 @pytest.mark.parametrize(

@@ -567,3 +567,12 @@ def test_the_place_is_said_beside_the_behaviour_and_does_not_change_it() -> None
     assert str(Places(("kv.01",), jointly=jointly)) == jointly, "all tokens of a block do not say which are read"
     assert str(Places(("kv.01 image",), jointly="read at kv.01 image")) == "read at kv.01 image"
     assert str(Places(("kv.01",), jointly="past kv")) == "read at kv.01"
+
+
+def test_a_direction_whose_name_holds_words_of_the_sentence_is_carried_at_its_own_place() -> None:
+    carried = (("file:left at start; 1", "backbone.01 image"), ("mean-difference", "kv.01 language"))
+    assert Places(("backbone.01",), carried).parts == [
+        "passes at backbone.01",
+        "carried by file:left at start; 1 at backbone.01 image",
+        "mean-difference at kv.01 language",
+    ]

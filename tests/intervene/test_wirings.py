@@ -17,7 +17,7 @@ from probe_kit.intervene.kinds.joint import (
     JointEffect,
     JointPlaces,
     describe_joint_places,
-    describe_remainder,
+    describe_remainders,
 )
 from probe_kit.intervene.patching import Cell
 from probe_kit.intervene.places import resolve_sites
@@ -233,10 +233,10 @@ def test_what_opposes_the_effect_is_read_too(wired: WiredSession) -> None:
     assert rows["every-cell"].finding == "opposes it"
     assert describe_joint_places(list(rows.values())) == ""
     opposed = "opposed at kv.01 language; all cells of kv language carry -2.00 of it"
-    assert describe_remainder(list(rows.values())) == opposed
+    assert "; ".join(describe_remainders(list(rows.values()))) == opposed
     rows = joint(wired, "balance")
     assert describe_joint_places(list(rows.values())) == "read at kv.01 language"
-    assert describe_remainder(list(rows.values())) == "opposed at kv.02 language"
+    assert describe_remainders(list(rows.values())) == ("opposed at kv.02 language",)
 
 
 def test_what_acts_against_the_answer_reads_it_where_all_others_do(wired: WiredSession) -> None:

@@ -1,4 +1,4 @@
-"""What `probe-kit retention` refuses, and how it names probes, before it reads a run."""
+"""What `probe-kit retention` and `compare` refuse, and how they name probes, before they read a run."""
 
 import csv
 import io
@@ -57,21 +57,62 @@ def test_a_choice_of_probes_for_no_run_or_twice_for_one_is_refused(choices: list
 @pytest.mark.parametrize(
     "options",
     [
-        ["nowhere", "--iterations", "first"],
-        ["nowhere", "--epsilons", "wide"],
-        ["nowhere", "--html", "."],
-        ["nowhere", "--figures", __file__],
-        ["nowhere", "--compare", "steps="],
-        ["nowhere", "--compare", "vlm-vla=x"],
+        ["retention", "nowhere", "--iterations", "first"],
+        ["retention", "nowhere", "--epsilons", "wide"],
+        ["retention", "nowhere", "--html", "."],
+        ["retention", "nowhere", "--figures", __file__],
+        ["compare", "nowhere", "--iterations", "first"],
+        ["compare", "nowhere", "--figures", __file__],
+        ["compare", "nowhere", "--kind", "steps", "--figures", __file__],
+        ["compare", "nowhere", "nowhere", "--kind", "stages", "--figures", __file__],
     ],
     ids=" ".join,
 )
 def test_options_are_checked_before_runs_are_opened(options: list[str]) -> None:
     """The run is not there either, but that is not what is said."""
-    result = CliRunner().invoke(app, ["retention", *options])
+    result = CliRunner().invoke(app, options)
     assert result.exit_code == 2
-    assert "nowhere" not in result.stderr
+    assert "is not a run" not in result.stderr
     assert "UsageError" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--kind", "stages", "--rule", "box"], "--rule is not for --kind stages"),
+        (["--kind", "stages", "--reference", "a"], "--reference is not for --kind stages"),
+        (["--kind", "vlm-vla", "--reference", "a"], "--reference is not for --kind vlm-vla"),
+        (["--kind", "vlm-vla", "--steps", "1,2"], "--steps is not for --kind vlm-vla"),
+        (["--kind", "steps", "--epsilons", "0.1"], "--epsilons is not for a table of training steps"),
+        (["--kind", "groups", "--as-paper"], "--as-paper is not for runs compared"),
+        (["--target", "y", "--reference", "a"], "--reference is not for labels of your own"),
+        (["--family", "table"], "--family is for labels of your own"),
+        (["--kind", "steps", "--rule", "disc"], None),
+    ],
+)  # fmt: skip
+def test_an_option_that_a_table_does_not_have_is_refused_by_name(options: list[str], message: str | None) -> None:
+    result = CliRunner().invoke(app, ["compare", "nowhere", "elsewhere", *options])
+    assert result.exit_code == 2
+    assert (message or "nowhere is not a run") in " ".join(result.stderr.split())
+
+
+def test_retention_of_several_runs_is_refused_with_the_line_that_compares_them() -> None:
+    result = CliRunner().invoke(app, ["retention", "runs/a", "runs/b c"])
+    assert result.exit_code == 2
+    assert "`probe-kit compare runs/a 'runs/b c'`" in " ".join(result.stderr.split())
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        (["retention", "a", "b", "--compare", "stages"], "`probe-kit compare RUN…`"),
+        (["run", "list", "folder"], "`probe-kit run show FOLDER`"),
+    ],
+)
+def test_an_old_spelling_is_answered_with_the_new_one(old: list[str], new: str) -> None:
+    result = CliRunner().invoke(app, old)
+    assert result.exit_code == 2
+    assert new in " ".join(result.stderr.replace("│", " ").split())
 
 
 def test_a_folder_that_is_no_run_has_nothing_to_show(tmp_path: Path) -> None:
@@ -91,9 +132,9 @@ def test_the_inventory_names_the_probes_of_a_table(
 @pytest.mark.parametrize(
     "options",
     [
-        ["--compare", "groups"],
         ["--score", "order-balanced"],
-        ["--compare", "vlm-vla"],
+        ["--epsilons", "0.1"],
+        ["--absent-below", "0.7"],
         ["--details", "all"],
         ["--html", "r.html"],
     ],
@@ -249,20 +290,20 @@ def test_the_step_is_that_of_the_checkpoints_folder(path: str, step: int) -> Non
 
 @pytest.mark.parametrize("path", ["", "embedded", "lerobot/pi0_base", "data/20261124/policy", "models/pi05"])
 def test_a_folder_that_names_no_step_is_refused_and_no_date_above_is_taken_for_one(path: str) -> None:
-    with pytest.raises(UsageError, match=r"training step of runs/a is unknown.*--compare steps=1000,2000"):
+    with pytest.raises(UsageError, match=r"training step of runs/a is unknown.*--steps 1000,2000"):
         training_step(of_checkpoint(path))
 
 
 def test_steps_by_hand_are_one_per_run_and_different(probed_run: Callable[..., ArrayRun]) -> None:
     runs = [probed_run({"color": SIGNAL_TRAINING_STEPS}, name) for name in ("a", "b")]
-    assert list(read_steps("2000,500", runs).values()) == [2000, 500]
+    assert list(read_steps(["2000", "500"], runs).values()) == [2000, 500]
     for text, why in (
         ("500", "1 step for 2 runs"),
         ("500,500", "different training steps"),
         ("soon", "expected"),
     ):
         with pytest.raises(UsageError, match=why):
-            read_steps(text, runs)
+            read_steps(text.split(","), runs)
 
 
 def test_a_row_has_the_numbers_of_its_run_and_drift_is_that_from_the_first_step(

@@ -390,13 +390,13 @@ def test_a_folder_that_holds_no_run_is_refused(folder: Path) -> None:
 def test_the_list_names_every_run_and_the_one_that_cannot_be_read(folder: Path) -> None:
     (folder / "broken").mkdir()
     (folder / "broken" / "run.json").write_text("{", encoding="utf-8")
-    result = CliRunner().invoke(app, ["run", "list", str(folder), "--format", "json"])
+    result = CliRunner().invoke(app, ["run", "show", str(folder), "--json"])
     assert result.exit_code == 0, result.output
     lines = json.loads(result.stdout)
     assert [line["run"] for line in lines] == ["b", "broken", "deep/a"]
     assert "error" in lines[1]
     assert lines[0]["episodes"] == lines[2]["episodes"] > 0
-    printed = CliRunner().invoke(app, ["run", "list", str(folder)])
+    printed = CliRunner().invoke(app, ["run", "show", str(folder)])
     assert "deep/a" in printed.stdout
     assert "broken cannot be read" in printed.stderr
 
@@ -406,7 +406,7 @@ def test_names_of_runs_can_be_copied_from_a_narrow_terminal(folder: Path, monkey
     (folder / name).parent.mkdir(parents=True)
     (folder / "b").rename(folder / name)
     monkeypatch.setattr(console.out, "_width", 60)
-    assert name in CliRunner().invoke(app, ["run", "list", str(folder)]).stdout
+    assert name in CliRunner().invoke(app, ["run", "show", str(folder)]).stdout
 
 
 def test_the_viewer_opens_all_runs_of_a_folder(folder: Path) -> None:

@@ -281,17 +281,17 @@ def localised_by_category(maps: Mapping[str, Sequence[PatchEffect]]) -> dict[str
     }
 
 
-def carrying_directions(along: Mapping[str, Sequence[PatchEffect]]) -> dict[str, tuple[str, ...]]:
-    """Return by category the directions that carry half of the effect, beyond random ones.
+def carrying_directions(along: Mapping[str, Sequence[PatchEffect]]) -> dict[str, tuple[tuple[str, str], ...]]:
+    """Return by category the directions that carry half of the effect, beyond random ones, each with its place.
 
-    A direction is spelt `mean-difference at backbone.02 image`.
+    A place is spelt `backbone.02 image`.
 
     Args:
         along: Effects by category, as `stored_subspace_effects` gives them.
     """
     return {
         category: tuple(
-            f"{row.direction} at {row.sites} {row.role}"
+            (row.direction, f"{row.sites} {row.role}")
             for row in rows
             if row.is_localised and row.control_displacement is not None
         )

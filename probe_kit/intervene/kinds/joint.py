@@ -198,7 +198,7 @@ class JointPlaces(Intervention):
         """Return which cells carry the answer, alone or together."""
         del context
         places = describe_joint_places(rows) or "where the answer is read remains open"
-        return "; ".join(filter(None, (places, describe_remainder(rows))))
+        return "; ".join(filter(None, (places, *describe_remainders(rows))))
 
     @staticmethod
     def finding(rows: "Sequence[JointEffect]", context: Measurement) -> str:
@@ -400,14 +400,14 @@ def describe_joint_places(rows: Sequence[JointEffect]) -> str:
     return f"{text} (alone: {alone})" if alone else f"no single place: {text}"
 
 
-def describe_remainder(rows: Sequence[JointEffect]) -> str:
-    """Return the part that places leave out: cells that oppose it, and a part that passes outside of all cells."""
+def describe_remainders(rows: Sequence[JointEffect]) -> tuple[str, ...]:
+    """Return the parts that places leave out: cells that oppose it, and what passes outside of all cells."""
     (every,) = (row for row in rows if row.part == EVERY)
     opposing = [row.cells for row in rows if row.part == "cell" and row.finding == "opposes it"]
     parts = [f"opposed at {list_places(opposing)}"] if opposing else []
     if not joint_places(rows).is_past and every.alone_ci is not None and every.alone_ci[1] < KEEP:
         parts.append(f"all cells of {every.cells} carry {every.alone:z.2f} of it")
-    return "; ".join(parts)
+    return tuple(parts)
 
 
 def _rows(

@@ -218,8 +218,8 @@ TERMS = {
         "was run. So there may be nothing to retain."
     ),
     "B − A": (
-        "Difference of a run and the first one, or that of --compare, on the same questions. They count as pairs, "
-        "with a 95 % interval. Zero inside it: they may be equal."
+        "Difference of a run and the first one, or that of --reference, on the same questions. They count as "
+        "pairs, with a 95 % interval. Zero inside it: they may be equal."
     ),
     "against": ("Before a verdict: the same, away from the correct picture."),
     "random weights": ("The model is untrained. It shows the numbers of a model that knows nothing."),

@@ -554,7 +554,7 @@ def compare_runs(
         UsageError: For a name that is none of the runs, or several.
     """
     if against is not None and len(runs) < 2:
-        raise UsageError(f"--compare {against} needs a second run to compare with it")
+        raise UsageError(f"--reference {against} needs a second run to compare with it")
     differences: list[Difference] = []
     unpaired: list[str] = []
     for minuend, subtrahend in _pairs(runs, against, pairs):
@@ -567,7 +567,7 @@ def compare_runs(
         first, second = (Side.of(run.name, run.run, rows) for run in (minuend, subtrahend))
         differences += compare(first, second, items=items)
     if not vlm_vla and pairs is None and len({run.answers for run in runs}) == 2:
-        unpaired.append("VLM runs and policy runs are not compared with each other; --compare vlm-vla does that.")
+        unpaired.append("VLM runs and policy runs are not compared with each other; --kind vlm-vla does that.")
     return with_holm(differences), tuple(unpaired)
 
 
@@ -751,7 +751,7 @@ def _run_called(name: str, runs: Sequence[TableRun]) -> TableRun:
         if len(matches) == 1:
             return matches[0]
     candidates = ", ".join(f"{run.run.location.name} ({run.name})" for run in runs)
-    raise UsageError(f"--compare {name!r} is {'several' if matches else 'none'} of the runs {candidates}")
+    raise UsageError(f"--reference {name!r} is {'several' if matches else 'none'} of the runs {candidates}")
 
 
 def _why_not(minuend: RunReader, subtrahend: RunReader, items: Mapping[str, CommonItems]) -> str:

@@ -377,7 +377,7 @@ def fold_samples(train: Features, held_out: Array) -> tuple[DenseDesign | Stream
     triangle = factor if isinstance(factor, np.ndarray) else factor[1]
     inner = triangle[:count, :count].T
     axes = principal_axes(inner)
-    return DenseDesign(_turned(inner, axes)), _turned(triangle[:count, count:].T, axes)
+    return DenseDesign(_turn(inner, axes)), _turn(triangle[:count, count:].T, axes)
 
 
 def _stay(features: RowSubset) -> bool:

@@ -34,7 +34,7 @@ def differences(answer: Any) -> list[dict[str, Any]]:
 
 
 def test_two_runs_are_compared_on_their_common_items_with_a_corrected_p(runs: StoredRuns) -> None:
-    answer = probe_kit("retention", runs.trained, runs.untrained, "--format", "json").json()
+    answer = probe_kit("compare", runs.trained, runs.untrained, "--format", "json").json()
     rows = {(row["run"]["label"], row["category"]): row for row in rows_of(answer)}
     (color,) = [one for one in differences(answer) if one["category"] == "color"]
     first, second = correct(runs.trained, "color"), correct(runs.untrained, "color")
@@ -54,24 +54,24 @@ def test_two_runs_are_compared_on_their_common_items_with_a_corrected_p(runs: St
 
 def test_against_names_the_run_that_is_subtracted_and_the_table_prints_the_difference(runs: StoredRuns) -> None:
     def color(*words: object) -> dict[str, Any]:
-        answer = probe_kit("retention", *words, "--format", "json").json()
+        answer = probe_kit("compare", *words, "--format", "json").json()
         return next(one for one in differences(answer) if one["category"] == "color")
 
     straight = color(runs.trained, runs.untrained)
     turned = color(runs.untrained, runs.trained)
-    against = color(runs.untrained, runs.trained, "--compare", runs.untrained)
+    against = color(runs.untrained, runs.trained, "--reference", runs.untrained)
     assert turned["sr"] > 0.5
     assert straight["sr"] == pytest.approx(-turned["sr"])
     assert against["sr"] == pytest.approx(turned["sr"])
     assert against["backbone"] == pytest.approx(turned["backbone"]) == pytest.approx(-straight["backbone"])
-    text = probe_kit("retention", runs.untrained, runs.trained, "--format", "markdown").out
+    text = probe_kit("compare", runs.untrained, runs.trained, "--format", "markdown").out
     assert f"+{100 * turned['sr']:.1f}" in text
 
 
 def test_a_group_of_models_is_compared_with_another_with_the_exact_p_over_models(runs: StoredRuns) -> None:
     groups = (f"right={runs.expert}", f"wrong={runs.mirrored},{runs.idle}")
-    typed = ("--compare", "groups", *groups)
-    answer = probe_kit("retention", *typed, "--format", "json").json()
+    typed = ("--kind", "groups", *groups)
+    answer = probe_kit("compare", *typed, "--format", "json").json()
     (color,) = [one for one in differences(answer) if one["category"] == "color"]
     assert (color["group"], color["minus"]) == ("wrong", "right")
     rates = {row["run"]["label"]: row["success"]["sr"] for row in rows_of(answer) if row["category"] == "color"}
@@ -81,11 +81,11 @@ def test_a_group_of_models_is_compared_with_another_with_the_exact_p_over_models
     # Three labelings of one model against two; the observed one is the most extreme.
     assert models["smallest_p"] == pytest.approx(1 / 3)
     assert models["smallest_p"] <= models["p"] <= 1
-    assert "wrong - right" in probe_kit("retention", *typed).text.replace("−", "-")
+    assert "wrong - right" in probe_kit("compare", *typed).text.replace("−", "-")
 
 
 def test_vlm_minus_vla_is_the_paired_difference_on_the_same_first_frames(runs: StoredRuns) -> None:
-    answer = probe_kit("retention", runs.asked, runs.trained, "--compare", "vlm-vla", "--format", "json").json()
+    answer = probe_kit("compare", runs.asked, runs.trained, "--kind", "vlm-vla", "--format", "json").json()
     pairs = {pair["category"]: pair for pair in answer["vlm_vla"]}
     assert set(pairs) == {"color", "state", "mean"}
     for category in ("color", "state"):
@@ -98,13 +98,13 @@ def test_vlm_minus_vla_is_the_paired_difference_on_the_same_first_frames(runs: S
         assert 0 < pair["p"] <= pair["p_holm"] <= 1
     # State: the VLM answers it, the policy was not trained to act on it.
     assert pairs["state"]["difference"] > 0.2
-    text = probe_kit("retention", runs.asked, runs.trained, "--compare", "vlm-vla").out
+    text = probe_kit("compare", runs.asked, runs.trained, "--kind", "vlm-vla").out
     printed = f"{100 * pairs['state']['difference']:.1f}"
     assert any(printed in " ".join(cells) for cells in rows_with(text, "state"))
 
 
 def test_stages_count_items_by_answered_encoded_and_acted(runs: StoredRuns) -> None:
-    typed = ("retention", runs.asked, runs.trained, "--compare", "stages")
+    typed = ("compare", runs.asked, runs.trained, "--kind", "stages")
     rows = {row["category"]: row for row in probe_kit(*typed, "--format", "json").json()["rows"]}
     for category in ("color", "state"):
         row = rows[category]
@@ -150,6 +150,6 @@ def test_wordings_of_one_run_are_compared_on_the_same_seeds_and_chosen_by_name(t
 def test_runs_of_other_seeds_or_items_are_named_and_not_subtracted(runs: StoredRuns, tmp_path: Any) -> None:
     settings = ("--categories", "color", "--items", "4", "--max-steps", "1", "--env-workers", "0", "--seed", "5")
     probe_kit("extract", "--model", "idle", *settings, "--out", tmp_path / "elsewhere")
-    answer = probe_kit("retention", runs.expert, tmp_path / "elsewhere", "--format", "json").json()
+    answer = probe_kit("compare", runs.expert, tmp_path / "elsewhere", "--format", "json").json()
     assert not differences(answer)
-    assert "seed" in probe_kit("retention", runs.expert, tmp_path / "elsewhere").text
+    assert "seed" in probe_kit("compare", runs.expert, tmp_path / "elsewhere").text

@@ -102,7 +102,7 @@ def other_frames(room: Room) -> tuple[object, ...]:
     )
     probe_kit("ask", *settings, "--out", room.folder / "asked")
     asked = next((room.folder / "asked").glob("*/run.json")).parent
-    return ("retention", asked, room.runs.trained, "--compare", "stages")
+    return ("compare", asked, room.runs.trained, "--kind", "stages")
 
 
 def too_few_groups(room: Room) -> tuple[object, ...]:
@@ -144,7 +144,7 @@ def steered(room: Room, site: str) -> tuple[object, ...]:
 
 SITUATIONS: dict[str, tuple[str, Callable[[Room], tuple[object, ...]], str]] = {
     "an odd number of items": ("UsageError", lambda room: played(room, "--items", "3"), "even"),
-    "one run twice": ("UsageError", lambda room: ("retention", room.runs.idle, room.runs.idle), "twice"),
+    "one run twice": ("UsageError", lambda room: ("compare", room.runs.idle, room.runs.idle), "twice"),
     "a misspelled model": ("UnknownModelError", lambda room: played(room, model="pi0-tyni"), "pi0-tiny"),
     "a misspelled category": (
         "UnknownCategoryError", lambda room: played(room, "--categories", "colour"), "color"

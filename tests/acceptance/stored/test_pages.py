@@ -37,7 +37,7 @@ def hostile(runs: StoredRuns, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def report(hostile: Path, runs: StoredRuns, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The report of both policies, alone in a folder."""
     file = tmp_path_factory.mktemp("report") / "report.html"
-    probe_kit("retention", hostile, runs.untrained, "--html", file)
+    probe_kit("compare", hostile, runs.untrained, "--html", file)
     return file
 
 
@@ -59,7 +59,7 @@ def test_the_report_is_one_file_that_names_no_outside_address(report: Path) -> N
 
 
 def test_the_report_shows_the_values_of_the_table(report: Path, hostile: Path, runs: StoredRuns) -> None:
-    rows = probe_kit("retention", hostile, runs.untrained, "--format", "json").json()
+    rows = probe_kit("compare", hostile, runs.untrained, "--format", "json").json()
     rows = rows["rows"] if isinstance(rows, dict) else rows
     page = Page(report.read_text(encoding="utf-8"))
     printed = intervals([[cell.replace("−", "-") for cell in row] for table in page.tables for row in table])
@@ -116,7 +116,7 @@ def test_the_viewers_folder_needs_no_server_and_no_address(hostile: Path, tmp_pa
 def test_figures_are_written_as_png_and_pdf_that_open(runs: StoredRuns, tmp_path: Path) -> None:
     from PIL import Image
 
-    probe_kit("retention", runs.trained, runs.untrained, "--figures", tmp_path, "--details", "all")
+    probe_kit("compare", runs.trained, runs.untrained, "--figures", tmp_path, "--details", "all")
     names = {path.stem for path in tmp_path.glob("*.png")}
     assert len(names) > 8
     assert names == {path.stem for path in tmp_path.glob("*.pdf")}

@@ -141,7 +141,7 @@ def test_unknown_formats_and_details_are_refused_with_the_names_that_exist(runs:
 
 
 def test_the_json_has_no_value_that_json_does_not_know(runs: StoredRuns) -> None:
-    text = probe_kit("retention", runs.trained, runs.untrained, runs.expert, "--format", "json").out
+    text = probe_kit("compare", runs.trained, runs.untrained, runs.expert, "--format", "json").out
     json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
     assert not re.search(r"\bNaN\b", text)
 

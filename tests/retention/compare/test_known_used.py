@@ -330,7 +330,7 @@ def test_it_prints_the_counts_of_match_runs_and_draws_their_figure(
     runs_stages_command: tuple[Run, Run], tmp_path: Path
 ) -> None:
     answer_run, acted = runs_stages_command
-    command = ["retention", str(answer_run.path), str(acted.path), "--compare", "stages"]
+    command = ["compare", str(answer_run.path), str(acted.path), "--kind", "stages"]
     answer = CliRunner().invoke(app, [*command, "--format", "json"])
     assert answer.exit_code == 0, answer.output
     assert json.loads(answer.stdout) == json.loads(
@@ -345,10 +345,10 @@ def test_it_prints_the_counts_of_match_runs_and_draws_their_figure(
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--format", "csv"], "--format csv is not for --compare stages"),
-        (["--rule", "box"], "--rule is not for --compare stages"),
-        (["--as-paper"], "--as-paper is not for --compare stages"),
-        (["--views", "mean,last"], "--compare stages reads probes of one view; --views mean,last has 2. Give one"),
+        (["--format", "csv"], "--format csv is not for --kind stages"),
+        (["--rule", "box"], "--rule is not for --kind stages"),
+        (["--as-paper"], "--as-paper is not for --kind stages"),
+        (["--views", "mean,last"], "--kind stages reads probes of one view; --views mean,last has 2. Give one"),
         (["--views", "mean"], "has no activations to probe"),
     ],
 )
@@ -356,7 +356,7 @@ def test_options_of_other_tables_are_refused(
     options: list[str], words: str, runs_stages_command: tuple[Run, Run]
 ) -> None:
     answer = CliRunner().invoke(
-        app, ["retention", *(str(run.path) for run in runs_stages_command), "--compare", "stages", *options]
+        app, ["compare", *(str(run.path) for run in runs_stages_command), "--kind", "stages", *options]
     )
     assert answer.exit_code == 2
     assert words in " ".join(answer.stderr.split())
@@ -364,6 +364,6 @@ def test_options_of_other_tables_are_refused(
 
 @pytest.mark.slow
 def test_it_needs_two_runs(runs_stages_command: tuple[Run, Run]) -> None:
-    answer = CliRunner().invoke(app, ["retention", str(runs_stages_command[0].path), "--compare", "stages"])
+    answer = CliRunner().invoke(app, ["compare", str(runs_stages_command[0].path), "--kind", "stages"])
     assert answer.exit_code == 2
     assert "expected VLM_RUN RUN" in answer.stderr

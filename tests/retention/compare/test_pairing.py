@@ -187,9 +187,9 @@ def test_pairs_that_are_named_are_compared_as_one_family(tmp_path: Path) -> None
 
 def test_a_name_that_is_no_run_or_several_is_refused(tmp_path: Path) -> None:
     runs = [run(tmp_path / name, hits(0.5, at), called="pi0") for at, name in enumerate("ab")]
-    with pytest.raises(UsageError, match=r"--compare 'c' is none of the runs a \(pi0 · .*\), b"):
+    with pytest.raises(UsageError, match=r"--reference 'c' is none of the runs a \(pi0 · .*\), b"):
         retention_table(runs, against="c")
-    with pytest.raises(UsageError, match="--compare 'pi0' is several of the runs"):
+    with pytest.raises(UsageError, match="--reference 'pi0' is several of the runs"):
         retention_table(runs, against="pi0")
     with pytest.raises(UsageError, match="there is no group 'z' to compare with; there are x, y"):
         retention_table({"x": runs[:1], "y": runs[1:]}, against="z")
@@ -342,7 +342,7 @@ def test_asked_runs_are_compared_with_asked_ones_and_acting_with_acting(tmp_path
     table = retention_table(mixed)
     assert pairs(table) == [("vlm-1", "vlm-0"), ("policy-1", "policy-0")]
     assert table.unpaired == (
-        "VLM runs and policy runs are not compared with each other; --compare vlm-vla does that.",
+        "VLM runs and policy runs are not compared with each other; --kind vlm-vla does that.",
     )
     assert retention_table(mixed, vlm_vla=True).unpaired == ()
     assert [row.mode for row in table.differences] == ["answers"] * 3 + ["acts"] * 3
