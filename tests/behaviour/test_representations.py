@@ -290,9 +290,9 @@ def changed_bytes(stored: Stored, draw: Random) -> Fault | None:
 
 
 @pytest.fixture(scope="module")
-def real(recorded_run: Run, tmp_path_factory: pytest.TempPathFactory) -> Stored:
+def real(trainable_run: Run, tmp_path_factory: pytest.TempPathFactory) -> Stored:
     """A copy of a run of pi0-tiny with all tokens, with probes and an intervention."""
-    run_folder = Path(shutil.copytree(recorded_run.path, tmp_path_factory.mktemp("real") / "run"))
+    run_folder = Path(shutil.copytree(trainable_run.path, tmp_path_factory.mktemp("real") / "run"))
     train_probes(open_run(run_folder), ["color"], permutations=1)
     intervene_on_little_run(open_run(run_folder))
     return Stored.of(run_folder, run_folder)
