@@ -18,8 +18,6 @@ from nbformat import NotebookNode
 from probe_kit._terminal.notebook import PROGRESS_MARK
 
 FOLDER = Path(__file__).parent
-UNASKED = "TqdmWarning"
-"""Printed where ipywidgets is not installed; no output of a cell."""
 
 
 def notebooks() -> list[Path]:
@@ -72,7 +70,7 @@ def _clean(output: NotebookNode, folder: str) -> bool:
     """Take the folder's own path out of an output; whether anything is left."""
     if output.output_type == "stream":
         output.text = output.text.replace(folder, "")
-        return bool(output.text.strip()) and UNASKED not in output.text
+        return bool(output.text.strip())
     content = output.get("data", {})
     if PROGRESS_MARK in content.get("text/html", ""):
         return False  # how long it took here

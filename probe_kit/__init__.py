@@ -11,6 +11,7 @@ Data flows one way: suite → env → hooks → runs → extract → train → i
 from typing import TYPE_CHECKING
 
 from probe_kit._system.imports import lazy_names
+from probe_kit._terminal.notebook import ignore_absent_widgets
 from probe_kit.version import __version__ as __version__
 
 if TYPE_CHECKING:
@@ -91,6 +92,8 @@ __all__ = [
     "train_probes",
     "write_report",
 ]
+
+ignore_absent_widgets()
 
 # `import probe_kit` must not load torch.
 __getattr__, __dir__ = lazy_names(

@@ -20,8 +20,6 @@ NAMES = (
     "06-vlm-against-vla", "07-from-readable-to-used", "08-your-own-labels", "09-your-own-recordings",
     "10-why-does-my-policy-ignore-me", "11-a-policy-server",
 )  # fmt: skip
-WHOLE_ONLY = NAMES[2:]
-"""They run in the slow suite only: the tests in `acceptance/` use the same commands in the default one."""
 EXTRAS = {
     **dict.fromkeys(("09-your-own-recordings", "10-why-does-my-policy-ignore-me"), ("datasets", "av")),
     "11-a-policy-server": ("websockets", "msgpack"),
@@ -33,60 +31,18 @@ PICTURE = re.compile(r"(?:\.plot\(\)|^pk\.layer_curve\(.*\)|^Image\.open\(.*\)|^
 """How a cell ends that is there to show a picture; a semicolon would hide it where no backend is inline."""
 
 
-SCENE = 'scene=pk.SceneSpec.preset("act2answer", max_steps=4), batch=12, '
-SHORT = {
-    'ExtractSettings("pi0-tiny", ': f'ExtractSettings("pi0-tiny", {SCENE}',
-    "permutations=24": "permutations=3",
-}
-"""Short episodes and few label permutations."""
-
-
-def shortened(source: str) -> str:
-    """A cell with short episodes, which are played in the kernel itself: starting simulators would take longer."""
-    for long, short in SHORT.items():
-        source = source.replace(long, short)
-    return source if "env_workers" in source else source.replace(SCENE, f"{SCENE}env_workers=0, ")
-
-
-@pytest.fixture(
-    scope="module",
-    params=[pytest.param("short", marks=pytest.mark.slow), pytest.param("whole", marks=pytest.mark.slow)],
-)
-def executed_notebooks(
-    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Path, dict[str, NotebookNode]]:
+@pytest.fixture(scope="module")
+def executed_notebooks(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, NotebookNode]]:
     """The folder in which all notebooks ran, and the notebooks with fresh outputs."""
     folder = tmp_path_factory.mktemp("notebooks")
-
-    def source(name: str) -> Path:
-        """The notebook as it is, or with short episodes."""
-        if request.param == "whole":
-            return FOLDER / f"{name}.ipynb"
-        notebook = nbformat.read(FOLDER / f"{name}.ipynb", as_version=4)
-        for cell in notebook.cells:
-            cell.source = shortened(cell.source)
-        path = folder / f"{name}.ipynb"
-        nbformat.write(notebook, path)
-        return path
-
-    names = [name for name in NAMES if (request.param == "whole" or name not in WHOLE_ONLY) and not absent(name)]
+    names = [name for name in NAMES if not absent(name)]
     with kernel(folder) as manager:
-        return folder, {name: executed(source(name), folder, manager) for name in names}
+        return folder, {name: executed(FOLDER / f"{name}.ipynb", folder, manager) for name in names}
 
 
 def absent(name: str) -> list[str]:
     """Modules that a notebook needs and that are not installed."""
     return [module for module in EXTRAS.get(name, ()) if find_spec(module) is None]
-
-
-def test_the_short_notebooks_are_shorter() -> None:
-    sources = [
-        cell.source
-        for name in NAMES
-        if name not in WHOLE_ONLY
-        for cell in nbformat.read(FOLDER / f"{name}.ipynb", as_version=4).cells
-    ]
-    assert [sum(long in source for source in sources) for long in SHORT] == [2, 3]
 
 
 def printed(notebook: NotebookNode) -> str:
@@ -107,20 +63,19 @@ def test_these_are_all_notebooks() -> None:
     assert tuple(path.stem for path in notebooks()) == NAMES
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_a_notebook_runs_and_its_committed_outputs_are_those_of_its_cells(
     name: str, executed_notebooks: tuple[Path, dict[str, NotebookNode]]
 ) -> None:
     if missing := absent(name):
         pytest.skip(f"{', '.join(missing)} of the extra `datasets` is not installed")
-    if name not in executed_notebooks[1]:
-        pytest.skip("runs in the slow suite")
     committed = nbformat.read(FOLDER / f"{name}.ipynb", as_version=4)
     assert any(outputs for outputs in kinds(committed))
     assert kinds(executed_notebooks[1][name]) == kinds(committed)
 
 
-@pytest.mark.parametrize("executed_notebooks", [pytest.param("whole", marks=pytest.mark.slow)], indirect=True)
+@pytest.mark.slow
 def test_what_the_first_notebook_says_of_the_embedded_policy_is_so(
     executed_notebooks: tuple[Path, dict[str, NotebookNode]],
 ) -> None:
@@ -132,7 +87,7 @@ def test_what_the_first_notebook_says_of_the_embedded_policy_is_so(
     assert rows["color"].retention.defined
 
 
-@pytest.mark.parametrize("executed_notebooks", [pytest.param("whole", marks=pytest.mark.slow)], indirect=True)
+@pytest.mark.slow
 def test_the_untrained_network_is_marked_and_shows_no_signal(
     executed_notebooks: tuple[Path, dict[str, NotebookNode]],
 ) -> None:
@@ -141,7 +96,7 @@ def test_the_untrained_network_is_marked_and_shows_no_signal(
     assert not any(row.retention.defined for row in retention_table([run]).rows)
 
 
-@pytest.mark.parametrize("executed_notebooks", [pytest.param("whole", marks=pytest.mark.slow)], indirect=True)
+@pytest.mark.slow
 def test_the_adapter_of_the_fourth_notebook_passes_its_contract(
     executed_notebooks: tuple[Path, dict[str, NotebookNode]],
 ) -> None:
@@ -152,7 +107,7 @@ def test_the_adapter_of_the_fourth_notebook_passes_its_contract(
     assert open_run(executed_notebooks[0] / "work" / "runs" / "tiny-vla").certificate["hooks_on_equals_hooks_off"]
 
 
-@pytest.mark.parametrize("executed_notebooks", [pytest.param("whole", marks=pytest.mark.slow)], indirect=True)
+@pytest.mark.slow
 def test_the_questions_of_the_fifth_notebook_are_valid_and_answered(
     executed_notebooks: tuple[Path, dict[str, NotebookNode]],
 ) -> None:
@@ -162,7 +117,7 @@ def test_the_questions_of_the_fifth_notebook_are_valid_and_answered(
     assert len(open_run(executed_notebooks[0] / "work" / "runs" / "blots").episodes) == 24
 
 
-@pytest.mark.parametrize("executed_notebooks", [pytest.param("whole", marks=pytest.mark.slow)], indirect=True)
+@pytest.mark.slow
 def test_the_vlms_of_the_sixth_notebook_are_what_it_says(
     executed_notebooks: tuple[Path, dict[str, NotebookNode]],
 ) -> None:
@@ -177,7 +132,7 @@ def test_the_vlms_of_the_sixth_notebook_are_what_it_says(
     assert answer_run.episodes["first_frame_sha256"].tolist() == acted.episodes["first_frame_sha256"].tolist()
 
 
-@pytest.mark.parametrize("executed_notebooks", [pytest.param("whole", marks=pytest.mark.slow)], indirect=True)
+@pytest.mark.slow
 def test_the_last_layer_of_the_seventh_notebook_is_read_by_nothing(
     executed_notebooks: tuple[Path, dict[str, NotebookNode]],
 ) -> None:
@@ -189,7 +144,7 @@ def test_the_last_layer_of_the_seventh_notebook_is_read_by_nothing(
     assert last.relative_change > 0
 
 
-@pytest.mark.parametrize("executed_notebooks", [pytest.param("whole", marks=pytest.mark.slow)], indirect=True)
+@pytest.mark.slow
 def test_the_recordings_of_the_ninth_notebook_are_shown_and_their_side_is_decoded(
     executed_notebooks: tuple[Path, dict[str, NotebookNode]],
 ) -> None:

@@ -2,6 +2,7 @@
 
 import sys
 import time
+import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from html import escape
 from typing import Any
@@ -44,6 +45,16 @@ def _safe(text: str) -> str:
 def notebook_progress(label: str) -> Callable[..., None] | None:
     """Return a callback (done, total, …) that draws one progress bar below the cell; None outside notebooks."""
     return _Bar(label) if _in_notebook() else None
+
+
+def ignore_absent_widgets() -> None:
+    """Keep tqdm's warning that ipywidgets is not installed out of notebooks.
+
+    tqdm warns as soon as transformers, datasets or huggingface_hub is imported in a kernel. The bars of probe_kit
+    need no widget, and tqdm's own are then plain text.
+    """
+    if "ipykernel" in sys.modules:
+        warnings.filterwarnings("ignore", message="IProgress not found")
 
 
 def _in_notebook() -> bool:

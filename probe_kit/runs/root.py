@@ -97,6 +97,8 @@ class Card(Record):
     @classmethod
     def _with_one_token(cls, streams: Any) -> Any:
         """Give streams one token where a selection decides their number."""
+        if not isinstance(streams, list):
+            return streams  # which the field's own type refuses
         return [{"tokens": 1, **stream} if isinstance(stream, dict) else stream for stream in streams]
 
     @field_validator("streams")

@@ -14,12 +14,13 @@ import pytest
 
 from probe_kit.errors import ProbeKitError
 from tests.support.faults import KINDS, Change, Stored, applied, draw_fault
+from tests.support.nightly_draws import seeds_of_tonight
 from tests.support.reading import readings
 
 pytestmark = pytest.mark.slow  # `tests/acceptance` holds what a user sees of it
 
 ACCIDENTS = ("a bit", "cut", "missing", "exchanged", "of another run")
-DRAWN, BLOCK = 5000, 100
+DRAWN = 1000
 REMEDY = re.compile(r"Restore|Delete|Remove|Extract|Make|Write|Choose|Give|Take|run the same|with the same|again")
 
 
@@ -99,11 +100,9 @@ def verdicts(stored: Stored, seeds: range) -> Iterator[tuple[int, str, str]]:
         yield seed, fault.words, verdict
 
 
-@pytest.mark.parametrize("start", range(0, DRAWN, BLOCK))
-def test_five_thousand_drawn_accidents_change_no_number_that_verification_does_not_see(
-    stored: Stored, start: int
-) -> None:
-    came = list(verdicts(stored, range(start, start + BLOCK)))
+@pytest.mark.parametrize("seeds", seeds_of_tonight(DRAWN), ids=str)
+def test_no_drawn_accident_changes_a_number_that_verification_does_not_see(stored: Stored, seeds: range) -> None:
+    came = list(verdicts(stored, seeds))
     print(Counter(verdict.partition(" ")[0].rstrip(":") for _, _, verdict in came), flush=True)
     wrong = [came_of for came_of in came if came_of[2] not in ("found", "harmless")]
     assert not wrong, "\n".join(map(str, wrong))

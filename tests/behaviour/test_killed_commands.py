@@ -172,14 +172,6 @@ ALL = ("suite build", "suite convert", "run verify --seal", "train", "intervene"
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["suite build", "run verify --seal"])
-def test_a_kill_loses_nothing_and_changes_no_byte(
-    name: str, request: pytest.FixtureRequest, tmp_path: Path
-) -> None:
-    print(kill_often(_command(name, request), tmp_path, 1, seed=1))
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ALL)
 def test_twenty_kills_lose_nothing_and_change_no_byte(
     name: str, request: pytest.FixtureRequest, tmp_path: Path

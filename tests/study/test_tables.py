@@ -240,7 +240,7 @@ def test_a_report_is_one_page_with_state_tables_figures_and_the_file(played: Loa
     )
     assert all(f'id="{name}"' in html for name in made_of)
     assert html.count('<img class="plot"') == 1
-    assert "&lt;b&gt;Idle &amp; 5 %&lt;/b&gt;" in html
+    assert "&lt;b&gt;Idle &amp; 5\u00a0%&lt;/b&gt;" in html
     assert "<b>Idle" not in html
     assert str(tmp_path.parent) not in html
     assert 'src="http' not in html
