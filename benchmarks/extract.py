@@ -26,7 +26,7 @@ from probe_kit.hooks.contract.sites import Site
 from probe_kit.hooks.families.pi0.network import Pi0Size, build_pi0
 from probe_kit.hooks.families.shared.lerobot.paligemma import GemmaSize, SiglipSize
 from probe_kit.models.building import initialise
-from probe_kit.models.embedded import tiny
+from probe_kit.hooks.families import embedded as tiny
 from probe_kit.runs import open_run, seal
 from probe_kit.runs.layout import CODECS, StoredStream
 from probe_kit.runs.plan import Plan

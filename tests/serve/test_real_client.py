@@ -217,7 +217,7 @@ def test_every_fault_of_an_observation_is_a_line_and_the_next_one_is_answered(cl
     server = opened(captured_calls=1, rule="said")
     with serving(server) as address:
         played = subprocess.run(
-            [client, "-c", FAULTS, address], capture_output=True, text=True, check=False, timeout=300
+            [client, "-c", FAULTS, address], capture_output=True, encoding="utf-8", check=False, timeout=300
         )
     assert played.returncode == 0, played.stderr
     lines = json.loads(played.stdout)
@@ -299,7 +299,7 @@ def lines_of(*command: str | Path) -> Iterator[subprocess.Popen[str]]:
     """A process that reads and writes lines until the body ends."""
     process = subprocess.Popen(
         [str(word) for word in command],
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env={**os.environ, "OMP_NUM_THREADS": "1"},
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, encoding="utf-8", env={**os.environ, "OMP_NUM_THREADS": "1"},
         cwd=ROOT,
     )  # fmt: skip
     try:

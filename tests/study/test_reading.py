@@ -131,7 +131,7 @@ def test_wrong_values_are_said_together_before_names_are_looked_at(tmp_path: Pat
 def test_a_study_file_that_is_empty_or_no_toml_is_refused(tmp_path: Path, text: str, reason: str) -> None:
     with pytest.raises(UsageError, match=reason):
         load_study(written(tmp_path, text))
-    with pytest.raises(UsageError, match="the package has embedded, paper"):
+    with pytest.raises(UsageError, match="or one of embedded, paper"):
         load_study(tmp_path / "other.toml")
 
 
