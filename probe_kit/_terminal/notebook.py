@@ -96,7 +96,8 @@ class _Drawn:
         self._done, self._total = finished, total
 
     def __repr__(self) -> str:
-        return self._text
+        # A stored notebook holds results: of a bar at its end it keeps no text, and no time of this machine.
+        return self._text if self._done < self._total else ""
 
     def _repr_html_(self) -> str:
         bar = f'<progress value="{self._done}" max="{self._total}" style="width:16em"></progress>'
