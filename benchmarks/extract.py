@@ -23,10 +23,10 @@ from probe_kit.extract import Extraction, ExtractSettings, prepare
 from probe_kit.extract.rollout.capturing import EpisodeBuffers
 from probe_kit.hooks import Observation
 from probe_kit.hooks.contract.sites import Site
+from probe_kit.hooks.families import embedded as tiny
 from probe_kit.hooks.families.pi0.network import Pi0Size, build_pi0
 from probe_kit.hooks.families.shared.lerobot.paligemma import GemmaSize, SiglipSize
 from probe_kit.models.building import initialise
-from probe_kit.hooks.families import embedded as tiny
 from probe_kit.runs import open_run, seal
 from probe_kit.runs.layout import CODECS, StoredStream
 from probe_kit.runs.plan import Plan
