@@ -299,7 +299,8 @@ def lines_of(*command: str | Path) -> Iterator[subprocess.Popen[str]]:
     """A process that reads and writes lines until the body ends."""
     process = subprocess.Popen(
         [str(word) for word in command],
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, encoding="utf-8", env={**os.environ, "OMP_NUM_THREADS": "1"},
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, encoding="utf-8",
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
         cwd=ROOT,
     )  # fmt: skip
     try:
