@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from probe_kit._system.types import Matrix
 from probe_kit.errors import TooFewGroupsError
-from probe_kit.statistics.folds import INNER_FOLDS, Fold
+from probe_kit.statistics.folds import INNER_FOLDS, OUTER_FOLDS, Fold
 from probe_kit.train.crossval.joint_objective import JointProblems, JointSite, solve
 from probe_kit.train.crossval.nested_folds import (
     STRENGTHS,
@@ -281,14 +281,11 @@ ROUGH_FROM, ROUGH_AT_ONCE = 8, 800
 """Label columns from which on rough optima save more than they cost, and columns of all folds together, beyond
 which float32 arrays of some dozen samples leave a processor's cache."""
 
-ROUGH_MEMORY = IN_MEMORY // 4
-"""Bytes that the samples of all inner folds may take together, in float64. With more, products take the time."""
-
 
 def can_be_rough(samples: Samples, labels: NDArray[np.bool_]) -> bool:
     """Whether rough optima can choose C for most columns of (E, K) labels: of pooled samples, outside a device."""
     count, width = samples.features.shape
-    in_memory = 8 * INNER_FOLDS * count * (min(count, width) + width) <= ROUGH_MEMORY
+    in_memory = 8 * OUTER_FOLDS * INNER_FOLDS * count * min(count, width) <= IN_MEMORY
     return samples.pools and isinstance(samples.means, np.ndarray) and labels.shape[1] >= ROUGH_FROM and in_memory
 
 
@@ -303,29 +300,36 @@ def choose_roughly(samples: Samples, labels: NDArray[np.bool_], folds: Sequence[
         ProbeNotConvergedError: If an exact probe stops before its optimum.
         TooFewGroupsError: For a training set with a single class.
     """
+    inner = [[_Training.of(samples, fold) for fold in nested.inner] for nested in folds]
+    at_once = max(1, ROUGH_AT_ONCE // (labels.shape[1] * INNER_FOLDS))
+    parts = [_rough_losses(labels, some) for some in batched(inner, at_once)]
+    loss, bound = (np.concatenate(part, axis=1) for part in zip(*parts, strict=True))
+    best = select_c(loss)
+    # What one outer fold leaves open is solved for all: few columns more, in the same calls.
+    settled = is_c_settled(loss, bound, best)
+    open_ = np.append(True, ~np.all(settled[:, 1:], axis=0))
+    few = labels[:, open_]
+    if is_small(samples, few):
+        exact = _choose_stacked(few, inner)
+    else:
+        exact = [_choose_alone(samples, few, trainings) for trainings in inner]
     choices: list[Choice] = []
-    for some in batched(folds, max(1, ROUGH_AT_ONCE // (labels.shape[1] * INNER_FOLDS))):
-        inner = [[_Training.of(samples, fold) for fold in nested.inner] for nested in some]
-        loss, bound = _rough_losses(labels, [training for trainings in inner for training in trainings])
-        begins = np.cumsum([0, *(len(trainings) for trainings in inner[:-1])])
-        loss, bound = (np.add.reduceat(part, begins, axis=1) for part in (loss, bound))
-        for number, trainings in enumerate(inner):
-            best = select_c(loss[:, number])
-            open_ = ~is_c_settled(loss[:, number], bound[:, number], best)
-            open_[0] = True
-            few = labels[:, open_]
-            if is_small(samples, few):
-                (exact,) = _choose_stacked(few, [trainings])
-            else:
-                exact = _choose_alone(samples, few, trainings)
-            strengths, total = STRENGTHS[best], -np.take_along_axis(loss[:, number], best[None], 0)[0]
-            strengths[open_], total[open_] = exact[0], exact[1].total
-            choices.append((strengths, InnerQuality(total, exact[1].first)))
+    for number, (exact_strengths, quality) in enumerate(exact):
+        strengths = STRENGTHS[best[number]]
+        total = -np.take_along_axis(loss[:, number], best[None, number], 0)[0]
+        strengths[open_], total[open_] = exact_strengths, quality.total
+        choices.append((strengths, InnerQuality(total, quality.first)))
     return choices
 
 
-def _rough_losses(labels: NDArray[np.bool_], trainings: Sequence[_Training]) -> tuple[Matrix, Matrix]:
-    """Return log-losses (C, F, K) of the test episodes, summed, of rough optima, and bounds of their errors."""
+def _rough_losses(labels: NDArray[np.bool_], inner: Sequence[Sequence[_Training]]) -> tuple[Matrix, Matrix]:
+    """Return log-losses (C, F, K) of the inner test episodes, summed, of rough optima, and bounds of their errors.
+
+    Args:
+        labels: (E, K) labels.
+        inner: Inner folds of F outer folds.
+    """
+    trainings = [training for of_fold in inner for training in of_fold]
     stacked = StackedDesign.of_folds([training.design for training in trainings], labels.shape[1]).samples
     held_out = stack_samples([part.held_out for part in trainings])
     signs = _stacked_signs(trainings, labels).swapaxes(1, 2)
@@ -338,7 +342,8 @@ def _rough_losses(labels: NDArray[np.bool_], trainings: Sequence[_Training]) -> 
             test = training.fold.test
             loss[step, number] = log_losses(decisions[number, :, : test.size].T, labels[test]).sum(axis=0)
             bound[step, number] = bounds[number, :, : test.size].sum(axis=1)
-    return loss, bound
+    begins = np.cumsum([0, *(len(of_fold) for of_fold in inner[:-1])])
+    return np.add.reduceat(loss, begins, axis=1), np.add.reduceat(bound, begins, axis=1)
 
 
 # -- many samples, whose products are shared ----------------------------------------------------------------------

@@ -128,12 +128,12 @@ def select_c(loss: Matrix) -> NDArray[np.intp]:
 
 
 def is_c_settled(loss: Matrix, bound: Matrix, best: NDArray[np.intp]) -> NDArray[np.bool_]:
-    """Return whether the exact losses are least where rough ones are, and are no tie, (K,).
+    """Return whether the exact losses are least where rough ones are, and are no tie.
 
     Args:
-        loss: (C, K) rough losses along the grid.
-        bound: (C, K) by how much they can differ from the exact ones.
-        best: (K,) position of the least rough loss.
+        loss: (C, ...) rough losses along the grid.
+        bound: (C, ...) by how much they can differ from the exact ones.
+        best: (...) position of the least rough loss.
     """
     highest = np.take_along_axis(loss + bound, best[None], 0)[0]
     lowest = loss - bound

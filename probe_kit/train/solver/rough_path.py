@@ -94,19 +94,22 @@ def _newton_steps(
     direction = residual / diagonal
     slope = np.vecdot(residual, direction)
     step, change = np.zeros_like(residual), np.zeros_like(curvature)
+    # Results are written where memory is in the cache already.
+    along, bent = np.empty_like(curvature), np.empty_like(curvature)
+    product, scaled = np.empty_like(residual), np.empty_like(residual)
     for _ in range(MAX_CG_STEPS):
-        along = direction @ across
-        product = (curvature * along) @ samples
+        np.matmul(direction, across, out=along)
+        np.matmul(np.multiply(curvature, along, out=bent), samples, out=product)
         product[..., :-1] += direction[..., :-1]
         length = (slope / np.vecdot(direction, product).clip(np.finfo(np.float32).tiny))[..., None]
-        step += length * direction
+        step += np.multiply(length, direction, out=scaled)
         along *= length
         change += along
         product *= length
         residual -= product
         if not (np.vecdot(residual, residual) > goal).any():
             break
-        scaled = residual / diagonal
+        np.divide(residual, diagonal, out=scaled)
         before, slope = slope, np.vecdot(residual, scaled)
         direction *= (slope / before.clip(np.finfo(np.float32).tiny))[..., None]
         direction += scaled
