@@ -11,11 +11,11 @@ arrive one by one, as in a served run, a record holds the row alone: they follow
 import re
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import count
-from typing import Any, ClassVar, NotRequired, Self, TypedDict
+from itertools import count, islice
+from typing import Any, ClassVar, NotRequired, Self, TypedDict, overload
 
 from pydantic import ConfigDict
 
@@ -220,6 +220,44 @@ class PlanRecord(Record):
     order: list[int] | None = None
 
 
+class Prefix[T](Sequence[T]):
+    """The first items of a list that grows at its end. A longer prefix shares the list, so that none is copied."""
+
+    def __init__(self, items: list[T], count: int) -> None:
+        self._items, self._count = items, count
+
+    @classmethod
+    def of(cls, items: Sequence[T]) -> "Prefix[T]":
+        """Return all of `items`, which are copied unless they are a prefix."""
+        return items if isinstance(items, Prefix) else cls(list(items), len(items))
+
+    def extend(self, items: Iterable[T]) -> "Prefix[T]":
+        """Return a prefix with further items; this one keeps its own."""
+        shared = self._items if len(self._items) == self._count else self._items[: self._count]
+        shared.extend(items)
+        return Prefix(shared, len(shared))
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __iter__(self) -> Iterator[T]:
+        return islice(self._items, self._count)
+
+    @overload
+    def __getitem__(self, index: int) -> T: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[T]: ...
+    def __getitem__(self, index: int | slice) -> T | list[T]:
+        if isinstance(index, slice):
+            return [self._items[at] for at in range(*index.indices(self._count))]
+        return self._items[range(self._count)[index]]
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Sequence) and list(self) == list(other)
+
+    __hash__ = None  # type: ignore[assignment]  # as of a list
+
+
 @dataclass(frozen=True)
 class StoredPlan:
     """All plan records of a run together.
@@ -237,8 +275,8 @@ class StoredPlan:
     selection: Mapping[str, Any] = field(default_factory=dict)
     suite_parent: str | None = None
     tokens: Mapping[str, int] = field(default_factory=dict)
-    extents: tuple[int, ...] = ()
-    hashes: tuple[str, ...] = ()
+    extents: Sequence[int] = ()
+    hashes: Sequence[str] = ()
 
     def hash_of(self, number: int) -> str:
         """Return the hash of the record that added the episode of this number."""
@@ -246,14 +284,14 @@ class StoredPlan:
 
     def with_record(self, record: PlanRecord) -> "StoredPlan":
         """Return the plan after a further record, whose rows follow those before."""
-        rows = [*self.rows, *record.episodes]
+        rows = Prefix.of(self.rows).extend(record.episodes)
         return StoredPlan(
             rows,
             self.selection if record.selection is None else record.selection,
             record.suite_parent,
             record.tokens,
-            (*self.extents, len(rows)),
-            (*self.hashes, record.hash),
+            Prefix.of(self.extents).extend([len(rows)]),
+            Prefix.of(self.hashes).extend([record.hash]),
         )
 
 

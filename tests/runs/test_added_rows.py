@@ -8,7 +8,7 @@ import pytest
 
 from probe_kit.errors import RunDamagedError, RunIncompleteError, SettingsMismatchError
 from probe_kit.runs import open_run
-from probe_kit.runs.plan import Plan, Row, plan_key
+from probe_kit.runs.plan import Plan, Prefix, Row, plan_key
 from probe_kit.runs.store import locate
 from probe_kit.runs.verify import verify_run
 from probe_kit.runs.writer import EpisodeRecord, RunWriter
@@ -85,3 +85,14 @@ def test_a_plan_record_that_is_lost_is_damage(tmp_path: Path, lost: int) -> None
     (tmp_path / "run" / plan_key(lost)).unlink()
     with pytest.raises(RunDamagedError, match=plan_key(lost).replace(".", r"\.")):
         open_run(tmp_path / "run")
+
+
+def test_a_plan_that_grows_row_by_row_keeps_the_shorter_ones_as_they_were() -> None:
+    first = Prefix.of([1, 2])
+    second = first.extend([3])
+    other, third = first.extend([9]), second.extend([4, 5])
+    assert (list(first), list(second), list(third), list(other)) == ([1, 2], [1, 2, 3], [1, 2, 3, 4, 5], [1, 2, 9])
+    assert (second[-1], second[1:], len(second), bool(Prefix.of([]))) == (3, [2, 3], 3, False)
+    assert second == [1, 2, 3] != third
+    with pytest.raises(IndexError):
+        second[3]
