@@ -567,7 +567,10 @@ def compare_runs(
         first, second = (Side.of(run.name, run.run, rows) for run in (minuend, subtrahend))
         differences += compare(first, second, items=items)
     if not vlm_vla and pairs is None and len({run.answers for run in runs}) == 2:
-        unpaired.append("VLM runs and policy runs are not compared with each other; --kind vlm-vla does that.")
+        unpaired.append(
+            "VLM runs and policy runs are not compared with each other; `probe-kit compare --kind vlm-vla` does "
+            "that."
+        )
     return with_holm(differences), tuple(unpaired)
 
 

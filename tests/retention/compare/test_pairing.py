@@ -342,7 +342,7 @@ def test_asked_runs_are_compared_with_asked_ones_and_acting_with_acting(tmp_path
     table = retention_table(mixed)
     assert pairs(table) == [("vlm-1", "vlm-0"), ("policy-1", "policy-0")]
     assert table.unpaired == (
-        "VLM runs and policy runs are not compared with each other; --kind vlm-vla does that.",
+        "VLM runs and policy runs are not compared with each other; `probe-kit compare --kind vlm-vla` does that.",
     )
     assert retention_table(mixed, vlm_vla=True).unpaired == ()
     assert [row.mode for row in table.differences] == ["answers"] * 3 + ["acts"] * 3
