@@ -176,13 +176,18 @@ def _choose_stacked(labels: NDArray[np.bool_], inner: Sequence[Sequence[_Trainin
     some = _at_once([training for trainings in inner for training in trainings], labels)
     parts = [_Together.of(trainings, labels).losses() for trainings in some]
     loss, by_episode = (np.concatenate(part, axis=1) for part in zip(*parts, strict=True))
-    begins = np.cumsum([0, *(len(trainings) for trainings in inner[:-1])])
-    loss, by_episode = (np.add.reduceat(part, begins, axis=1) for part in (loss, by_episode))
+    loss, by_episode = _sum_inner(loss, inner), _sum_inner(by_episode, inner)
     best = select_c(loss)
     return [
         (STRENGTHS[best[number]], InnerQuality.of(-loss[:, number], -by_episode[:, number], best[number]))
         for number in range(len(inner))
     ]
+
+
+def _sum_inner(losses: Matrix, inner: Sequence[Sequence[_Training]]) -> Matrix:
+    """Return losses (C, inner folds, …) summed by the outer fold that they belong to."""
+    begins = np.cumsum([0, *(len(trainings) for trainings in inner[:-1])])
+    return np.add.reduceat(losses, begins, axis=1)
 
 
 def _fit_together(
@@ -192,7 +197,7 @@ def _fit_together(
     fitted: list[FittedFold] = []
     for some in _at_once(zip(folds, choices, strict=True), labels):
         trainings, coordinates = zip(*(_Training.projected(samples, fold.outer) for fold, _ in some), strict=True)
-        of_folds = _Together.of(trainings, labels).decided([strengths for _, (strengths, _) in some])
+        of_folds = _Together.of(trainings, labels).decide([strengths for _, (strengths, _) in some])
         for projection, (weights, decisions), (_, choice) in zip(coordinates, of_folds, some, strict=True):
             fitted.append(FittedFold.of(projection, weights, decisions, *choice))
     return fitted
@@ -245,7 +250,7 @@ class _Together:
                 by_episode[step, number, test] = log_losses(decisions[:, 0], truth[:, 0])
         return loss, by_episode
 
-    def decided(self, strengths: Sequence[Matrix]) -> Iterator[tuple[Array, Matrix]]:
+    def decide(self, strengths: Sequence[Matrix]) -> Iterator[tuple[Array, Matrix]]:
         """Yield the weights (R, K) of every fold at its (K,) strengths, and the decisions (m, K)."""
         of_columns = to_device_of(self.signs, np.concatenate(strengths))
         (weights,) = self.solver.path_of_signs(self.signs, [of_columns])
@@ -342,8 +347,7 @@ def _rough_losses(labels: NDArray[np.bool_], inner: Sequence[Sequence[_Training]
             test = training.fold.test
             loss[step, number] = log_losses(decisions[number, :, : test.size].T, labels[test]).sum(axis=0)
             bound[step, number] = bounds[number, :, : test.size].sum(axis=1)
-    begins = np.cumsum([0, *(len(of_fold) for of_fold in inner[:-1])])
-    return np.add.reduceat(loss, begins, axis=1), np.add.reduceat(bound, begins, axis=1)
+    return _sum_inner(loss, inner), _sum_inner(bound, inner)
 
 
 # -- many samples, whose products are shared ----------------------------------------------------------------------

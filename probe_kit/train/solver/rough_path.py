@@ -67,7 +67,8 @@ def rough_path(samples: Narrow, signs: Narrow, strengths: Matrix) -> Iterator[Na
             # Columns that have settled share the products, and need no further ones.
             goal = np.where(far, relative.clip(FINEST**2, COARSEST**2) * size, np.inf)
             step, change = _newton_steps(samples, lengths, gradient, curvature, goal)
-            # A step of this length lowers the objective, see the module; shorter ones are taken whole.
+            # Shortened so, a Newton step lowers a self-concordant objective. Short steps are taken whole: if one
+            # leads astray, the bound shows it.
             longest = abs(change).max(axis=2)
             share = np.where(longest < LONG, 1, np.log1p(longest) / longest.clip(LONG))[..., None]
             weights = weights + share * step
