@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from probe_kit.statistics.folds import Fold
 from probe_kit.train.crossval import logistic_folds
 from probe_kit.train.crossval.logistic_folds import can_be_rough, choose_roughly, choose_strengths, cross_validate
-from probe_kit.train.crossval.nested_folds import STRENGTHS, NestedFold, is_c_settled, nested_folds, select_c
+from probe_kit.train.crossval.nested_folds import STRENGTHS, NestedFold, can_be_least, nested_folds
 from probe_kit.train.samples import Samples
 from probe_kit.train.solver import rough_path as rough
 from probe_kit.train.solver.arrays import RowSubset, Standardiser, threads_for
@@ -63,9 +63,11 @@ def test_no_decision_differs_from_the_exact_one_by_more_than_its_bound(
     columns = np.column_stack([LABELS[:30], GENERATOR.random((30, 20)) < 0.5])
     signs = (2.0 * columns - 1.0).T[None]
     exact = LogisticSolver(design).path(columns, STRENGTHS)
-    path = rough.rough_path(design.samples[None].astype(np.float32), signs.astype(np.float32), STRENGTHS)
+    optima = rough.RoughOptima.start(design.samples[None], signs)
     finite = 0
-    for strength, optimum, weights in zip(STRENGTHS, exact, path, strict=True):
+    for strength, optimum in zip(STRENGTHS, exact, strict=True):
+        optima.advance(strength)
+        weights = optima.weights
         (bounds,) = rough.decision_bounds(design.samples[None], signs, weights, strength, held_out[None])
         errors = abs(held_out @ weights[0].T - held_out @ optimum).T
         assert (errors <= bounds + 1e-8).all()  # the exact optimum is one to 1e-9 of its weights
@@ -80,11 +82,13 @@ def test_a_finer_optimum_has_a_narrower_bound(monkeypatch: pytest.MonkeyPatch) -
     widest = []
     for tolerance in (1e-1, 1e-3):
         monkeypatch.setattr(rough, "TOLERANCE", tolerance)
-        path = rough.rough_path(design.samples[None].astype(np.float32), signs.astype(np.float32), STRENGTHS)
-        parts = zip(STRENGTHS, path, strict=True)
-        widest.append(
-            max(rough.decision_bounds(design.samples[None], signs, w, c, held_out[None]).max() for c, w in parts)
-        )
+        optima = rough.RoughOptima.start(design.samples[None], signs)
+        bounds = []
+        for strength in STRENGTHS:
+            optima.advance(strength)
+            parts = design.samples[None], signs, optima.weights, strength, held_out[None]
+            bounds.append(rough.decision_bounds(*parts).max())
+        widest.append(max(bounds))
     assert widest[1] < widest[0] / 10
 
 
@@ -128,7 +132,7 @@ def test_columns_that_rough_optima_leave_open_are_solved_exactly(monkeypatch: py
     monkeypatch.setattr(
         logistic_folds,
         "_choose_alone",
-        lambda samples, labels, inner: solved.append(labels.shape[1]) or alone(samples, labels, inner),
+        lambda samples, labels, *inner: solved.append(labels.shape[1]) or alone(samples, labels, *inner),
     )
     choices = choose_roughly(samples, labels, folds)
     assert max(solved) > 32  # more than are solved by whole Hessians
@@ -136,12 +140,36 @@ def test_columns_that_rough_optima_leave_open_are_solved_exactly(monkeypatch: py
         np.testing.assert_array_equal(strengths, exact)
 
 
+def test_a_large_c_is_left_out_where_some_inner_folds_show_that_it_loses() -> None:
+    samples, labels, folds = study(12, 40, columns=50, seed=3)
+    inner = [[logistic_folds._Training.of(samples, part) for part in fold.inner] for fold in folds]
+    loss, bound = logistic_folds._rough_losses(labels, inner)
+    is_left_out = np.isinf(loss)
+    assert is_left_out[-1].mean() > 0.5
+    assert not is_left_out[: logistic_folds.CHEAP].any()
+    assert (bound[is_left_out] == 0).all()
+
+
+@pytest.mark.parametrize("is_small", [True, False])
+def test_exact_optima_end_at_the_largest_c_that_can_be_best(
+    monkeypatch: pytest.MonkeyPatch, is_small: bool
+) -> None:
+    samples, labels, folds = study(12, 40, columns=50, seed=3)
+    grids: list[int] = []
+    name = "_choose_stacked" if is_small else "_choose_alone"
+    exact = getattr(logistic_folds, name)
+    monkeypatch.setattr(logistic_folds, "is_small", lambda *_: is_small)
+    monkeypatch.setattr(logistic_folds, name, lambda *parts: grids.append(len(parts[-1])) or exact(*parts))
+    choices = choose_roughly(samples, labels, folds)
+    first = max(np.flatnonzero(strengths[0] == STRENGTHS)[0] for strengths, _ in choices)
+    assert first < grids[0] <= STRENGTHS.size
+
+
 def test_a_choice_is_settled_if_no_other_loss_can_be_the_least() -> None:
-    loss = np.array([[1.0, 1.0, 1.0, 1.0], [1.3, 1.3, 1.0, np.nan]])
-    bound = np.array([[0.1, 0.2, 0.0, 0.1], [0.1, 0.1, 0.0, np.inf]])
-    best = select_c(np.nan_to_num(loss, nan=2.0))
-    np.testing.assert_array_equal(best, 0)
-    np.testing.assert_array_equal(is_c_settled(loss, bound, best), [True, False, False, False])
+    loss = np.array([[1.0, 1.0, 1.0, 1.0, 1.0], [1.3, 1.3, 1.0, np.nan, np.inf]])
+    bound = np.array([[0.1, 0.2, 0.0, 0.1, 0.1], [0.1, 0.1, 0.0, np.inf, 0.0]])
+    possible = can_be_least(loss - bound, loss + bound)
+    np.testing.assert_array_equal(possible, [[True] * 5, [False, True, True, True, False]])
 
 
 def test_few_columns_tokens_and_devices_are_not_solved_roughly() -> None:

@@ -8,7 +8,7 @@ only the losses are needed: rough ones do, as far as their errors are bounded an
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import batched
-from typing import NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,7 @@ from probe_kit.train.crossval.nested_folds import (
     FittedFold,
     InnerQuality,
     NestedFold,
-    is_c_settled,
+    can_be_least,
     select_c,
 )
 from probe_kit.train.crossval.task_scores import log_loss, log_losses
@@ -38,7 +38,7 @@ from probe_kit.train.solver.design_matrix import (
     stack_samples,
 )
 from probe_kit.train.solver.logistic import LogisticSolver, check_single_class
-from probe_kit.train.solver.rough_path import decision_bounds, rough_path
+from probe_kit.train.solver.rough_path import RoughOptima, decision_bounds
 
 # -- the probes of a site -----------------------------------------------------------------------------------------
 
@@ -113,17 +113,19 @@ def choose_strengths(samples: Samples, labels: NDArray[np.bool_], folds: list[Fo
     return _choose_alone(samples, labels, (_Training.of(samples, fold) for fold in folds))
 
 
-def _choose_alone(samples: Samples, labels: NDArray[np.bool_], inner: Iterable[_Training]) -> Choice:
-    loss = np.zeros((STRENGTHS.size, labels.shape[1]))
-    by_episode = np.zeros((STRENGTHS.size, len(labels)))
+def _choose_alone(
+    samples: Samples, labels: NDArray[np.bool_], inner: Iterable[_Training], strengths: Matrix = STRENGTHS
+) -> Choice:
+    loss = np.zeros((strengths.size, labels.shape[1]))
+    by_episode = np.zeros((strengths.size, len(labels)))
     for training in inner:
         test, truth = training.fold.test, labels[training.fold.test]
-        for step, weights in enumerate(_path(samples, labels, training, STRENGTHS)):
+        for step, weights in enumerate(_path(samples, labels, training, strengths)):
             decisions = to_numpy(training.held_out @ weights)
             loss[step] += log_loss(decisions, truth) * test.size
             by_episode[step, test] = log_losses(decisions[:, 0], truth[:, 0])
     best = select_c(loss)
-    return STRENGTHS[best], InnerQuality.of(-loss, -by_episode, best)
+    return strengths[best], InnerQuality.of(-loss, -by_episode, best)
 
 
 def _path(samples: Samples, labels: NDArray[np.bool_], training: _Training, strengths: Matrix) -> Iterator[Array]:
@@ -172,14 +174,16 @@ def choose_together(samples: Samples, labels: NDArray[np.bool_], folds: Sequence
     return _choose_stacked(labels, [[_Training.of(samples, inner) for inner in fold.inner] for fold in folds])
 
 
-def _choose_stacked(labels: NDArray[np.bool_], inner: Sequence[Sequence[_Training]]) -> list[Choice]:
+def _choose_stacked(
+    labels: NDArray[np.bool_], inner: Sequence[Sequence[_Training]], strengths: Matrix = STRENGTHS
+) -> list[Choice]:
     some = _at_once([training for trainings in inner for training in trainings], labels)
-    parts = [_Together.of(trainings, labels).losses() for trainings in some]
+    parts = [_Together.of(trainings, labels).losses(strengths) for trainings in some]
     loss, by_episode = (np.concatenate(part, axis=1) for part in zip(*parts, strict=True))
     loss, by_episode = _sum_inner(loss, inner), _sum_inner(by_episode, inner)
     best = select_c(loss)
     return [
-        (STRENGTHS[best[number]], InnerQuality.of(-loss[:, number], -by_episode[:, number], best[number]))
+        (strengths[best[number]], InnerQuality.of(-loss[:, number], -by_episode[:, number], best[number]))
         for number in range(len(inner))
     ]
 
@@ -231,16 +235,16 @@ class _Together:
         columns = _stacked_signs(trainings, labels).transpose(1, 0, 2).reshape(design.shape[0], -1)
         return cls(labels, trainings, LogisticSolver(design), to_device_of(design.samples, columns))
 
-    def losses(self) -> tuple[Matrix, Matrix]:
-        """Return the log-losses along the grid of C: of all label columns, and of the first one by episode.
+    def losses(self, strengths: Matrix) -> tuple[Matrix, Matrix]:
+        """Return the log-losses along ascending C: of all label columns, and of the first one by episode.
 
         Returns:
             (C, F, K) log-losses of the test episodes, summed; (C, F, E) log-losses of the first column, which are
             0 outside of a fold's test episodes.
         """
-        loss = np.empty((STRENGTHS.size, len(self.trainings), self.labels.shape[1]))
-        by_episode = np.zeros((STRENGTHS.size, len(self.trainings), len(self.labels)))
-        for step, weights in enumerate(self.solver.path_of_signs(self.signs, STRENGTHS)):
+        loss = np.empty((strengths.size, len(self.trainings), self.labels.shape[1]))
+        by_episode = np.zeros((strengths.size, len(self.trainings), len(self.labels)))
+        for step, weights in enumerate(self.solver.path_of_signs(self.signs, strengths)):
             for number, (training, of_fold) in enumerate(
                 zip(self.trainings, self._of_folds(weights), strict=True)
             ):
@@ -309,15 +313,17 @@ def choose_roughly(samples: Samples, labels: NDArray[np.bool_], folds: Sequence[
     at_once = max(1, ROUGH_AT_ONCE // (labels.shape[1] * INNER_FOLDS))
     parts = [_rough_losses(labels, some) for some in batched(inner, at_once)]
     loss, bound = (np.concatenate(part, axis=1) for part in zip(*parts, strict=True))
-    best = select_c(loss)
+    best, can_be_best = select_c(loss), can_be_least(loss - bound, loss + bound)
     # What one outer fold leaves open is solved for all: few columns more, in the same calls.
-    settled = is_c_settled(loss, bound, best)
-    open_ = np.append(True, ~np.all(settled[:, 1:], axis=0))
+    open_ = (can_be_best.sum(axis=0) > 1).any(axis=0)
+    open_[0] = True
     few = labels[:, open_]
+    # Every optimum starts from the one before: those of larger C than any that can be best are not needed.
+    grid = STRENGTHS[: 1 + np.flatnonzero(can_be_best[..., open_].any(axis=(1, 2))).max()]
     if is_small(samples, few):
-        exact = _choose_stacked(few, inner)
+        exact = _choose_stacked(few, inner, grid)
     else:
-        exact = [_choose_alone(samples, few, trainings) for trainings in inner]
+        exact = [_choose_alone(samples, few, trainings, grid) for trainings in inner]
     choices: list[Choice] = []
     for number, (exact_strengths, quality) in enumerate(exact):
         strengths = STRENGTHS[best[number]]
@@ -327,27 +333,140 @@ def choose_roughly(samples: Samples, labels: NDArray[np.bool_], folds: Sequence[
     return choices
 
 
+@dataclass(frozen=True)
+class _InnerFolds:
+    """Inner folds of several outer folds, F together, with K label columns.
+
+    Attributes:
+        samples: (F, N, R) training samples, filled up with zeros.
+        signs: (F, K, N) their labels −1/+1, filled up with zeros.
+        held_out: (F, T, R) test samples, filled up with zeros.
+        truth: (F, K, T) their labels −1/+1, filled up with zeros.
+        outer: (F,) number of the outer fold of each.
+        turn: (F,) number of each among those of its outer fold.
+    """
+
+    samples: Matrix
+    signs: Matrix
+    held_out: Matrix
+    truth: Matrix
+    outer: NDArray[np.intp]
+    turn: NDArray[np.intp]
+
+    @classmethod
+    def of(cls, inner: Sequence[Sequence[_Training]], labels: NDArray[np.bool_]) -> Self:
+        """Return the folds of (E, K) labels.
+
+        Raises:
+            TooFewGroupsError: For a training set with a single class.
+        """
+        trainings = [training for of_fold in inner for training in of_fold]
+        samples = StackedDesign.of_folds([training.design for training in trainings], labels.shape[1]).samples
+        held_out = stack_samples([part.held_out for part in trainings])
+        truth = np.zeros((len(trainings), labels.shape[1], held_out.shape[1]))
+        for signs, training in zip(truth, trainings, strict=True):
+            signs[:, : training.fold.test.size] = 2.0 * labels[training.fold.test].T - 1.0
+        numbers = [(outer, turn) for outer, of_fold in enumerate(inner) for turn in range(len(of_fold))]
+        return cls(
+            samples, _stacked_signs(trainings, labels).swapaxes(1, 2), held_out, truth, *np.array(numbers).T
+        )
+
+    def losses(
+        self, optima: RoughOptima, strength: float, folds: NDArray[np.intp], columns: NDArray[np.intp]
+    ) -> tuple[Matrix, Matrix]:
+        """Return the log-losses (G, L), summed over the test samples, and by how much they can differ.
+
+        Args:
+            optima: Of `folds` (G,) and, of each, `columns` (G, L).
+            strength: Their C.
+            folds: Numbers of the folds.
+            columns: Numbers of the label columns.
+        """
+        held_out, truth = self.held_out[folds], self.truth[folds[:, None], columns]
+        decisions = optima.weights @ held_out.swapaxes(1, 2)
+        samples, signs = self.samples[folds], self.signs[folds[:, None], columns]
+        bounds = decision_bounds(samples, signs, optima.weights, strength, held_out)
+        is_test = abs(truth)
+        losses = np.logaddexp(0.0, -truth * decisions)
+        # Not by a product, in which an infinite bound of what fills up would be no number.
+        bounds[np.broadcast_to(is_test == 0, bounds.shape)] = 0.0
+        return (losses * is_test).sum(axis=2), bounds.sum(axis=2)
+
+
+@dataclass(frozen=True)
+class _RoughLosses:
+    """Losses of rough optima, as far as they were computed; all (C, F, K).
+
+    Attributes:
+        begins: Numbers of the first inner fold of every outer fold.
+        loss: Log-losses of the test episodes of every inner fold, summed.
+        bound: By how much these can differ from those of exact optima.
+        is_done: Whether the loss was computed.
+    """
+
+    begins: NDArray[np.intp]
+    loss: Matrix
+    bound: Matrix
+    is_done: NDArray[np.bool_]
+
+    @classmethod
+    def none(cls, folds: _InnerFolds, columns: int) -> Self:
+        """Return losses of which none was computed."""
+        shape = STRENGTHS.size, folds.turn.size, columns
+        return cls(np.flatnonzero(folds.turn == 0), np.zeros(shape), np.zeros(shape), np.zeros(shape, bool))
+
+    def add(self, where: tuple[Any, ...], loss: Matrix, bound: Matrix) -> None:
+        """Add losses that were computed."""
+        self.loss[where], self.bound[where], self.is_done[where] = loss, bound, True
+
+    def can_win(self) -> NDArray[np.bool_]:
+        """Return whether a C can have the least loss of an outer fold, (C, outer folds, K)."""
+        loss, bound = self.totals()
+        # A loss is not negative, so that the sum of some inner folds is at most that of all.
+        return can_be_least(np.add.reduceat(self.loss - self.bound, self.begins, axis=1), loss + bound)
+
+    def totals(self) -> tuple[Matrix, Matrix]:
+        """Return losses and bounds summed by outer fold; a loss is infinite where an inner fold is not done."""
+        is_whole = np.logical_and.reduceat(self.is_done, self.begins, axis=1)
+        loss, bound = (np.add.reduceat(part, self.begins, axis=1) for part in (self.loss, self.bound))
+        return np.where(is_whole, loss, np.inf), np.where(is_whole, bound, 0.0)
+
+
+CHEAP = 5
+"""Values of C, from the smallest on, that are tried in all inner folds at once. Larger ones take most of the time:
+they are tried in one inner fold after another, since few label columns can still prefer them after the first."""
+
+
 def _rough_losses(labels: NDArray[np.bool_], inner: Sequence[Sequence[_Training]]) -> tuple[Matrix, Matrix]:
     """Return log-losses (C, F, K) of the inner test episodes, summed, of rough optima, and bounds of their errors.
+
+    The loss is infinite where it cannot be the least: losses are not negative, so that those of some inner folds
+    can show it. The others were not computed then.
 
     Args:
         labels: (E, K) labels.
         inner: Inner folds of F outer folds.
     """
-    trainings = [training for of_fold in inner for training in of_fold]
-    stacked = StackedDesign.of_folds([training.design for training in trainings], labels.shape[1]).samples
-    held_out = stack_samples([part.held_out for part in trainings])
-    signs = _stacked_signs(trainings, labels).swapaxes(1, 2)
-    loss, bound = np.empty((2, STRENGTHS.size, len(trainings), labels.shape[1]))
-    path = rough_path(stacked.astype(np.float32), signs.astype(np.float32), STRENGTHS)
-    for step, (strength, weights) in enumerate(zip(STRENGTHS, path, strict=True)):
-        decisions = weights @ held_out.swapaxes(1, 2)
-        bounds = decision_bounds(stacked, signs, weights, strength, held_out)
-        for number, training in enumerate(trainings):
-            test = training.fold.test
-            loss[step, number] = log_losses(decisions[number, :, : test.size].T, labels[test]).sum(axis=0)
-            bound[step, number] = bounds[number, :, : test.size].sum(axis=1)
-    return _sum_inner(loss, inner), _sum_inner(bound, inner)
+    folds = _InnerFolds.of(inner, labels)
+    sums = _RoughLosses.none(folds, labels.shape[1])
+    start = RoughOptima.start(folds.samples, folds.signs)
+    cheap, dear = np.split(np.arange(STRENGTHS.size), [CHEAP])
+    by_turn = [np.flatnonzero(folds.turn == turn) for turn in range(folds.turn.max() + 1)]
+    for some, steps in ((np.arange(folds.turn.size), cheap), *((turn, dear) for turn in by_turn)):
+        columns = np.tile(np.arange(labels.shape[1]), (some.size, 1))
+        optima = start if steps is cheap else start.select(some, columns)
+        for step in steps:
+            is_needed: NDArray[np.bool_] = np.any(sums.can_win()[step:], axis=0)
+            is_needed = np.take_along_axis(is_needed[folds.outer[some]], columns, 1)
+            most = is_needed.sum(axis=1).max()
+            if most == 0:
+                break
+            if most < columns.shape[1]:  # as many of every fold, first those that are needed
+                order = np.argsort(~is_needed, axis=1, kind="stable")[:, :most]
+                columns, optima = np.take_along_axis(columns, order, 1), optima.select(np.arange(some.size), order)
+            optima.advance(STRENGTHS[step])
+            sums.add((step, some[:, None], columns), *folds.losses(optima, STRENGTHS[step], some, columns))
+    return sums.totals()
 
 
 # -- many samples, whose products are shared ----------------------------------------------------------------------

@@ -127,16 +127,13 @@ def select_c(loss: Matrix) -> NDArray[np.intp]:
     return best
 
 
-def is_c_settled(loss: Matrix, bound: Matrix, best: NDArray[np.intp]) -> NDArray[np.bool_]:
-    """Return whether the exact losses are least where rough ones are, and are no tie.
+def can_be_least(lowest: Matrix, highest: Matrix) -> NDArray[np.bool_]:
+    """Return where along the grid (C, ...) the least loss can lie, or a tie with it.
 
     Args:
-        loss: (C, ...) rough losses along the grid.
-        bound: (C, ...) by how much they can differ from the exact ones.
-        best: (...) position of the least rough loss.
+        lowest: (C, ...) lower bounds of the losses.
+        highest: (C, ...) upper bounds.
     """
-    highest = np.take_along_axis(loss + bound, best[None], 0)[0]
-    lowest = loss - bound
-    np.put_along_axis(lowest, best[None], np.inf, 0)
-    settled: NDArray[np.bool_] = lowest.min(axis=0) > highest + 2 * 10.0**-LOSS_DECIMALS
-    return settled
+    # Negated, so that what is no number stays possible.
+    possible: NDArray[np.bool_] = ~(lowest > highest.min(axis=0) + 2 * 10.0**-LOSS_DECIMALS)
+    return possible

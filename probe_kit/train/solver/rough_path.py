@@ -1,7 +1,7 @@
 """Rough optima of many small logistic problems in float32, and how far their decisions can be from the exact ones.
 
 The objective is that of `logistic`. A problem of some dozen samples costs numpy's calls, not arithmetic, so all
-label columns of several folds share them, without the bookkeeping that an exact optimum needs. A rough path
+label columns of several folds share them, without the bookkeeping that an exact optimum needs. A rough optimum
 promises nothing by itself: `decision_bounds` says in float64 what it is worth.
 
 The bound rests on the self-concordance of the logistic loss (Bach, Electronic Journal of Statistics 4, 2010). Let
@@ -16,8 +16,8 @@ About the mean μ of the samples weighted by their curvatures s, H has one block
 the penalty's, 1, and one for the intercept, C Σ s. So ‖z̄‖² ≤ ‖z − μ‖² + 1 / (C Σ s) in the norm of H⁻¹.
 """
 
-from collections.abc import Iterator
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,45 +35,78 @@ MAX_NEWTON_STEPS, MAX_CG_STEPS = 12, 20
 """Bounds of loops. What does not settle within them is left as it is: its bound is then wide."""
 LONG = 4.0
 """Change of a decision from which on a Newton step is shortened."""
+FEW = 0.5
+"""Share of the label columns up to which those that have not settled go on by themselves."""
 LARGEST = 80.0
 """Largest margin whose exponential float32 holds."""
+TINY = float(np.finfo(np.float32).tiny)
 
 
-def rough_path(samples: Narrow, signs: Narrow, strengths: Matrix) -> Iterator[Narrow]:
-    """Yield about the optimal weights (F, K, R) of K label columns of F folds for each C of ascending `strengths`.
+@dataclass
+class RoughOptima:
+    """About the optimal weights of K label columns of F folds, for one C after another.
 
-    Args:
-        samples: (F, N, R) samples of the folds in nearly orthogonal columns, the last one all ones for the
+    Attributes:
+        samples: (F, N, R) float32 samples of the folds in nearly orthogonal columns, the last one all ones for the
             intercept; rows of zeros fill up a fold of fewer samples.
-        signs: (F, K, N) labels −1 and +1; 0 where a fold has no sample.
-        strengths: Ascending C; each starts at the optimum of the one before.
+        signs: (F, K, N) float32 labels −1 and +1; 0 where a fold has no sample.
+        weights: (F, K, R) float32.
+        decisions: (F, K, N) float32 decisions on the samples.
     """
-    lengths = np.square(samples).sum(axis=1)[:, None]
-    weights: Narrow = np.zeros((*signs.shape[:2], samples.shape[2]), np.float32)
-    decisions: Narrow = np.zeros(signs.shape, np.float32)
-    for strength in strengths.astype(np.float32):
-        for _ in range(MAX_NEWTON_STEPS):
-            misfit = _misfit(signs * decisions)
-            curvature = strength * misfit * (1 - misfit)
-            gradient = (signs * misfit) @ samples
-            gradient *= -strength
-            gradient[..., :-1] += weights[..., :-1]
+
+    samples: Narrow
+    signs: Narrow
+    weights: Narrow
+    decisions: Narrow
+
+    @classmethod
+    def start(cls, samples: Matrix, signs: Matrix) -> Self:
+        """Return weights of zero for samples and labels as in the attributes, of any precision."""
+        weights = np.zeros((*signs.shape[:2], samples.shape[2]), np.float32)
+        narrow = signs.astype(np.float32)
+        return cls(samples.astype(np.float32), narrow, weights, np.zeros_like(narrow))
+
+    def select(self, folds: NDArray[np.intp], columns: NDArray[np.intp]) -> Self:
+        """Return the optima of `folds` (G,), of each its `columns` (G, L)."""
+        of_fold = folds[:, None]
+        parts = (part[of_fold, columns] for part in (self.signs, self.weights, self.decisions))
+        return type(self)(self.samples[folds], *parts)
+
+    def advance(self, strength: float) -> None:
+        """Go on from the optima of the C before, a smaller one, to those of `strength`."""
+        self._advance(strength, MAX_NEWTON_STEPS)
+
+    def _advance(self, strength: float, steps: int) -> None:
+        lengths = np.square(self.samples).sum(axis=1)[:, None]
+        for left in reversed(range(steps)):
+            misfit = _misfit(self.signs * self.decisions)
+            curvature = np.float32(strength) * misfit * (1 - misfit)
+            gradient = (self.signs * misfit) @ self.samples
+            gradient *= -np.float32(strength)
+            gradient[..., :-1] += self.weights[..., :-1]
             size = np.vecdot(gradient, gradient)
-            scale = np.maximum(np.vecdot(weights[..., :-1], weights[..., :-1]), size)
-            relative = size / scale.clip(np.finfo(np.float32).tiny)
+            scale = np.maximum(np.vecdot(self.weights[..., :-1], self.weights[..., :-1]), size)
+            relative = size / np.maximum(scale, TINY)
             far = relative > TOLERANCE**2
-            if not far.any():
-                break
+            most = far.sum(axis=1).max()
+            if most == 0:
+                return
+            if most <= FEW * far.shape[1]:
+                folds, columns = np.arange(len(far)), np.argsort(~far, axis=1, kind="stable")[:, :most]
+                rest = self.select(folds, columns)
+                rest._advance(strength, left + 1)
+                self.weights[folds[:, None], columns] = rest.weights
+                self.decisions[folds[:, None], columns] = rest.decisions
+                return
             # Columns that have settled share the products, and need no further ones.
             goal = np.where(far, relative.clip(FINEST**2, COARSEST**2) * size, np.inf)
-            step, change = _newton_steps(samples, lengths, gradient, curvature, goal)
+            step, change = _newton_steps(self.samples, lengths, gradient, curvature, goal)
             # Shortened so, a Newton step lowers a self-concordant objective. Short steps are taken whole: if one
             # leads astray, the bound shows it.
             longest = abs(change).max(axis=2)
             share = np.where(longest < LONG, 1, np.log1p(longest) / longest.clip(LONG))[..., None]
-            weights = weights + share * step
-            decisions = decisions + share * change
-        yield weights
+            self.weights = self.weights + share * step
+            self.decisions = self.decisions + share * change
 
 
 def _newton_steps(
@@ -102,7 +135,7 @@ def _newton_steps(
         np.matmul(direction, across, out=along)
         np.matmul(np.multiply(curvature, along, out=bent), samples, out=product)
         product[..., :-1] += direction[..., :-1]
-        length = (slope / np.vecdot(direction, product).clip(np.finfo(np.float32).tiny))[..., None]
+        length = (slope / np.maximum(np.vecdot(direction, product), TINY))[..., None]
         step += np.multiply(length, direction, out=scaled)
         along *= length
         change += along
@@ -112,7 +145,7 @@ def _newton_steps(
             break
         np.divide(residual, diagonal, out=scaled)
         before, slope = slope, np.vecdot(residual, scaled)
-        direction *= (slope / before.clip(np.finfo(np.float32).tiny))[..., None]
+        direction *= (slope / np.maximum(before, TINY))[..., None]
         direction += scaled
     return step, change
 
@@ -125,8 +158,8 @@ def decision_bounds(
     Infinite where the point is too far from the optimum to tell. See the module for the bound.
 
     Args:
-        samples: (F, N, R) training samples as for `rough_path`, in float64.
-        signs: (F, K, N) labels as for `rough_path`, in float64.
+        samples: (F, N, R) training samples as of `RoughOptima`, in float64.
+        signs: (F, K, N) labels as of `RoughOptima`, in float64.
         weights: (F, K, R) weights of any precision.
         strength: Their C.
         held_out: (F, T, R) held-out samples.
