@@ -1,4 +1,4 @@
-"""The page of a diagnosis: its table, its sentences, and a figure from the layers to the action."""
+"""The HTML page of a diagnosis: its table, its sentences, and a figure over the sites up to the action."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,4 +1,8 @@
-"""Attribution patching: gradients order cells, exact patches check the order and anchor it; enters no verdict."""
+"""Attribution patching: gradients estimate which patches matter, and exact patches check the estimates.
+
+The estimates order the cells. Some cells with a sure effect, the anchors, are patched exactly: if gradients miss
+one of them, the order is void. The result enters no verdict.
+"""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,10 +1,10 @@
 """Concept erasure: the linearly decodable answer is removed from each token, with random controls.
 
-This file has the intervention, its effects and their table. The fits are in `erasers`, which interchange and steer
-share with it (`--direction mean-difference:K`). Erasure is a supplement, and the weakest. A policy may read what
-is not linear. An answer that is erased at one place may pass at another, and information that is removed along
-with it disrupts the task. Erasers that know only the mean over tokens blind a probe and leave the behaviour, so
-that there is one per position.
+This file has the intervention, its effects and their table. The fits are in `erasers`; interchange and steer use
+them too (`--direction mean-difference:K`). Erasure gives the weakest evidence of all kinds. A policy may read what
+is not linear. An answer that is erased at one place may pass at another. Other information that is removed with it
+may disrupt the task. Erasers are fitted at every token position: one of the mean over tokens would hide the answer
+from a probe of that mean, and leave the action as it is.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,8 @@
 """Image swap: with the two images swapped, and nothing else, does the action change sides?
 
-Two inferences per episode have the same state and noise. Displacements are in units of the policy's own reach. In
-runs without sides, one input is exchanged for a donor's, and sizes are in spreads of clean actions.
+Every episode is inferred twice, with the same state and noise. Displacements are in units of the policy's own
+reach, the lateral distance between its actions to either side. In runs without sides, one input is exchanged for a
+donor's, and sizes are in spreads (standard deviations) of the clean actions.
 """
 
 from abc import abstractmethod

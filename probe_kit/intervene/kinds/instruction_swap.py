@@ -1,7 +1,7 @@
-"""Instruction swap: asked for the other picture before the same images, does the action change sides?
+"""Instruction swap: with the same images and the other picture asked for, does the action change sides?
 
-If the action follows the images, they are read; if it follows the instruction, that is read. A policy may follow
-one and not the other: it can have learnt what to look for, whatever is asked.
+If the action follows a swap of the images, the policy reads images; if it follows the instruction, it reads words.
+It may follow one and not the other: a policy can have learnt what to look for, whatever is asked.
 """
 
 from collections.abc import Sequence

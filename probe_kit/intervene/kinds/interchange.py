@@ -1,13 +1,14 @@
-"""Interchange (activation patching) at places, and what a run's stored edits found inside the network.
+"""Interchange (activation patching) at places, and what a run's stored edits show inside the network.
 
-Tokens are patched from the same inference with swapped images. The patch is what this policy computes there in
-this state, so it is on the policy's own distribution and has no strength to choose. It can do no more than the
-image swap: with all that differs patched, the effect is 1.
+Tokens are replaced by those of the same inference with swapped images. This policy computes such tokens itself in
+this state, so a patch stays on its own distribution and has no strength to choose. A patch can do no more than the
+image swap: if all that differs is patched, the effect is 1.
 
-Effects are signed. The *target side* is the one on which the correct picture lies once the two are swapped, or the
-side that is steered to. A flip rate alone is no evidence: actions flip away from that side as well. Maps,
-directions and steering are each read by themselves. Family-wise p-values are against everything that was tried in
-the same stream on the same episodes, in one intervention or in several.
+Effects have a sign. The *target side* is the side on which the correct picture lies after the swap; of a steering,
+it is the side that is steered to. How often actions flip is no evidence alone, because some flip away from that
+side. So flips away are subtracted. Full patches, patches along directions and steering have rows of their own.
+Family-wise p-values are against everything that was tried in the same stream on the same episodes, in one
+intervention or in several.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence

@@ -1,6 +1,7 @@
-"""Joint places: which cells carry the effect together, which alone, and which are needed.
+"""Joint places: which cells carry the effect together, which of them alone, and which are needed.
 
-Sets of cells are patched in one inference, as an interchange patches a single one.
+A cell is the tokens of one role at one place. Sets of cells are patched in one inference, as an interchange
+patches a single cell.
 """
 
 from collections.abc import Mapping, Sequence
