@@ -242,7 +242,7 @@ def _columns(exchange: str) -> tuple[EffectColumn[AttributionEffect], ...]:
         EffectColumn(
             "estimate [95 %]",
             lambda row: interval_cell(row.estimate, row.estimate_ci),
-            f"estimate: share of the {exchange} by gradients",
+            f"estimate: share of the {exchange} that gradients predict for a patch of these tokens",
         ),
         EffectColumn(
             "exact [95 %]",

@@ -437,8 +437,8 @@ _ACTION = (
     EffectColumn[ErasureEffect](
         "p",
         lambda row: p_of(row.p, is_resolved(100 * row.mean_displacement, row.right_before - row.right)),
-        "p: exact, that the action moves away farther than under the controls, by item and by group, the larger "
-        "one",
+        "p: exact, of a larger move away from the correct picture than under the controls; the larger of the "
+        "tests by item and by group",
     ),
     EffectColumn[ErasureEffect](
         "relative change",

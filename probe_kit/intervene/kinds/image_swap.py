@@ -200,7 +200,8 @@ _INPUT_COLUMNS = (
     EffectColumn[InputEffect](
         "size",
         lambda row: TableCell(row.size, number),
-        "size: mean change of the action by the donor's input, in spreads of the clean actions",
+        "size: mean change of the action by the donor's input, in spreads (standard deviations) of the clean "
+        "actions",
     ),
     EffectColumn[InputEffect](
         "control",

@@ -890,7 +890,7 @@ def _columns(rows: "Sequence[KnockoutEffect]", is_scene: bool) -> list[EffectCol
     change = EffectColumn[KnockoutEffect](
         "change",
         lambda row: TableCell(row.size, number),
-        "change: of the action, in spreads of the clean actions",
+        "change: how far the cut moves the action, in spreads (standard deviations) of the clean actions",
     )
     if _is_played(rows):
         change = EffectColumn[KnockoutEffect](

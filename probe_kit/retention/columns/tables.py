@@ -280,7 +280,7 @@ def _controls(rows: Sequence[RetentionRow]) -> str:
     untrained = f"; untrained: {name}" if name else ""
     fewest = min(row.success.n_items for row in rows if row.category != MEAN)
     share = f"{100 * detectable(fewest):.1f}"
-    findable = f"with {plural(fewest, 'item')} a leak of {share} % is found in 4 of 5 suites"
+    findable = f"with {plural(fewest, 'item')} a leak that gives a control {share} % is found in 4 of 5 suites"
     return (
         f"held-out accuracy % without the model, {findable}; selectivity: accuracy above random labels{untrained}"
     )
