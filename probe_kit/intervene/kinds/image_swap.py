@@ -216,7 +216,7 @@ _INPUT_COLUMNS = (
     EffectColumn[InputEffect](
         "share [95 %]",
         lambda row: interval_cell(row.share, row.share_ci),
-        "share: displacement toward the donor's action, as a share of that by the full exchange",
+        "share: displacement toward the donor's action by this input, as a share of that by all inputs",
     ),
     EffectColumn[InputEffect](
         "p",
@@ -428,8 +428,8 @@ SWAP_COLUMNS = (
     EffectColumn[ImageSwapEffect](
         "moved [95 %]",
         lambda row: signed_interval(row.reach_share, row.reach_share_ci),
-        "moved: displacement toward the correct picture in units of the policy's own reach, "
-        f"{SMALLEST_SHARE_OF_INTEREST} of which count",
+        "moved: displacement toward the correct picture, as a share of the policy's own reach; less than "
+        f"{SMALLEST_SHARE_OF_INTEREST} does not matter",
     ),
     EffectColumn[ImageSwapEffect](
         "follow %",
@@ -440,7 +440,7 @@ SWAP_COLUMNS = (
     EffectColumn[ImageSwapEffect](
         "net [95 %]",
         lambda row: signed_interval(row.net_follow_rate, row.net_follow_rate_ci),
-        f"net: follow − reversal, {SMALLEST_EFFECT_OF_INTEREST} of which count",
+        f"net: follow minus reversal, as a share; less than {SMALLEST_EFFECT_OF_INTEREST} does not matter",
     ),
     EffectColumn[ImageSwapEffect](
         "p",

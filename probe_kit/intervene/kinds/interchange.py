@@ -634,8 +634,16 @@ def _columns(exchange: str, is_scene: bool) -> list[EffectColumn[PatchEffect]]:
                 "nearer to the source: share of episodes whose action is nearer to the source's than to the clean "
                 "one",
             ),
-            EffectColumn("displacement", lambda row: TableCell(row.mean_displacement, with_sign)),
-            EffectColumn("controls", lambda row: TableCell(row.control_displacement, with_sign)),
+            EffectColumn(
+                "displacement",
+                lambda row: TableCell(row.mean_displacement, with_sign),
+                "displacement: toward the source's action, in spreads (standard deviations) of the clean actions",
+            ),
+            EffectColumn(
+                "controls",
+                lambda row: TableCell(row.control_displacement, with_sign),
+                "controls: the mean displacement of random directions",
+            ),
             p,
             change,
         ]

@@ -914,7 +914,8 @@ def _columns(rows: "Sequence[KnockoutEffect]", is_scene: bool) -> list[EffectCol
     wrong = EffectColumn[KnockoutEffect](
         "wrong side",
         lambda row: TableCell(row.net, with_sign),
-        "wrong side: share of episodes whose action leaves the correct picture's side, minus those that come",
+        "wrong side: share of episodes whose action leaves the correct picture's side, minus the share that comes "
+        "to it",
     )
     return [
         EffectColumn(
