@@ -300,7 +300,7 @@ def _probe_accuracy(features: "TokenFeatures", fits: Sequence[tuple[Fold, Eraser
 class ErasureEffect(EffectRow):
     """The effect on the action of erasing an answer at one place, in one category; see `EffectRow`.
 
-    Here `net` is the share of episodes that no longer go to the correct side minus those that do now.
+    Here `net` is the share of episodes that no longer go to the correct side, minus those that go there only now.
 
     Attributes:
         right_before: Share of episodes whose action goes to the correct picture's side, without the edit.

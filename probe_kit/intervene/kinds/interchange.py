@@ -388,7 +388,7 @@ def _depth(subject: tuple[str, ...]) -> tuple[object, ...]:
 
 
 def best_patch_targets(run: RunReader, categories: Sequence[str]) -> tuple[str, ...]:
-    """Return `PLACE|ROLE`, of each category the last place of the backbone located, in its narrowest role.
+    """Return `PLACE|ROLE` by category: the last located place of the backbone, in the role of the largest effect.
 
     The last place lies behind all other places through which the answer passes. Where none of the backbone was
     located, it is the last of the acting stream or of `kv`. Of its roles it has the one with the largest effect,
