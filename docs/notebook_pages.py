@@ -29,7 +29,8 @@ def notebook_markdown(path: Path, pictures: dict[str, bytes]) -> str:
     for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]:
         source = "".join(cell["source"])
         if cell["cell_type"] == "markdown":
-            parts.append(source.replace(".ipynb)", ".md)"))
+            # Notebooks are pages beside those of `docs/`, and their links are written for the checkout.
+            parts.append(source.replace(".ipynb)", ".md)").replace("](../docs/", "](../"))
             continue
         parts.append(_fenced(source, "python"))
         parts += [_output(output, path.stem, pictures) for output in cell["outputs"]]

@@ -1,4 +1,4 @@
-"""The executor, which hands tasks to workers, here or elsewhere, and tries again what a lost worker held."""
+"""The executor: it gives tasks to workers, here or elsewhere, and repeats the tasks of a lost worker."""
 
 import warnings
 from collections import Counter, defaultdict

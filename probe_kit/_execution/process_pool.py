@@ -1,9 +1,9 @@
 """A child process that answers requests over one connection, and a pool of workers in such processes.
 
-`multiprocessing` starts a child by importing the caller's script again, which breaks every script and notebook
-without a main guard; forking breaks torch and zarr. So a child is a fresh interpreter that runs this module and
-talks to its parent through a socket. It lives in its own session, so that Ctrl-C reaches the parent alone, and
-ends when the parent closes the socket or dies.
+`multiprocessing` starts a child by importing the caller's script again. That breaks every script and notebook
+without a main guard. Forking breaks torch and zarr. So a child is a fresh interpreter that runs this module and
+exchanges messages with its parent through a socket. It lives in its own session, so that Ctrl-C reaches the parent
+alone. It ends when the parent closes the socket or dies.
 """
 
 import os

@@ -181,7 +181,7 @@ InferenceLimit = Annotated[
 # -- planning and output ----------------------------------------------------------------------------------------
 
 DryRun = Annotated[
-    bool, typer.Option("--dry-run", help="Print the plan and stop. Needs no weights, network or GPU.")
+    bool, typer.Option("--dry-run", help="Print the plan and stop. Needs no weights, no internet and no GPU.")
 ]
 AllowMixed = Annotated[
     bool,

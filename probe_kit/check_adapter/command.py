@@ -19,8 +19,8 @@ Instructions = Annotated[
     typer.Option(
         "--instruction",
         metavar="TEXT",
-        help="An instruction that your tokenizer knows; repeatable. Give at least two with different numbers "
-        "of tokens, and two with the same number. Default: sentences of the embedded suite.",
+        help="An instruction that your tokenizer knows; repeatable. The first two must have different numbers of "
+        "tokens, and any two the same number. Default: sentences of the embedded suite.",
     ),
 ]
 

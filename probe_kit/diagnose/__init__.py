@@ -1,7 +1,8 @@
 """Diagnosis of a policy that ignores an input: does it arrive, does it matter, and where on the way is it lost?
 
-`inputs` draws observations of a run and names their inputs. `measure` exchanges these. `importance` measures how
-much of the action an input decides. `diagnosis` finds the sites at which it passes, and stores all of it.
+`inputs` draws frames of a run and names their inputs. `measure` exchanges inputs between frames and infers the
+actions. `importance` computes how much of the action an input decides. `diagnosis` finds the sites at which an
+input passes, and stores all of it.
 """
 
 from typing import TYPE_CHECKING

@@ -1,4 +1,4 @@
-"""`probe-kit diagnose`."""
+"""The command `probe-kit diagnose`."""
 
 import os
 from collections.abc import Collection, Iterable, Mapping, Sequence

@@ -1,9 +1,13 @@
 """The share of the action that an input decides: total-effect indices, intervals and the verdict. Loads no model.
 
-The index of an input is the share of the action's variance that is due to it, alone and together with others. It
-is S = Σ (a(x) − a(x with another value of the input))² / 2 V, by Jansen's estimator (M. Jansen, Computer Physics
-Communications 117, 1999; Saltelli et al., Computer Physics Communications 181, 2010). V is the variance of the
-actions over frames and seeds. Both inferences of a pair have one seed.
+The index of an input is the share of the action's variance that is due to it, alone and together with other
+inputs. It is the mean over pairs of frames
+
+    S = mean of (a(x) − a(x with another value of the input))² / 2 V
+
+by Jansen's estimator (M. Jansen, Computer Physics Communications 117, 1999; Saltelli et al., Computer Physics
+Communications 181, 2010). V is the variance of the actions over frames and seeds. Both inferences of a pair have
+the same seed.
 """
 
 from dataclasses import dataclass

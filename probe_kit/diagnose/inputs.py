@@ -1,4 +1,4 @@
-"""The inputs that frames hold, and the frames of a run that are diagnosed: first inferences, of many groups."""
+"""The inputs of a frame (words, pictures, state), and the frames of a run between which they are exchanged."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""The inferences of a diagnosis: clean, with every input exchanged, blanked and hardly changed."""
+"""The inferences of a diagnosis: unchanged, with each input exchanged, blanked, and changed without meaning."""
 
 from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress

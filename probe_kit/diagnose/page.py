@@ -1,4 +1,4 @@
-"""The page of a diagnosis: its table, its sentences, and a figure from the layers to the action."""
+"""The HTML page of a diagnosis: its table, its sentences, and a figure over the sites up to the action."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +21,7 @@ _HEAD = (
 
 
 def draw_passage(diagnosis: "Diagnosis") -> "Figure":
-    """Draw a curve per input over the sites in the network's order: the difference, and the share carried on.
+    """Draw how far every input comes: relative difference and share carried, over the sites in their order.
 
     Below them the curve of a target is drawn: its score above chance.
     """

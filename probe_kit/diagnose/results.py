@@ -1,4 +1,4 @@
-"""The results of a diagnosis, input by input: as they are stored, their table and sentences. Loads no model."""
+"""The results of a diagnosis, input by input: stored form, table and sentences. Loads no model."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -93,7 +93,8 @@ PictureSizes = Annotated[
 ]
 
 Large = Annotated[
-    bool, stored_option("--yes", help="Start although the run would take more than 64 GB before compression.")
+    bool,
+    stored_option("--yes", help="Start although the run may take more than 64 GB of disk (before compression)."),
 ]
 
 ConfigFile = Annotated[

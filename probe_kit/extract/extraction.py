@@ -1,4 +1,4 @@
-"""Extraction from settings to a run: source, checks, model and plan; then workers play, and the run is sealed."""
+"""Extraction, from settings to a run: open the source, check, load the model, plan, play in workers, seal."""
 
 import json
 import os

@@ -1,8 +1,9 @@
-"""Parts of the settings of a run: model, capture, task, machine. The part of a field says if it is identity.
+"""The parts of a run's settings: model, capture, task, machine. Each part says whether it identifies the run.
 
-The parts `capture` and `task` are identity as they are. The part `model` and the source (in `sources/`) are
-identity by what they lead to, a hash of weights and a list of rows. The part `machine` never is. A field is
-declared here once: its annotation holds the option of the command line, and study files have the same fields.
+Two runs are the same run if the settings that identify them are equal. `capture` and `task` identify a run as they
+are. The model and the source (in `sources/`) do so by what they lead to: a hash of weights, and a list of rows.
+`machine` never does. Each field is declared here once: its annotation holds the option of the command line, and
+study files have the same fields.
 """
 
 from collections.abc import Callable, Mapping, Sequence

@@ -116,7 +116,8 @@ Controls = Annotated[
     int | None,
     _inside_option(
         "--controls",
-        help="Number of controls: random directions of equal size. Of a knockout: cuts of random tokens.",
+        help="Number of random controls: directions of the same size; of a knockout, cuts of random tokens; of "
+        "an attribution, further places.",
         min=0,
         max=100,
     ),

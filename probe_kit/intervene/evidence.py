@@ -307,7 +307,7 @@ def _best_site(
     along: Sequence[PatchEffect],
 ) -> str:
     if results is None:
-        return "there are no probes, which probe-kit train makes"
+        return "no probes are stored: probe-kit train makes them"
     view, scores = results.settings.views[0], results.scores
     site_scores = scores[
         (scores["stream"] == BACKBONE) & (scores["view"] == view) & (scores["category"] == category)
@@ -324,5 +324,5 @@ def _best_site(
         tie = _TIES[at_site]
         carries = any((row.sites, row.role) == (site, role) and row.is_localised for row in rows)
         if at_site == "not tested" and carries:
-            tie = "carries the effect; --direction mean-difference tests what probes read there"
+            tie = "carries the effect; --direction mean-difference tests whether what probes read is used there"
     return f"the probes' best site {site}{'' if best['signal'] else ' (no signal)'} {tie}"

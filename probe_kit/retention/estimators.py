@@ -1,6 +1,8 @@
-"""The scores of a category's streams, and retention: the share of the backbone's knowledge that the action holds.
+"""The scores of a category's streams, and retention: the share of the backbone's signal that the action keeps.
 
-The action is made in the action expert or, in a policy without one, at the positions that choose its tokens.
+The score of a stream is the held-out accuracy of a site that was chosen on the training questions. Retention is
+the score of the action above chance, divided by that of the backbone. The action is read in the action expert. In
+a policy without one it is read at the positions that choose the action's tokens.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,8 @@
 """Reading of the column store: one pooled vector per episode, as probes need it.
 
-A row store answers "everything of one episode". Columns hold the same numbers the other way round; `seal` writes
-them. They are derived: safe to delete, and used only while their stamp matches the commits.
+A run stores rows: everything of one episode together. Columns hold the same numbers ordered the other way: one
+site and view of all episodes together. `seal` writes them. They can be made again, so they are safe to delete.
+They are used only while their stamp matches the commits.
 
     columns.zarr/<stamp>/<stream>/
         pooled            float32 (call, view, [iteration,] layer, episode, feature)
@@ -9,9 +10,9 @@ them. They are derived: safe to delete, and used only while their stamp matches 
         role              uint8 (call, episode, token), codes named by the attribute `roles`
     sealed/<stamp>.json   the hash of every object there, and of which run and commits they are
 
-Their key carries the stamp, so that processes that saw different commits never mix them. A seal says which
-episodes it was made of. It is older than a run that has more. A seal that names an episode which is not committed
-any more shows that the run lost it.
+The stamp is part of their path, so that processes which saw different commits never mix columns. A seal names the
+episodes of which it was made. If the run has more episodes, the seal is older. If the seal names an episode that
+is no longer committed, the run lost it.
 """
 
 from collections.abc import Mapping

@@ -4,11 +4,11 @@
     certificate.json              the first process's record, with its provenance
     certificates/<digits>.json    a record per process, named by the sha256 of its content
 
-Each of the three follows from the others as far as a run of one process goes. What is missing and follows is read
-as if it were there, and written again where a command may write.
+In a run of one process, each of the three can be made from the others. A missing one that can be made is read as
+if it were there, and written again by commands that may write.
 
-Settings say what was requested; provenance says which machine and libraries computed it. Numbers of another kind
-of device or of other libraries are not the same numbers. So a run is continued there only on request, and says so.
+Settings say what was requested; provenance says which machine and libraries computed it. Another kind of device or
+other libraries give other numbers. So a run continues there only on request, and records it.
 """
 
 import json

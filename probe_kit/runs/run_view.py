@@ -1,6 +1,7 @@
 """A view of a run: the same run with other episodes or outcomes, for answers by a score, wordings and rules.
 
-A view is a run of the same class. It shares what was read; the index of its episodes is their position in the run.
+A view has the class of the run and shares what was read of it. The index of its episodes is their position in the
+run.
 """
 
 from copy import copy

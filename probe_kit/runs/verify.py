@@ -1,7 +1,7 @@
-"""Sealing and verification of a run: columns for each site and view, and every record, object and reader.
+"""Sealing and verification of a run: columns for each site and view; every record, object and reader is checked.
 
-Reading refuses more than other bytes, such as probes in the folder of interventions. So deep verification calls
-the functions that read: it says no wherever one of them would.
+Files can be intact and still be refused by a reader, such as probes in the folder of interventions. So deep
+verification also calls the functions that read, and fails wherever one of them would.
 """
 
 import os

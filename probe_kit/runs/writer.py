@@ -1,4 +1,4 @@
-"""Writing of a run: created once, then one committed episode at a time; it may grow and never gets smaller."""
+"""Writing of a run: it is created once, then gets one committed episode at a time. It may grow, never shrink."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence

@@ -59,7 +59,8 @@ Metadata = Annotated[
     typer.Option(
         "--metadata",
         metavar="KEY=JSON",
-        help="Entry of the first message to a client, such as reset_pose=[0,0.1]; repeatable.",
+        help="Setting for clients of openpi, such as reset_pose=[0,0.1]: the server sends it when they connect. "
+        "Repeatable.",
         rich_help_panel="Network",
     ),
 ]

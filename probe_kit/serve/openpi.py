@@ -1,4 +1,4 @@
-"""The wire of openpi: a websocket on which an observation and an answer follow each other."""
+"""The protocol of openpi: a websocket on which each observation is followed by one answer."""
 
 from time import monotonic, perf_counter
 from typing import Any

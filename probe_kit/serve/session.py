@@ -1,6 +1,6 @@
 """A session of a policy server: episodes of its clients, one inference at a time, and the run that they make.
 
-A session knows no wire. Its methods are called one at a time, on the thread that infers, but for `connect`.
+A session knows no network protocol. All methods but `connect` are called one at a time, on the thread that infers.
 Another thread writes.
 """
 

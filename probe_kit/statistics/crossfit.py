@@ -1,8 +1,8 @@
-"""Balanced scores of sites, and cross-fitted ones: the site of a fold is chosen by its inner folds, scored on it.
+"""Balanced scores of sites, and cross-fitted scores of streams: inner folds choose a site, outer folds score it.
 
 Missing episodes of one side favour no site, and chance is always one half. The choice of a site is repeated on
-resampled groups, and sites share it by how often they are best. The spread over the resamples says what the choice
-adds to the variance. See Efron, “Estimation and accuracy after model selection”, Journal of the American
+resampled groups, and sites share the score by how often they are best. The spread over the resamples says how much
+variance the choice adds. See Efron, “Estimation and accuracy after model selection”, Journal of the American
 Statistical Association 109 (2014).
 """
 

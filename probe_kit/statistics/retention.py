@@ -1,4 +1,4 @@
-"""Retention, with limits: the score of the action's best site as a share of the backbone's."""
+"""Retention with its interval: the score of the action above chance, as a share of the backbone's."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

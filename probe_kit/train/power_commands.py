@@ -140,7 +140,10 @@ def _print(estimates: "list[Power]") -> None:
             term=f"absent: how often a stream without signal is called absent, below {100 * ABSENT_BELOW:g} %",
         ),
         Heading("± (standard error)", term="±: of the four, the largest, measured over seeds"),
-        Heading("red control from %", term="a leaking control of that accuracy is red in 80 % of suites"),
+        Heading(
+            "leak found from %",
+            term="leak found: a control that a leak of the suite brings to this accuracy is red in 80 % of suites",
+        ),
     )
     shares = ("above", "chance", "random_features", "untrained", "absent")
     rows: list[Cells] = [

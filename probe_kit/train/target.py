@@ -1,7 +1,7 @@
 """The labels that probes decode, one for every episode or captured inference: `Target`.
 
-A target is a side of a picture, another built-in column, or a column of a user's table. Its cells are read in
-`label_columns`; which samples of a run it names is decided in `target_samples`.
+A target is a side of a picture, another built-in column, or a column of a user's table. `label_columns` reads the
+cells; `target_samples` decides which samples of a run have one.
 """
 
 from collections.abc import Sequence

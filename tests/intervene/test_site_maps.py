@@ -386,7 +386,7 @@ def test_where_no_layer_carries_it_no_place_to_steer_is_named(run: ArrayRun) -> 
 def test_without_an_interchange_and_probes_it_names_the_commands_that_are_missing(run: ArrayRun) -> None:
     steered = {"backbone.01|image|mean-difference|2": 0.0}
     store(run, steered, "steer", direction="mean-difference", target_side="wrong", seed=0)
-    assert line(run).split("; ") == [UNTESTED, OPEN, "there are no probes, which probe-kit train makes"]
+    assert line(run).split("; ") == [UNTESTED, OPEN, "no probes are stored: probe-kit train makes them"]
 
 
 @pytest.mark.parametrize(

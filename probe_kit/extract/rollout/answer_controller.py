@@ -1,8 +1,8 @@
 """The task ask: a model answers one question about the first frame of an episode.
 
-Every question is asked with the left side named first. Where the prompt can be turned round, it is asked once more
-with the right side named first. Each time the answer is both spoken and forced: greedy text, and the logits of the
-admissible answers at its beginning.
+Every question names the left side first. If the prompt can be turned round, it is asked once more with the right
+side first. Each answer is read in two ways: as the text that greedy decoding writes, and by the logits of the
+admissible answers at its first token.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,8 @@
-"""Controllers: a policy whose inferences are captured, or a script; actions as executed; the input check.
+"""Controllers decide the actions of an episode: a policy whose inferences are captured, or a script.
 
-The check decides only that an input is dead: one inference cannot show that a model uses it. `probe-kit diagnose`
-does.
+This file also has the conversion of predicted actions to executed ones, and the check of inputs before a run. The
+check finds only inputs that change nothing. That a model uses an input cannot be shown by one inference;
+`probe-kit diagnose` shows it.
 """
 
 import warnings

@@ -1,6 +1,6 @@
-"""Tasks: a policy acts or is captured on the observations of a source; an answer model answers questions.
+"""Tasks: what a model does with the observations of a source. It acts, is only captured, or answers questions.
 
-A task knows no particular source, and has no state: all choices are in the settings.
+A task knows no particular source and has no state: all choices are in the settings.
 """
 
 from collections.abc import Callable, Iterable

@@ -1,4 +1,4 @@
-"""A worker that plays its episodes and commits them: players alternate with the model, one thread writes."""
+"""A worker plays its episodes and commits them. Players and model take turns, and one thread writes."""
 
 import tempfile
 from collections import deque

@@ -212,7 +212,7 @@ _CHECKS: Sequence[tuple[str, str, Callable[[_Trial], str | None]]] = (
 def check_environment(
     source: EnvironmentSettings | str, picture: Path | str | None = None
 ) -> Iterator[EnvironmentCheck]:
-    """Check the promises of the contract, each on the first two episodes; an error is a failure.
+    """Check that an environment keeps its contract, each rule on the first two episodes; an error is a failure.
 
     Args:
         source: An `EnvironmentSettings`, or MODULE:CLASS.

@@ -1,4 +1,4 @@
-"""Players, which show the rows of a source, in this process or in a process of their own."""
+"""Players show the rows of a source, one observation after the other, here or in a process of their own."""
 
 import traceback
 from abc import ABC, abstractmethod

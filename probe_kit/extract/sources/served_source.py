@@ -1,4 +1,4 @@
-"""Observations as clients send them: the map to those of a model, what an episode keeps, and its replay."""
+"""Observations that clients send: how they become those of a model, what is kept of an episode, and its replay."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""The class `Source`, from which the observations of a run come. A source is one class and its settings.
+"""The class `Source`, which gives the observations of a run. A source is one class and its settings.
 
 A source knows neither what a model does with its observations nor how runs are stored.
 """

@@ -1,1 +1,1 @@
-"""Capturing and editing activations while a model runs."""
+"""Capture and edit activations while a model runs."""

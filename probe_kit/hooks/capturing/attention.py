@@ -1,4 +1,4 @@
-"""Attention: the mass that the acting stream gives to every token, and the patterns of every head.
+"""Attention: how much the acting stream gives to every token, the patterns of every head, and cuts of attention.
 
 with capture_attention(policy) as mass:
     policy.act([seen], [seed])
@@ -11,8 +11,9 @@ patterns["expert.02.heads@9"]  # (B, H, S, T): S positions of the stream attend 
 with cut_attention(policy, {site: AttentionCut(keys) for site in policy.streams["expert"].sites("heads")}) as log:
     policy.act([seen], [0])  # no head reads the tokens that `keys` marks
 
-Queries, keys, masks and scales are those that reach torch, behind rotation and norms. Every pattern is checked:
-with the values of the same call it must give what the heads read. An attended token need not be used.
+Queries, keys, masks and scales are those that reach torch's attention, after rotation and norms. Every pattern is
+checked: multiplied with the values of the same call, it must give what the heads read. A token that gets attention
+need not be used.
 """
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence

@@ -3,11 +3,13 @@
 value, slopes = gradients_at(policy, [observation], [seed], policy.sites(), lambda actions: actions[0, :, 1].sum())
 slopes["backbone.02.residual"]  # (B, T, D)
 
-A gradient at a site is of everything behind it. At `kv` that is what the acting part reads: the backbone's own
-reading of the same keys and values lies beside it.
+A gradient at a site covers every path from the site to the action. At `kv` that is what the acting part reads of a
+block. It does not cover what later blocks of the backbone read of the same keys and values: they have read them
+before the values pass `kv`.
 
 `torch.nn.TransformerEncoder` computes with fused kernels while no hook is registered in it. With hooks it runs its
-submodules, and the rounding differs. `Family.load` switches these kernels off, so that both ways are the same.
+submodules, and the rounding differs. `Family.load` switches these kernels off, so that both ways give the same
+bits.
 """
 
 from collections import defaultdict

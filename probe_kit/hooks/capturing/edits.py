@@ -1,11 +1,12 @@
-"""Edits: declared changes of sites, changes of tokens, and the engine that makes them while a model runs once.
+"""Edits: declared changes of sites, changes of tokens, and the code that makes them while a model runs once.
 
 move = Edit("add", (Site("backbone", 2),), roles=("language",), vector=vector_hash(direction), strength=2.0)
 with apply_edits(model, [move], seen, {move.vector: direction}) as log:
     model.act(seen, seeds)
-log.entries  # what fired where, and how far it moved
+log.entries  # which sites fired, and how far tokens were moved
 
-`apply_patch` is the same for one observation, with the tokens and what becomes of them as objects.
+`apply_patch` does the same for one observation. It takes the tokens, and the function that changes them, as
+objects.
 """
 
 import hashlib

@@ -1,11 +1,12 @@
-"""Activations of whole passes: references while a stack runs, then one copy or product for all its layers.
+"""Activations of whole passes: hooks keep references, and one copy or product serves all layers of a stack.
 
-On a GPU the number of operations costs, not their size. Therefore a firing keeps what passes, and does no more.
-When the last site of a pass has fired, all tensors become one: (n * R, T, D) of n sites and R rows, of which one
-product makes all views.
+On a GPU the number of operations costs time, not their size. Therefore a hook keeps a reference to its tensor and
+does no more. When the last site of a pass has fired, the tensors of all n sites and R rows become one tensor (n *
+R, T, D). One product of it makes all views.
 
-A network may write into a tensor after it passed. The first pass of each kind therefore copies at once too, and
-compares. Sites whose tensor was written are copied at once from then on. Kinds differ in sites, rows and hooks.
+A network may write into a tensor after the hook saw it. The first pass of each kind therefore also copies each
+tensor at once, and compares at the end. Tensors that were written to are copied at once from then on. Two passes
+are of one kind if their sites, rows and hooks are the same.
 """
 
 from collections import defaultdict

@@ -1,6 +1,7 @@
 """Activations through the model's own projections: contributions of single heads, and the logit lens.
 
-The lens says what a layer would put out, not what later layers read there (nostalgebraist, 2020).
+The logit lens shows what tokens a layer would put out if no layer came after it. It does not show what later
+layers read there (nostalgebraist, 2020).
 
     with capture(model, model.streams["answer"].sites()) as cache:
         model.read([question])

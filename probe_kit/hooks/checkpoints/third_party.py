@@ -1,9 +1,9 @@
-"""Calls of other people's code: its errors get names, and what it changed in the process is put back.
+"""Calls of third-party code: its errors get the names of model and checkpoint, and its side effects are undone.
 
-A policy of a third party runs in the process that plays other episodes, and writes them. What it changes there by
-accident is put back after every call: random numbers, torch's default dtype, the working directory, environment
-variables, how Ctrl-C is answered. What it prints is shown as text on stderr. What it does on purpose is not
-contained; see SECURITY.md.
+A policy of a third party runs in the process that plays and writes other episodes too. After every call these are
+restored: random numbers, torch's default dtype, the working directory, environment variables, and the handling of
+Ctrl-C. What the code prints is shown as text on stderr. This guards against accidents, not against intent; see
+SECURITY.md.
 """
 
 import logging

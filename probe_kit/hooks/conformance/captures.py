@@ -464,7 +464,7 @@ def roles_cover_every_position_and_are_the_declared_ones(subject: Subject) -> No
 
 
 @check(
-    "Another picture moves positions with the role `image` only, at the embeddings.",
+    "At the embeddings, another picture changes only tokens with the role `image`.",
     "Correct the order and the numbers of positions in `roles`.",
 )
 def another_picture_moves_image_positions_only(subject: Subject) -> None:
@@ -473,7 +473,7 @@ def another_picture_moves_image_positions_only(subject: Subject) -> None:
 
 
 @check(
-    "Another instruction moves positions with the role `language` only, at the embeddings.",
+    "At the embeddings, another instruction changes only tokens with the role `language`.",
     "Correct the order and the numbers of positions in `roles`.",
 )
 def another_instruction_moves_language_positions_only(subject: Subject) -> None:

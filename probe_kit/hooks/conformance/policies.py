@@ -314,7 +314,7 @@ def every_token_of_the_picture_comes_of_the_patches_that_are_named(subject: Poli
 
 
 @check(
-    "Attention is recorded without changing an action, and its shares are shares.",
+    "Recording attention changes no action, and the recorded shares sum to at most 1.",
     "Record softmax weights over all tokens of the backbone, computed in addition where kernels return none.",
 )
 def attention_is_recorded_without_changing_an_action_bit_for_bit(subject: PolicySubject) -> None:

@@ -1,4 +1,4 @@
-"""The contract of every model family: `Model`, which acts (`Policy`), answers (`AnswerModel`) or both."""
+"""The interface of every model family: `Model`, which acts (`Policy`), answers (`AnswerModel`) or both."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence

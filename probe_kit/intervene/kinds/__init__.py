@@ -1,6 +1,7 @@
-"""Kinds of intervention, one file each: options, conditions, effects with columns, and the sentence.
+"""Kinds of intervention. Each is one file: its options, conditions, effects with their columns, and its sentence.
 
-A file in this folder, or a module that `register` is called with, is a kind; see `base.Intervention`.
+A file in this folder is a kind, and so is a module that `register` is called with. `base.Intervention` is what
+they extend.
 """
 
 from importlib import import_module

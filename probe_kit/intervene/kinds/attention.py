@@ -1,7 +1,8 @@
-"""Attention: the share of the acting stream's attention on images, tiles, instruction and state; descriptive.
+"""Attention: how much of the acting stream's attention falls on images, tiles, instruction and state.
 
-An attended token need not be used, and a used one may get little attention. So this enters no verdict, and nothing
-is edited. Every inference runs twice, with and without recording, and both actions must be bit-identical.
+This kind only describes. A token that gets attention need not be used, and a token that is used may get little
+attention, so the result enters no verdict. Nothing is edited. Every inference runs twice, with and without
+recording, and both actions must be equal bit for bit.
 """
 
 from collections.abc import Mapping, Sequence

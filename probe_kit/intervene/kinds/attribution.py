@@ -1,4 +1,8 @@
-"""Attribution patching: gradients order cells, exact patches check the order and anchor it; enters no verdict."""
+"""Attribution patching: gradients estimate which patches matter, and exact patches check the estimates.
+
+The estimates order the cells. Some cells with a sure effect, the anchors, are patched exactly: if gradients miss
+one of them, the order is void. The result enters no verdict.
+"""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -238,7 +242,7 @@ def _columns(exchange: str) -> tuple[EffectColumn[AttributionEffect], ...]:
         EffectColumn(
             "estimate [95 %]",
             lambda row: interval_cell(row.estimate, row.estimate_ci),
-            f"estimate: share of the {exchange} by gradients",
+            f"estimate: share of the {exchange} that gradients predict for a patch of these tokens",
         ),
         EffectColumn(
             "exact [95 %]",

@@ -1,6 +1,6 @@
-"""The parts that every kind of intervention shares: settings, names of conditions, effects, tests, tables.
+"""The parts that all kinds of intervention share: settings, names of conditions, effects, tests, tables.
 
-It loads neither torch nor a simulator, and neither do the kinds: tables read them without a model.
+This file loads neither torch nor a simulator, and neither do the kinds, because tables read them without a model.
 """
 
 import warnings

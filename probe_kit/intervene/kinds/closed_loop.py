@@ -1,10 +1,10 @@
 """Closed loop: the episode is played again, with the edit at every inference.
 
-The first inference's action is a forecast. Here the cube lands somewhere, and is compared with the run's own
-outcomes. Scene and seeds are the same, and an identity patch must reproduce every outcome.
+The action of the first inference only forecasts where the cube ends. Here it is seen, and compared with the
+outcome in the run. Scene and seeds are the same, and an identity patch must reproduce every outcome.
 
-Two effects are kept apart: which picture the cube was brought to, and whether it was brought to any. An edit that
-disrupts the task lowers a success rate as well as one that turns the choice, so that it enters no verdict.
+Two effects are measured apart: to which picture the cube was brought, and whether it was brought to any. An edit
+that disrupts the task lowers a success rate just as one that changes the choice. So it enters no verdict.
 """
 
 from collections.abc import Callable, Mapping, Sequence

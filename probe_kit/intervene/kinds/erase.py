@@ -1,10 +1,10 @@
 """Concept erasure: the linearly decodable answer is removed from each token, with random controls.
 
-This file has the intervention, its effects and their table. The fits are in `erasers`, which interchange and steer
-share with it (`--direction mean-difference:K`). Erasure is a supplement, and the weakest. A policy may read what
-is not linear. An answer that is erased at one place may pass at another, and information that is removed along
-with it disrupts the task. Erasers that know only the mean over tokens blind a probe and leave the behaviour, so
-that there is one per position.
+This file has the intervention, its effects and their table. The fits are in `erasers`; interchange and steer use
+them too (`--direction mean-difference:K`). Erasure gives the weakest evidence of all kinds. A policy may read what
+is not linear. An answer that is erased at one place may pass at another. Other information that is removed with it
+may disrupt the task. Erasers are fitted at every token position: one of the mean over tokens would hide the answer
+from a probe of that mean, and leave the action as it is.
 """
 
 from collections.abc import Mapping, Sequence
@@ -300,7 +300,7 @@ def _probe_accuracy(features: "TokenFeatures", fits: Sequence[tuple[Fold, Eraser
 class ErasureEffect(EffectRow):
     """The effect on the action of erasing an answer at one place, in one category; see `EffectRow`.
 
-    Here `net` is the share of episodes that no longer go to the correct side minus those that do now.
+    Here `net` is the share of episodes that no longer go to the correct side, minus those that go there only now.
 
     Attributes:
         right_before: Share of episodes whose action goes to the correct picture's side, without the edit.
@@ -437,8 +437,8 @@ _ACTION = (
     EffectColumn[ErasureEffect](
         "p",
         lambda row: p_of(row.p, is_resolved(100 * row.mean_displacement, row.right_before - row.right)),
-        "p: exact, that the action moves away farther than under the controls, by item and by group, the larger "
-        "one",
+        "p: exact, of a larger move away from the correct picture than under the controls; the larger of the "
+        "tests by item and by group",
     ),
     EffectColumn[ErasureEffect](
         "relative change",

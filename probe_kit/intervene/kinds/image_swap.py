@@ -1,7 +1,8 @@
 """Image swap: with the two images swapped, and nothing else, does the action change sides?
 
-Two inferences per episode have the same state and noise. Displacements are in units of the policy's own reach. In
-runs without sides, one input is exchanged for a donor's, and sizes are in spreads of clean actions.
+Every episode is inferred twice, with the same state and noise. Displacements are in units of the policy's own
+reach, the lateral distance between its actions to either side. In runs without sides, one input is exchanged for a
+donor's, and sizes are in spreads (standard deviations) of the clean actions.
 """
 
 from abc import abstractmethod
@@ -199,7 +200,8 @@ _INPUT_COLUMNS = (
     EffectColumn[InputEffect](
         "size",
         lambda row: TableCell(row.size, number),
-        "size: mean change of the action by the donor's input, in spreads of the clean actions",
+        "size: mean change of the action by the donor's input, in spreads (standard deviations) of the clean "
+        "actions",
     ),
     EffectColumn[InputEffect](
         "control",
@@ -214,7 +216,7 @@ _INPUT_COLUMNS = (
     EffectColumn[InputEffect](
         "share [95 %]",
         lambda row: interval_cell(row.share, row.share_ci),
-        "share: displacement toward the donor's action, as a share of that by the full exchange",
+        "share: displacement toward the donor's action by this input, as a share of that by all inputs",
     ),
     EffectColumn[InputEffect](
         "p",
@@ -426,8 +428,8 @@ SWAP_COLUMNS = (
     EffectColumn[ImageSwapEffect](
         "moved [95 %]",
         lambda row: signed_interval(row.reach_share, row.reach_share_ci),
-        "moved: displacement toward the correct picture in units of the policy's own reach, "
-        f"{SMALLEST_SHARE_OF_INTEREST} of which count",
+        "moved: displacement toward the correct picture, as a share of the policy's own reach; less than "
+        f"{SMALLEST_SHARE_OF_INTEREST} does not matter",
     ),
     EffectColumn[ImageSwapEffect](
         "follow %",
@@ -438,7 +440,7 @@ SWAP_COLUMNS = (
     EffectColumn[ImageSwapEffect](
         "net [95 %]",
         lambda row: signed_interval(row.net_follow_rate, row.net_follow_rate_ci),
-        f"net: follow − reversal, {SMALLEST_EFFECT_OF_INTEREST} of which count",
+        f"net: follow minus reversal, as a share; less than {SMALLEST_EFFECT_OF_INTEREST} does not matter",
     ),
     EffectColumn[ImageSwapEffect](
         "p",

@@ -1,7 +1,7 @@
-"""Instruction swap: asked for the other picture before the same images, does the action change sides?
+"""Instruction swap: with the same images and the other picture asked for, does the action change sides?
 
-If the action follows the images, they are read; if it follows the instruction, that is read. A policy may follow
-one and not the other: it can have learnt what to look for, whatever is asked.
+If the action follows a swap of the images, the policy reads images; if it follows the instruction, it reads words.
+It may follow one and not the other: a policy can have learnt what to look for, whatever is asked.
 """
 
 from collections.abc import Sequence
@@ -44,8 +44,8 @@ _FOLLOW = (
     "images, state and noise"
 )
 _ONE_STEP = (
-    "one step: median lateral distance between where the two actions bring the hand, and in how many episodes any "
-    "number changed; with the noise drawn anew for comparison"
+    "one step: how far apart two actions bring the hand sideways, the median over episodes; and the share of "
+    "episodes in which any number of the action changed. Noise: the same with newly drawn noise, for comparison"
 )
 
 
@@ -164,7 +164,7 @@ class InstructionSwap(Swap):
         if not context.is_scene:
             return super().table(rows, context)
         swap = [replace(each, term=_FOLLOW if each.heading == "follow %" else "") for each in SWAP_COLUMNS]
-        parts = {"Does the action follow the instruction?": swap, "What one step owes to": _STEP_COLUMNS}
+        parts = {"Does the action follow the instruction?": swap, "What changes one step": _STEP_COLUMNS}
         lines = [((row.category,), row) for row in rows]
         title = f"Is the instruction read? {context.subject}"
         return effect_table(title, ("category",), lines, parts, after=[_ONE_STEP])

@@ -1,13 +1,14 @@
-"""Interchange (activation patching) at places, and what a run's stored edits found inside the network.
+"""Interchange (activation patching) at places, and what a run's stored edits show inside the network.
 
-Tokens are patched from the same inference with swapped images. The patch is what this policy computes there in
-this state, so it is on the policy's own distribution and has no strength to choose. It can do no more than the
-image swap: with all that differs patched, the effect is 1.
+Tokens are replaced by those of the same inference with swapped images. This policy computes such tokens itself in
+this state, so a patch stays on its own distribution and has no strength to choose. A patch can do no more than the
+image swap: if all that differs is patched, the effect is 1.
 
-Effects are signed. The *target side* is the one on which the correct picture lies once the two are swapped, or the
-side that is steered to. A flip rate alone is no evidence: actions flip away from that side as well. Maps,
-directions and steering are each read by themselves. Family-wise p-values are against everything that was tried in
-the same stream on the same episodes, in one intervention or in several.
+Effects have a sign. The *target side* is the side on which the correct picture lies after the swap; of a steering,
+it is the side that is steered to. How often actions flip is no evidence alone, because some flip away from that
+side. So flips away are subtracted. Full patches, patches along directions and steering have rows of their own.
+Family-wise p-values are against everything that was tried in the same stream on the same episodes, in one
+intervention or in several.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -387,7 +388,7 @@ def _depth(subject: tuple[str, ...]) -> tuple[object, ...]:
 
 
 def best_patch_targets(run: RunReader, categories: Sequence[str]) -> tuple[str, ...]:
-    """Return `PLACE|ROLE`, of each category the last place of the backbone located, in its narrowest role.
+    """Return `PLACE|ROLE` by category: the last located place of the backbone, in the role of the largest effect.
 
     The last place lies behind all other places through which the answer passes. Where none of the backbone was
     located, it is the last of the acting stream or of `kv`. Of its roles it has the one with the largest effect,
@@ -633,8 +634,16 @@ def _columns(exchange: str, is_scene: bool) -> list[EffectColumn[PatchEffect]]:
                 "nearer to the source: share of episodes whose action is nearer to the source's than to the clean "
                 "one",
             ),
-            EffectColumn("displacement", lambda row: TableCell(row.mean_displacement, with_sign)),
-            EffectColumn("controls", lambda row: TableCell(row.control_displacement, with_sign)),
+            EffectColumn(
+                "displacement",
+                lambda row: TableCell(row.mean_displacement, with_sign),
+                "displacement: toward the source's action, in spreads (standard deviations) of the clean actions",
+            ),
+            EffectColumn(
+                "controls",
+                lambda row: TableCell(row.control_displacement, with_sign),
+                "controls: the mean displacement of random directions",
+            ),
             p,
             change,
         ]

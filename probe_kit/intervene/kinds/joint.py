@@ -1,6 +1,7 @@
-"""Joint places: which cells carry the effect together, which alone, and which are needed.
+"""Joint places: which cells carry the effect together, which of them alone, and which are needed.
 
-Sets of cells are patched in one inference, as an interchange patches a single one.
+A cell is the tokens of one role at one place. Sets of cells are patched in one inference, as an interchange
+patches a single cell.
 """
 
 from collections.abc import Mapping, Sequence
@@ -246,14 +247,14 @@ def _columns(exchange: str) -> "tuple[EffectColumn[JointEffect], ...]":
         EffectColumn(
             "needed [95 %]",
             lambda row: interval_cell(row.needed, row.needed_ci),
-            "needed: share that all other cells together lose without them",
+            "needed: share of the effect of all cells that is lost when these are left out",
         ),
         EffectColumn(
             "p",
             lambda row: p_of(
                 row.p if row.p_fwe is None else row.p_fwe, row.alone is None or is_resolved(row.alone)
             ),
-            "p: of moving toward the target side; of cells family-wise over all of them",
+            "p: one-sided, of a move toward the target side; of single cells family-wise over all of them",
         ),
         EffectColumn("groups", lambda row: TableCell(row.n_groups)),
         EffectColumn("finding", lambda row: row.finding, _FINDINGS),

@@ -1,30 +1,34 @@
 """Attention knockout: from which tokens, and in which layers, does the action read?
 
-The attention of the acting stream to the tokens of a role is cut in a window of layers, on the clean inference:
-the weights become 0 and the others are renormalised. Windows grow from the first layer, from the last one, or
-slide. The control cuts as many random tokens of other roles in the same layers. Source: Geva, Bastings, Filippova,
-Globerson: Dissecting recall of factual associations in auto-regressive language models, EMNLP 2023.
+The attention of the acting stream to the tokens of a role is cut in a window of layers, on the clean inference.
+The weights of these tokens become 0, and the others are renormalised. Windows grow from the first layer, or from
+the last, or slide over the layers. A control cuts random tokens of other roles, as many, in the same layers.
+Source: Geva, Bastings, Filippova, Globerson: Dissecting recall of factual associations in auto-regressive language
+models, EMNLP 2023.
 
-What is cut is the view of the acting stream, not the information: words that the backbone carried into other
-tokens still pass. So *cut and nothing lost* says that nothing is read there directly.
+The cut removes the acting stream's view of the tokens, not their information. If the backbone has carried a word
+into other tokens, it still reaches the action from there. So a cut that loses nothing shows that the action does
+not read these tokens directly.
 
-In a scene the loss is a share of the effect of the picture's place. An item is played with its pictures in both
-orders, and what remains of the difference between the two is what the action still knows:
+In a scene, the loss is a share of the effect of the picture's place. Each item is played with its pictures in both
+orders. The difference between both actions is what the action knows of the order; the loss is the share of it that
+the cut removes:
 
     lost = 2 · Σ s (x_clean − x_cut) / Σ s (x_clean − x_swapped)
 
-over episodes, where x is the displacement and s the side of the correct picture. 1 is an action that no longer
-tells both orders apart, and 2 one that answers as after the swap. Without sides, and where the pictures have no
-such effect, the size of the change, in spreads of the clean actions, is compared with that of the controls.
+over episodes, where x is the displacement and s the side of the correct picture. At 1 the action no longer tells
+both orders apart; at 2 it acts as after the swap. Where the pictures have no such effect, and in runs without
+sides, the size of the change counts instead, in spreads of the clean actions. It is compared with that of the
+controls.
 
-A control cuts as many tokens. Where other roles have less than half as many, as the words beside a picture, there
-is none of that size; without sides a change then counts from a tenth of the spread on.
+The other roles may have fewer tokens than the cut: beside a picture there are few words. In runs without sides a
+control of less than half the size is left out. There a change counts from a tenth of the spread on.
 
 The role `kv.NN` is a place: all that the acting stream reads of block NN of the backbone. That is every token of
 the backbone, in the one layer that reads the block, so that no other token is left for a control.
 
-With whole episodes in an environment the loss is of success: share of episodes that succeed without the cut and
-fail with it, minus that of the reverse.
+With whole episodes in an environment, the loss is of success. It is the share of episodes that succeed without the
+cut and fail with it, minus the share of the reverse.
 """
 
 from collections.abc import Mapping, Sequence
@@ -886,7 +890,7 @@ def _columns(rows: "Sequence[KnockoutEffect]", is_scene: bool) -> list[EffectCol
     change = EffectColumn[KnockoutEffect](
         "change",
         lambda row: TableCell(row.size, number),
-        "change: of the action, in spreads of the clean actions",
+        "change: how far the cut moves the action, in spreads (standard deviations) of the clean actions",
     )
     if _is_played(rows):
         change = EffectColumn[KnockoutEffect](
@@ -910,7 +914,8 @@ def _columns(rows: "Sequence[KnockoutEffect]", is_scene: bool) -> list[EffectCol
     wrong = EffectColumn[KnockoutEffect](
         "wrong side",
         lambda row: TableCell(row.net, with_sign),
-        "wrong side: share of episodes whose action leaves the correct picture's side, minus those that come",
+        "wrong side: share of episodes whose action leaves the correct picture's side, minus the share that comes "
+        "to it",
     )
     return [
         EffectColumn(

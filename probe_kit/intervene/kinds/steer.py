@@ -1,12 +1,13 @@
-"""Steering: a direction added to the tokens of one role, with matched controls of the same norm.
+"""Steering: a direction is added to the tokens of one role, with controls of the same norm.
 
-One vector for all tokens cannot move an answer that lies in *which* tokens are marked: it marks all of them alike.
-A direction `mean-difference:K` has a vector for each position, which moves the mark from one tile to the other.
+An answer may lie in *which* tokens are marked. One vector for all tokens cannot move such an answer, because it
+marks all of them alike. A direction `mean-difference:K` has a vector for each position, which moves the mark from
+one tile to the other.
 
-Steering is a supplement to the interchange, not a replacement. The sum may lie off the network's distribution, a
-coefficient has no natural size, and at a large one every direction disrupts the task. So coefficients count half
-class-mean differences (2 goes from one mean to the other). Controls are orthogonal directions of the data's own
-covariance with the same norm, and both sides are reported.
+Steering adds to the evidence of an interchange and does not replace it. The sum may lie where the network was
+never trained, a coefficient has no natural size, and with a large one every direction disrupts the task. So
+coefficients count half the difference of the class means: 2 goes from one mean to the other. Controls are
+orthogonal directions of the data's own covariance with the same norm. Flips to either side are reported.
 """
 
 from collections.abc import Mapping, Sequence

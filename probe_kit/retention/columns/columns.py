@@ -401,7 +401,7 @@ RULES = tuple(
             share(
                 "rules.share_both_zones",
                 "in both zones %",
-                "Share of episodes whose cube counts for both pictures, which is called correct.",
+                "Share of episodes that end in the zones of both pictures; they count as correct.",
                 cell=lambda row: Cell(row.rules.share_both_zones or None, percent),
             ),
         ),
@@ -636,7 +636,7 @@ ACTION_VERDICT = Column(
 ACTION_LAYER = Column(
     key="action.layer",
     heading="action layer @iteration",
-    help=f"{_LAYER} After @: the iteration, a flow-matching step or an action token, of which the first sees no "
+    help=f"{_LAYER} After @: the flow-matching step or action token, counted from 0. At 0 the stream has seen no "
     "action yet.",
     cell=lambda row: site_cell(row.action.layer, row.action.iteration, row.action.ties),
     answers=("answer layer", _LAYER),

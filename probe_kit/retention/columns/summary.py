@@ -1,4 +1,4 @@
-"""The summary, the same in every format: a row and a short sentence per category, and the next step."""
+"""The summary: in every format a row and a short sentence per category, and the next step."""
 
 import re
 from collections.abc import Sequence

@@ -231,27 +231,29 @@ def _cell(column: Column, line: RowOrDifference) -> Cell:
 
 # -- notes -------------------------------------------------------------------------------------------------------
 
-_ANSWERS = "wrong and unread (no answer, or several) in % of all"
+_ANSWERS = "wrong and unread (no answer, or several) are shares of all questions"
 _OUTCOMES = (
-    "Δ decides the regime, over as many items as count; wrong, outside, never moved (part of outside): each in % "
-    "of all episodes"
+    "regime: SR compared with 50 % ± Δ, which counts independent items; wrong and outside are shares of all "
+    "episodes, and never moved is a part of outside"
 )
 _SITES = (
-    "layer: the first of the best, + as many others that tie; after @ the iteration (flow step or action token), "
-    "of which the first sees no action yet; p family-wise"
+    "layer: the first of the best layers, + how many others are as good; after @ the flow step or action token, "
+    "counted from 0; p: family-wise over all layers"
 )
 _ABOVE = (
-    "above chance: score of the sites that the inner folds choose, on the outer folds, minus its mean score with "
-    "permuted labels; 95 % intervals over groups; layer: that of the largest score above its own chance; p "
-    "family-wise"
+    "above chance: held-out score of the sites that the inner folds choose, minus the mean score with permuted "
+    "labels; 95 % intervals over groups; layer: that of the largest score above its own chance; p: family-wise "
+    "over all layers"
 )
-_ANSWER_SITES = "layer: the first of the best, + as many others that tie; p family-wise"
+_ANSWER_SITES = (
+    "layer: the first of the best layers, + how many others are as good; p: family-wise over all layers"
+)
 
 
 def _legend(title: str, rows: Sequence[RetentionRow]) -> list[str]:
     if title == "Accuracy of answers":
         scores = ", ".join(dict.fromkeys(str(row.answers.score) for row in rows))
-        return [f"accuracy is by {scores}; a constant answer is right in one half; {_ANSWERS}"]
+        return [f"accuracy is by {scores}; a model that always names one side is right in 50 %; {_ANSWERS}"]
     if title == "Success rate":
         return [_OUTCOMES, *dict.fromkeys(rule_sentence(row.rules) for row in rows if row.category == MEAN)]
     calls = sorted({row.run.call for row in rows if row.run.call is not None})
@@ -272,7 +274,7 @@ def _list_undefined(rows: Sequence[RetentionRow]) -> list[str]:
             reasons.setdefault(row.retention.note, []).append(name_of(row))
     means = {row.retention.note for row in rows if row.retention.defined and row.retention.note}
     sentences = [f"{reason}: {', '.join(dict.fromkeys(names))}" for reason, names in reasons.items()]
-    return [*sentences, *(f"mean {note}" for note in sorted(means))]
+    return [*sentences, *(f"in the mean: {note}" for note in sorted(means))]
 
 
 def _controls(rows: Sequence[RetentionRow]) -> str:
@@ -280,9 +282,10 @@ def _controls(rows: Sequence[RetentionRow]) -> str:
     untrained = f"; untrained: {name}" if name else ""
     fewest = min(row.success.n_items for row in rows if row.category != MEAN)
     share = f"{100 * detectable(fewest):.1f}"
-    findable = f"with {plural(fewest, 'item')} a leak of {share} % is found in 4 of 5 suites"
+    findable = f"with {plural(fewest, 'item')} a leak that gives a control {share} % is found in 4 of 5 suites"
     return (
-        f"held-out accuracy % without the model, {findable}; selectivity: accuracy above random labels{untrained}"
+        f"held-out accuracy of probes without the model, in %; {findable}; selectivity: accuracy minus that with "
+        f"random labels{untrained}"
     )
 
 
@@ -292,17 +295,17 @@ def _difference_legend(differences: Sequence[Difference], has_tests: bool) -> st
         return ""
     parts = []
     if any(row.paired for row in differences):
-        parts.append("groups of items as pairs")
+        parts.append("groups of items are pairs")
     if not all(row.paired for row in differences):
-        parts.append("of other items: each side's own groups")
+        parts.append("where items differ, each side has its own groups")
     if has_tests and any(row.p is not None for row in differences):
         parts.append(
-            "p of the share right: exact, signs of groups flipped, in means over all items (Holm: all categories "
-            f"and pairs); {P_DECIDES}"
+            "p of the share right: exact, by sign flips of groups, in means over all items; in brackets corrected "
+            f"for all categories and pairs (Holm); {P_DECIDES}"
         )
     if any(row.sr_models for row in differences):
-        parts.append("these models, other items")
-    return f"differences: 95 %, {'; '.join(parts)}"
+        parts.append("intervals hold for these models on other items")
+    return f"differences: with 95 % intervals; {'; '.join(parts)}"
 
 
 def _sizes(rows: Sequence[RetentionRow]) -> list[str]:
@@ -310,7 +313,7 @@ def _sizes(rows: Sequence[RetentionRow]) -> list[str]:
     sizes: dict[str, list[str]] = {}
     for of_run in by_run([row for row in rows if row.category != MEAN]):
         sizes.setdefault(_size(of_run), []).append(Path(of_run[0].run.location).name)
-    return [f"run{'s' if len(names) > 1 else ''} {', '.join(names)}: {size}" for size, names in sizes.items()]
+    return [f"size of {', '.join(names)}: {size}" for size, names in sizes.items()]
 
 
 def _size(rows: Sequence[RetentionRow]) -> str:
@@ -448,7 +451,7 @@ def _vlm_vla_table(vlm: str, policy: str, rows: Sequence[Difference]) -> Table:
 
 Columns = Sequence[tuple[Heading | str, Callable[[CategoryCounts], Cell]]]
 _p4 = partial(number, digits=4)
-_BOTH_LAYOUTS = "each counts only where both layouts of an item are right, which a coin reaches in 25 %"
+_BOTH_LAYOUTS = "an item counts as right only if it is right in both layouts; guessing reaches that in 25 %"
 _NAMES = {"answered": "answer", "encoded": "probe", "acted": "success"}
 _CODES = "a capital letter for what is right, a small one for what is not"
 _TESTS = "p: exact McNemar over items or over whole groups, the larger; (Holm) over all categories and pairs shown"

@@ -338,7 +338,8 @@ _READABLE_HELP = {
     },
 }
 _BEHAVIOUR_HELP = {
-    "used": "A swap turns the action, in at least half of the episodes and by at least half of the reach.",
+    "used": "A swap turns the action to the other side in at least half of the episodes, by at least half of the "
+    "reach: the distance between its own actions to the left and to the right.",
     "partly used, one-sided": "A swap turns the action where the answer lies on the named side only.",
     "partly used, graded": "A swap turns the action in fewer episodes, or by less, than where it is used.",
     "moves with it, does not decide": "A swap moves the action by a tenth of the reach, and does not turn it.",

@@ -1,7 +1,7 @@
-"""One comparison: the first side minus the second, on the same items, with one exact test; and its sides.
+"""One comparison: the first side minus the second, on the same items, with one exact test.
 
-Two runs, two groups of models, a VLM and a policy, two wordings of a run are calls of `compare`. Rows pair by
-item, layout and content. Groups of items are the unit of intervals and p.
+A side is a run, a group of models, a VLM or its policy, or one wording of a run. Rows pair by item, layout and
+content. Groups of items are the unit of intervals and p.
 """
 
 from collections.abc import Callable, Mapping, Sequence

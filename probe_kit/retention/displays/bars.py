@@ -284,7 +284,9 @@ _LOOKS: Mapping[str, tuple[str, str]] = {
 
 @dataclass(kw_only=True)
 class KnownUsedDisplay(BarDisplay):
-    """A bar per category: shares of its items by answered, encoded and acted on, in both layouts each.
+    """A bar per category: shares of items that the VLM answers, probes read, and the policy acts on.
+
+    Each counts only if it is right in both layouts.
 
     Attributes:
         joined: The result of `probe_kit.retention.compare.known_used.match_runs`.

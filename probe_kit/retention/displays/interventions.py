@@ -583,7 +583,9 @@ class CutCurve:
 
 @dataclass(kw_only=True)
 class KnockoutDisplay(Display):
-    """A curve a role by the layers in which the acting part no longer reads its tokens, over the controls.
+    """A curve per role: the loss by the layers in which the acting part no longer reads its tokens.
+
+    The band behind the curves marks the controls.
 
     Attributes:
         curves: One for every role and growth of windows.

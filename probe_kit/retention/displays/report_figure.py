@@ -1,4 +1,4 @@
-"""The figures of reports and `--figures`: each with its explanation, and all that fit a table."""
+"""The figures of reports and of `--figures`: each with its explanation, and which of them fit a table."""
 
 import re
 from collections.abc import Callable, Iterator, Sequence

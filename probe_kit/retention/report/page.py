@@ -1,4 +1,4 @@
-"""The page of a report: one HTML file with everything in it, for every target; and the parts of any page."""
+"""The page of a report, one HTML file with everything in it, for runs of any target; and the parts of any page."""
 
 import json
 import re

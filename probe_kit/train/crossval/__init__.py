@@ -1,1 +1,1 @@
-"""Cross-validated probes of one site and category."""
+"""Cross-validated probes of one site and one category."""

@@ -1,9 +1,9 @@
-"""Logistic objectives of several training sets of one site in shared products, and Newton's method for them.
+"""Logistic regressions of several training sets of one site, solved together by Newton's method.
 
-The objective is that of `solver.logistic`. Conjugate gradients find every step in float32, which halves their
-time. Far from the optimum the gradient is float32 too; near it the gradient is float64 on the exact data. No
-solution is accepted before this gradient is below the tolerance. So float32 decides how a solution is found, never
-what it is.
+The training sets share large matrix products. The objective is that of `solver.logistic`. Steps are found by
+conjugate gradients in float32, which halves their time. Far from the optimum the gradient is float32 too; near it
+the gradient is float64, on the exact data. A solution is accepted only when this exact gradient is below the
+tolerance. So float32 decides how a solution is found, never what it is.
 """
 
 from collections.abc import Callable, Sequence

@@ -1,8 +1,9 @@
-"""Nested logistic probes of a site: C by the log-loss of the inner folds, for every column of labels at once.
+"""Nested logistic probes of one site, for the labels and all their permutations at once.
 
-Three ways lead to the same optimum. Every fold is solved by itself; small problems of all folds are stacked; with
-many samples, training sets, permutations and C share the products with them. C is chosen among optima of which
-only the losses are needed: rough ones do, as far as their errors are bounded and leave no doubt.
+The inner folds choose C by log-loss. The problems are solved in one of three ways, all with the same optimum.
+Every fold is solved by itself. Or small problems of all folds are stacked. Or, with many samples, training sets,
+permutations and values of C share the large products. To choose C only the losses of its optima are needed. Rough
+optima do for that, as long as the bounds of their errors leave no doubt about the choice.
 """
 
 from collections.abc import Iterable, Iterator, Sequence

@@ -1,6 +1,6 @@
-"""Nested, grouped cross-validation: the folds, the grid of C, and the probes of an outer fold.
+"""Nested cross-validation by groups: the folds, the grid of C, and the probes of one outer fold.
 
-Ridge probes choose λ from a grid of their own on the same folds.
+Ridge probes choose their penalty λ from a grid of their own, on the same folds.
 """
 
 from collections.abc import Callable

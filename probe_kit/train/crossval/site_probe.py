@@ -1,13 +1,13 @@
-"""The probe of one site: nested, grouped cross-validation for the labels and all their permutations at once.
+"""The probe of one site: nested cross-validation by groups, for the labels and all their permutations at once.
 
 Sides and binary labels are decoded by logistic regression, see `logistic_folds`; classes and quantities by ridge.
-Ridge solves many targets and penalties by one factorisation of the training samples. For standardised training
-samples Z, test samples T and centred targets Y the predictions at penalty λ are
+Ridge solves many targets and penalties with one factorisation of the training samples. For standardised training
+samples Z, test samples T and centred targets Y, the predictions at penalty λ are
 
     T Zᵀ (Z Zᵀ + λ)⁻¹ Y = T (Zᵀ Z + λ)⁻¹ Zᵀ Y
 
-(Hoerl and Kennard, Technometrics 12, 1970), plus the mean of the targets. The smaller of both products is
-factorised once, so that every relabelling is a matrix product.
+(Hoerl and Kennard, Technometrics 12, 1970), plus the mean of the targets. Z Zᵀ or Zᵀ Z, whichever is smaller, is
+factorised once. Each permutation of the labels then costs one matrix product.
 """
 
 from collections.abc import Iterator, Sequence

@@ -1,4 +1,4 @@
-"""A score per sample whose mean is the metric of a task.
+"""A score for each sample whose mean over samples is the metric of a task.
 
 | task | score of sample i | mean |
 |---|---|---|

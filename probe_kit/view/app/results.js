@@ -32,16 +32,16 @@ function Results({ run }) {
     : html`<p class="empty">Nothing is stored with this run yet. <code>probe-kit diagnose RUN</code> says which inputs matter, <code>probe-kit intervene RUN</code> where they are used, <code>probe-kit train RUN --target TARGET</code> what can be decoded.</p>`;
 }
 
-const LONGEST_HEADLINE = 30;
+const LONGEST_HEADLINE = 30, LARGE_HEADLINE = 14; // letters: of a headline at all, and of one in large type
 /* Overview of a run without sides: what it shows, how its episodes ended, and what is stored with it. */
 function SourceOverview({ run, list }) {
   const ends = {};
   for (const one of list) ends[one.outcome] = (ends[one.outcome] ?? 0) + 1;
   const texts = new Set(list.map((one) => one.instruction).filter(Boolean));
   const suite = run.suite.split("#")[0], source = suite.length > LONGEST_HEADLINE ? suite.split("@")[0] : suite; // a revision may be long
-  const Head = ({ name, value, words }) => html`<div class="head"><span>${name}</span><strong>${value}</strong><small>${words}</small></div>`;
+  const Head = ({ name, value, words, long }) => html`<div class="head"><span>${name}</span><strong class=${long ? "long" : ""}>${value}</strong><small>${words}</small></div>`;
   return html`<div class="overview"><section class="heads" aria-label="At a glance">
-      <${Head} name="source" value=${html`<${Text}>${source}<//>`} words=${run.suite} />
+      <${Head} name="source" value=${html`<${Text}>${source}<//>`} words=${run.suite} long=${source.length > LARGE_HEADLINE} />
       <a class="head" href=${link({ view: "episodes" })}><span>episodes</span><strong>${list.length.toLocaleString("en")}</strong><small>${texts.size.toLocaleString("en")} ${texts.size === 1 ? "instruction" : "instructions"}</small></a>
       ${Object.entries(ends).filter(([end]) => end !== "null" && end !== "capture_only").map(([end, count]) => html`<${Head} name=${OUTCOMES[end] ?? end} value=${count.toLocaleString("en")} words=${`of ${list.length.toLocaleString("en")} episodes`} />`)}
       ${run.success && html`<${Head} name="success_once" value=${`${Math.round(100 * run.success.success_once)}%`} words=${run.success.sentence} />`}

@@ -1,4 +1,4 @@
-"""Prompts of GR00T: settings of its processor files, pictures as two codes resize them, chats."""
+"""Prompts of GR00T: settings of its processor files, pictures as lerobot and NVIDIA resize them, and chats."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace

@@ -1,7 +1,7 @@
-"""Quantities in which Prismatic is compared with golden references, also those recorded from answers.
+"""The quantities in which Prismatic is compared with golden references, also with those recorded from answers.
 
-B rows, T text tokens, P patches, L blocks, D width. Rows of answers were read alone and are padded in front;
-ids are recorded without the picture's positions and padded behind.
+B rows, T text tokens, P patches, L blocks, D width. Rows of answers were read one at a time and are padded in
+front. Their ids are recorded without the picture's positions and padded at the end.
 """
 
 from collections.abc import Callable, Collection, Sequence

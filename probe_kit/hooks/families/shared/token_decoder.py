@@ -1,4 +1,4 @@
-"""Base of native models whose language model chooses tokens behind a prompt: streams, taps, roles, sampling."""
+"""Base of native models whose language model writes tokens after a prompt: streams, taps, roles, sampling."""
 
 import warnings
 from collections.abc import Mapping, Sequence

@@ -1,10 +1,11 @@
 """Base adapter of vision-language models with text answers: packing, prefill, decoding, taps, roles, outputs.
 
-One stack has two streams, distinguished by position: `backbone` is the prompt without its last position. `answer`
-is the last one, whose logits choose the first token of the answer. Padding stands in front of every row.
+One stack of layers has two streams, distinguished by position. `backbone` is the prompt without its last position.
+`answer` is the last position, whose logits choose the first token of the answer. Padding stands in front of every
+row.
 
-B rows, T positions, L blocks, D width, V vocabulary. The questions of a golden reference stand in `dims.json`
-beside it, as whole prompts; the adapter is given what stands between their frames.
+B rows, T positions, L blocks, D width, V vocabulary. The questions of a golden reference are whole prompts in
+`dims.json` beside it. The adapter gets the part of each that its prompt template leaves open.
 """
 
 import re
