@@ -60,12 +60,15 @@ def load_of[Loaded: "Model"](load_by_name: Callable[..., Loaded], settings: Sett
     )
 
 
-def fit_source[Chosen: Settings](card: "ModelCard", settings: Chosen, source: Source[Any]) -> Chosen:
+def fit_source[Chosen: Settings](
+    card: "ModelCard", decided: Decided[Chosen], source: Source[Any]
+) -> Decided[Chosen]:
     """Return the settings with those of a source that was fitted to a model.
 
     Raises:
         UsageError: If the model takes smaller batches, or needs what the source does not show.
     """
+    settings = decided.settings
     # `auto` is measured after this check, and by `largest_batch` never exceeds the card.
     batch = settings.machine.batch if isinstance(settings.machine.batch, int) else 1
     if card.batch is not None and batch > card.batch:
@@ -78,7 +81,9 @@ def fit_source[Chosen: Settings](card: "ModelCard", settings: Chosen, source: So
             f"{card.family} reads {', '.join(lacking)}, which {settings.source.subject} do not show; observations "
             "have pictures and the state, in a scene also the intrinsics"
         )
-    return settings.changed(source=source.settings) if source.settings != settings.source else settings
+    if source.settings == settings.source:
+        return decided
+    return replace(decided, settings=settings.changed(source=source.settings))
 
 
 _SCRIPT_REFUSES = (
@@ -258,8 +263,9 @@ class Act:
             check_misfit(settings, model.embodiment_mismatch(), model.card.checkpoint)
         # The source first: it may give the policy further cameras, and batch and needs are those of that card.
         source, policy = source.check(model, settings.machine.accept_units)
-        settings = fit_source(policy.card, settings, source)
-        check_reachable(settings, policy.card, source)
+        decided = fit_source(policy.card, decided, source)
+        check_reachable(decided, policy.card, source)
+        settings = decided.settings
         controller = PolicyController(policy, source, settings)
         fitted, calibration, batch = count_calls(settings, controller.execute), None, settings.machine.batch
         if batch == "auto":  # last, because it times the controller as the run will use it
@@ -286,8 +292,9 @@ def check_misfit(settings: ExtractSettings, reason: str | None, checkpoint: str)
         )
 
 
-def check_reachable(settings: ExtractSettings, card: "ModelCard", source: Source[Any]) -> None:
+def check_reachable(decided: Decided[ExtractSettings], card: "ModelCard", source: Source[Any]) -> None:
     """Raise UsageError for more actions than a chunk has, or more captured inferences than an episode can have."""
+    settings = decided.settings
     if settings.task.capture_only or not source.executes:
         return
     family, execute = settings.model.family, settings.task.execute or card.execute
@@ -390,6 +397,6 @@ class Ask:
         """Show the source to the model, and choose how its answers are read."""
         assert model is not None, "no script answers"
         source = source.for_cameras(model.card.cameras)
-        settings = fit_source(model.card, decided.settings, source)
+        settings = fit_source(model.card, decided, source).settings
         controller = AnswerController(model, source, settings)
         return count_calls(settings, execute=1), source, LoadedModel(controller, settings.machine.batch)
