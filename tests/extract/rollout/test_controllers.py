@@ -220,10 +220,8 @@ def test_intrinsics_project_as_the_camera_does_whatever_the_picture_size() -> No
 def test_a_batch_that_changes_numbers_and_a_camera_that_is_not_there_are_refused(small_suite: Suite) -> None:
     source, requested = SceneSource(SceneSettings(scene=SceneSpec()), small_suite), ExtractSettings("pi0", batch=2)
     two, single = Decided(requested), Decided(requested.changed(batch=1))
-    fit_source(
-        replace(CARD, batch=1, needs=frozenset({"intrinsics", "state"})), Decided(two.changed(batch=1)), source
-    )
+    fit_source(replace(CARD, batch=1, needs=frozenset({"intrinsics", "state"})), single, source)
     with pytest.raises(UsageError, match="--batch 2 with mine, which takes at most 1"):
-        fit_source(replace(CARD, batch=1), Decided(two), source)
+        fit_source(replace(CARD, batch=1), two, source)
     with pytest.raises(UsageError, match=r"reads camera\.wrist"):
-        fit_source(replace(CARD, needs=frozenset({"camera.wrist"})), Decided(two), source)
+        fit_source(replace(CARD, needs=frozenset({"camera.wrist"})), two, source)
