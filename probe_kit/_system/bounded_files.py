@@ -131,6 +131,13 @@ def check_no_pointer(path: Path) -> None:
     _check_beginning(path, beginning)
 
 
+def check_no_pointers(folder: Path) -> None:
+    """Raise LfsPointerError for a Git LFS pointer in a folder, or in one that lies in it."""
+    for pattern in ("*", "*/*") if folder.is_dir() else ():
+        for file in sorted(folder.glob(pattern)):
+            check_no_pointer(file)
+
+
 def _check_beginning(path: Path, beginning: bytes) -> None:
     if not beginning.startswith(_POINTER):
         return

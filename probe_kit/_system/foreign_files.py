@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from probe_kit._system.bounded_files import check_no_pointer
+from probe_kit._system.bounded_files import check_no_pointer, check_no_pointers
 from probe_kit._system.machine import is_out_of_memory
 from probe_kit.errors import CheckpointError, ProbeKitError
 
@@ -45,13 +45,6 @@ def while_reading(
             raise  # the file may be whole: the machine is too small for it
         check_no_pointers(path)
         raise raises(f"{_locate(path, names)} cannot be read: {reason_of(error)}. {advice}") from error
-
-
-def check_no_pointers(folder: Path) -> None:
-    """Raise LfsPointerError for a Git LFS pointer in a folder, or in one that lies in it."""
-    for pattern in ("*", "*/*") if folder.is_dir() else ():
-        for file in sorted(folder.glob(pattern)):
-            check_no_pointer(file)
 
 
 def reason_of(error: BaseException) -> str:

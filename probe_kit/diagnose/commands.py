@@ -210,14 +210,15 @@ class _Request(NamedTuple):
             subject: The name of what has them.
             in_scene: Whether they are of the scene.
         """
-        from probe_kit.diagnose.diagnosis import check_words
         from probe_kit.diagnose.inputs import check_groups
+        from probe_kit.intervene.further_instructions import check_further_instructions
         from probe_kit.statistics.sufficiency import GROUPS_FOR_PROBES
 
         if not self.pairs:
             check_groups(episodes, self.frames, in_scene, lambda: f"{subject} has")
         if self.instructions:
-            check_words(self.instructions, episodes["instruction"].astype(str), bool(self.pairs))
+            words = episodes["instruction"].astype(str)
+            check_further_instructions(self.instructions, words, bool(self.pairs))
         if self.target is None:
             return
         if not (self.target.is_label or in_scene):

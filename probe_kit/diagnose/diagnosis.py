@@ -3,7 +3,7 @@
 The knowledge of a target is that of `probe-kit train`'s probes, which the run stores too.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from copy import copy
 from dataclasses import replace
@@ -43,7 +43,7 @@ from probe_kit.intervene.tokens import PairTokens, roles_of_tokens
 from probe_kit.runs.layout import DIAGNOSES, UNITS
 from probe_kit.runs.reader import origin_of
 from probe_kit.runs.records import as_json
-from probe_kit.runs.results import Bundle, find_bundle, read_bundle, write_bundle
+from probe_kit.runs.results import find_bundle, read_bundle, write_bundle
 from probe_kit.train.choices import EVERYWHERE
 
 if TYPE_CHECKING:
@@ -226,7 +226,7 @@ def diagnose_run(
     }
     key = key_of(settings)
     if (stored := find_bundle(run.location, DIAGNOSES, key)) is not None:
-        return replace(_read(stored), knowledge=knowledge)
+        return replace(stored.read_as(FILE, Diagnosis.from_json, FORMAT), knowledge=knowledge)
     with open_session(run, source, load, table=pairs, instructions=instructions) as session, session.ready():
         if base_policy is not None:
             base_policy = with_inputs_of(session.policy, base_policy)
@@ -275,22 +275,15 @@ def check_diagnosis(
     The frames of a table of pairs are looked up when the source is open, see `open_session`.
     """
     check_network(run)
-    cameras = cameras_of(run)
-    check_names(inputs, names_of(cameras))
     if not pairs:
         check_groups(run.episodes, frames, run.source.is_scene, lambda: f"{run.location} has")
+    cameras = cameras_of(run)
+    check_names(inputs, names_of(cameras))
     if instructions:
-        check_words(instructions, run.episodes["instruction"].astype(str), bool(pairs))
+        check_further_instructions(instructions, run.episodes["instruction"].astype(str), bool(pairs))
         check_readable(run, source, instructions)
     if base is not None:
         check_base(run, source, base, cameras)
-
-
-def check_words(instructions: Sequence[str], of_frames: Iterable[str], tabled: bool) -> None:
-    """Raise UsageError for further instructions beside a table of pairs, or that frames have."""
-    if tabled:
-        raise UsageError("--instructions gives words of donors, and --pairs names donors; leave one of both out")
-    check_further_instructions(instructions, of_frames)
 
 
 def with_units(run: "Run", inputs: Sequence[InputDiagnosis]) -> tuple[InputDiagnosis, ...]:
@@ -322,16 +315,7 @@ def load_diagnosis(run: "Run", key: str) -> Diagnosis:
     Raises:
         RunDamagedError: If it was changed, or another version of probe_kit made it.
     """
-    return _read(read_bundle(run.location, DIAGNOSES, key))
-
-
-def _read(bundle: Bundle) -> Diagnosis:
-    bundle.check_format(FORMAT)
-    values = bundle.read_json(FILE)
-    try:
-        return Diagnosis.from_json(values)
-    except ValueError as error:
-        raise bundle.damaged(FILE, "has other fields: another version of probe_kit made it") from error
+    return read_bundle(run.location, DIAGNOSES, key).read_as(FILE, Diagnosis.from_json, FORMAT)
 
 
 def check_base(run: "Run", source: "ReplayFiles", base: str, cameras: Sequence[str]) -> None:

@@ -167,7 +167,7 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
     plan, identity, free = extraction.plan, extraction.identity(), location.free_bytes()
     accepted = extraction.settings.machine.accept_units
     calibrated, measures = extraction.calibration, extraction.settings.machine.batch == "auto"
-    needed = in_units(sum(space_needed(extraction.further_plan(location), extraction.settings).values()))
+    needed = in_units(sum(space_needed(extraction.further_plan(location), extraction.fitted).values()))
     weights = "not read" if extraction.declared else (identity["weights_sha256"] or "scripted")[:12]
     source = f" ({extraction.declared}; the weights were not read)" if extraction.declared and plan.streams else ""
     rows = {
@@ -271,7 +271,7 @@ def check_size(extraction: "Extraction", location: "Location", agreed: bool) -> 
     from probe_kit.extract.sizes import space_needed
     from probe_kit.runs.run_folders import in_units
 
-    needed = sum(space_needed(extraction.further_plan(location), extraction.settings).values())
+    needed = sum(space_needed(extraction.further_plan(location), extraction.fitted).values())
     if needed > LARGE and not agreed:
         raise DiskSpaceError(
             f"{location} would take up to {in_units(needed)}; more than {in_units(LARGE)} is written with --yes "

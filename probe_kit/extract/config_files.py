@@ -112,12 +112,11 @@ def _typed_or_stored_source(run: "Run", typed: Mapping[str, Any]) -> dict[str, A
     kind = kind_of(run.settings[CONFIG]["source"])
     if kinds_typed(typed).keys() - {kind}:
         return {}
-    flags = {field: option.flag for field, option in kind.command_options().items()}
-    return {"source": _source_with_files(run, kind, kind.replaced_by(typed), flags)}
+    return {"source": _source_with_files(run, kind, kind.replaced_by(typed), kind.command_options())}
 
 
 def _source_with_files(
-    run: "Run", kind: "type[SourceSettings]", replaced: Collection[str], flags: Mapping[str, str]
+    run: "Run", kind: "type[SourceSettings]", replaced: Collection[str], offered: Collection[str]
 ) -> dict[str, Any]:
     """Return the settings of a run's source as values, with its files where the run had them.
 
@@ -125,7 +124,7 @@ def _source_with_files(
         run: The run whose source is opened again; it stores its settings.
         kind: The class of these settings.
         replaced: The fields that are given anew.
-        flags: The options of a command that give fields, by field.
+        offered: The fields that an option of the command gives.
 
     Raises:
         UsageError: For files that are gone.
@@ -134,8 +133,9 @@ def _source_with_files(
     source = kind.with_files(run.settings[CONFIG]["source"], files)
     # A run that does not say where its files were leads to their names, which may lie here.
     for field, path in (kind(**source).files() | {field: Path(path) for field, path in files.items()}).items():
-        if field not in replaced:
-            _check_there(run, field, path, flags.get(field))
+        if field not in replaced and not path.exists():
+            option = kind.command_options()[field].flag if field in offered else None
+            _check_there(run, field, path, option)
     kind.find_again(files)
     return source
 
@@ -206,6 +206,5 @@ def source_again(run: "Run", moved: Mapping[str, Any]) -> "SourceSettings":
     if CONFIG not in run.settings:
         raise UsageError(f"{run.location} does not say with which settings it was requested; extract it again")
     kind = kind_of(run.settings[CONFIG]["source"])
-    flags = {field: option.flag for field, option in _options(kind).items()}
-    values = kind.with_moved(_source_with_files(run, kind, moved, flags), moved)
-    return kind(**values, **({"run": run.location.address} if kind.of_run else {}))
+    stored = _source_with_files(run, kind, moved, kind.moves)
+    return kind(**kind.with_moved(stored, moved), **({"run": run.location.address} if kind.of_run else {}))

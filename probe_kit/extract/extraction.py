@@ -22,12 +22,13 @@ from probe_kit.errors import DiskSpaceError, EpisodesFailedError, MissingExtraEr
 from probe_kit.extract.parts import SCRIPTED
 from probe_kit.extract.rollout.calibration import Calibration
 from probe_kit.extract.rollout.controllers import Controller
-from probe_kit.extract.rollout.tasks import task_of
+from probe_kit.extract.rollout.tasks import LoadedModel, task_of
 from probe_kit.extract.rollout.worker import Worker
 from probe_kit.extract.settings import CONFIG, AskSettings, ExtractSettings, Settings, run_label
 from probe_kit.extract.sizes import planned_sizes, space_needed
 from probe_kit.extract.sources.player import Done, Event, Failed
 from probe_kit.extract.sources.source import Source, raise_together
+from probe_kit.extract.states import Decided, Fitted
 from probe_kit.hashing import canonical_json, sha256_json
 from probe_kit.hooks.registry import find_family, get_family
 from probe_kit.runs.commits import failure_key
@@ -60,24 +61,38 @@ class Extraction:
     """A prepared extraction, ready to run: the source is open, the model is loaded and the plan is made.
 
     Attributes:
-        settings: The settings, fitted to the model, see `Settings`.
+        fitted: The settings, fitted to the model.
         source: The source as the model is shown it.
         card: The part of the identity that the loaded model decides.
-        controller: The controller of the loaded model. None: workers elsewhere load the model again.
-        calibration: The measurement that chose the batch; None if it was not requested or is left to workers.
+        loaded: The model, loaded here. None: workers elsewhere load it again, or none was loaded.
         declared: The origin of the sizes of the streams, where no model was loaded and the run has no name yet.
             Empty where a model was loaded.
         row_ids: The ids of the planned rows, where only some of the source's are planned; else None.
     """
 
-    settings: Settings
+    fitted: Fitted[Settings]
     source: Source[Any]
     plan: Plan
     card: dict[str, Any]
-    controller: Controller | None
-    calibration: Calibration | None = None
+    loaded: LoadedModel | None
     declared: str = ""
     row_ids: tuple[str, ...] | None = None
+
+    @property
+    def settings(self) -> Settings:
+        """The settings by part."""
+        settings: Settings = self.fitted.settings
+        return settings
+
+    @property
+    def controller(self) -> Controller | None:
+        """The controller of the model that is loaded here, if any."""
+        return None if self.loaded is None else self.loaded.controller
+
+    @property
+    def calibration(self) -> Calibration | None:
+        """The measurement that chose the batch; None if it was not requested or is left to workers."""
+        return None if self.loaded is None else self.loaded.calibration
 
     def identity(self) -> dict[str, Any]:
         """Return everything that decides the numbers of an episode, without selection, machine and label.
@@ -111,8 +126,8 @@ class Extraction:
 
     def worker(self, writer: RunWriter, episodes: int) -> Worker:
         """Return a worker of this process, which plays at most `episodes` episodes with the loaded model."""
-        assert self.controller is not None
-        return Worker(writer, self.settings, self.controller, self.source, episodes)
+        assert self.loaded is not None
+        return Worker(writer, self.fitted, self.loaded.controller, self.loaded.observations, self.source, episodes)
 
     def run(self, out: Path | str | Location, force: bool = False, progress: Progress | None = None) -> Run:
         """Play and commit every episode of the plan that is not committed yet, seal the run and open it.
@@ -141,7 +156,7 @@ class Extraction:
         with location.explained_errors():
             addition = self.further_plan(location)
             if not force and addition.episodes:
-                check_if_full(space_needed(addition, self.settings), location)
+                check_if_full(space_needed(addition, self.fitted), location)
             writer = self.writer(location)
             with writer.claim():
                 check_exclusive(location, GROUP_FILE, writer.root.stored_metadata[GROUP_FILE])
@@ -221,8 +236,8 @@ def load(
         ProbeKitError: For any other fault of settings, source or model.
     """
     decided, source = open_checked(settings, location, model is not None, fetch)
-    task = task_of(decided)
-    rows = _select_rows(task.rows(decided, source), choose_rows)
+    task = task_of(decided.settings)
+    rows = _select_rows(task.rows(decided.settings, source), choose_rows)
     if not rehearsed:
         source.rehearse(rows)
     if model is not None:
@@ -231,23 +246,22 @@ def load(
         raise_together(task.early_checks(decided, source, fetch))
     if check_cameras is not None and (early := source.shown_cameras(task.declared_inputs(decided))) is not None:
         check_cameras(early)
-    if not fetch and (sizes := planned_sizes(decided, source.instructions)) is not None:
-        counted = task.planned(decided, sizes)
-        plan = _plan(counted, source, rows, sizes.streams, counted.task.execute or sizes.execute)
-        requested = counted.model
+    if not fetch and (sizes := planned_sizes(decided.settings, source.instructions)) is not None:
+        fitted = task.planned(decided, sizes)
+        requested, execute = fitted.settings.model, fitted.settings.task.execute
+        plan = _plan(fitted, source, rows, sizes.streams, execute or sizes.execute)
         card = {"model": requested.family, "random_weights": requested.random_weights, "weights_sha256": None}
-        declared = {"dtype": requested.dtype, "execute": counted.task.execute}
+        declared = {"dtype": requested.dtype, "execute": execute}
         card |= {name: value for name, value in declared.items() if value is not None}
-        return Extraction(counted, source, plan, card, None, None, sizes.source, _ids(rows, choose_rows))
-    fitted, source, controller, calibration = task.fit(
-        decided, source, task.load(decided) if model is None else model
-    )
+        return Extraction(fitted, source, plan, card, None, sizes.source, _ids(rows, choose_rows))
+    fitted, source, loaded = task.fit(decided, source, task.load(decided.settings) if model is None else model)
+    controller = loaded.controller
     if check_cameras is not None and (cameras := source.shown_cameras()) is not None:
         check_cameras(cameras)
-    rows = _select_rows(task.rows(fitted, source), choose_rows)  # of the source as the model is shown it
+    rows = _select_rows(task.rows(fitted.settings, source), choose_rows)  # of the source as the model is shown it
     plan = _plan(fitted, source, rows, controller.streams, controller.execute)
     row_ids = _ids(rows, choose_rows)
-    return Extraction(fitted, source, plan, controller.identity, controller, calibration, row_ids=row_ids)
+    return Extraction(fitted, source, plan, controller.identity, loaded, row_ids=row_ids)
 
 
 def _select_rows(rows: tuple[Row, ...], choose: ChooseRows | None) -> tuple[Row, ...]:
@@ -267,9 +281,9 @@ def _rows_of(ids: Sequence[str], rows: Sequence[Row]) -> list[Row]:
     return [by_id[name] for name in ids]
 
 
-def open_checked(
-    settings: Settings, location: Location | None = None, loaded: bool = False, fetch: bool = True
-) -> tuple[Settings, Source[Any]]:
+def open_checked[Chosen: Settings](
+    settings: Chosen, location: Location | None = None, loaded: bool = False, fetch: bool = True
+) -> tuple[Decided[Chosen], Source[Any]]:
     """Return the settings with what protocol and source decide, and the open source. Raises as `load`.
 
     All is checked that needs no model.
@@ -282,18 +296,19 @@ def open_checked(
             machine are read, see `Family.check`.
     """
     check_meaningless(settings)
-    decided = settings.followed()
-    task = task_of(decided)
+    settings = settings.followed()
+    task = task_of(settings)
     if not loaded:
-        check_model(decided, fetch)
+        check_model(settings, fetch)
     if location is not None:
         _check_writable(location)
-    source = task.view_of(decided.source.open(not fetch and _selects_only(decided, location)))
-    if by_source := {name: value for name, value in source.decided().items() if name in decided.names()}:
-        decided = decided.changed(**by_source)
-    if not loaded and decided.model.family not in SCRIPTED:
-        family = find_family(decided.model.family, tuple(SCRIPTED))
-        family.check_words(task.texts(decided, source), decided.model.checkpoint)
+    source = task.view_of(settings.source.open(not fetch and _selects_only(settings, location)))
+    by_source = {name: value for name, value in source.decided().items() if name in settings.names()}
+    decided = Decided(settings.changed(**by_source) if by_source else settings)
+    model = decided.settings.model
+    if not loaded and model.family not in SCRIPTED:
+        family = find_family(model.family, tuple(SCRIPTED))
+        family.check_words(task.texts(decided.settings, source), model.checkpoint)
     if location is not None:
         _check_other_run(decided, source, location)
     return decided, source
@@ -357,7 +372,7 @@ def _check_writable(location: Location) -> None:
         raise UsageError(f"{location} cannot be used: {nearest} cannot be written. Give another path")
 
 
-def _check_other_run(settings: Settings, source: Source[Any], location: Location) -> None:
+def _check_other_run(decided: Decided[Settings], source: Source[Any], location: Location) -> None:
     """Raise SettingsMismatchError for a location that holds a run with other settings, or one that cannot grow so.
 
     Only what is known without the model is compared; the writer compares all of it.
@@ -370,8 +385,9 @@ def _check_other_run(settings: Settings, source: Source[Any], location: Location
         root = None if early is None else find_continuable(location)
         if early is None or root is None:
             return
-        decided = {name: value for name, value in settings.identity().items() if name not in _OF_THE_CHECKPOINT}
-        requested = json.loads(canonical_json({**decided, **early}))
+        settings = decided.settings
+        comparable = {name: value for name, value in settings.identity().items() if name not in _OF_THE_CHECKPOINT}
+        requested = json.loads(canonical_json({**comparable, **early}))
         stored = {name: root.own_settings[name] for name in requested if name in root.own_settings}
         check_other_settings(stored, {name: requested[name] for name in stored}, str(location))
         if root.plan:
@@ -398,17 +414,18 @@ def _selects_only(settings: Settings, location: Location | None) -> bool:
 
 
 def _plan(
-    settings: Settings,
+    fitted: Fitted[Settings],
     source: Source[Any],
     rows: tuple[Row, ...],
     streams: Iterable[StoredStream],
     execute: int,
 ) -> Plan:
     """Return the plan of rows that store these streams, with `execute` actions per inference, 0 for none."""
-    capture, streams = settings.capture, tuple(streams)
+    settings, streams = fitted.settings, tuple(streams)
+    capture = settings.capture
     notes = source.unit_notes(settings.machine.accept_units)
     units = {UNITS: {name: asdict(note) for name, note in notes.items()}} if notes else {}
-    size = sum(stream.raw_bytes(capture.tokens == "all", capture.calls, capture.later_views) for stream in streams)
+    size = sum(stream.raw_bytes(capture.tokens == "all", fitted.calls, capture.later_views) for stream in streams)
     return Plan(
         rows,
         streams,
@@ -458,6 +475,8 @@ def play_episodes(
     report: Callable[[Event], None],
 ) -> None:
     """Do the work of a worker elsewhere: load the model, then play the episodes that are handed out.
+
+    The settings of the run are a request to it: what this machine decides, such as a batch, it decides anew.
 
     The run is held meanwhile.
 
@@ -552,7 +571,7 @@ def prepare(
     measures = {"batch": 1} if settings.machine.batch == "auto" else {}
     planned = load_with(settings.changed(device="cpu", **measures))
     for_workers = planned.settings.changed(device=settings.machine.device, batch=settings.machine.batch)
-    return replace(planned, settings=for_workers, controller=None, calibration=None)
+    return replace(planned, fitted=replace(planned.fitted, settings=for_workers), loaded=None)
 
 
 def extract_run(settings: ExtractSettings, out: Path | str, progress: Progress | None = None) -> Run:

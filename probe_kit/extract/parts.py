@@ -166,13 +166,6 @@ class Capture(Part):
         if self.tokens == "all":
             raise UsageError("--later-views mean and --tokens all contradict each other; leave one out")
 
-    @property
-    def calls(self) -> int:
-        """The number of inferences captured per episode. Raises UsageError for `all`, which has no number yet."""
-        if self.captured_calls == "all":
-            raise UsageError("captured_calls is 'all', which has no number before the model is loaded")
-        return self.captured_calls
-
 
 class AskCapture(Part):
     """The stored activations of a model that answers: of its only inference, or nothing."""
@@ -189,7 +182,6 @@ class AskCapture(Part):
     codec: Codec = "zstd"
     captured_calls: ClassVar[int] = 1
     later_views: ClassVar[LaterViews] = "all"
-    calls: ClassVar[int] = 1
 
 
 # -- tasks --------------------------------------------------------------------------------------------------
@@ -380,14 +372,6 @@ class Machine(Part):
                 f"--inference-limit {self.inference_limit:g} needs a process that can be ended: add --workers 1, "
                 "or leave it out and end a model that hangs with Ctrl-C"
             )
-
-    @property
-    def observations(self) -> int:
-        """The observations per call of the model. Raises UsageError for `auto`, which has no number yet."""
-        batch = getattr(self, "batch", 1)
-        if not isinstance(batch, int):
-            raise UsageError(f"batch is {batch!r}, which has no number before it is measured")
-        return batch
 
     @property
     def capture_bytes(self) -> int | None:

@@ -84,10 +84,8 @@ def _model_of(settings: "type[Settings]", part: str) -> Any:
 class Settings(Part):
     """Settings of a run of any kind; the defaults are the command line's.
 
-    They have three states, and `load` in `extraction.py` names which it holds. *Requested* is what a user typed.
-    *Decided* adds what the protocol and the open source decide (`open_checked`). *Fitted* adds what the loaded
-    model decides: the numbers of captured inferences and of observations per call (`Task.fit`). The settings of an
-    `Extraction` are fitted.
+    They are a request: what protocol, source and model decide is not in them yet. `states.py` has the types of
+    settings in which it is.
 
     Attributes:
         asks: Whether the model answers questions, and does not act.
@@ -305,11 +303,6 @@ class Settings(Part):
     def most_inferences(self, execute: int) -> int:
         """Return how many inferences an episode can have with `execute` actions per inference."""
         return -(-self.source.steps() // max(1, execute))
-
-    def with_every_call(self, execute: int) -> Self:
-        """Return the settings with a number in place of `captured_calls` `all`."""
-        every = self.capture.captured_calls == "all"
-        return self.changed(captured_calls=self.most_inferences(execute)) if every else self
 
     def followed(self) -> Self:
         """Return the settings with all that a protocol decides; of a question it decides the scene alone."""

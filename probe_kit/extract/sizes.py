@@ -8,6 +8,7 @@ import numpy as np
 
 from probe_kit.errors import ProbeKitError
 from probe_kit.extract.settings import Settings
+from probe_kit.extract.states import Fitted
 from probe_kit.hooks.contract.sites import view_names
 from probe_kit.hooks.family import DTYPES
 from probe_kit.runs.layout import StoredStream
@@ -34,18 +35,15 @@ REPORT = 5_000_000
 """The bytes of a report with its figures."""
 
 
-def space_needed(plan: Plan, settings: Settings) -> dict[str, int]:
+def space_needed(plan: Plan, fitted: Fitted[Settings]) -> dict[str, int]:
     """Return the bytes by part, uncompressed. Probes are those of one view; each further view takes as much."""
-    return space_of(plan.streams, len(plan.episodes), settings)
+    return space_of(plan.streams, len(plan.episodes), fitted)
 
 
-def space_of(streams: Sequence[StoredStream], episodes: int, settings: Settings) -> dict[str, int]:
+def space_of(streams: Sequence[StoredStream], episodes: int, fitted: Fitted[Settings]) -> dict[str, int]:
     """Return the bytes by part, uncompressed, of a number of episodes that store these streams."""
-    calls, later, with_tokens = (
-        settings.capture.calls,
-        settings.capture.later_views,
-        settings.capture.tokens == "all",
-    )
+    settings, calls = fitted.settings, fitted.calls
+    later, with_tokens = settings.capture.later_views, settings.capture.tokens == "all"
     machine, frames = settings.machine, settings.source.steps() + 1
     films = {"all": episodes, "first": 1, "none": 0}[machine.video]
     pictures = {"none": 0, "ends": THUMBNAILS, "all": FRAME * frames}[machine.frames]

@@ -6,12 +6,11 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from importlib import import_module
 from importlib.util import find_spec
-from operator import attrgetter
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
-from probe_kit._system.imports import install_command, one_scan_of_packages
+from probe_kit._system.imports import install_command
 from probe_kit._system.machine import AUTO, check_device_name, device_here, what_is_here
 from probe_kit.errors import (
     CheckpointError,
@@ -30,7 +29,7 @@ from probe_kit.hooks.checkpoints.checkpoint import (
     without_revision,
 )
 from probe_kit.hooks.checkpoints.folders import check_files, checkpoint_folder, with_adapters_named
-from probe_kit.hooks.checkpoints.third_party import while_loading
+from probe_kit.hooks.checkpoints.third_party import import_loader, import_object, while_loading
 from probe_kit.hooks.contract.card import ModelCard
 from probe_kit.hooks.contract.declared import (
     RELEASED,
@@ -156,7 +155,7 @@ class Family:
         from probe_kit.hooks.capturing.capture_context import switch_off_fused_encoder
 
         switch_off_fused_encoder()
-        load = self._import_loader(self.loader)
+        load = import_loader(self.name, self.loader)
         if weights_seed:
             if "weights_seed" not in inspect.signature(load).parameters:
                 raise UsageError(f"{self.name} has one untrained network only: its loader takes no weights_seed")
@@ -311,7 +310,7 @@ class Family:
         location, loader_options = self._locate(checkpoint, options)
         if (folder := configuration_folder(location)) is None:
             return None  # before the loader is imported, and torch with it
-        load = self._import_loader(self.loader)
+        load = import_loader(self.name, self.loader)
         with while_loading(self.name, str(location)):
             values = self._with_defaults(loader_options, location)
             return outline_of(self.name, load, str(location), folder, dtype, values)
@@ -361,7 +360,7 @@ class Family:
         location, loader_options = self._locate(checkpoint, options)
         if self.abilities.words is None or (not fetch and location is not None and is_on_hub(location)):
             return
-        check = self._import_loader(self.abilities.words)
+        check = import_loader(self.name, self.abilities.words)
         with while_loading(self.name, str(location or "what it brings")):
             check(location, instructions, **loader_options)
 
@@ -382,7 +381,7 @@ class Family:
         location, loader_options = self._locate(checkpoint, options)
         if self.abilities.units is None or location is None or (not fetch and is_on_hub(location)):
             return ""
-        describe_units = self._import_loader(self.abilities.units)
+        describe_units = import_loader(self.name, self.abilities.units)
         with while_loading(self.name, location):
             return with_adapters_named(
                 str(describe_units(location, **self._with_defaults(loader_options, location)))
@@ -446,15 +445,10 @@ class Family:
             UsageError: If it has none.
         """
         self.check_purpose(purpose)
-        return self._import_loader(str(self._function(purpose)))
+        return import_loader(self.name, str(self._function(purpose)))
 
     def _function(self, purpose: Literal["outputs", "full_size"]) -> str | None:
         return self.abilities.outputs if purpose == "outputs" else self.checkpoints.full_size
-
-    def _import_loader(self, path: str) -> Callable[..., Any]:
-        with while_loading(self.name, path), one_scan_of_packages():
-            function: Callable[..., Any] = import_object(path)
-        return function
 
     def _locate(self, checkpoint: str | None, options: Mapping[str, Any]) -> tuple[str | None, dict[str, Any]]:
         """The checkpoint, and the options as the loader gets them."""
@@ -534,9 +528,3 @@ def _check_device(device: str) -> None:
     except (RuntimeError, AssertionError) as error:  # what torch raises: unknown, absent
         reason = str(error).partition("\n")[0]
         raise UsageError(f"device {device!r} cannot be used: {reason}. {what_is_here()}") from error
-
-
-def import_object(path: str) -> Any:
-    """The object at `module:name` or `module:Class.method`."""
-    module, name = path.split(":")
-    return attrgetter(name)(import_module(module))

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from probe_kit._system.bounded_files import UNREADABLE, load_gzipped_json, load_json, open_arrays
 from probe_kit.errors import UsageError
-from probe_kit.hooks.checkpoints.third_party import in_words, while_loading
-from probe_kit.hooks.family import import_object
+from probe_kit.hooks.checkpoints.third_party import import_object, in_words, while_loading
 from probe_kit.hooks.registry import find_family
 from probe_kit.models.checkpoint_files import rename_tensor
 

@@ -61,13 +61,18 @@ def _pairs_of_table(path: Path) -> Iterable[tuple[str, str]]:
     return [(table.where(line), cells[INSTRUCTION] or "") for line, cells in table.rows((INSTRUCTION,))]
 
 
-def check_further_instructions(task_words: Sequence[str], instructions: Iterable[str]) -> None:
+def check_further_instructions(
+    task_words: Sequence[str], instructions: Iterable[str], has_pairs: bool = False
+) -> None:
     """Raise UsageError for a further instruction that frames hold already, but for spelling.
 
     Args:
         task_words: The words of other tasks.
         instructions: The instructions of the frames.
+        has_pairs: Whether a table of pairs names the donors, whose words these would be.
     """
+    if has_pairs:
+        raise UsageError("--instructions gives words of donors, and --pairs names donors; leave one of both out")
     held = {normal_form(text): text for text in instructions}
     for text in task_words:
         if (same := held.get(normal_form(text))) is not None:

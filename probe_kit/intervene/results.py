@@ -27,14 +27,14 @@ from probe_kit.intervene.stored import (
     EFFECTS,
     EPISODES,
     Measurement,
+    find_measurement,
     find_stored,
-    is_stored,
 )
 from probe_kit.intervene.verdict import UseVerdict, describe_readouts, size_of_groups
 from probe_kit.runs.layout import INTERVENTIONS
 from probe_kit.runs.reader import RunReader
 from probe_kit.runs.records import as_json
-from probe_kit.runs.results import tidy_bundle, write_bundle
+from probe_kit.runs.results import find_bundle, tidy_bundle, write_bundle
 from probe_kit.statistics.paired_tests import smallest_flip_p
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.suite.categories import category_of
@@ -229,8 +229,19 @@ def load_effects(run: RunReader, key: str | None = None, kind: str | None = None
         NoInterventionsError: If there is none.
         UsageError: For a key that does not exist or is not the only one.
     """
-    result = InterventionResult.of_stored(find_stored(run, key, kind))
-    _ = result.outcomes, result.certificate  # read now, so that a changed file is refused here and not in a table
+    return _read_in_full(find_stored(run, key, kind))
+
+
+def find_effects(run: RunReader, key: str) -> InterventionResult | None:
+    """Return the stored intervention with exactly this key; None if there is none. Raises as `load_effects`."""
+    stored = find_measurement(run, key)
+    return None if stored is None else _read_in_full(stored)
+
+
+def _read_in_full(stored: Measurement) -> InterventionResult:
+    """Return the result, whose files are read now: a changed one is refused here and not in a table."""
+    result = InterventionResult.of_stored(stored)
+    _ = result.outcomes, result.certificate
     return result
 
 
@@ -268,7 +279,7 @@ def save(
         extra_files: Further files by name.
     """
     key = key_of(settings)
-    if is_stored(run.location, key):
+    if find_bundle(run.location, INTERVENTIONS, key) is not None:
         tidy_bundle(run.location, INTERVENTIONS, key)
         return key
     files = {EPISODES: outcomes.to_bytes(), CERTIFICATE: as_json(certificate), **extra_files}

@@ -17,10 +17,9 @@ from probe_kit.intervene.open_session import open_session
 from probe_kit.intervene.outcomes import ConditionOutcomes, arrays_of
 from probe_kit.intervene.places import ALL, resolve_all, roles_of, unread_note, unread_places
 from probe_kit.intervene.replay import Condition
-from probe_kit.intervene.results import InterventionResult, load_effects, save
+from probe_kit.intervene.results import InterventionResult, find_effects, save
 from probe_kit.intervene.sessions import LoadPolicy, ReplayFiles, ReplaySession
 from probe_kit.intervene.settings import check_run_fits, key_of, settings_of
-from probe_kit.intervene.stored import is_stored
 from probe_kit.runs.layout import INTERVENTIONS
 from probe_kit.runs.provenance import provenance_here
 from probe_kit.runs.results import Pieces, tidy_bundle
@@ -67,9 +66,9 @@ def run_intervention(
     check_intervention(run, intervention)
     settings = settings_of(intervention, run)
     key = key_of(settings)
-    if is_stored(run.location, key):
+    if (stored := find_effects(run, key)) is not None:
         tidy_bundle(run.location, INTERVENTIONS, key)
-        return load_effects(run, key)
+        return stored
     pieces = Pieces.of(run.location, INTERVENTIONS, key, run.stamp, REDO)
     requested = intervention.items_in(run)
     with open_session(run, source or ReplayFiles(), load, intervention) as session, session.ready():
@@ -100,7 +99,9 @@ def run_intervention(
     # Only now: the unit, spreads of all clean actions, is known once every item was replayed.
     save(run, settings, outcomes.in_spreads(), certificate, extra_files)
     pieces.discard()  # only now: killed in between, the result is there, and the pieces are tidied away
-    return load_effects(run, key)
+    stored = find_effects(run, key)
+    assert stored is not None, "it was written just now"
+    return stored
 
 
 def check_roles(intervention: Intervention, policy: "Policy") -> None:

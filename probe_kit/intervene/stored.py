@@ -43,6 +43,7 @@ from probe_kit.runs.results import (
     axes_problem,
     complete_key,
     fields_problem,
+    find_bundle,
     is_complete,
     read_bundles,
 )
@@ -206,11 +207,28 @@ def read_interventions(run: Location) -> dict[str, Bundle]:
         RunDamagedError: If one was changed or has another format.
     """
     bundles = read_bundles(run, INTERVENTIONS)
-    for key, bundle in bundles.items():
-        bundle.check_format(FORMAT)
-        if (key_of_settings := key_of(bundle.head["settings"])) != key:
-            raise bundle.head_damaged(f"has the settings of {key_of_settings}")
+    for bundle in bundles.values():
+        _check_bundle(bundle)
     return bundles
+
+
+def find_measurement(run: RunReader, key: str) -> Measurement | None:
+    """Return the complete intervention with this key; None if there is none. No other one is read.
+
+    Raises:
+        RunDamagedError: If it was changed or has another format.
+    """
+    if (bundle := find_bundle(run.location, INTERVENTIONS, key)) is None:
+        return None
+    _check_bundle(bundle)
+    return Measurement.of(run, bundle)
+
+
+def _check_bundle(bundle: Bundle) -> None:
+    """Raise RunDamagedError for an intervention of another format, or with the settings of another one."""
+    bundle.check_format(FORMAT)
+    if (key_of_settings := key_of(bundle.head["settings"])) != bundle.key:
+        raise bundle.head_damaged(f"has the settings of {key_of_settings}")
 
 
 def stored_interventions(run: RunReader, kind: str | None = None) -> list[Measurement]:

@@ -116,14 +116,12 @@ def score_streams(curve: ProbeCurve, rows: Mapping[str, NDArray[np.intp]], seed_
             tuple(rows), crossfit(list(streams.values()), curve.group_names, seed_text, chance=0.0)
         )
     fit = crossfit(list(streams.values()), curve.group_names, seed_text)
+    thresholds = {name: permuted_threshold(curve.null[of_stream]) for name, of_stream in rows.items()}
     return StreamScores(
         tuple(rows),
         fit,
         {name: at_most(stream.scores) for name, stream in streams.items()},
-        {
-            name: findable(stream.scores, permuted_threshold(curve.null[rows[name]]))
-            for name, stream in streams.items()
-        },
+        {name: findable(stream.scores, thresholds[name]) for name, stream in streams.items()},
     )
 
 
@@ -452,7 +450,10 @@ def retention_of(
     curve = probed_curve(results, category, view)
     seed_text = results.settings.seed_text if seed_text is None else seed_text
     peaks, streams = stream_peaks(curve, iterations), curve_scores(curve, iterations, seed_text)
-    return estimate_of_peaks(results, category, view, peaks, streams, absent_below)
+    exceeds: Exceeds = {}
+    if (best := peaks.get(BACKBONE)) is not None:
+        exceeds = results.controls.exceeds(category, view, best.site, best.p_fwe)
+    return estimate_of_peaks(results, category, view, peaks, exceeds, streams, absent_below)
 
 
 def probed_curve(results: ProbeResults, category: str, view: str) -> ProbeCurve:
@@ -475,15 +476,23 @@ def estimate_of_peaks(
     category: str,
     view: str,
     peaks: Mapping[str, Peak],
+    exceeds: Exceeds,
     streams: StreamScores | None,
     absent_below: float = ABSENT_BELOW,
 ) -> RetentionEstimate:
-    """Return the retention of best sites and scores that are known already; see `retention_of`."""
-    exceeds: Exceeds = {}
+    """Return the retention of best sites and scores that are known already; see `retention_of`.
+
+    Args:
+        results: Probes of the target.
+        category: Category of the probes.
+        view: View of the probes.
+        peaks: The best sites by name.
+        exceeds: By name, whether the backbone's best site exceeds chance and each control; empty without one.
+        streams: Cross-fitted scores of both; None where no score is defined.
+        absent_below: Accuracy below which a backbone without signal counts as absent, see `verdict`.
+    """
     estimate = RetentionEstimate(value=nan, interval=NO_LIMITS, published=nan, defined=False, note=ONE_STREAM)
     if len(peaks) == 2:
-        backbone = peaks[BACKBONE]
-        exceeds = results.controls.exceeds(category, view, str(backbone.site), backbone.p_fwe)
         estimate = estimate_retention(peaks, streams, exceeds, absent_below)
     if results.settings.balanced:
         return estimate

@@ -11,11 +11,11 @@ Files are never written over: what changes gets another name, and counts when th
 
 import re
 import warnings
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import MISSING, dataclass, fields
 from io import BytesIO
 from pathlib import PurePosixPath
-from typing import Annotated, Any, BinaryIO, ClassVar
+from typing import Annotated, Any, BinaryIO, ClassVar, TypeVar
 from zipfile import ZipFile
 
 import numpy as np
@@ -26,9 +26,10 @@ from probe_kit._system.bounded_files import open_arrays, parse_json
 from probe_kit.errors import RunDamagedError, UsageError
 from probe_kit.runs.layout import DIAGNOSES, INTERVENTIONS, PROBES
 from probe_kit.runs.records import DIGEST_BYTES, Checksum, Record, digest, digest_of, parse_sum
-from probe_kit.runs.root import find_root
+from probe_kit.runs.root import Root, find_root
 from probe_kit.runs.store import Location
 
+Parsed = TypeVar("Parsed")
 BUNDLES = (PROBES, INTERVENTIONS, DIAGNOSES)
 """The folders of a run that hold bundles."""
 _MAKERS = {PROBES: "train", INTERVENTIONS: "intervene", DIAGNOSES: "diagnose"}
@@ -143,6 +144,24 @@ class Bundle:
             raise self.damaged(name, f"holds a {type(content).__name__}, not an object")
         return content
 
+    def read_as(self, name: str, read: Callable[[Mapping[str, Any]], Parsed], *readable: int | str) -> Parsed:
+        """Return what a function makes of the JSON object in one file.
+
+        Args:
+            name: The name of the file.
+            read: The function. A ValueError of it says that the object has other fields.
+            *readable: The formats of the bundle that it reads.
+
+        Raises:
+            RunDamagedError: For a bundle of another format, and for a file that was changed or has other fields.
+        """
+        self.check_format(*readable)
+        content = self.read_json(name)
+        try:
+            return read(content)
+        except ValueError as error:
+            raise self.damaged(name, "has other fields: another version of probe_kit made it") from error
+
     def check_format(self, *readable: int | str) -> None:
         """Raise RunDamagedError unless the settings say one of these formats."""
         stored = self.head["settings"].get("format")
@@ -178,8 +197,8 @@ def write_bundle(
         times: The times of events by name (UTC, ISO 8601), which replace the former ones.
     """
     with location.take_turns(f"{home}/{key}"):
-        folder, run = f"{home}/{key}", _identity(location)
-        before = find_bundle(location, home, key)
+        folder = f"{home}/{key}"
+        run, before = _look_up(location, home, key)
         former = dict(before.files) if before else {}
         files_now = dict(former)
         for name, content in files.items():
@@ -209,13 +228,20 @@ def is_complete(location: Location, home: str, key: str) -> bool:
     folder = f"{home}/{key}"
     if not location.exists(f"{folder}/{HEAD}"):
         return False
-    head = _read_head(location, folder)
-    names = {actual: name for name, (actual, _) in head.files.items()}
-    missing = {TIMES, *names} - {*location.sizes(folder, (TIMES, *names))}
-    if not missing:
-        return True
-    root = find_root(location)  # of a copy without activations, files may be missing on purpose
-    return root is not None and {names.get(actual) for actual in missing} <= root.left_out
+    missing = _missing_files(location, folder, _read_head(location, folder))
+    return not missing or _are_left_out(missing, find_root(location))
+
+
+def _missing_files(location: Location, folder: str, head: Head) -> set[str | None]:
+    """Return the names of the files that a bundle lacks; None stands for its times."""
+    names: dict[str, str | None] = {TIMES: None} | {actual: name for name, (actual, _) in head.files.items()}
+    stored = location.sizes(folder, tuple(names))
+    return {name for actual, name in names.items() if actual not in stored}
+
+
+def _are_left_out(missing: set[str | None], root: Root | None) -> bool:
+    """Whether a bundle lacks files on purpose, in a copy without activations."""
+    return root is not None and missing <= root.left_out
 
 
 def tidy_bundle(location: Location, home: str, key: str) -> None:
@@ -236,13 +262,31 @@ def read_bundle(location: Location, home: str, key: str) -> Bundle:
 
 def find_bundle(location: Location, home: str, key: str) -> Bundle | None:
     """Return the bundle `key` if it is stored with all its files, else None. Raises as `read_bundle`."""
-    return read_bundle(location, home, key) if is_complete(location, home, key) else None
+    return _look_up(location, home, key)[1]
+
+
+def _look_up(location: Location, home: str, key: str) -> tuple[str | None, Bundle | None]:
+    """Return the identity of the run, and what `find_bundle` returns: run and head are read once."""
+    folder, root = f"{home}/{key}", find_root(location)
+    run = None if root is None else root.identity
+    if not location.exists(f"{folder}/{HEAD}"):
+        return run, None
+    head = _read_head(location, folder)
+    if (missing := _missing_files(location, folder, head)) and not _are_left_out(missing, root):
+        return run, None
+    if (head.key, head.run) != (key, run):
+        return run, _read_bundle(location, home, key, run)  # which raises, and says whose head it is
+    return run, _with_times(location, home, key, run, head)
 
 
 def _read_bundle(location: Location, home: str, key: str, run: str | None) -> Bundle:
-    folder, expected = f"{home}/{key}", {"key": key, "run": run}
-    head = _read_head(location, folder, **expected)
-    times = Times.read(location, f"{folder}/{TIMES}", advice_for(folder), **expected)
+    return _with_times(location, home, key, run, _read_head(location, f"{home}/{key}", key=key, run=run))
+
+
+def _with_times(location: Location, home: str, key: str, run: str | None, head: Head) -> Bundle:
+    """Return the bundle of a head, with its times."""
+    folder = f"{home}/{key}"
+    times = Times.read(location, f"{folder}/{TIMES}", advice_for(folder), key=key, run=run)
     parts = {part: value for part, value in head.content.items() if part not in ("key", "run", "files")}
     return Bundle(location, home, key, parts, times.model_extra or {}, head.files)
 

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from probe_kit._system.escaping import as_argument
 from probe_kit.errors import MissingExtraError, ProbeKitError, RunDamagedError
+from probe_kit.hooks.checkpoints.third_party import import_object
 from probe_kit.hooks.contract.sites import PADDING
-from probe_kit.hooks.family import import_object
 from probe_kit.runs.array_store import ArrayStore
 from probe_kit.runs.arrays import EpisodeRows, create_array, open_array
 from probe_kit.runs.columns import Columns, columns_folder, find_columns, seal_key, write_seal

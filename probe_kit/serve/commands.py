@@ -16,6 +16,7 @@ from probe_kit.errors import UsageError
 from probe_kit.extract.parts import ActMachine, ActTask, Capture, ModelSettings
 from probe_kit.extract.settings import ExtractSettings
 from probe_kit.extract.sources.served import ServedSettings
+from probe_kit.extract.states import count_calls
 
 if TYPE_CHECKING:
     from probe_kit.runs import Run
@@ -147,7 +148,7 @@ def _print_plan(plan: "ServerPlan", address: str) -> None:
     from probe_kit.extract.sizes import weights_needed
     from probe_kit.runs.run_folders import in_units
 
-    settings, source = plan.settings, plan.source
+    settings, calls, source = plan.fitted.settings, plan.fitted.calls, plan.source
     served: Any = settings.source
     capture = settings.capture
     cameras = [f"{key} → {camera}, uint8 (height, width, 3)" for camera, key in source.cameras]
@@ -155,9 +156,7 @@ def _print_plan(plan: "ServerPlan", address: str) -> None:
     pictures = "; ".join(cameras) or f"a picture by the name of a camera ({names}), or the only one"
     words = f"none: --instruction {served.instruction!r}" if served.instruction else f"{served.words_key}, a text"
     per_call = sum(stream.raw_bytes(capture.tokens == "all", 1) for stream in plan.streams)
-    episode = sum(
-        stream.raw_bytes(capture.tokens == "all", capture.calls, capture.later_views) for stream in plan.streams
-    )
+    episode = sum(stream.raw_bytes(capture.tokens == "all", calls, capture.later_views) for stream in plan.streams)
     chunk = tuple("?" if size is None else str(size) for size in plan.chunk)
     streams = "; ".join(f"{stream.name} {stream.layers} layers x {stream.width}" for stream in plan.streams)
     model = settings.model
@@ -171,7 +170,7 @@ def _print_plan(plan: "ServerPlan", address: str) -> None:
         "state": " and ".join(served.state) + ", numbers of one axis" if served.state else "none is read",
         "words": words,
         **_wire_rows(settings, chunk),
-        "stores": f"the first {plural(capture.calls, 'inference')} of an episode"
+        "stores": f"the first {plural(calls, 'inference')} of an episode"
         + (f", of each {served.every}th" if served.every > 1 else ""),
         "streams": (streams or "unknown before the model is loaded")
         + (f" ({plan.origin})" if plan.origin else ""),
@@ -237,7 +236,8 @@ def settings_of(typed: Mapping[str, Any]) -> ExtractSettings:
     source = ServedSettings(**{served[name]: value for name, value in typed.items() if name in served})
     values = {fields[name]: value for name, value in typed.items() if name in fields and name not in served}
     settings = ExtractSettings(values.pop("family", None), source=source, **{"captured_calls": CALLS, **values})
-    return settings.with_every_call(1)
+    # A client may infer at every step: `all` has its number here, and the run that is continued is compared by it.
+    return count_calls(settings, execute=1).settings
 
 
 def _metadata(texts: "list[str] | tuple[str, ...]") -> dict[str, Any]:

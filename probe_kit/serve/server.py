@@ -25,6 +25,7 @@ from probe_kit.extract.sizes import planned_sizes
 from probe_kit.extract.sources.served import Wire
 from probe_kit.extract.sources.served_source import ServedSource
 from probe_kit.extract.sources.source import raise_together
+from probe_kit.extract.states import Decided, Fitted, count_calls
 from probe_kit.hashing import canonical_json
 from probe_kit.runs.layout import DATASET, StoredStream
 from probe_kit.runs.root import Root, find_continuable
@@ -54,14 +55,14 @@ class ServerPlan:
     """A server that is planned and not started.
 
     Attributes:
-        settings: The settings of the run.
+        fitted: The settings of the run.
         source: What is served.
         streams: The streams that are captured.
         origin: Where the sizes of the streams come from, in words.
         chunk: The shape of an answer, as far as it is known.
     """
 
-    settings: ExtractSettings
+    fitted: Fitted[ExtractSettings]
     source: ServedSource
     location: Location
     streams: tuple[StoredStream, ...] = ()
@@ -139,8 +140,9 @@ class Server:
         parts = self.session, self.listener, self.token, self.metadata, stop, note
         if self.session.source.settings.wire == "openpi":
             return OpenpiServer(*parts)
-        assert self.plan.settings.task.execute is not None, "it was decided with the model"
-        return VlaEvalServer(*parts, execute=self.plan.settings.task.execute)
+        execute = self.plan.fitted.settings.task.execute
+        assert execute is not None, "it was decided with the model"
+        return VlaEvalServer(*parts, execute=execute)
 
     def close(self) -> Run | None:
         """Commit what was played, seal the run and return it; None where nothing was played.
@@ -175,11 +177,11 @@ def plan_server(settings: ExtractSettings, out: str) -> ServerPlan:
     location = locate(out)
     root = find_continuable(location)
     settings = _with_source_name(settings, root, location)
-    opened, source = _open_source(settings, location, root, fetch=False)
-    sizes = planned_sizes(opened, source.instructions)
-    plan = ServerPlan(opened, source, location, stored=root)
+    decided, source = _open_source(settings, location, root, fetch=False)
+    sizes = planned_sizes(decided.settings, source.instructions)
+    plan = ServerPlan(count_calls(decided.settings, execute=1), source, location, stored=root)
     if sizes is None:
-        policy = Act().load(opened)
+        policy = Act().load(decided.settings)
         assert policy is not None, "scripts are refused before"
         source, policy = source.check(policy, accept_units=True)
         plan.cameras, plan.chunk = policy.card.cameras, _answer_shape(policy, source)
@@ -232,16 +234,16 @@ def open_server(
     token, drawn = _token(host, token_file)
     listener = _bound(host, port)
     try:
-        opened, source = _open_source(settings, location, root, loaded=policy is not None)
+        decided, source = _open_source(settings, location, root, loaded=policy is not None)
         stored = None if root is None or not root.plan else read_run(location)
-        policy = policy or Act().load(opened)
+        policy = policy or Act().load(decided.settings)
         assert policy is not None, "scripts are refused before"
-        source, policy = source.check(policy, opened.machine.accept_units)
-        opened = _with_executed(opened, policy)
+        source, policy = source.check(policy, decided.settings.machine.accept_units)
+        fitted = _fit(decided, policy)
         versions = {package: version(package) for package in packages}
-        session = Session(opened, source, policy, location, report, versions)
+        session = Session(fitted, source, policy, location, report, versions)
         session.open_stored(stored)
-        plan = ServerPlan(opened, source, location, stored=root, cameras=policy.card.cameras)
+        plan = ServerPlan(fitted, source, location, stored=root, cameras=policy.card.cameras)
         plan.streams, plan.chunk = session.streams, _answer_shape(policy, source)
     except BaseException:
         listener.close()
@@ -279,31 +281,31 @@ def _with_source_name(settings: ExtractSettings, root: Root | None, location: Lo
 
 def _open_source(
     settings: ExtractSettings, location: Location, root: Root | None, loaded: bool = False, fetch: bool = True
-) -> tuple[ExtractSettings, ServedSource]:
+) -> tuple[Decided[ExtractSettings], ServedSource]:
     """Return the settings and the open source, checked as far as needs no model; arguments as of `open_checked`.
 
     Raises:
         SettingsMismatchError: If the place holds a run with other settings.
         UsageError: For settings that cannot be served.
     """
-    opened, source = open_checked(settings, location, loaded, fetch)
-    assert isinstance(opened, ExtractSettings)
+    decided, source = open_checked(settings, location, loaded, fetch)
     assert isinstance(source, ServedSource)
-    decides_execution(opened)
-    _check_stored(opened, source, root, location)
+    decides_execution(decided.settings)
+    _check_stored(decided, source, root, location)
     if not loaded:
-        _check_before_weights(opened, source)
-    return opened, source
+        _check_before_weights(decided, source)
+    return decided, source
 
 
-def _check_before_weights(settings: ExtractSettings, source: ServedSource) -> None:
+def _check_before_weights(decided: Decided[ExtractSettings], source: ServedSource) -> None:
     """Compare cameras, state and edits with what the checkpoint's files say, before its weights are read.
 
     Raises:
         UsageError: For what does not fit.
     """
+    settings = decided.settings
     checkpoint = settings.model.checkpoint or settings.model.family
-    if (inputs := Act().declared_inputs(settings)) is not None:
+    if (inputs := Act().declared_inputs(decided)) is not None:
         raise_together(source.early_checks(inputs, checkpoint))
     if conditions := [condition for condition in source.settings.conditions if condition.edits]:
         sizes = planned_sizes(settings, source.instructions)
@@ -313,12 +315,15 @@ def _check_before_weights(settings: ExtractSettings, source: ServedSource) -> No
                 condition.check(outlined, None)
 
 
-def _check_stored(settings: ExtractSettings, source: ServedSource, root: Root | None, location: Location) -> None:
+def _check_stored(
+    decided: Decided[ExtractSettings], source: ServedSource, root: Root | None, location: Location
+) -> None:
     """Raise SettingsMismatchError for a run whose settings differ in what is known before the model is loaded."""
     if root is None:
         return
-    decided = {name: value for name, value in settings.identity().items() if name not in _NOT_YET}
-    requested = json.loads(canonical_json({**decided, DATASET: source.early_identity()}))
+    settings = decided.settings
+    comparable = {name: value for name, value in settings.identity().items() if name not in _NOT_YET}
+    requested = json.loads(canonical_json({**comparable, DATASET: source.early_identity()}))
     stored = {name: root.own_settings.get(name) for name in requested}
     stored[DATASET] = {name: root.own_settings[DATASET].get(name) for name in requested[DATASET]}
     if settings.model.dtype is not None:
@@ -339,18 +344,19 @@ def _check_network(wire: Wire, host: str, token_file: Path | None, metadata: Map
         raise UsageError(f"--metadata is for clients of openpi; {wire} has no first message. Leave it out")
 
 
-def _with_executed(settings: ExtractSettings, policy: "Policy") -> ExtractSettings:
+def _fit(decided: Decided[ExtractSettings], policy: "Policy") -> Fitted[ExtractSettings]:
     """Return the settings with the number of actions that are sent of a chunk, where that is ours to decide.
 
     Raises:
         UsageError: For another number than a chunk has.
     """
+    settings = decided.settings
     if not decides_execution(settings):
-        return settings
+        return count_calls(settings, execute=1)
     execute, chunk = settings.task.execute or policy.card.execute, policy.card.chunk
     if not 1 <= execute <= chunk:
         raise UsageError(f"--execute {execute}: a chunk of {policy.card.checkpoint} has {chunk} actions")
-    return settings.changed(execute=execute)
+    return count_calls(settings.changed(execute=execute), execute=1)
 
 
 def decides_execution(settings: ExtractSettings) -> bool:

@@ -33,6 +33,7 @@ from probe_kit.extract.settings import CONFIG, ExtractSettings, run_label
 from probe_kit.extract.sources.conditions import next_condition
 from probe_kit.extract.sources.player import EPISODE_ERRORS, traceback_of
 from probe_kit.extract.sources.served_source import Received, ServedEpisode, ServedSource, flat_keys
+from probe_kit.extract.states import Fitted
 from probe_kit.hashing import derive_seed
 from probe_kit.runs.commits import failure_key, read_commits
 from probe_kit.runs.layout import (
@@ -185,14 +186,15 @@ class Session:
 
     def __init__(
         self,
-        settings: ExtractSettings,
+        fitted: Fitted[ExtractSettings],
         source: ServedSource,
         policy: "Policy",
         location: Location,
         report: Callable[[Line], None],
         versions: Mapping[str, str],
     ) -> None:
-        self._settings, self._source, self._location = settings, source, location
+        self._fitted, self._settings = fitted, fitted.settings
+        self._source, self._location = source, location
         self._loaded = self._policy = policy
         self._report, self._versions = report, versions
         self._controller: PolicyController | None = None
@@ -358,7 +360,7 @@ class Session:
 
     def _certificate(self) -> dict[str, Any]:
         assert self._controller is not None, "a session with episodes has one"
-        return certificate_of(self._controller, self._settings)
+        return certificate_of(self._controller, self._fitted)
 
     # -- one observation -----------------------------------------------------------------------------
 
@@ -601,7 +603,7 @@ class Session:
         capture = self._settings.capture
         return EpisodeBuffers(
             self._controller.streams,
-            capture.calls,
+            self._fitted.calls,
             capture.tokens == "all",
             self._controller.on_gpu,
             capture.later_views,
@@ -618,7 +620,7 @@ class Session:
         controller = self._controller
         assert controller is not None, "the first observation made it"
         number, playing = episode.inferences, episode.playing
-        every, calls = self._source.settings.every, self._settings.capture.calls
+        every, calls = self._source.settings.every, self._fitted.calls
         captured = number % every == 0 and len(playing.buffers.roles) < calls and episode.failure is None
         turn = Turn(received.observation, playing.planned, number, playing.buffers if captured else None)
         started = perf_counter()
@@ -759,7 +761,7 @@ class Session:
             counts |= {} if episode.actions is None else {"steps": episode.actions}
             ending = episode.record.ending({**outcome, **counts})
             assert self._controller is not None, "it inferred"
-            write_episode(self._writer, self._controller, self._settings, playing, ending, self.certified())
+            write_episode(self._writer, self._controller, self._fitted, playing, ending, self.certified())
             self.committed += 1
             self._certify_condition(episode.condition)
             self._say(episode, number, outcome["outcome"])

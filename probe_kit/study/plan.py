@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from probe_kit._system.counting import plural
 from probe_kit.errors import ProbeKitError, RunIncompleteError, RunNotFoundError, UsageError
 from probe_kit.extract.sizes import planned_sizes, space_of
+from probe_kit.extract.states import count_calls
 from probe_kit.hooks.registry import family_names
 from probe_kit.runs import verify_run
 from probe_kit.runs.layout import RUN_FILE, StoredStream
@@ -450,8 +451,8 @@ def bytes_per_episode(cell: PlannedRun, stored: Sequence[StoredStream] | None) -
         if sizes is None:
             return None
         stored = sizes.streams
-    settings = settings.with_every_call(settings.task.execute or 1)  # before the model says how many it executes
-    space = space_of(stored or (), 1, settings)  # a script has no network, and no stream
+    fitted = count_calls(settings, settings.task.execute or 1)  # before the model says how many it executes
+    space = space_of(stored or (), 1, fitted)  # a script has no network, and no stream
     return sum(space.values()) - space["report"]
 
 

@@ -215,10 +215,10 @@ def _problem(planned: PlannedCell, rehearsed: list[SceneSpec], ray: str | None) 
         if planned.state == "damaged":
             raise ProbeKitError(planned.why.removeprefix("damaged: "))
         settings = cell.settings_to_play.changed(ray=ray)  # the devices of a cluster are elsewhere
-        settings, source = open_checked(settings, locate(planned.location))
-        if settings.scene not in rehearsed:
-            source.rehearse(source.rows(settings.seed))
-            rehearsed.append(settings.scene)
+        decided, source = open_checked(settings, locate(planned.location))
+        if (scene := decided.settings.scene) not in rehearsed:
+            source.rehearse(source.rows(decided.settings.seed))
+            rehearsed.append(scene)
     except STOPS_ALL:
         raise
     except ProbeKitError as error:

@@ -21,6 +21,7 @@ from probe_kit.errors import (
 )
 from probe_kit.extract import ExtractSettings, extract_run, prepare
 from probe_kit.extract.rollout.capturing import EpisodeBuffers
+from probe_kit.extract.states import count_calls
 from probe_kit.hooks import Site
 from probe_kit.retention import retention_table
 from probe_kit.retention.displays import collect_figures
@@ -145,10 +146,9 @@ def test_a_view_of_later_inferences_that_cannot_be_kept_is_refused(options: dict
 
 def test_all_inferences_are_as_many_as_an_episode_can_have() -> None:
     settings = ExtractSettings("pi0-tiny", scene=SceneSpec(max_steps=5), captured_calls="all")
-    assert [settings.with_every_call(execute).capture.calls for execute in (1, 2, 5, 8)] == [5, 3, 1, 1]
-    assert settings.changed(captured_calls=4).with_every_call(2).capture.calls == 4
-    with pytest.raises(UsageError, match="before the model is loaded"):
-        _ = settings.capture.calls
+    assert [count_calls(settings, execute).calls for execute in (1, 2, 5, 8)] == [5, 3, 1, 1]
+    assert count_calls(settings, 2).settings == settings.changed(captured_calls=3)
+    assert count_calls(settings.changed(captured_calls=4), 2).calls == 4
 
 
 def test_bytes_of_a_run_count_what_later_inferences_keep() -> None:

@@ -132,6 +132,17 @@ def test_a_stored_intervention_is_loaded_and_not_played_again(copy: Run, effects
     assert json.loads(effects.to_json())["settings"]["items"] == 2
 
 
+def test_damage_to_another_intervention_does_not_stop_one_that_is_stored(
+    mine: Run, effects: InterventionResult
+) -> None:
+    other = mine.path / "interventions" / "0123456789ab"
+    shutil.copytree(mine.path / "interventions" / effects.key, other)
+    again = run_intervention(mine, ImageSwap(items=2), ReplayFiles(Path("nowhere")))
+    assert again.to_csv() == effects.to_csv()
+    with pytest.raises(RunDamagedError, match="0123456789ab"):
+        load_effects(mine)
+
+
 def test_an_intervened_run_is_whole(copy: Run, effects: InterventionResult) -> None:
     verification = verify_run(copy.path, deep=True)
     assert (verification.problems, verification.strays) == ((), ())

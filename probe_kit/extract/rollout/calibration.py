@@ -5,7 +5,7 @@ numbers batching changes more says so on its card and never gets more than the c
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from time import perf_counter
 from typing import Any
@@ -20,6 +20,7 @@ from probe_kit.extract.rollout.worker import torch_threads
 from probe_kit.extract.settings import ExtractSettings
 from probe_kit.extract.sources.player import Ending
 from probe_kit.extract.sources.source import Played, Source
+from probe_kit.extract.states import Fitted
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.runs.plan import Row
 
@@ -55,6 +56,11 @@ class Calibration:
     env_workers: int
     waits: float
 
+    def chosen_for(self, fitted: Fitted[ExtractSettings]) -> Fitted[ExtractSettings]:
+        """Return the settings with the chosen batch and processes."""
+        settings = fitted.settings.changed(batch=self.batch, env_workers=self.env_workers)
+        return replace(fitted, settings=settings)
+
     @property
     def words(self) -> str:
         """The line of the plan."""
@@ -70,23 +76,23 @@ class Calibration:
 
 
 def calibrate(
-    settings: ExtractSettings, controller: PolicyController, source: Source[Any], rows: Sequence[Row]
-) -> tuple[ExtractSettings, Calibration]:
-    """Return `settings` with a batch and simulating processes chosen for this machine, and the measurement.
+    fitted: Fitted[ExtractSettings], controller: PolicyController, source: Source[Any], rows: Sequence[Row]
+) -> Calibration:
+    """Measure, and choose a batch and simulating processes for this machine.
 
     Takes `BUDGET_S` or a little more.
 
     Raises:
         UsageError: For settings that choose the simulating processes themselves.
     """
+    settings = fitted.settings
     if settings.machine.env_workers is not None:
         raise UsageError("--batch auto chooses batch and simulating processes: leave out --env-workers")
     example = source.example(rows[0].instruction)
     most = largest_batch(controller.model.card.batch, len(rows))
     with torch_threads(controller.threads):
         times = inference_times(lambda batch: _infer(controller, example, batch), most)
-    calibration = choose(times, _turn(settings, controller, source, rows[0]), cores_here())
-    return settings.changed(batch=calibration.batch, env_workers=calibration.env_workers), calibration
+    return choose(times, _turn(settings, controller, source, rows[0]), cores_here())
 
 
 def largest_batch(of_card: int | None, episodes: int) -> int:

@@ -24,6 +24,7 @@ from probe_kit.extract.rollout.capturing import FEWEST_FOR_THREADS, Capturer, st
 from probe_kit.extract.settings import ExtractSettings
 from probe_kit.extract.sources.inputs import INSTRUCTION, PICTURE, blank_of, normal_form, same_input, with_input
 from probe_kit.extract.sources.source import Source, check_predictions
+from probe_kit.extract.states import count_calls
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.checkpoints.third_party import begin_randomness, copy_observations, while_acting
 from probe_kit.hooks.contract.declared import PLAIN, Rotation
@@ -428,7 +429,7 @@ class PolicyController(ModelController["Policy", Observation]):
         self.capture_only = task.capture_only and source.executes
         self.execute = task.execute or card.execute
         self.rotation: Rotation = task.rotation or PLAIN
-        self.captured_calls = settings.with_every_call(self.execute).capture.calls
+        self.captured_calls = count_calls(settings, self.execute).calls
         self._edits = {"": (task.edits, task.vectors), **source.edits_by_condition()}
         self.identity |= {"execute": self.execute} if source.executes else {}
         if self.capture_only and (deaf := policy.zero_filled_inputs()):

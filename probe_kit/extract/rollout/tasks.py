@@ -1,10 +1,10 @@
 """Tasks: what a model does with the observations of a source. It acts, is only captured, or answers questions.
 
-A task knows no particular source and has no state: all choices are in the settings.
+A task knows no particular source and has no state: all choices are in the settings, see `states.py`.
 """
 
 from collections.abc import Callable, Iterable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 from probe_kit.errors import CheckpointError, UsageError
@@ -16,6 +16,7 @@ from probe_kit.extract.rollout.controllers import Controller, PolicyController, 
 from probe_kit.extract.settings import AskSettings, ExtractSettings, Settings
 from probe_kit.extract.sizes import PlannedSizes
 from probe_kit.extract.sources.source import Source
+from probe_kit.extract.states import Decided, Fitted, count_calls
 from probe_kit.hooks.checkpoints.third_party import with_origin
 from probe_kit.runs.plan import Row
 
@@ -25,8 +26,19 @@ if TYPE_CHECKING:
     from probe_kit.hooks.family import Family
 
 
-Fitted = tuple[Settings, Source[Any], Controller, Calibration | None]
-"""The settings and source as the model is shown them, the controller, and the calibration of `--batch auto`."""
+@dataclass(frozen=True)
+class LoadedModel:
+    """A model that is loaded in this process, with what this machine decides.
+
+    Attributes:
+        controller: The controller of the model.
+        observations: The number of observations per call of the model.
+        calibration: The measurement that chose it; None if it was not requested.
+    """
+
+    controller: Controller
+    observations: int
+    calibration: Calibration | None = None
 
 
 def task_of(settings: Settings) -> "Task[Any, Any]":
@@ -48,12 +60,15 @@ def load_of[Loaded: "Model"](load_by_name: Callable[..., Loaded], settings: Sett
     )
 
 
-def fit_source[Chosen: Settings](card: "ModelCard", settings: Chosen, source: Source[Any]) -> Chosen:
+def fit_source[Chosen: Settings](
+    card: "ModelCard", decided: Decided[Chosen], source: Source[Any]
+) -> Decided[Chosen]:
     """Return the settings with those of a source that was fitted to a model.
 
     Raises:
         UsageError: If the model takes smaller batches, or needs what the source does not show.
     """
+    settings = decided.settings
     # `auto` is measured after this check, and by `largest_batch` never exceeds the card.
     batch = settings.machine.batch if isinstance(settings.machine.batch, int) else 1
     if card.batch is not None and batch > card.batch:
@@ -66,7 +81,9 @@ def fit_source[Chosen: Settings](card: "ModelCard", settings: Chosen, source: So
             f"{card.family} reads {', '.join(lacking)}, which {settings.source.subject} do not show; observations "
             "have pictures and the state, in a scene also the intrinsics"
         )
-    return settings.changed(source=source.settings) if source.settings != settings.source else settings
+    if source.settings == settings.source:
+        return decided
+    return replace(decided, settings=settings.changed(source=source.settings))
 
 
 _SCRIPT_REFUSES = (
@@ -102,23 +119,27 @@ class Task[Chosen: Settings, Loaded: "Model"](Protocol):
     def rows(self, settings: Chosen, source: Source[Any]) -> tuple[Row, ...]:
         """Return the rows that are played."""
 
-    def check_loaded(self, settings: Chosen, model: Loaded) -> None:
+    def check_loaded(self, decided: Decided[Chosen], model: Loaded) -> None:
         """Check a model that the caller loaded."""
 
-    def early_checks(self, settings: Chosen, source: Source[Any], fetch: bool) -> list[Callable[[], object]]:
+    def early_checks(
+        self, decided: Decided[Chosen], source: Source[Any], fetch: bool
+    ) -> list[Callable[[], object]]:
         """Return the checks of a model by its small files, before its weights are read."""
 
-    def declared_inputs(self, settings: Chosen) -> "DeclaredInputs | None":
+    def declared_inputs(self, decided: Decided[Chosen]) -> "DeclaredInputs | None":
         """Return the inputs that the files of the model declare; None where they declare none."""
 
-    def planned(self, settings: Chosen, sizes: PlannedSizes) -> Chosen:
+    def planned(self, decided: Decided[Chosen], sizes: PlannedSizes) -> Fitted[Chosen]:
         """Return the settings with what sizes decide, for a plan."""
 
     def load(self, settings: Chosen) -> "Loaded | None":
         """Load the model; None for a script."""
 
-    def fit(self, settings: Chosen, source: Source[Any], model: "Loaded | None") -> Fitted:
-        """Fit source and model to each other."""
+    def fit(
+        self, decided: Decided[Chosen], source: Source[Any], model: "Loaded | None"
+    ) -> tuple[Fitted[Chosen], Source[Any], LoadedModel]:
+        """Fit source and model to each other; return the source as the model is shown it."""
 
 
 class Act:
@@ -160,11 +181,12 @@ class Act:
         return source.instructions if settings.source.is_scene else ()
 
     def early_checks(
-        self, settings: ExtractSettings, source: Source[Any], fetch: bool
+        self, decided: Decided[ExtractSettings], source: Source[Any], fetch: bool
     ) -> list[Callable[[], object]]:
         """Return checks of instructions, of units that have to be chosen, and of cameras and states."""
         from probe_kit.hooks.registry import get_family
 
+        settings = decided.settings
         model, family = settings.model, get_family(settings.model.family)
         if family is None:
             return []
@@ -179,10 +201,11 @@ class Act:
         checkpoint = model.checkpoint or model.family
         return [check_instructions, *(() if inputs is None else source.early_checks(inputs, checkpoint))]
 
-    def declared_inputs(self, settings: ExtractSettings) -> "DeclaredInputs | None":
+    def declared_inputs(self, decided: Decided[ExtractSettings]) -> "DeclaredInputs | None":
         """Return the inputs of a checkpoint in lerobot's layout, else those of the model without its weights."""
         from probe_kit.hooks.registry import get_family
 
+        settings = decided.settings
         model, family = settings.model, get_family(settings.model.family)
         if family is None:
             return None
@@ -191,12 +214,13 @@ class Act:
         outline = family.outline(model.checkpoint, model.options, model.dtype)
         return None if outline is None or outline.model is None else outline.model.card.inputs()
 
-    def planned(self, settings: ExtractSettings, sizes: PlannedSizes) -> ExtractSettings:
+    def planned(self, decided: Decided[ExtractSettings], sizes: PlannedSizes) -> Fitted[ExtractSettings]:
         """Return the settings with the inferences of an episode counted."""
+        settings = decided.settings
         # Only a scene has an arm that actions could misfit.
         if settings.source.is_scene and sizes.outline is not None:
             check_misfit(settings, sizes.outline.misfit(), sizes.outline.checkpoint)
-        return settings.with_every_call(settings.task.execute or sizes.execute)
+        return count_calls(settings, settings.task.execute or sizes.execute)
 
     def load(self, settings: ExtractSettings) -> "Policy | None":
         """Load the policy, with what its protocol decides. Raises as `load_policy`."""
@@ -204,11 +228,11 @@ class Act:
 
         return None if settings.model.family in SCRIPTED else load_of(load_policy, settings.followed())
 
-    def check_loaded(self, settings: ExtractSettings, model: "Policy") -> None:
+    def check_loaded(self, decided: Decided[ExtractSettings], model: "Policy") -> None:
         """Raise UsageError for a loaded policy that the settings do not describe."""
         from probe_kit.hooks.registry import family_names
 
-        card, requested = model.card, settings.model
+        card, requested = model.card, decided.settings.model
         pairs: dict[str, tuple[object, object]] = {}
         # A file may call its weights random; requested random weights have a seed.
         if requested.random_weights or card.weights_seed is not None:
@@ -223,26 +247,32 @@ class Act:
                 f"the loaded policy has {', '.join(wrong)}. Give the policy of these settings, or leave it out"
             )
 
-    def fit(self, settings: ExtractSettings, source: Source[Any], model: "Policy | None") -> Fitted:
+    def fit(
+        self, decided: Decided[ExtractSettings], source: Source[Any], model: "Policy | None"
+    ) -> tuple[Fitted[ExtractSettings], Source[Any], LoadedModel]:
         """Show the source to a policy, count its inferences, and choose its batch where that was requested.
 
         Raises an error for whatever does not fit.
         """
-        if settings.model.family in SCRIPTED:
-            return settings, source, ScriptedController(settings.model.family), None
+        settings = decided.settings
+        if settings.model.family in SCRIPTED:  # a script captures nothing, and refuses another batch than 1
+            script = ScriptedController(settings.model.family)
+            return count_calls(settings, execute=1), source, LoadedModel(script, observations=1)
         assert model is not None, "only scripts have no network"
         if not source.own_units:
             check_misfit(settings, model.embodiment_mismatch(), model.card.checkpoint)
         # The source first: it may give the policy further cameras, and batch and needs are those of that card.
         source, policy = source.check(model, settings.machine.accept_units)
-        settings = fit_source(policy.card, settings, source)
-        check_reachable(settings, policy.card, source)
+        decided = fit_source(policy.card, decided, source)
+        check_reachable(decided, policy.card, source)
+        settings = decided.settings
         controller = PolicyController(policy, source, settings)
-        settings, calibration = settings.with_every_call(controller.execute), None
-        if settings.machine.batch == "auto":  # last, because it times the controller as the run will use it
-            rows = source.rows(settings.seed)
-            settings, calibration = calibrate(settings, controller, source, rows)
-        return settings, source, controller, calibration
+        fitted, calibration, batch = count_calls(settings, controller.execute), None, settings.machine.batch
+        if batch == "auto":  # last, because it times the controller as the run will use it
+            calibration = calibrate(fitted, controller, source, source.rows(settings.seed))
+            fitted, batch = calibration.chosen_for(fitted), calibration.batch
+        assert batch is not None, "settings name a number or auto"
+        return fitted, source, LoadedModel(controller, batch, calibration)
 
 
 def _declared_inputs(family: "Family", settings: ExtractSettings) -> "DeclaredInputs | None":
@@ -262,8 +292,9 @@ def check_misfit(settings: ExtractSettings, reason: str | None, checkpoint: str)
         )
 
 
-def check_reachable(settings: ExtractSettings, card: "ModelCard", source: Source[Any]) -> None:
+def check_reachable(decided: Decided[ExtractSettings], card: "ModelCard", source: Source[Any]) -> None:
     """Raise UsageError for more actions than a chunk has, or more captured inferences than an episode can have."""
+    settings = decided.settings
     if settings.task.capture_only or not source.executes:
         return
     family, execute = settings.model.family, settings.task.execute or card.execute
@@ -293,23 +324,25 @@ class Ask:
     def check_meaningless(self, settings: AskSettings) -> None:
         """Accept all settings: none is meaningless by itself."""
 
-    def check_loaded(self, settings: AskSettings, model: "AnswerModel") -> None:
+    def check_loaded(self, decided: Decided[AskSettings], model: "AnswerModel") -> None:
         """Accept every answer model."""
 
-    def early_checks(self, settings: AskSettings, source: Source[Any], fetch: bool) -> list[Callable[[], object]]:
+    def early_checks(
+        self, decided: Decided[AskSettings], source: Source[Any], fetch: bool
+    ) -> list[Callable[[], object]]:
         """Return no checks: the questions are read when the model is there."""
-        del settings, source, fetch
+        del decided, source, fetch
         return []
 
-    def declared_inputs(self, settings: AskSettings) -> "DeclaredInputs | None":
+    def declared_inputs(self, decided: Decided[AskSettings]) -> "DeclaredInputs | None":
         """Return None: the cameras of a question are chosen by the prompt."""
-        del settings
+        del decided
         return None
 
-    def planned(self, settings: AskSettings, sizes: PlannedSizes) -> AskSettings:
+    def planned(self, decided: Decided[AskSettings], sizes: PlannedSizes) -> Fitted[AskSettings]:
         """Return the settings: sizes decide nothing."""
         del sizes
-        return settings
+        return count_calls(decided.settings, execute=1)
 
     def check_family(self, settings: AskSettings, family: "Family | None") -> None:
         """Raise UsageError for a model that acts."""
@@ -358,9 +391,12 @@ class Ask:
             )
         return model
 
-    def fit(self, settings: AskSettings, source: Source[Any], model: "AnswerModel | None") -> Fitted:
+    def fit(
+        self, decided: Decided[AskSettings], source: Source[Any], model: "AnswerModel | None"
+    ) -> tuple[Fitted[AskSettings], Source[Any], LoadedModel]:
         """Show the source to the model, and choose how its answers are read."""
         assert model is not None, "no script answers"
         source = source.for_cameras(model.card.cameras)
-        settings = fit_source(model.card, settings, source)
-        return settings, source, AnswerController(model, source, settings), None
+        settings = fit_source(model.card, decided, source).settings
+        controller = AnswerController(model, source, settings)
+        return count_calls(settings, execute=1), source, LoadedModel(controller, settings.machine.batch)

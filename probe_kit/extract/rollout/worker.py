@@ -34,6 +34,7 @@ from probe_kit.extract.sources.player import (
     traceback_of,
 )
 from probe_kit.extract.sources.source import Played, Source
+from probe_kit.extract.states import Fitted
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.runs.commits import Seconds
 from probe_kit.runs.layout import VIDEOS, FrameChoice
@@ -242,8 +243,9 @@ class Worker:
 
     Args:
         writer: The writer of the run.
-        settings: The settings of the run.
+        fitted: The settings of the run.
         controller: The controller that infers.
+        observations: The number of observations per call of the model.
         source: The source that is played.
         episodes: The most episodes that it will play; for few of them no processes are started.
     """
@@ -251,14 +253,16 @@ class Worker:
     def __init__(
         self,
         writer: RunWriter,
-        settings: Settings,
+        fitted: Fitted[Settings],
         controller: Controller,
+        observations: int,
         source: Source[Any],
         episodes: int,
     ) -> None:
-        self._writer, self._settings, self._controller = writer, settings, controller
-        self._episodes = episodes
-        played = Played(settings.machine.frames, settings.capture.calls, controller.script)
+        self._writer, self._fitted, self._controller = writer, fitted, controller
+        self._machine = fitted.settings.machine
+        self._observations, self._episodes = observations, episodes
+        played = Played(self._machine.frames, fitted.calls, controller.script)
         self._opens = source.play(played)
         # Once, and not on the writing thread: recordings decode a few pictures for it.
         self._content = list(source.content_notes())
@@ -268,7 +272,7 @@ class Worker:
         with ExitStack() as stack:
             stack.enter_context(torch_threads(self._controller.threads))
             # Two groups of players: one simulates while the model infers for the other, see `EpisodeLoop`.
-            count = 2 * self._settings.machine.observations
+            count = 2 * self._observations
             self._players = [self._open_player(position, stack) for position in range(count)]
             self._free: SimpleQueue[EpisodeBuffers] = SimpleQueue()
             for _ in range(count + SPARE_BUFFERS):
@@ -283,23 +287,22 @@ class Worker:
         self._opened.close()
 
     def _open_player(self, position: int, stack: ExitStack) -> AskablePlayer:
-        processes = self._settings.machine.env_workers
+        processes = self._machine.env_workers
         if processes is None:
-            processes = 2 * self._settings.machine.observations if self._episodes >= WORTH_PROCESSES else 0
+            processes = 2 * self._observations if self._episodes >= WORTH_PROCESSES else 0
         kind = ProcessPlayer if position < processes else LocalPlayer
         player = kind(self._opens)
         stack.callback(player.close)
         return player
 
     def _make_buffers(self) -> EpisodeBuffers:
-        settings, controller = self._settings, self._controller
-        with_tokens = settings.capture.tokens == "all"
+        capture = self._fitted.settings.capture
         return EpisodeBuffers(
             self._writer.streams,
-            settings.capture.calls,
-            with_tokens,
-            controller.on_gpu,
-            settings.capture.later_views,
+            self._fitted.calls,
+            capture.tokens == "all",
+            self._controller.on_gpu,
+            capture.later_views,
         )
 
     def run(self, next_number: Callable[[], int | None]) -> Iterator[Event]:
@@ -326,21 +329,20 @@ class Worker:
         """Write an episode, on the writing thread."""
         content = {INPUT_CONTENT: self._content} if self._content else {}
         try:
-            return write_episode(self._writer, self._controller, self._settings, playing, ending, content)
+            return write_episode(self._writer, self._controller, self._fitted, playing, ending, content)
         finally:
             playing.buffers.clear()
             self._free.put(playing.buffers)
 
     def _is_filmed(self, planned: Row) -> bool:
-        return self._settings.machine.video == "all" or (
-            self._settings.machine.video == "first" and planned.index == 0
-        )
+        video = self._machine.video
+        return video == "all" or (video == "first" and planned.index == 0)
 
 
 def write_episode(
     writer: RunWriter,
     controller: Controller,
-    settings: Settings,
+    fitted: Fitted[Settings],
     playing: Playing,
     ending: Ending,
     certified: Mapping[str, Any],
@@ -350,30 +352,30 @@ def write_episode(
     Args:
         writer: The writer of the run, which plans the episode.
         controller: The controller that inferred.
-        settings: The settings of the run.
+        fitted: The settings of the run.
         playing: The episode; its buffers are the caller's again afterwards.
         ending: Its ending.
         certified: Further entries of the certificate.
     """
-    outcome = playing.outcome(ending)
+    outcome, machine = playing.outcome(ending), fitted.settings.machine
     playing.buffers.wait()  # copies from a GPU may still be under way
     record = playing.buffers.record(
         playing.planned, outcome, trajectory=ending.trajectory, instruction_ids=playing.instruction_ids,
         control_steps=playing.control_steps, seconds=Seconds(playing.seconds, ending.seconds),
-        inputs=ending.inputs or {}, pictures=_pictures(settings.machine.frames, playing.planned, outcome, ending),
-        frames=len(ending.small_frames) or None if settings.machine.frames == "all" else None,
+        inputs=ending.inputs or {}, pictures=_pictures(machine.frames, playing.planned, outcome, ending),
+        frames=len(ending.small_frames) or None if machine.frames == "all" else None,
     )  # fmt: skip
     with writer.location.explained_errors():
         # Not before: the certificate holds fire counts and proofs, which the first inference gives.
-        writer.write_certificate({**certificate_of(controller, settings), **certified})
+        writer.write_certificate({**certificate_of(controller, fitted), **certified})
         writer.write(record)
     return Done(playing.planned.index, outcome)
 
 
-def certificate_of(controller: Controller, settings: Settings) -> dict[str, Any]:
+def certificate_of(controller: Controller, fitted: Fitted[Settings]) -> dict[str, Any]:
     """Return the controller's certificate with the origin of this process."""
     certificate = controller.certificate()
-    return {**certificate, ORIGIN: origin_of_process(settings, certificate["policy"]).to_json()}
+    return {**certificate, ORIGIN: origin_of_process(fitted.settings, certificate["policy"]).to_json()}
 
 
 def _pictures(frames: FrameChoice, planned: Row, outcome: Mapping[str, Any], ending: Ending) -> dict[str, bytes]:

@@ -15,7 +15,9 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import replace
+from importlib import import_module
 from io import TextIOBase
+from operator import attrgetter
 from pathlib import Path
 from types import FrameType
 from typing import Any, TextIO
@@ -23,9 +25,10 @@ from typing import Any, TextIO
 import numpy as np
 from rich.file_proxy import FileProxy
 
-from probe_kit._system.bounded_files import recorded_files
+from probe_kit._system.bounded_files import check_no_pointers, recorded_files
 from probe_kit._system.escaping import terminal_safe
-from probe_kit._system.foreign_files import check_no_pointers, reason_of
+from probe_kit._system.foreign_files import reason_of
+from probe_kit._system.imports import one_scan_of_packages
 from probe_kit._system.machine import is_out_of_memory
 from probe_kit.errors import CheckpointError, InstructionError, PolicyFailedError, ProbeKitError, WeightsError
 from probe_kit.hooks.checkpoints.folders import with_adapters_named
@@ -284,6 +287,19 @@ def while_loading(model: str, location: str) -> Iterator[None]:
             f"{model} cannot be loaded from {location}: {in_words(error)}. A file of the checkpoint is damaged"
             f"{read}, or was made for another version; download it again"
         ) from error
+
+
+def import_object(path: str) -> Any:
+    """Return the object at `module:name` or `module:Class.method`."""
+    module, name = path.split(":")
+    return attrgetter(name)(import_module(module))
+
+
+def import_loader(model: str, path: str) -> Callable[..., Any]:
+    """Return a function of a family's code, see `import_object`. Raises as `while_loading`."""
+    with while_loading(model, path), one_scan_of_packages():
+        function: Callable[..., Any] = import_object(path)
+    return function
 
 
 @contextmanager

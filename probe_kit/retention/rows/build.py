@@ -395,7 +395,8 @@ def with_probes(
         backbone=BackbonePart(**parts.get(BACKBONE, {})),
         action=ActionPart(**parts.get(ACTION, {}), **_iterations(curve, peaks.get(ACTION))),
     )
-    retained = estimate_of_peaks(results, row.category, view, peaks, streams, absent_below)
+    exceeds = row.backbone.exceeds if BACKBONE in peaks else {}
+    retained = estimate_of_peaks(results, row.category, view, peaks, exceeds, streams, absent_below)
     estimate = RetentionPart(
         value=number_or_none(retained.value),
         ci=limits(retained.interval) if len(peaks) == 2 else None,

@@ -29,6 +29,7 @@ from probe_kit.extract.rollout.controllers import (
 from probe_kit.extract.rollout.tasks import check_reachable, fit_source
 from probe_kit.extract.sources.scene import SceneSettings
 from probe_kit.extract.sources.scene_source import SceneSource
+from probe_kit.extract.states import Decided
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks import ModelCard, Observation, load_policy
 from probe_kit.intervene.rollout import executed_chunk
@@ -143,8 +144,8 @@ def test_an_episode_is_played_by_the_mean_of_its_plans(
     assert len(past) == 3
     spatialvla_settings = spatialvla_settings.changed(execute=2)
     with pytest.raises(UsageError, match="needs an inference per action"):
-        check_reachable(spatialvla_settings, policy.card, source)
-    check_reachable(spatialvla_settings.changed(execute=None), policy.card, source)
+        check_reachable(Decided(spatialvla_settings), policy.card, source)
+    check_reachable(Decided(spatialvla_settings.changed(execute=None)), policy.card, source)
 
 
 WORDS = ["put", "the", "cube", "on", "the", "black", "shape"]
@@ -217,8 +218,9 @@ def test_intrinsics_project_as_the_camera_does_whatever_the_picture_size() -> No
 
 
 def test_a_batch_that_changes_numbers_and_a_camera_that_is_not_there_are_refused(small_suite: Suite) -> None:
-    source, two = SceneSource(SceneSettings(scene=SceneSpec()), small_suite), ExtractSettings("pi0", batch=2)
-    fit_source(replace(CARD, batch=1, needs=frozenset({"intrinsics", "state"})), two.changed(batch=1), source)
+    source, requested = SceneSource(SceneSettings(scene=SceneSpec()), small_suite), ExtractSettings("pi0", batch=2)
+    two, single = Decided(requested), Decided(requested.changed(batch=1))
+    fit_source(replace(CARD, batch=1, needs=frozenset({"intrinsics", "state"})), single, source)
     with pytest.raises(UsageError, match="--batch 2 with mine, which takes at most 1"):
         fit_source(replace(CARD, batch=1), two, source)
     with pytest.raises(UsageError, match=r"reads camera\.wrist"):
