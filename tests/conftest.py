@@ -8,7 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from functools import cache
 from itertools import takewhile
 from pathlib import Path
@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+from probe_kit._system.machine import same_scheduling
 from tests.support.buckets import bad_server, bucket, bucket_elsewhere, deaf_bucket
 from tests.support.made_once import made_once, shared_folder
 
@@ -168,6 +169,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         return len(first) + (item.path.parent != tests)
 
     items.sort(key=rank)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol() -> Generator[None, object, object]:
+    """No test leaves this process a real-time one, as the encoder of AV1 does for root: all others would wait."""
+    with same_scheduling():
+        return (yield)
 
 
 def pytest_collection_finish() -> None:

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
+from pathlib import Path
 from types import ModuleType
 from typing import Any, cast
 
@@ -136,6 +137,42 @@ class WithoutFilling(TorchFunctionMode):
             if filled.is_meta or filled.ndim >= 2:
                 return filled
         return func(*args, **(kwargs or {}))
+
+
+_FACTORIES = frozenset({"empty", "zeros", "ones", "full", "rand", "randn"})
+_SPARE = 1 << 26
+"""Numbers that a network may have beyond its weights: buffers, and what tiny checkpoints build and drop again."""
+
+
+class LimitedSize(TorchFunctionMode):
+    """A context in which no network is built that its weights could never fill.
+
+    Where a configuration lacks a part, transformers takes the sizes of a class, often those of a released model: a
+    checkpoint of a megabyte would fill the memory before its weights are compared with its network.
+    """
+
+    def __init__(self, folder: Path, weight_bytes: int) -> None:
+        """Limit the numbers of a network.
+
+        Args:
+            folder: The folder of the checkpoint, for messages.
+            weight_bytes: Size of the files of its weights, in bytes.
+        """
+        super().__init__()
+        self._folder, self._weight_bytes = folder, weight_bytes
+        self._built = 0
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        options = kwargs or {}
+        if getattr(func, "__name__", "") in _FACTORIES:
+            self._built += func(*args, **{**options, "device": "meta"}).numel()
+            if self._built > self._weight_bytes + _SPARE:
+                raise CheckpointError(
+                    f"{self._folder}: its configuration describes a network of more than {self._built:,} numbers, "
+                    f"and its weights have {self._weight_bytes:,} bytes. A part of the configuration is missing, "
+                    "or belongs to another checkpoint. Download its JSON files again"
+                )
+        return func(*args, **options)
 
 
 def build_empty[Network: nn.Module](

@@ -245,9 +245,13 @@ def load_pretrained(loader: Any, source: Path | str, **options: Any) -> Any:
         **options: Further keyword arguments of `from_pretrained`.
 
     Raises:
-        CheckpointError: If the object needs such code, or transformers cannot read its files.
+        CheckpointError: If the object needs such code, or transformers cannot read its files, and for a folder
+            without the configuration that is asked for: transformers would take the sizes of a class.
         LfsPointerError: For a Git LFS pointer among them.
     """
+    reads_sizes, folder = hasattr(loader, "get_config_dict"), Path(source)
+    if reads_sizes and folder.is_dir() and not (folder / "config.json").is_file():
+        raise CheckpointError(f"{source} has no config.json. Download the checkpoint's JSON files again")
     try:
         with while_reading_pretrained(Path(source), getattr(loader, "__name__", "its loader")):
             return loader.from_pretrained(str(source), trust_remote_code=False, **options)

@@ -216,6 +216,34 @@ def test_an_index_may_only_name_files_beside_it(tmp_path: Path, name: Any) -> No
         read_weights(tmp_path)
 
 
+def _without_text_sizes(file: Path, *parts: str) -> None:
+    """Take `text_config` from a configuration, or from a part of it."""
+    part = config = json.loads(file.read_text(encoding="utf-8"))
+    for name in parts:
+        part = part[name]
+    del part["text_config"]
+    file.write_text(json.dumps(config), encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("family", "lose", "complaint"),
+    [
+        ("groot", lambda folder: _without_text_sizes(folder / "base" / "vlm" / "config.json"), "describes a netw"),
+        ("eo1", lambda folder: _without_text_sizes(folder / "config.json", "vlm_config"), "describes a netw"),
+        ("molmoact2", lambda folder: _without_text_sizes(folder / "vlm" / "config.json"), "describes a netw"),
+        ("molmoact2", lambda folder: (folder / "vlm" / "config.json").unlink(), r"vlm has no config\.json"),
+    ],
+    ids=["groot", "eo1", "molmoact2", "molmoact2-file"],
+)
+def test_sizes_that_are_missing_are_named_before_a_network_of_billions_fills_the_memory(
+    family: str, checkpoint: Path, lose: Callable[[Path], None], complaint: str
+) -> None:
+    """transformers takes the sizes of a class for those that a configuration lacks."""
+    lose(checkpoint)
+    with pytest.raises(CheckpointError, match=complaint):
+        load(family, checkpoint)
+
+
 def damage(checkpoint: Path, random: Random) -> str:
     """One accident, chosen at random; what it was."""
     file = random.choice(

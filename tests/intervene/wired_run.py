@@ -12,6 +12,7 @@ from probe_kit.intervene.kinds.base import Intervention
 from probe_kit.intervene.places import ALL
 from probe_kit.intervene.results import verdicts_of
 from probe_kit.intervene.settings import FORMAT
+from probe_kit.runs.run_source import SCENE, RunSource
 from probe_kit.train import ArrayRun, train_probes
 from tests.intervene.answers import store_outcomes
 from tests.intervene.wirings import BLOCKS, IMAGE, WORDS, WiredSession, outcomes_of, replay_inputs
@@ -19,6 +20,14 @@ from tests.intervene.wirings import BLOCKS, IMAGE, WORDS, WiredSession, outcomes
 SUITE = "suite@1#0123456789ab"
 VIEWS = {"mean": slice(None), "mean:image": IMAGE, "mean:language": WORDS}
 ROLES = (ALL, "image", "language", "state")
+
+
+class WiredRun(ArrayRun):
+    """Arrays of a scene: the pictures of every item lie on two sides, and are swapped."""
+
+    @property
+    def source(self) -> RunSource:
+        return RunSource(SCENE, self.suite, super().source.words)
 
 
 def wired_run(session: WiredSession, names: Sequence[str], folder: Path) -> ArrayRun:
@@ -40,7 +49,7 @@ def wired_run(session: WiredSession, names: Sequence[str], folder: Path) -> Arra
         "original" if replay_input.episode.endswith(":o") else "swapped" for replay_input in inputs
     ]
     episodes["outcome"], episodes["side_placed"] = "correct", episodes["side_correct"]
-    run = ArrayRun(folder, "wired", SUITE, episodes, {key: np.array(rows) for key, rows in features.items()})
+    run = WiredRun(folder, "wired", SUITE, episodes, {key: np.array(rows) for key, rows in features.items()})
     session.run = run  # type: ignore[assignment]
     return run
 

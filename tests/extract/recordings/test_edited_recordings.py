@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from probe_kit._system.machine import same_scheduling
 from probe_kit.extract import LeRobotSource
 from probe_kit.extract.sources.recording_source import RecordingSource
 
@@ -45,6 +46,7 @@ def words(episode: int, frame: int) -> str:
     return TEXTS[(episode + (episode == 3 and frame > 2)) % 2]
 
 
+@same_scheduling()
 def write(folder: Path, videos: bool) -> Path:
     from lerobot.datasets import LeRobotDataset
 

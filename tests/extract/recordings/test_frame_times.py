@@ -15,6 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from probe_kit._system.machine import same_scheduling
 from probe_kit.errors import RecordingError
 from probe_kit.extract import LeRobotSource
 from probe_kit.extract.sources.frame_times import NONE, TickTimes, nearest_by_far
@@ -112,6 +113,7 @@ def shade(number: int) -> int:
     return 20 + 12 * number
 
 
+@same_scheduling()
 def film(file: Path, codec: str, rate: Fraction, count: int, muxer: dict[str, str], coder: dict[str, str]) -> None:
     """Write frames whose shade is their number."""
     file.parent.mkdir(parents=True, exist_ok=True)

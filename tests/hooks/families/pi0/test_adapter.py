@@ -124,7 +124,7 @@ def wide_observation() -> Observation:
 @pytest.mark.slow
 @pytest.mark.parametrize("openness", ["measured", "release"])
 def test_actions_are_those_of_the_bare_network_in_the_evaluations_units(
-    folder: Path, statistics: Path, policy: Pi0, observation: Observation, openness: str
+    folder: Path, statistics: Path, policy: Pi0, wide_observation: Observation, openness: str
 ) -> None:
     """Everything around the network recomputed in float64: squashed picture, seven numbers, p01 and p99."""
     acting = (
@@ -132,15 +132,15 @@ def test_actions_are_those_of_the_bare_network_in_the_evaluations_units(
     )
     low, high = bounds_of("proprio")
     gripper = 0.8 if openness == "measured" else 1 - (0.015 + 0.8 * 0.022)
-    numbers = np.array([*observation.state[:6], gripper], np.float64)
+    numbers = np.array([*wide_observation.state[:6], gripper], np.float64)
     state = np.clip((numbers - low) / (high - low) * 2 - 1, -1, 1)
-    picture = cv2.resize(observation.image, (96, 96), interpolation=cv2.INTER_LANCZOS4)
-    raw = network_chunk(acting, picture, state, observation.instruction, SEED)
+    picture = cv2.resize(wide_observation.image, (96, 96), interpolation=cv2.INTER_LANCZOS4)
+    raw = network_chunk(acting, picture, state, wide_observation.instruction, SEED)
     first, last = bounds_of("action")
     expected = (raw + 1) / 2 * (last - first) + first
     expected[:, 6] = raw[:, 6] > 0.5
 
-    actions = acting.act([observation], [SEED])
+    actions = acting.act([wide_observation], [SEED])
     assert actions.shape == (1, 4, 7)
     np.testing.assert_allclose(actions[0], expected, atol=1e-5)
     assert set(np.unique(actions[..., 6])) <= {0.0, 1.0}

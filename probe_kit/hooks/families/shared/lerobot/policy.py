@@ -5,6 +5,7 @@ The `from_pretrained` of lerobot is never used: it returns partly or fully rando
 
 from abc import abstractmethod
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from copy import copy
 from dataclasses import replace
 from pathlib import Path
@@ -17,8 +18,8 @@ from torch import Tensor
 
 from probe_kit._system.foreign_files import while_reading
 from probe_kit.errors import CheckpointError, ObservationError
-from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE, side_files
-from probe_kit.hooks.checkpoints.folders import checkpoint_folder
+from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE, is_weights, side_files
+from probe_kit.hooks.checkpoints.folders import adapter_in, checkpoint_folder
 from probe_kit.hooks.checkpoints.weights import Weights, load_weights, read_weights
 from probe_kit.hooks.contract.card import ARM
 from probe_kit.hooks.contract.model import Tap
@@ -33,11 +34,21 @@ from probe_kit.hooks.families.shared.lerobot.pipelines import (
 )
 from probe_kit.hooks.families.shared.loading import Loaded
 from probe_kit.hooks.families.shared.taps import ALL_TOKENS, Stack, kv_tap
-from probe_kit.models.building import WithoutFilling, initialise
+from probe_kit.models.building import LimitedSize, WithoutFilling, builds_sizes_only, initialise
 from probe_kit.models.decoding import PromptKV
 
 _VISION = "vision"
 """The stream of a vision tower."""
+
+
+def _limit_size(folder: Path, random_weights: bool) -> AbstractContextManager[object]:
+    """Return a context that builds no network which the weights in `folder` could not fill; see `LimitedSize`."""
+    if random_weights or builds_sizes_only():
+        return nullcontext()
+    adapter = adapter_in(folder)
+    weights_folder = folder if adapter is None else adapter.base_folder()
+    total = sum(file.stat().st_size for file in weights_folder.iterdir() if is_weights(file) and file.is_file())
+    return LimitedSize(folder, total) if total else nullcontext()
 
 
 class LerobotPolicy(RecordedPolicy):
@@ -148,7 +159,7 @@ class LerobotPolicy(RecordedPolicy):
         config = cls._read_config(folder, evaluation)
         if dtype is not None:
             config.dtype = dtype
-        with WithoutFilling(), while_reading(folder / CONFIG_FILE):
+        with WithoutFilling(), _limit_size(folder, random_weights), while_reading(folder / CONFIG_FILE):
             network = cls.build(config, folder)
         if random_weights:
             initialise(network, weights_seed)
