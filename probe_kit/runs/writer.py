@@ -210,7 +210,8 @@ class RunWriter:
                 root = self._grow_root()
         root.check()
         if root.plan:  # an array has no length before its first row arrives
-            root.set_lengths()
+            with self.location.locked(lambda: None):  # or another process would take a draft for a leftover
+                root.set_lengths()
         return root
 
     def _lacks(self, root: Root) -> bool:

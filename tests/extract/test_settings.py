@@ -38,6 +38,7 @@ from probe_kit.runs import Run, open_run, provenance, verify_run
 from probe_kit.runs.records import HASH
 from probe_kit.runs.store import locate
 from probe_kit.suite import Suite, load_suite
+from tests.support.begun_runs import play_first_episodes
 
 ZERO = Edit("zero", (Site("backbone", 1),))
 EVERY = {
@@ -320,20 +321,6 @@ def expert(suite: Suite) -> ExtractSettings:
     return ExtractSettings("expert", suite=suite.folder, scene=SHORT, env_workers=0)
 
 
-def begin(settings: ExtractSettings, folder: Path) -> None:
-    """Play the first episode only."""
-
-    class EnoughError(Exception):
-        pass
-
-    def stop(*_: object) -> None:
-        raise EnoughError
-
-    with pytest.raises(EnoughError):
-        extract_run(settings, folder, stop)
-    assert 0 < len(open_run(folder, allow_partial=True).episodes) < 4
-
-
 def test_a_scene_run_has_the_identity_and_the_plan_that_it_had(suite: Suite) -> None:
     """A hash that changes by accident would stop runs from being continued."""
     prepared = prepare(expert(suite))
@@ -373,7 +360,7 @@ def elsewhere(monkeypatch: pytest.MonkeyPatch, **changes: object) -> None:
 def test_a_run_is_not_continued_where_numbers_come_out_otherwise(
     suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: dict[str, str], message: str
 ) -> None:
-    begin(expert(suite), tmp_path / "run")
+    play_first_episodes(expert(suite), tmp_path / "run")
     elsewhere(monkeypatch, **change)
     with pytest.raises(SettingsMismatchError, match=message) as caught:
         extract_run(expert(suite), tmp_path / "run")
@@ -383,7 +370,7 @@ def test_a_run_is_not_continued_where_numbers_come_out_otherwise(
 
 @pytest.mark.slow
 def test_a_mixed_run_says_so(suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    begin(expert(suite), tmp_path / "run")
+    play_first_episodes(expert(suite), tmp_path / "run")
     elsewhere(monkeypatch, torch="1.0", device="cuda")
     run = extract_run(expert(suite).changed(allow_mixed=True), tmp_path / "run")
     assert run.mixed == ("device", "versions.torch")
@@ -407,7 +394,7 @@ def test_a_copy_of_a_run_does_not_count_beside_it(suite: Suite, tmp_path: Path) 
 def test_other_writers_interpreters_and_processes_are_no_other_numbers(
     suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    begin(expert(suite), tmp_path / "run")
+    play_first_episodes(expert(suite), tmp_path / "run")
     elsewhere(monkeypatch, python="3.13.0", machine="aarch64", zarr="9")
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
     run = extract_run(expert(suite).changed(env_workers=1), tmp_path / "run")

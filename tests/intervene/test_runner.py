@@ -132,15 +132,17 @@ def test_a_stored_intervention_is_loaded_and_not_played_again(copy: Run, effects
     assert json.loads(effects.to_json())["settings"]["items"] == 2
 
 
-def test_damage_to_another_intervention_does_not_stop_one_that_is_stored(
+def test_a_stored_intervention_is_found_by_its_key_and_no_other_one_is_read(
     mine: Run, effects: InterventionResult
 ) -> None:
     other = mine.path / "interventions" / "0123456789ab"
     shutil.copytree(mine.path / "interventions" / effects.key, other)
     again = run_intervention(mine, ImageSwap(items=2), ReplayFiles(Path("nowhere")))
-    assert again.to_csv() == effects.to_csv()
+    assert again.key == effects.key
     with pytest.raises(RunDamagedError, match="0123456789ab"):
-        load_effects(mine)
+        load_effects(mine)  # the newest of all, which are read
+    with pytest.raises(RunDamagedError, match="0123456789ab"):
+        again.to_csv()  # its verdicts are of all interventions
 
 
 def test_an_intervened_run_is_whole(copy: Run, effects: InterventionResult) -> None:

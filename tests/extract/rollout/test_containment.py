@@ -365,7 +365,8 @@ def test_a_limit_changes_no_name_of_a_run(settings: ExtractSettings) -> None:
 @pytest.mark.slow
 def test_the_limit_ends_a_process_that_holds_the_interpreter() -> None:
     code = (
-        "from probe_kit.hooks.checkpoints.third_party import contained\nwith contained(0.2):\n  sum(range(10**12))"
+        "from probe_kit.hooks.checkpoints.third_party import contain_policy\n"
+        "with contain_policy(0.2):\n  sum(range(10**12))"
     )
     completed = subprocess.run([sys.executable, "-c", code], check=False, timeout=120)
     assert completed.returncode == -signal.SIGALRM
