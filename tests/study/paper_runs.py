@@ -81,7 +81,7 @@ def run_of(
     table = pd.concat(tables, ignore_index=True)
     if is_answer_run:
         table = table.assign(
-            parse="letter", option_mass=1.0, letter_bias=0.0, near_tie=False, side_word=False,
+            parse="letter", parse_tier="strict", option_mass=1.0, letter_bias=0.0, near_tie=False, side_word=False,
             outcome_logits=table["outcome"], side_logits=table["side_placed"],
             outcome_debiased=table["outcome"], side_debiased=table["side_placed"],
         )  # fmt: skip

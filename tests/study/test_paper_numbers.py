@@ -213,7 +213,7 @@ def test_ablations_minus_the_default_are_paired_on_the_four_categories_in_common
         if name not in derived["ablation_minus_default"] or row["model"] != "pi0":
             continue
         ablated = run_of(name, row["values"], tables["items"]["values"])
-        table = retention_table([ablated, runs[row["model"]]])
+        table = retention_table([ablated, runs[row["model"]]], against=row["model"])
         computed = {
             difference.category: 100 * (difference.sr or 0)
             for difference in table.differences
