@@ -36,7 +36,7 @@ MAX_NEWTON_STEPS, MAX_CG_STEPS = 12, 20
 LONG = 4.0
 """Change of a decision from which on a Newton step is shortened."""
 FEW = 0.5
-"""Share of the label columns up to which those that have not settled go on by themselves."""
+"""Share of the label columns up to which those that have not settled are solved by themselves."""
 LARGEST = 80.0
 """Largest margin whose exponential float32 holds."""
 TINY = float(np.finfo(np.float32).tiny)
@@ -73,7 +73,7 @@ class RoughOptima:
         return type(self)(self.samples[folds], *parts)
 
     def advance(self, strength: float) -> None:
-        """Go on from the optima of the C before, a smaller one, to those of `strength`."""
+        """Continue from the optima of the C before, a smaller one, to those of `strength`."""
         self._advance(strength, MAX_NEWTON_STEPS)
 
     def _advance(self, strength: float, steps: int) -> None:
@@ -93,10 +93,10 @@ class RoughOptima:
                 return
             if most <= FEW * far.shape[1]:
                 folds, columns = np.arange(len(far)), np.argsort(~far, axis=1, kind="stable")[:, :most]
-                rest = self.select(folds, columns)
-                rest._advance(strength, left + 1)
-                self.weights[folds[:, None], columns] = rest.weights
-                self.decisions[folds[:, None], columns] = rest.decisions
+                unsettled = self.select(folds, columns)
+                unsettled._advance(strength, left + 1)
+                self.weights[folds[:, None], columns] = unsettled.weights
+                self.decisions[folds[:, None], columns] = unsettled.decisions
                 return
             # Columns that have settled share the products, and need no further ones.
             goal = np.where(far, relative.clip(FINEST**2, COARSEST**2) * size, np.inf)
