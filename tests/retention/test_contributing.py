@@ -46,7 +46,9 @@ def apply(diff: str, package: Path) -> None:
             lines = hunk.splitlines()
             old = "".join(f"{line[1:]}\n" for line in lines if line[0] in " -")
             new = "".join(f"{line[1:]}\n" for line in lines if line[0] in " +")
-            assert text.count(old) == 1 or not old, (file, old)
+            assert text.count(old) == 1 or not old, (
+                f"{file.name} has no such lines; change CONTRIBUTING's diff:\n{old}"
+            )
             text = text.replace(old, new) if old else new
         file.write_text(text, encoding="utf-8")
 
