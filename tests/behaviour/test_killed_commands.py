@@ -229,7 +229,7 @@ def disk(little_runs: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterato
         mount("-o", "remount,ro", str(folder))
         yield folder
     finally:
-        subprocess.run(["umount", str(folder)], check=True)
+        subprocess.run(["umount", "--lazy", str(folder)], check=True)
 
 
 def test_a_run_on_a_read_only_disk_is_read_and_verified(disk: Path, little_runs: Path) -> None:
