@@ -181,7 +181,8 @@ def _choose_stacked(
     some = _at_once([training for trainings in inner for training in trainings], labels)
     parts = [_Together.of(trainings, labels).losses(strengths) for trainings in some]
     loss, by_episode = (np.concatenate(part, axis=1) for part in zip(*parts, strict=True))
-    loss, by_episode = _sum_inner(loss, inner), _sum_inner(by_episode, inner)
+    begins = _first_inner(inner)
+    loss, by_episode = _sum_inner(loss, begins), _sum_inner(by_episode, begins)
     best = select_c(loss)
     return [
         (strengths[best[number]], InnerQuality.of(-loss[:, number], -by_episode[:, number], best[number]))
@@ -189,9 +190,13 @@ def _choose_stacked(
     ]
 
 
-def _sum_inner(losses: Matrix, inner: Sequence[Sequence[_Training]]) -> Matrix:
-    """Return losses (C, inner folds, …) summed by the outer fold that they belong to."""
-    begins = np.cumsum([0, *(len(trainings) for trainings in inner[:-1])])
+def _first_inner(inner: Sequence[Sequence[_Training]]) -> NDArray[np.intp]:
+    """Return the number of the first inner fold of every outer fold, where all are counted together."""
+    return np.cumsum([0, *(len(trainings) for trainings in inner[:-1])])
+
+
+def _sum_inner(losses: Matrix, begins: NDArray[np.intp]) -> Matrix:
+    """Return losses (C, inner folds, …) summed by outer fold, which begin where `_first_inner` says."""
     return np.add.reduceat(losses, begins, axis=1)
 
 
@@ -399,7 +404,7 @@ class _RoughLosses:
     """Losses of rough optima, as far as they were computed; all (C, F, K).
 
     Attributes:
-        begins: Numbers of the first inner fold of every outer fold.
+        begins: Numbers of the first inner folds, see `_first_inner`.
         loss: Log-losses of the test episodes of every inner fold, summed.
         bound: By how much these can differ from those of exact optima.
         is_done: Whether the loss was computed.
@@ -411,10 +416,10 @@ class _RoughLosses:
     is_done: NDArray[np.bool_]
 
     @classmethod
-    def none(cls, folds: _InnerFolds, columns: int) -> Self:
-        """Return losses of which none was computed."""
-        shape = STRENGTHS.size, folds.turn.size, columns
-        return cls(np.flatnonzero(folds.turn == 0), np.zeros(shape), np.zeros(shape), np.zeros(shape, bool))
+    def none(cls, begins: NDArray[np.intp], folds: int, columns: int) -> Self:
+        """Return losses of so many inner folds and label columns, of which none was computed."""
+        shape = STRENGTHS.size, folds, columns
+        return cls(begins, np.zeros(shape), np.zeros(shape), np.zeros(shape, bool))
 
     def add(self, where: tuple[Any, ...], loss: Matrix, bound: Matrix) -> None:
         """Add losses that were computed."""
@@ -424,12 +429,12 @@ class _RoughLosses:
         """Return whether a C can have the least loss of an outer fold, (C, outer folds, K)."""
         loss, bound = self.totals()
         # A loss is not negative, so that the sum of some inner folds is at most that of all.
-        return can_be_least(np.add.reduceat(self.loss - self.bound, self.begins, axis=1), loss + bound)
+        return can_be_least(_sum_inner(self.loss - self.bound, self.begins), loss + bound)
 
     def totals(self) -> tuple[Matrix, Matrix]:
         """Return losses and bounds summed by outer fold; a loss is infinite where an inner fold is not done."""
         is_whole = np.logical_and.reduceat(self.is_done, self.begins, axis=1)
-        loss, bound = (np.add.reduceat(part, self.begins, axis=1) for part in (self.loss, self.bound))
+        loss, bound = (_sum_inner(part, self.begins) for part in (self.loss, self.bound))
         return np.where(is_whole, loss, np.inf), np.where(is_whole, bound, 0.0)
 
 
@@ -449,7 +454,7 @@ def _rough_losses(labels: NDArray[np.bool_], inner: Sequence[Sequence[_Training]
         inner: Inner folds of F outer folds.
     """
     folds = _InnerFolds.of(inner, labels)
-    sums = _RoughLosses.none(folds, labels.shape[1])
+    sums = _RoughLosses.none(_first_inner(inner), folds.turn.size, labels.shape[1])
     start = RoughOptima.start(folds.samples, folds.signs)
     cheap, dear = np.split(np.arange(STRENGTHS.size), [CHEAP])
     by_turn = [np.flatnonzero(folds.turn == turn) for turn in range(folds.turn.max() + 1)]

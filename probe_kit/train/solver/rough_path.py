@@ -17,6 +17,7 @@ the penalty's, 1, and one for the intercept, C Σ s. So ‖z̄‖² ≤ ‖z −
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
@@ -66,6 +67,12 @@ class RoughOptima:
         narrow = signs.astype(np.float32)
         return cls(samples.astype(np.float32), narrow, weights, np.zeros_like(narrow))
 
+    @cached_property
+    def lengths(self) -> Narrow:
+        """The squared length of every column of the samples, (F, 1, R)."""
+        squares: Narrow = np.square(self.samples).sum(axis=1)
+        return squares[:, None]
+
     def select(self, folds: NDArray[np.intp], columns: NDArray[np.intp]) -> Self:
         """Return the optima of `folds` (G,), of each its `columns` (G, L)."""
         of_fold = folds[:, None]
@@ -77,7 +84,6 @@ class RoughOptima:
         self._advance(strength, MAX_NEWTON_STEPS)
 
     def _advance(self, strength: float, steps: int) -> None:
-        lengths = np.square(self.samples).sum(axis=1)[:, None]
         for left in reversed(range(steps)):
             misfit = _misfit(self.signs * self.decisions)
             curvature = np.float32(strength) * misfit * (1 - misfit)
@@ -100,7 +106,7 @@ class RoughOptima:
                 return
             # Columns that have settled share the products, and need no further ones.
             goal = np.where(far, relative.clip(FINEST**2, COARSEST**2) * size, np.inf)
-            step, change = _newton_steps(self.samples, lengths, gradient, curvature, goal)
+            step, change = _newton_steps(self.samples, self.lengths, gradient, curvature, goal)
             # Shortened so, a Newton step lowers a self-concordant objective. Short steps are taken whole: if one
             # leads astray, the bound shows it.
             longest = abs(change).max(axis=2)
