@@ -13,7 +13,7 @@ import os
 import sys
 import warnings
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from importlib import import_module
@@ -140,6 +140,19 @@ class Camera:
         down = (v - self.spec.height / 2) / self.spec.focal_length
         return np.asarray(np.stack([across, -down, np.ones_like(across)], -1) @ self.axes)
 
+    def can_see(self, points: ArrayLike, margin: float = 0.0) -> NDArray[np.bool_]:
+        """Return whether some of the space between world points (..., P, 3) can be in view, (...).
+
+        Args:
+            points: Corners of convex bodies.
+            margin: Share of width and height by which the view is taken larger.
+        """
+        x, y, z = np.moveaxis((np.asarray(points) - self.spec.eye) @ self.axes.T, -1, 0)
+        depth = (1 + margin) * z / (2 * self.spec.focal_length)
+        across, up = self.spec.width * depth, self.spec.height * depth
+        beyond = np.stack([x - across, -x - across, y - up, -y - up, -z])
+        return np.asarray(~(beyond > 0).all(axis=-1).any(axis=0))
+
     def magnified(self, factor: int) -> "Camera":
         """Return the same view with `factor` times the pixels in each direction."""
         spec = self.spec
@@ -216,7 +229,7 @@ class Backdrop:
     def under(self, frame: RenderedFrame) -> PictureArray:
         """Return the picture (H, W, 3) of `frame` composed with the backdrop: the nearer surface is visible."""
         # The renderer lets the surface that is drawn later win a tie, and the table is drawn first.
-        in_front = (frame.bodies >= 0) & (frame.depth <= self.depth)
+        in_front = np.nonzero((frame.bodies >= 0) & (frame.depth <= self.depth))
         picture = self.rgb.copy()
         picture[in_front] = frame.rgb[in_front]
         return picture
@@ -352,10 +365,57 @@ def _ease(share: Matrix) -> Matrix:
     return np.asarray(share * share * (3 - 2 * share))
 
 
-# -- films ----------------------------------------------------------------------------------------------------
+# -- what is drawn ----------------------------------------------------------------------------------------------
 
 INVISIBLE = (0.0, 0.0, 0.0, 0.0)
 """Colour of bodies that the renderer leaves out."""
+
+
+class VisualShapes:
+    """The visual shapes of one body, of which links can be hidden from the renderer.
+
+    The colours of the shapes are those that they have when this is made.
+
+    Attributes:
+        body: Id of the body.
+        hidden: Links that are hidden; −1 is the base.
+    """
+
+    def __init__(self, client: BulletClient, body: int) -> None:
+        self._client, self.body = client, body
+        # `changeVisualShape` asks for the number of a shape in its link.
+        self._colors: dict[int, list[tuple[float, ...]]] = {}
+        for shape in client.getVisualShapeData(body):
+            self._colors.setdefault(shape[1], []).append(shape[7])
+        self.hidden: frozenset[int] = frozenset()
+
+    @property
+    def shown(self) -> frozenset[int]:
+        """Links with a shape that are not hidden."""
+        return frozenset(self._colors) - self.hidden
+
+    def hide(self, links: Iterable[int]) -> None:
+        """Hide these links, and show all others."""
+        hidden = frozenset(links)
+        for link in hidden ^ self.hidden:
+            for number, color in enumerate(self._colors[link]):
+                shown = INVISIBLE if link in hidden else color
+                self._client.changeVisualShape(self.body, link, number, rgbaColor=shown)
+        self.hidden = hidden
+
+    @contextmanager
+    def away(self, links: Iterable[int] | None = None) -> Iterator[None]:
+        """Hide these links too, None for all; afterwards those are hidden that were before."""
+        before = self.hidden
+        self.hide(before | (self.shown if links is None else frozenset(links)))
+        try:
+            yield
+        finally:
+            self.hide(before)
+
+
+# -- films ----------------------------------------------------------------------------------------------------
+
 REST = 2e-4
 """Largest drift of resting bodies, in metres or parts of a unit quaternion: under a tenth of a film's pixel."""
 
@@ -377,8 +437,6 @@ class _Resting:
 class FilmCamera:
     """A camera that draws one scene with fewer pixels.
 
-    The colours of all bodies are those that they have when this is made.
-
     Args:
         client: Server of the scene.
         backdrop: The scene without robot, cube and tiles.
@@ -387,11 +445,14 @@ class FilmCamera:
     """
 
     def __init__(
-        self, client: BulletClient, backdrop: Backdrop, resting: Iterable[int], moving: Iterable[int]
+        self,
+        client: BulletClient,
+        backdrop: Backdrop,
+        resting: Iterable[VisualShapes],
+        moving: Iterable[VisualShapes],
     ) -> None:
         self._client, self._empty = client, backdrop
         self._resting, self._moving = tuple(resting), tuple(moving)
-        self._colors = {body: _colors(client, body) for body in (*self._resting, *self._moving)}
         self._drawn: _Resting | None = None
 
     def picture(self, camera: Camera, light: LightSpec, level: float, pictures: tuple[int, ...]) -> PictureArray:
@@ -404,11 +465,11 @@ class FilmCamera:
             pictures: Textures that the resting bodies show.
         """
         backdrop = self._backdrop(camera, light, level, pictures)
-        with self._without(self._resting):
+        with _away(self._resting):
             return backdrop.under(camera.render(self._client, light, level))
 
     def _backdrop(self, camera: Camera, light: LightSpec, level: float, pictures: tuple[int, ...]) -> Backdrop:
-        states = (self._client.getBasePositionAndOrientation(body) for body in self._resting)
+        states = (self._client.getBasePositionAndOrientation(shapes.body) for shapes in self._resting)
         places = np.array([np.concatenate(state) for state in states])
         drawn, shape = self._drawn, (camera.spec.height, camera.spec.width)
         if (
@@ -417,34 +478,18 @@ class FilmCamera:
             or drawn.pictures != pictures
             or np.abs(drawn.places - places).max() > REST
         ):
-            with self._without(self._moving):
+            with _away(self._moving):
                 frame = camera.render(self._client, light, level)
             self._drawn = drawn = _Resting(_over(self._empty.at_size(camera.spec), frame), places, pictures)
         return drawn.backdrop
 
-    @contextmanager
-    def _without(self, bodies: Iterable[int]) -> Iterator[None]:
-        for body in bodies:
-            for link, number, _ in self._colors[body]:
-                self._client.changeVisualShape(body, link, number, rgbaColor=INVISIBLE)
-        try:
-            yield
-        finally:
-            for body in bodies:
-                for link, number, color in self._colors[body]:
-                    self._client.changeVisualShape(body, link, number, rgbaColor=color)
 
-
-def _colors(client: BulletClient, body: int) -> list[tuple[int, int, tuple[float, ...]]]:
-    """Return link, number of the shape in its link, and colour of every visual shape.
-
-    These are the arguments of `changeVisualShape`.
-    """
-    colors: list[tuple[int, int, tuple[float, ...]]] = []
-    for shape in client.getVisualShapeData(body):
-        number = sum(link == shape[1] for link, *_ in colors)
-        colors.append((shape[1], number, shape[7]))
-    return colors
+@contextmanager
+def _away(bodies: Iterable[VisualShapes]) -> Iterator[None]:
+    with ExitStack() as stack:
+        for shapes in bodies:
+            stack.enter_context(shapes.away())
+        yield
 
 
 def _over(backdrop: Backdrop, frame: RenderedFrame) -> Backdrop:

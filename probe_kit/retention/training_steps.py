@@ -4,6 +4,8 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from probe_kit._system.counting import plural
 from probe_kit._system.table_cells import is_count
 from probe_kit._tables.numbers import number, percent, points
@@ -11,7 +13,16 @@ from probe_kit._tables.table import Cell, Heading, Table, absent
 from probe_kit.errors import UsageError
 from probe_kit.retention.columns.text import title_of
 from probe_kit.retention.compare.models import checkpoint_of, split_checkpoint
-from probe_kit.retention.displays.display import ProvenanceLine, caption, legend_above, panels, plain, series
+from probe_kit.retention.displays.display import (
+    ProvenanceLine,
+    caption,
+    draw_intervals,
+    legend_above,
+    legend_handles,
+    panels,
+    plain,
+    series,
+)
 from probe_kit.retention.displays.report_figure import ReportFigure
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 from probe_kit.retention.table import RetentionTable
@@ -207,7 +218,7 @@ def draw_training_steps(table: Table, lines: Sequence[ProvenanceLine]) -> "Figur
         plain(axes)
         axes.set_xlabel("training step", fontsize=8.5)
         axes.set_ylabel(label, fontsize=8.5)
-    legend_above(figure, grid[0].get_legend_handles_labels()[0])
+    legend_above(figure, list(legend_handles(*grid).values()))
     caption(figure, *lines)
     return figure
 
@@ -218,10 +229,9 @@ def _draw_line(
     look = series(at)
     values = [float("nan") if row[key] is None else factor * row[key] for row in rows]
     steps = [row["step"] + shift for row in rows]
-    for step, row, value in zip(steps, rows, values, strict=True):
-        low, high = row[f"{key}_ci"] or (None, None)
-        if low is not None and high is not None and value == value:
-            axes.plot([step, step], [factor * low, factor * high], color=look.colour, lw=0.8, alpha=0.6)
+    limits = [row[f"{key}_ci"] or (None, None) for row in rows]
+    ends = factor * np.array(limits, dtype=float).T
+    draw_intervals(axes, steps, values, look.colour, ends)
     axes.plot(
         steps, values, color=look.colour, ls=look.dash, marker=look.marker, ms=4.5, lw=1.3,
         label=title_of(rows[0]["category"]),

@@ -339,6 +339,7 @@ def test_a_row_has_the_numbers_of_its_run_and_drift_is_that_from_the_first_step(
     drawn = draw_training_steps(by_step, ())
     labels = [axes.get_ylabel() for axes in drawn.axes if axes.get_visible()]
     assert labels == ["success (%)", "backbone (%)", "retention", "drift of the backbone (points)"]
+    assert [text.get_text() for text in drawn.legends[0].get_texts()][-1] == "bar: 95 % interval"
 
 
 def test_a_mean_over_other_categories_stands_last_and_is_named_and_absent_columns_are_not_explained(

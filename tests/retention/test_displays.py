@@ -80,6 +80,8 @@ def test_one_panel_per_category_with_both_streams(probed_run: ProbedRun) -> None
     ]
     labels = [label for axes in panels for label in axes.get_legend_handles_labels()[1]]
     assert {"backbone", "action expert, by iteration", "iteration 0", "iteration 1", "chance"} <= set(labels)
+    entries = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert entries.count("bar: 95 % interval") == 1
     figure.savefig(io.BytesIO(), format="png")
 
 

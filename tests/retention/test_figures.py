@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from matplotlib import pyplot as plt
 from matplotlib.colors import to_rgb
+from matplotlib.container import ErrorbarContainer
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
@@ -26,7 +27,7 @@ from probe_kit.retention.displays import (
     collect_figures,
     save_figures,
 )
-from probe_kit.retention.displays.display import FILLED, OPEN
+from probe_kit.retention.displays.display import FILLED, INTERVAL, OPEN
 from probe_kit.train import ArrayRun, ProbeResults, load_results, save_results
 from tests.retention.conftest import runs_in
 
@@ -217,6 +218,18 @@ def test_filled_and_open_markers_mean_the_same_in_every_figure(drawn: Drawn) -> 
         words = [text.get_text() for legend in legends if legend is not None for text in legend.get_texts()]
         assert {FILLED, OPEN} <= set(words), name
     assert figure_count >= 2
+
+
+@pytest.mark.slow
+def test_the_legend_of_every_figure_with_intervals_names_them_once(drawn: Drawn) -> None:
+    names = set()
+    for name, figure in drawn[1].items():
+        containers = [container for axes in figure.axes for container in axes.containers]
+        has_intervals = any(isinstance(container, ErrorbarContainer) for container in containers)
+        words = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
+        assert words.count(INTERVAL) == has_intervals, name
+        names |= {name} if has_intervals else set()
+    assert any("layer-curves" in name for name in names)
 
 
 def is_white(colour: object) -> bool:

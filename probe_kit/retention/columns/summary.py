@@ -306,8 +306,7 @@ _TERMS = {
     "metric": ("Metric", "of a label, balanced accuracy of classes, R² of quantities"),
     "backbone above chance": (
         "Above chance",
-        "score minus the mean score with permuted labels, with 95 % intervals over groups; other groups chose "
-        "the layer",
+        "score minus the mean score with permuted labels; other groups chose the layer",
     ),
     "VLM %": (
         "VLM",
@@ -499,9 +498,11 @@ def _row(category: CategorySummary, run: str) -> TableRow:
 
 
 def _marks(summaries: Sequence[RunSummary], table: Table) -> list[str]:
-    """Return the meaning of the mark if a cell has it, and a warning where no control allows it."""
-    notes = []
-    if any(MARK in text for line in table.texts for text in line):
+    """Return the meaning of brackets and of the mark where a cell has them, and a warning of missing controls."""
+    notes, cells = [], [text for line in table.texts for text in line]
+    if any("[" in text for text in cells):
+        notes.append("in brackets: the 95 % interval, with groups as the unit")
+    if any(MARK in text for text in cells):
         notes.append(f"{MARK} above chance, and above every control that was run")
     warning = chance_only(
         [category.row for run in summaries for category in run.categories if not category.row.label]

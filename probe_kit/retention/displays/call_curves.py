@@ -18,6 +18,7 @@ from probe_kit.retention.displays.display import (
     Display,
     ProvenanceLine,
     accuracy_axis,
+    draw_intervals,
     in_panels,
     known_view,
     mark_below,
@@ -343,8 +344,7 @@ class CallCurveDisplay(Display):
     def _draw_calls(self, axes: "Axes") -> None:
         for line in self.lines:
             style, clear, accuracy = PARTS[line.part], line.significant, 100 * line.accuracy
-            arms = [(accuracy - 100 * line.low).clip(min=0), (100 * line.high - accuracy).clip(min=0)]
-            axes.errorbar(line.calls, accuracy, arms, fmt="none", ecolor=style.colour, elinewidth=0.8, alpha=0.7)
+            draw_intervals(axes, line.calls, accuracy, style.colour, [100 * line.low, 100 * line.high])
             _draw(axes, line.calls, line)
             axes.plot(line.calls, 100 * line.null, color=style.colour, lw=0.9, ls=":", label=_PERMUTED)
             axes.plot(line.calls[clear], accuracy[clear], color=style.colour, ls="none", marker=style.marker)

@@ -311,11 +311,58 @@ def legend_above(figure: "Figure", handles: "Sequence[Artist]", title: str = "")
 
 
 def legend_handles(*grid: "Axes") -> "dict[str, Artist]":
-    """Return the handles of a legend by their label, each label once, in the order in which they are drawn."""
+    """Return the handles of a legend by their label, each label once, in the order in which they are drawn.
+
+    Intervals come last, in grey, as they have the colour of their line.
+    """
+    from matplotlib.lines import Line2D
+
     handles: dict[str, Artist] = {}
     for axes in grid:
         handles |= {label: handle for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    if handles.pop(INTERVAL, None) is not None:
+        handles[INTERVAL] = Line2D([], [], color="0.3", ls="none", marker="|", ms=11, mew=0.8, label=INTERVAL)
     return handles
+
+
+INTERVAL = "bar: 95 % interval"
+
+
+def draw_intervals(
+    axes: "Axes",
+    x: "ArrayLike",
+    y: "ArrayLike",
+    colour: str,
+    upright: "ArrayLike | None" = None,
+    level: "ArrayLike | None" = None,
+    *,
+    is_faint: bool = False,
+) -> None:
+    """Draw the 95 % intervals of points as thin bars, which the legend explains.
+
+    Args:
+        axes: Axes to draw on.
+        x: (N,) places along the lower side.
+        y: (N,) values.
+        colour: Colour of the line of points.
+        upright: (2, N) lower and upper ends of the intervals of `y`, NaN where there is none; None for no bars.
+        level: The same for `x`.
+        is_faint: Whether other points lie on the bars, which are then drawn lightly.
+    """
+
+    def arms(values: "ArrayLike", ends: "ArrayLike | None") -> "NDArray[np.float64] | None":
+        if ends is None:
+            return None
+        low, high = np.asarray(ends, dtype=float)
+        # Rounding makes arms of less than nothing, where groups agree.
+        return np.array([values - low, high - values]).clip(min=0)
+
+    up, across = arms(y, upright), arms(x, level)
+    if any(part is not None and np.isfinite(part).any() for part in (up, across)):
+        axes.errorbar(
+            x, y, yerr=up, xerr=across, fmt="none", ecolor=colour, elinewidth=0.8, alpha=0.28 if is_faint else 0.7,
+            label=INTERVAL,
+        )  # fmt: skip
 
 
 def significance_handles() -> "list[Line2D]":

@@ -13,6 +13,7 @@ from probe_kit.retention.displays.display import (
     Display,
     ProvenanceLine,
     darker,
+    draw_intervals,
     series,
     significance_handles,
 )
@@ -235,10 +236,12 @@ def _draw_ground(axes: "Axes") -> None:
 def _draw_model(axes: "Axes", points: Sequence[GapPoint], position: int, model: str) -> None:
     line = series(position)
     for point in points:
-        across, up = _arms(point.accuracy, point.accuracy_ci), _arms(point.sr, point.sr_ci)
-        axes.errorbar(
-            100 * point.accuracy, 100 * point.sr, xerr=across, yerr=up, fmt="none", ecolor=line.colour,
-            elinewidth=0.7, alpha=0.28, zorder=2,
+        level, upright = (
+            None if ends is None else [[end] for end in ends]
+            for ends in (_ends(point.accuracy, point.accuracy_ci), _ends(point.sr, point.sr_ci))
+        )
+        draw_intervals(
+            axes, [100 * point.accuracy], [100 * point.sr], line.colour, upright, level, is_faint=True
         )  # fmt: skip
     for filled in (True, False):
         of_marker = [point for point in points if point.significant == filled]
@@ -252,16 +255,17 @@ def _draw_model(axes: "Axes", points: Sequence[GapPoint], position: int, model: 
 def _bars(point: GapPoint) -> "list[tuple[tuple[float, float], tuple[float, float]]]":
     """Return the ends of a point's error bars, in percent."""
     x, y = 100 * point.accuracy, 100 * point.sr
-    across, up = _arms(point.accuracy, point.accuracy_ci), _arms(point.sr, point.sr_ci)
-    level = [] if across is None else [((x - across[0][0], y), (x + across[1][0], y))]
-    upright = [] if up is None else [((x, y - up[0][0]), (x, y + up[1][0]))]
-    return level + upright
+    level, upright = _ends(point.accuracy, point.accuracy_ci), _ends(point.sr, point.sr_ci)
+    across = [] if level is None else [((level[0], y), (level[1], y))]
+    up = [] if upright is None else [((x, upright[0]), (x, upright[1]))]
+    return across + up
 
 
-def _arms(value: float, limits: Limits | None) -> list[list[float]] | None:
+def _ends(value: float, limits: Limits | None) -> tuple[float, float] | None:
+    """Return the ends of a value's interval in percent, with the value between them; None without two ends."""
     if limits is None or limits[0] is None or limits[1] is None:
         return None
-    return [[max(0.0, 100 * (value - limits[0]))], [max(0.0, 100 * (limits[1] - value))]]
+    return 100 * min(value, limits[0]), 100 * max(value, limits[1])
 
 
 _DOES: dict[Modes, str] = {"acts": "succeeds", "answers": "says it", "both": "succeeds or says it"}

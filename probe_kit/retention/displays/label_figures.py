@@ -18,6 +18,7 @@ from probe_kit.retention.displays.display import (
     LineLook,
     ProvenanceLine,
     best_row,
+    draw_intervals,
     in_panels,
     probed_curve,
     scores_of,
@@ -320,11 +321,9 @@ class StepScoresDisplay(BestSiteDisplay):
         """Draw the scores of the site and of the controls."""
         from matplotlib.ticker import MaxNLocator
 
-        (part,), score, (low, high) = self.curve.parts, self.score, self.limits
+        (part,), score = self.curve.parts, self.score
         line = PARTS[part]
-        # Rounding makes arms of less than nothing, where groups agree.
-        arms = np.array([score - low, high - score]).clip(min=0)
-        axes.errorbar(self.steps, score, yerr=arms, fmt="none", ecolor=line.colour, elinewidth=0.8, alpha=0.7)
+        draw_intervals(axes, self.steps, score, line.colour, self.limits)
         axes.plot(
             self.steps, score, color=line.colour, lw=1.3, marker=line.marker, ms=4.5,
             mfc=line.colour if self.signal else "white", label=f"best site, {part}",

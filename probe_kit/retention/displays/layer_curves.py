@@ -20,6 +20,7 @@ from probe_kit.retention.displays.display import (
     ProvenanceLine,
     accuracy_axis,
     best_of,
+    draw_intervals,
     in_panels,
     known_view,
     layer_axis,
@@ -444,10 +445,7 @@ def draw_line(
     """
     layers, scores = line.layers + sidestep, scale * line.score
     if bars:
-        arms = np.array([scores - scale * line.low, scale * line.high - scores]).clip(min=0)
-        axes.errorbar(
-            layers, scores, yerr=arms, fmt="none", ecolor=style.colour, elinewidth=0.8, alpha=0.7
-        )  # fmt: skip
+        draw_intervals(axes, layers, scores, style.colour, [scale * line.low, scale * line.high])
     size = 4.5 if bars else 3.2
     axes.plot(
         layers, scores, color=style.colour, lw=1.3, ls=style.dash, marker=style.marker, ms=size, mfc="white",
