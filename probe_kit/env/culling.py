@@ -38,18 +38,20 @@ class ViewCulling:
     def hide_unseen(self, camera: Camera) -> None:
         """Hide the links outside of the camera's view, and show the others."""
         if self._links:
-            seen = camera.can_see(self._corners(), MARGIN)
-            self._shapes.hide(link for link, is_seen in zip(self._links, seen, strict=True) if not is_seen)
+            in_view = camera.can_see(self._corners(), MARGIN)
+            self._shapes.hide(
+                link for link, is_in_view in zip(self._links, in_view, strict=True) if not is_in_view
+            )
 
     def count_drawing(self) -> None:
         """Count one drawing of every link that is not hidden."""
-        for link in self._shapes.shown:
+        for link in self._shapes.visible:
             self._drawings[link] += 1
 
     def align(self, number: int, draw: Callable[[], object]) -> None:
         """Let the drawings of all links that are shown have the parity of `number`: draw the others once more."""
-        aligned = [link for link in self._shapes.shown if (self._drawings[link] - number) % 2 == 0]
-        if len(aligned) < len(self._shapes.shown):
+        aligned = [link for link in self._shapes.visible if (self._drawings[link] - number) % 2 == 0]
+        if len(aligned) < len(self._shapes.visible):
             with self._shapes.away(aligned):
                 draw()
                 self.count_drawing()
@@ -58,8 +60,8 @@ class ViewCulling:
         """Return the corners (L, 8, 3) of the links' boxes in the world."""
         states = self._client.getLinkStates(self._shapes.body, self._links, computeForwardKinematics=True)
         turns = np.array([self._client.getMatrixFromQuaternion(state[5]) for state in states]).reshape(-1, 3, 3)
-        places = np.array([state[4] for state in states])
-        return np.asarray(self._boxes @ turns.swapaxes(1, 2) + places[:, None])
+        positions = np.array([state[4] for state in states])
+        return np.asarray(self._boxes @ turns.swapaxes(1, 2) + positions[:, None])
 
 
 def _mesh_boxes(client: BulletClient, body: int) -> dict[int, Matrix]:
@@ -68,15 +70,15 @@ def _mesh_boxes(client: BulletClient, body: int) -> dict[int, Matrix]:
     The base, which has few triangles in all arms, is left out: PyBullet names the pose of its centre of mass.
     """
     corners: dict[int, list[Matrix]] = {}
-    others = {-1}
-    for _, link, kind, scale, file, place, turn, *_ in client.getVisualShapeData(body):
+    always_drawn = {-1}
+    for _, link, kind, scale, file, position, turn, *_ in client.getVisualShapeData(body):
         ends = mesh_ends(Path(file.decode())) if kind == client.GEOM_MESH else None
         if ends is None:
-            others.add(link)
+            always_drawn.add(link)
         else:
             rotation = np.array(client.getMatrixFromQuaternion(turn)).reshape(3, 3)
-            corners.setdefault(link, []).append(_box(*ends) * scale @ rotation.T + place)
-    ends_of = {link: np.concatenate(parts) for link, parts in corners.items() if link not in others}
+            corners.setdefault(link, []).append(_box(*ends) * scale @ rotation.T + position)
+    ends_of = {link: np.concatenate(parts) for link, parts in corners.items() if link not in always_drawn}
     return {link: _box(points.min(axis=0), points.max(axis=0)) for link, points in ends_of.items()}
 
 

@@ -390,7 +390,7 @@ class VisualShapes:
         self.hidden: frozenset[int] = frozenset()
 
     @property
-    def shown(self) -> frozenset[int]:
+    def visible(self) -> frozenset[int]:
         """Links with a shape that are not hidden."""
         return frozenset(self._colors) - self.hidden
 
@@ -399,15 +399,15 @@ class VisualShapes:
         hidden = frozenset(links)
         for link in hidden ^ self.hidden:
             for number, color in enumerate(self._colors[link]):
-                shown = INVISIBLE if link in hidden else color
-                self._client.changeVisualShape(self.body, link, number, rgbaColor=shown)
+                look = INVISIBLE if link in hidden else color
+                self._client.changeVisualShape(self.body, link, number, rgbaColor=look)
         self.hidden = hidden
 
     @contextmanager
     def away(self, links: Iterable[int] | None = None) -> Iterator[None]:
         """Hide these links too, None for all; afterwards those are hidden that were before."""
         before = self.hidden
-        self.hide(before | (self.shown if links is None else frozenset(links)))
+        self.hide(before | (self.visible if links is None else frozenset(links)))
         try:
             yield
         finally:

@@ -110,7 +110,7 @@ def test_every_number_has_its_interval_and_a_mark_where_it_exceeds_every_control
 def test_the_legend_explains_brackets_only_where_a_cell_has_them() -> None:
     explained = "in brackets: the 95 % interval, with groups as the unit"
     assert explained in summary_table(summarise_runs([*ASKED, *ACTED])).notes
-    bare = [replace(asked, success=replace(asked.success, ci=None)) for asked in ASKED]
+    bare = [replace(answer_row, success=replace(answer_row.success, ci=None)) for answer_row in ASKED]
     assert explained not in summary_table(summarise_runs(bare)).notes
 
 
