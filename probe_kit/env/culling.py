@@ -33,7 +33,7 @@ class ViewCulling:
         self._client, self._shapes = client, shapes
         boxes = _mesh_boxes(client, shapes.body)
         self._links, self._boxes = list(boxes), np.array(list(boxes.values()))
-        self._drawings = dict.fromkeys(shapes.shown, 0)
+        self._drawings = dict.fromkeys(shapes.visible, 0)
 
     def hide_unseen(self, camera: Camera) -> None:
         """Hide the links outside of the camera's view, and show the others."""
