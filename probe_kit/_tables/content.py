@@ -69,9 +69,20 @@ class Cell:
         return isinstance(self.value, str) and self.value not in ("", NONE)
 
 
+@dataclass(frozen=True)
+class FixedText:
+    """A format that writes the same text for every value; formats of one text are equal, and so are their cells."""
+
+    text: str
+
+    def __call__(self, _: object) -> str:
+        """Return the text."""
+        return self.text
+
+
 def absent(text: str) -> Cell:
     """Return a cell with a text in place of a number, such as `n/a`, which is aligned like numbers."""
-    return Cell(None, lambda _: text)
+    return Cell(None, FixedText(text))
 
 
 Cells = tuple[Cell | str, ...]

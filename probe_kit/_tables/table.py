@@ -6,14 +6,24 @@ from typing import TYPE_CHECKING, Any
 
 from probe_kit._system.escaping import csv_of_rows
 from probe_kit._system.json_text import json_text
-from probe_kit._tables.content import Cell, Cells, Content, Heading, Legend, TableRow, absent, group_headings
+from probe_kit._tables.content import (
+    Cell,
+    Cells,
+    Content,
+    FixedText,
+    Heading,
+    Legend,
+    TableRow,
+    absent,
+    group_headings,
+)
 from probe_kit._tables.formats import render
 
 if TYPE_CHECKING:
     import pandas as pd
     from rich.console import Console, ConsoleOptions, RenderResult
 
-__all__ = ["Cell", "Cells", "Heading", "Legend", "Table", "TableRow", "absent", "group_headings"]
+__all__ = ["Cell", "Cells", "FixedText", "Heading", "Legend", "Table", "TableRow", "absent", "group_headings"]
 
 
 @dataclass(frozen=True)

@@ -98,4 +98,6 @@ def mesh_ends(path: Path) -> tuple[Matrix, Matrix] | None:
 def _ends_of_version(path: Path, _: int) -> tuple[Matrix, Matrix]:
     lines = read_regular(path).splitlines()
     points = np.array([line.split()[1:4] for line in lines if line.startswith(b"v ")], dtype=float)
+    if points.shape[1:] != (3,):
+        raise ValueError("vertices have three coordinates")
     return points.min(axis=0), points.max(axis=0)

@@ -239,6 +239,12 @@ def test_a_column_of_numbers_stands_right_whatever_its_texts_look_like() -> None
     assert [sort_key(cell, True) for cell in (rows[0][1], rows[1][1], rows[1][5])] == [3.0, None, None]
 
 
+def test_tables_of_the_same_cells_are_equal() -> None:
+    once, again = (Table("", (Heading("n"),), (TableRow((absent("n/a"),)),)) for _ in range(2))
+    assert once == again
+    assert once != Table("", (Heading("n"),), (TableRow((absent("none"),)),))
+
+
 def test_no_table_searches_a_text_for_its_values() -> None:
     """LaTeX alone uses expressions, to escape texts and to spell its label."""
     for file in Path(content.__file__).parent.rglob("*.py"):

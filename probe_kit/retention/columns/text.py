@@ -7,7 +7,7 @@ from typing import Literal, cast
 
 from probe_kit._system.counting import list_names, plural
 from probe_kit._tables.numbers import NONE, Write, number, p_text, percent, whole_percent, with_limits
-from probe_kit._tables.table import Cell, absent
+from probe_kit._tables.table import Cell, FixedText, absent
 from probe_kit.hooks.contract.sites import label_of
 from probe_kit.intervene.verdict import UNTESTED, UseVerdict
 from probe_kit.retention.behaviour import Regime, SuccessRate
@@ -162,7 +162,7 @@ def models_test(test: ModelTest | None, write: Write) -> Cell:
     p = models_p(test)
     if None in test.ci:
         return replace(p, after=f"{p.after} {NONE}")
-    return Cell(test.p, lambda _: p.text, test.ci, write_ends=write)
+    return Cell(test.p, FixedText(p.text), test.ci, write_ends=write)
 
 
 def models_p(test: ModelTest) -> Cell:
