@@ -71,7 +71,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class FixedText:
-    """A format that writes the same text for every value; formats of one text are equal, and so are their cells."""
+    """A format that writes the same text for every value. Formats of the same text are equal."""
 
     text: str
 
