@@ -14,9 +14,10 @@ from tests.support.encoder_vla.policy import write_checkpoint
 WITHOUT_PYTEST = "import sys\nsys.modules['pytest'] = None\n"
 HEAVY = """
 import torch
-from probe_kit.hooks import Family
+from probe_kit.hooks import Family, Requirements
 
-FAMILY = Family("heavy-vla", "imports torch", None, "heavy_vla:load", needs_checkpoint=True)
+NEEDED = Requirements(needs_checkpoint=True)
+FAMILY = Family("heavy-vla", "imports torch", None, "heavy_vla:load", requirements=NEEDED)
 
 
 def load(checkpoint, device="cpu", dtype=None, random_weights=False):
@@ -73,7 +74,7 @@ def test_a_broken_adapter_is_told_what_to_change(tmp_path: Path) -> None:
     failed = {check["name"]: check for check in answer["checks"] if check["state"] == "failed"}
     assert not answer["passed"]
     first = failed["every_site_of_every_quantity_fires_as_often_as_promised"]
-    assert first["seen"].startswith("SiteNeverFiredError")
+    assert first["actual"].startswith("SiteNeverFiredError")
     assert "correct `fires`" in first["change"]
     assert "two_episodes_are_extracted" in failed
 

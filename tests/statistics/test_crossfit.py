@@ -521,7 +521,7 @@ def test_the_limit_is_the_highest_of_the_sites_own_limits() -> None:
     assert each[0] == pytest.approx(beta.ppf(0.95, right * count + 1, (1 - right) * count))
 
 
-@pytest.mark.parametrize("sites", [1, 4, 60])
+@pytest.mark.parametrize("sites", [1, 4, pytest.param(60, marks=pytest.mark.slow)])
 def test_a_best_site_at_the_bound_is_rarely_called_absent(sites: int) -> None:
     """One site has exactly the bound, the others nothing; and all of them have it."""
     for shares in (np.append(np.full(sites - 1, 0.5), ABSENT_BELOW), np.full(sites, ABSENT_BELOW)):

@@ -242,7 +242,7 @@ def test_levels_are_a_good_way_apart_and_in_the_order_that_is_asked_for() -> Non
 def test_a_smaller_scale_never_makes_up_for_a_larger_level() -> None:
     """What is bigger must cover more of its tile, whatever its placement."""
     for couple in couples("attribute", 200):
-        if couple.left_tile.thing == "bigger ball":
+        if couple.left_tile.more == "bigger ball":
             bigger, smaller = sorted((couple.left_tile, couple.right_tile), key=lambda tile: -tile.level)
             ink = [(np.asarray(tile.draw()) != tile.background).any(axis=2).sum() for tile in (bigger, smaller)]
             assert ink[0] > 1.3 * ink[1]

@@ -137,13 +137,8 @@ def fork(_: Any, chunks: Any) -> Any:
     return chunks
 
 
-@pytest.mark.parametrize(
-    "spoil",
-    [
-        reseed,
-        *(pytest.param(fault, marks=pytest.mark.slow) for fault in (scribble, change_later, move, deafen, fork)),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("spoil", [reseed, scribble, change_later, move, deafen, fork])
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
 def test_what_a_policy_changes_around_itself_changes_no_number_and_is_put_back(
     spoil: Any, settings: ExtractSettings, pi0_tiny: Pi0, plain: dict[str, str], tmp_path: Path,

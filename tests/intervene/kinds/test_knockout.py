@@ -91,6 +91,7 @@ def test_layers_that_are_each_enough_are_named_together(seed: int) -> None:
     assert "in layers 1 to 4, where a part is enough" in reading_of(roles["image"])
 
 
+@pytest.mark.slow
 def test_what_nothing_reads_is_read_in_one_of_twenty_cases_at_most() -> None:
     alarms = [
         any(
