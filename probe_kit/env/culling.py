@@ -4,6 +4,7 @@ PyBullet's software renderer works through all triangles of a mesh, wherever it 
 them, and the camera of the protocol sees its hand alone, which has 8,300. Pictures are the same bit for bit.
 """
 
+import os
 from collections.abc import Callable
 from functools import lru_cache
 from itertools import product
@@ -72,7 +73,7 @@ def _mesh_boxes(client: BulletClient, body: int) -> dict[int, Matrix]:
     corners: dict[int, list[Matrix]] = {}
     always_drawn = {-1}
     for _, link, kind, scale, file, position, turn, *_ in client.getVisualShapeData(body):
-        ends = mesh_ends(Path(file.decode())) if kind == client.GEOM_MESH else None
+        ends = mesh_ends(Path(os.fsdecode(file))) if kind == client.GEOM_MESH else None
         if ends is None:
             always_drawn.add(link)
         else:

@@ -25,6 +25,7 @@ from probe_kit.retention.displays import (
     knockout_curve,
     site_effect_curve,
 )
+from probe_kit.retention.displays.display import OPEN, Display
 from probe_kit.retention.displays.interventions import _share
 from probe_kit.runs.thumbnails import as_thumbnail, thumbnail_key
 from probe_kit.train import ArrayRun, load_results
@@ -75,6 +76,13 @@ def run(probed_run: Callable[..., ArrayRun]) -> ArrayRun:
     return probed
 
 
+def legend_of(display: Display) -> list[str]:
+    """The entries of the legend of a display that was plotted alone."""
+    assert display.ax_ is not None
+    (legend,) = display.ax_.get_figure(root=True).legends
+    return [text.get_text() for text in legend.get_texts()]
+
+
 def test_it_shows_accuracies_and_turned_episodes_by_layer(run: ArrayRun) -> None:
     answers = outcomes_of({"color": follower(48)})
     store(run, "interchange", inside(answers, backbone__00=1.0, backbone__01=0.0))
@@ -87,6 +95,7 @@ def test_it_shows_accuracies_and_turned_episodes_by_layer(run: ArrayRun) -> None
     assert display.ax_ is not None
     labels = [line.get_label() for line in display.ax_.get_lines()]
     assert "passes: all" in labels
+    assert legend_of(display)[-2:] == ["filled: p < 0.05, family-wise", OPEN]
     names = [exhibit.name for exhibit in collect_figures([run], retention_table([run]))]
     assert any("causes" in name for name in names)
 
@@ -221,6 +230,7 @@ def test_it_shows_means_by_block_and_how_heads_and_iterations_differ(drawn_run: 
     assert display.ax_ is not None
     labels = {line.get_label() for line in display.ax_.get_lines()}
     assert {"correct picture's tile", "other picture's tile", "its own tokens", "language"} <= labels
+    assert legend_of(display)[-2:] == ["wide bar: least to largest iteration", "dot: one head"]
     assert len(attention_curve(drawn_run).axes) == 1
     (attention_exhibit,) = (
         exhibit
@@ -313,6 +323,7 @@ def test_it_shows_episodes_that_turn_by_dose_and_side_beside_controls(steered_ru
     assert display.ax_ is not None
     labels = [line.get_label() for line in display.ax_.get_lines()]
     assert {"all episodes", "pushed to the left", "pushed to the right"} <= set(labels)
+    assert legend_of(display)[-2:] == ["filled: more than random directions", OPEN]
     assert len(display.ax_.collections) == 1
     assert [tick.get_text() for tick in display.ax_.get_xticklabels()] == ["0\n100 %", "2\n100 %", "4\n100 %"]
     names = [exhibit.name for exhibit in collect_figures([steered_run], retention_table([steered_run]))]
@@ -359,6 +370,7 @@ def test_a_knockout_shows_a_curve_a_role_over_its_controls(run: ArrayRun) -> Non
     np.testing.assert_allclose(curves["language", "up to"].controls, 0, atol=5)
     assert not curves["language", "from"].is_read.any()
     labels = knockout_curve(run).legends[0].get_texts()
+    assert [text.get_text() for text in labels][-2:] == ["filled: more than random tokens", OPEN]
     assert "image, up to the layer" in {label.get_text() for label in labels}
     names = [figure.name for figure in collect_figures([run], retention_table([run]))]
     assert any(name.endswith("knockout") for name in names)

@@ -365,12 +365,17 @@ def draw_intervals(
         )  # fmt: skip
 
 
-def significance_handles() -> "list[Line2D]":
-    """Return the legend's entries for filled and open markers, which mean the same in every figure."""
+def significance_handles(filled: str | None = None) -> "list[Line2D]":
+    """Return the legend's entries for filled and open markers.
+
+    Args:
+        filled: The meaning of filled markers; None for that of probes.
+    """
     from matplotlib.lines import Line2D
 
+    label = FILLED if filled is None else f"filled: {filled}"
     return [
-        Line2D([], [], color="0.3", ls="none", marker="o", ms=4.5, label=FILLED),
+        Line2D([], [], color="0.3", ls="none", marker="o", ms=4.5, label=label),
         Line2D([], [], color="0.3", ls="none", marker="o", ms=4.5, mfc="white", label=OPEN),
     ]
 

@@ -44,6 +44,7 @@ from probe_kit.retention.displays.display import (
     probed_curve,
     scores_of,
     series,
+    significance_handles,
 )
 from probe_kit.retention.displays.report_figure import FigureSource, ReportFigure, in_report
 from probe_kit.runs.reader import RunReader
@@ -53,6 +54,7 @@ from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.results.probe_results import ProbeResults
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -137,6 +139,10 @@ class SiteEffectDisplay(Display):
             certificates=(ProvenanceLine.of_results(results, view),),
         )  # fmt: skip
 
+    def further_handles(self) -> "Sequence[Artist]":
+        """Return the handles of filled and open markers."""
+        return significance_handles(f"p < {SIGNIFICANCE}, family-wise")
+
     def draw(self, axes: "Axes") -> None:
         """Draw a line for probes, one for every role, one for `kv`."""
         axes.axhline(100 * CHANCE, color="0.45", lw=1, ls=(0, (1, 1)), label="chance of probes")
@@ -213,8 +219,8 @@ def site_effect_figures(source: FigureSource) -> Iterator[ReportFigure]:
         yield ReportFigure(
             f"{drawn.stem}-causes", "Readable and used", "interventions",
             "Where a probe reads the answer, and how many episodes turn to the other side when the tokens of one "
-            "layer are taken from the same inference with swapped images. A layer that is readable and "
-            "turns nothing is read by nothing behind it.",
+            "layer are taken from the same inference with swapped images. Filled: significant over all layers. A "
+            "layer that is readable and turns nothing is read by nothing behind it.",
             drawn.position, partial(site_effect_curve, drawn.run, drawn.results, drawn.results.settings.views[0]),
         )  # fmt: skip
 
@@ -288,6 +294,15 @@ class AttentionDisplay(Display):
             heads=shares("head"),
             certificates=(ProvenanceLine.of_run(run),),
         )
+
+    def further_handles(self) -> "Sequence[Artist]":
+        """Return the handles of the iterations' range and of the heads."""
+        from matplotlib.lines import Line2D
+
+        return [
+            Line2D([], [], color="0.3", lw=3, alpha=0.25, label="wide bar: least to largest iteration"),
+            Line2D([], [], color="0.3", ls="none", marker=".", ms=2.5, label="dot: one head"),
+        ]
 
     def draw(self, axes: "Axes") -> None:
         """Draw a line for every role, with the range of its iterations and its heads around it."""
@@ -498,6 +513,10 @@ class DoseResponseDisplay(Display):
             certificates=(ProvenanceLine.of_run(run),),
         )
 
+    def further_handles(self) -> "Sequence[Artist]":
+        """Return the handles of filled and open markers."""
+        return significance_handles("more than random directions")
+
     def draw(self, axes: "Axes") -> None:
         """Draw a line for all episodes and one for either side, over the band of the controls."""
         axes.axhline(0, color="0.45", lw=1, ls=(0, (1, 1)))
@@ -625,6 +644,10 @@ class KnockoutDisplay(Display):
             readable=effects[0].readable,
             certificates=(ProvenanceLine.of_run(run),),
         )
+
+    def further_handles(self) -> "Sequence[Artist]":
+        """Return the handles of filled and open markers."""
+        return significance_handles("more than random tokens")
 
     def draw(self, axes: "Axes") -> None:
         """Draw a line for every role and growth, over the band of the controls of all of them."""
