@@ -27,6 +27,7 @@ from probe_kit.intervene import ConditionOutcomes, ImageSwap, Interchange, Repla
 from probe_kit.intervene.kinds.image_swap import image_swap_effects
 from probe_kit.intervene.kinds.interchange import patch_effects
 from probe_kit.intervene.open_session import open_session
+from probe_kit.intervene.outcomes import arrays_from_bytes
 from probe_kit.intervene.pairs import Pair
 from probe_kit.intervene.replay import replay
 from probe_kit.intervene.stored import EPISODES, Measurement
@@ -115,7 +116,7 @@ class Frames:
             partial = file.with_suffix(".partial")
             partial.write_bytes(outcomes.to_bytes())
             partial.replace(file)
-        return ConditionOutcomes.from_bytes(file.read_bytes())
+        return ConditionOutcomes(**arrays_from_bytes(file.read_bytes()))
 
 
 def run_of(folder: Path, suite: Suite, model: str) -> Run:

@@ -292,7 +292,7 @@ NOT_TYPED = {
     r"^export AWS_|s3://": "needs keys of an object store; tests/runs/test_locations.py has a server of its own",
     r"--model (pi0|magma|openvla|spatialvla|xiaomi-r0|internvla-m1)( |$)": "needs released weights (8 to 18 GB)",
     r"^probe-kit diagnose (pi0|runs/mine) ": "needs released weights, or minutes; tests/diagnose has both",
-    r"suite convert vl-think --root BlindVLA|train runs/pi0 --untrained|retention runs/pi0 runs/pi0-random":
+    r"suite convert vl-think --root BlindVLA|train runs/pi0 --untrained|compare runs/pi0 runs/pi0-random":
         "of files that this repository may not pass on, and of runs on them (docs/paper.md)",
     r"kitchen|runs/own": "needs a LeRobotDataset or an environment; tests/extract/recordings and "
         "tests/extract/own_environments have some",
