@@ -319,12 +319,12 @@ def wooden_table(camera: Camera) -> PictureArray:
     fine = camera.magnified(SUPERSAMPLING)
     # A block of rows fits into a processor's cache.
     blocks = np.array_split(fine.rays(), ceil(fine.spec.height / ROWS_AT_ONCE))
-    color = np.concatenate([_surroundings(np.array(fine.spec.eye), rays) for rays in blocks])
+    color = np.concatenate([_ray_colors(np.array(fine.spec.eye), rays) for rays in blocks])
     picture = Image.fromarray(color).resize((camera.spec.width, camera.spec.height), Image.Resampling.LANCZOS)
     return np.asarray(picture)
 
 
-def _surroundings(eye: Matrix, rays: Matrix) -> PictureArray:
+def _ray_colors(eye: Matrix, rays: Matrix) -> PictureArray:
     """Return the colours (H, W, 3) that rays (H, W, 3) from a place (3,) meet."""
     with np.errstate(divide="ignore", invalid="ignore"):
         to_table = np.where(rays[..., 2] < 0, -eye[2] / rays[..., 2], np.inf)

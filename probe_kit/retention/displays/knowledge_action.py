@@ -4,7 +4,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
+from math import nan
 from typing import TYPE_CHECKING, Literal, Self
+
+import numpy as np
 
 from probe_kit._tables.numbers import Limits
 from probe_kit.errors import UsageError
@@ -235,14 +238,10 @@ def _draw_ground(axes: "Axes") -> None:
 
 def _draw_model(axes: "Axes", points: Sequence[GapPoint], position: int, model: str) -> None:
     line = series(position)
-    for point in points:
-        level, upright = (
-            None if ends is None else [[end] for end in ends]
-            for ends in (_ends(point.accuracy, point.accuracy_ci), _ends(point.sr, point.sr_ci))
-        )
-        draw_intervals(
-            axes, [100 * point.accuracy], [100 * point.sr], line.colour, upright, level, is_faint=True
-        )  # fmt: skip
+    accuracies, rates = [100 * point.accuracy for point in points], [100 * point.sr for point in points]
+    level = np.transpose([_ends(point.accuracy, point.accuracy_ci) for point in points])
+    upright = np.transpose([_ends(point.sr, point.sr_ci) for point in points])
+    draw_intervals(axes, accuracies, rates, line.colour, upright, level, is_faint=True)
     for filled in (True, False):
         of_marker = [point for point in points if point.significant == filled]
         axes.plot(
@@ -255,16 +254,15 @@ def _draw_model(axes: "Axes", points: Sequence[GapPoint], position: int, model: 
 def _bars(point: GapPoint) -> "list[tuple[tuple[float, float], tuple[float, float]]]":
     """Return the ends of a point's error bars, in percent."""
     x, y = 100 * point.accuracy, 100 * point.sr
-    level, upright = _ends(point.accuracy, point.accuracy_ci), _ends(point.sr, point.sr_ci)
-    across = [] if level is None else [((level[0], y), (level[1], y))]
-    up = [] if upright is None else [((x, upright[0]), (x, upright[1]))]
-    return across + up
+    (left, right), (low, high) = _ends(point.accuracy, point.accuracy_ci), _ends(point.sr, point.sr_ci)
+    bars = [((left, y), (right, y)), ((x, low), (x, high))]
+    return [ends for ends in bars if np.isfinite(ends).all()]
 
 
-def _ends(value: float, limits: Limits | None) -> tuple[float, float] | None:
-    """Return the ends of a value's interval in percent, with the value between them; None without two ends."""
+def _ends(value: float, limits: Limits | None) -> tuple[float, float]:
+    """Return the ends of a value's interval in percent, with the value between them; NaN without two ends."""
     if limits is None or limits[0] is None or limits[1] is None:
-        return None
+        return nan, nan
     return 100 * min(value, limits[0]), 100 * max(value, limits[1])
 
 
