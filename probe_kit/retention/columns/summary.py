@@ -301,7 +301,7 @@ def next_step(rows: Sequence[RetentionRow]) -> str:
 
 
 MARK = "✓"
-"""Mark after a share: the stream exceeds chance and a control, or the regime of the behaviour is knowledge."""
+"""Mark after a share: the stream exceeds chance and every control, or the regime of the behaviour is knowledge."""
 _TERMS = {
     "metric": ("Metric", "of a label, balanced accuracy of classes, R² of quantities"),
     "backbone above chance": (
@@ -503,11 +503,20 @@ def _marks(summaries: Sequence[RunSummary], table: Table) -> list[str]:
     if any("[" in text for text in cells):
         notes.append("in brackets: the 95 % interval, with groups as the unit")
     if any(MARK in text for text in cells):
-        notes.append(f"{MARK} above chance, and above every control that was run")
+        notes.append(_meaning_of_mark(table))
     warning = chance_only(
         [category.row for run in summaries for category in run.categories if not category.row.label]
     )
     return [*notes, warning] if warning else notes
+
+
+def _meaning_of_mark(table: Table) -> str:
+    """Return what the mark says of the table's columns: probes have controls, answers and success have none."""
+    has_probes = not {"backbone %", "backbone above chance"}.isdisjoint(table.columns)
+    has_behaviour = not {"VLM %", "success %"}.isdisjoint(table.columns)
+    if has_probes and has_behaviour:
+        return f"{MARK} above chance; of probes, above every control that was run too"
+    return f"{MARK} above chance, and above every control that was run" if has_probes else f"{MARK} above chance"
 
 
 def _difference_cells(row: Difference) -> tuple[Cell, ...]:

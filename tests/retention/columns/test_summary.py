@@ -114,6 +114,14 @@ def test_the_legend_explains_brackets_only_where_a_cell_has_them() -> None:
     assert explained not in summary_table(summarise_runs(bare)).notes
 
 
+def test_the_legend_claims_controls_for_probes_alone() -> None:
+    both = f"{MARK} above chance; of probes, above every control that was run too"
+    assert both in summary_table(summarise_runs([*ASKED, *ACTED])).notes
+    answered = summary_table(summarise_runs(ASKED))
+    assert f"{MARK} above chance" in answered.notes
+    assert "control" not in " ".join(answered.notes)
+
+
 def test_nothing_is_marked_where_no_control_was_run_and_a_warning_names_the_run() -> None:
     bare = [
         replace(
