@@ -2,7 +2,7 @@
 
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -25,6 +25,7 @@ from probe_kit.env.simulation import (
     TextureCache,
     VisualShapes,
     load_photo,
+    without_file_cache,
     wooden_table,
     write_quad,
 )
@@ -269,10 +270,9 @@ class Scene:
         self._load_tiles()
         self.cube = self._box((spec.cube_side,) * 3, LIMBO, (*spec.cube_color, 1), spec.cube_mass)
         model = ARMS[spec.arm]
-        if spec.arm_urdf is not None:
-            # PyBullet keeps meshes by name for the whole process: an edited mesh would be drawn as it was before.
-            client.setPhysicsEngineParameter(enableFileCaching=0)
-        self.arm = Arm(client, model, spec.physics, spec.arm_urdf or model.urdf(folder))
+        # An edited mesh of a user's arm would be drawn as it was before.
+        with nullcontext() if spec.arm_urdf is None else without_file_cache(client):
+            self.arm = Arm(client, model, spec.physics, spec.arm_urdf or model.urdf(folder))
         resting = [VisualShapes(client, body) for body in (*self.tiles.values(), *self.quads.values())]
         cube, arm = (VisualShapes(client, body) for body in (self.cube, self.arm.body))
         self._film = FilmCamera(client, self.backdrop, resting, (cube, arm))

@@ -102,6 +102,20 @@ class BulletClient:
             self._server = -1
 
 
+@contextmanager
+def without_file_cache(client: BulletClient) -> Iterator[None]:
+    """Let PyBullet read files anew in the body, also those that it read before.
+
+    It keeps meshes by name for the whole process, and this setting too: a server in which it stayed off would make
+    every later scene of the process read all meshes of its arm again, which takes five times as long.
+    """
+    client.setPhysicsEngineParameter(enableFileCaching=0)
+    try:
+        yield
+    finally:
+        client.setPhysicsEngineParameter(enableFileCaching=1)
+
+
 # -- camera ---------------------------------------------------------------------------------------------------
 
 

@@ -15,8 +15,8 @@ from probe_kit.env import arm as arm_module
 from probe_kit.env.arm import ARMS, DeltaController, check_action, write_urdf
 from probe_kit.env.rotations import Pose, SerialChain, from_euler_xyz, from_rpy, to_rpy, to_vector, yaw_quaternion
 from probe_kit.env.scene import Scene
-from probe_kit.env.simulation import BulletClient
-from probe_kit.env.spec import SceneSpec
+from probe_kit.env.simulation import BulletClient, Camera
+from probe_kit.env.spec import CameraSpec, LightSpec, SceneSpec
 from probe_kit.errors import ActionError, SceneError
 
 
@@ -310,6 +310,23 @@ def test_an_edited_mesh_is_drawn_in_the_same_process(copied_arm: Path) -> None:
     )
     copied_arm = fresh  # a name that PyBullet never read in this process
     np.testing.assert_array_equal(picture(), after)
+
+
+def test_a_scene_with_a_users_arm_leaves_the_file_cache_on_for_later_scenes(copied_arm: Path) -> None:
+    """PyBullet keeps the setting for the whole process, although a server sets it."""
+
+    def drawn_bodies() -> NDArray[np.int32]:
+        client, beside_the_hand = BulletClient(), CameraSpec(eye=(0.7, 0.0, 0.9), forward=(-1.0, 0.0, 0.0))
+        client.loadURDF(str(copied_arm), useFixedBase=True)
+        bodies = Camera(beside_the_hand).render(client, LightSpec(), 1.0).bodies
+        client.close()
+        return bodies
+
+    Scene(SceneSpec(arm_urdf=copied_arm)).close()
+    before = drawn_bodies()
+    assert (before >= 0).any()
+    enlarge_hand(copied_arm)
+    np.testing.assert_array_equal(drawn_bodies(), before, "the meshes were read again")
 
 
 @pytest.mark.parametrize("model", ARMS.values(), ids=ARMS)
