@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+from probe_kit._system.imports import one_scan_of_packages
 from probe_kit._system.machine import same_scheduling
 from tests.support.buckets import bad_server, bucket, bucket_elsewhere, deaf_bucket
 from tests.support.made_once import made_once, shared_folder
@@ -175,6 +176,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def pytest_runtest_protocol() -> Generator[None, object, object]:
     """No test leaves this process a real-time one, as the encoder of AV1 does for root: all others would wait."""
     with same_scheduling():
+        return (yield)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Tests import transformers and diffusers as they are collected: both look through all installed packages."""
+    with one_scan_of_packages():
         return (yield)
 
 

@@ -149,6 +149,9 @@ class RunWriter:
         label: The name in tables of a run that begins here, by default the model's name. A run that is there keeps
             its own, see `label_run`.
 
+    Attributes:
+        is_certified: Whether this process has recorded what it loaded and checked, see `write_certificate`.
+
     Raises:
         SettingsMismatchError: If the location holds a run with other settings, episodes that `plan` lacks while
             the run lacks others, or anything else.
@@ -161,7 +164,7 @@ class RunWriter:
     ) -> None:  # fmt: skip
         self.location, self.plan = location, plan
         self.provenance = provenance or provenance_here()
-        self._begun = self._certified = False
+        self._begun = self.is_certified = False
         self._ids: set[str] | None = None
         # As they will be read again: a tuple would differ from the stored list, and refuse to continue.
         self.settings = json.loads(canonical_json(settings))
@@ -431,9 +434,9 @@ class RunWriter:
 
         With `again` it is a further record, of what a process knows at its end alone.
         """
-        if again or not self._certified:
+        if again or not self.is_certified:
             write_certificate(self.root, certificate, self.provenance)
-            self._certified = True
+            self.is_certified = True
 
     def give_up(self, number: int, reason: str, traceback: str = "") -> None:
         """Record why episode `number` is not played, with the traceback of its error."""

@@ -8,6 +8,7 @@ import pytest
 from probe_kit._system.imports import one_scan_of_packages, packages_by_module
 
 
+@pytest.mark.slow
 def test_modules_belong_to_the_packages_that_the_standard_library_names() -> None:
     expected = {module: set(packages) for module, packages in metadata.packages_distributions().items()}
     assert {module: set(packages) for module, packages in packages_by_module().items()} == expected

@@ -61,7 +61,7 @@ def sound(little_runs: Path) -> Path:
         pytest.param(edited("probes", "seed", 17), marks=pytest.mark.slow),
         pytest.param(edited("probes", "run_settings", "0" * 64), marks=pytest.mark.slow),
         pytest.param(edited("interventions", "format", 99), marks=pytest.mark.slow),
-        edited("interventions", "kind", "no-such-kind"),
+        pytest.param(edited("interventions", "kind", "no-such-kind"), marks=pytest.mark.slow),
         pytest.param(edited("interventions", "seed", 17), marks=pytest.mark.slow),
     ],
     ids=[

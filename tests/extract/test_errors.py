@@ -36,7 +36,7 @@ from probe_kit.suite import Suite
 SHORT = SceneSpec(max_steps=2)
 
 
-@pytest.mark.parametrize("stage_kind", [LocalPlayer, ProcessPlayer])
+@pytest.mark.parametrize("stage_kind", [pytest.param(LocalPlayer, marks=pytest.mark.slow), ProcessPlayer])
 def test_a_stage_raises_the_same_error_wherever_it_stands(
     stage_kind: type[LocalPlayer | ProcessPlayer], suite: Suite, tmp_path: Path
 ) -> None:

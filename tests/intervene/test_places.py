@@ -216,7 +216,10 @@ def test_the_end_of_an_unread_stream_is_unread_and_nothing_before_it(
     [
         Interchange(roles=("image",)),
         Steering(sites=("backbone.*",), role="language", categories=("color",)),
-        JointPlaces(sites=("backbone.03",), roles=("image", "language"), categories=("color",)),
+        pytest.param(
+            JointPlaces(sites=("backbone.03",), roles=("image", "language"), categories=("color",)),
+            marks=pytest.mark.slow,
+        ),
     ],
     ids=lambda intervention: str(intervention.kind),
 )

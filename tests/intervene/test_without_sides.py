@@ -67,6 +67,7 @@ def observed(shown_run: Run, table: Path, twin: "Policy") -> Iterator[FrameSessi
         yield opened
 
 
+@pytest.mark.slow
 def test_recordings_of_scene_frames_give_the_numbers_of_the_scene_bit_for_bit(
     session: SceneSession, scene_pairs: list[Pair], observed: FrameSession
 ) -> None:

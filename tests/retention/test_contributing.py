@@ -98,6 +98,7 @@ from probe_kit._tables.printing import Format
     assert "| %%Color%% |" in printed
 
 
+@pytest.mark.slow
 def test_a_rule_is_a_class_and_its_name_from_the_option_to_the_verdict(use: Callable[[str, str], str]) -> None:
     code = """
 import numpy as np

@@ -315,7 +315,17 @@ def test_records_that_follow_from_nothing_are_damage_by_name(copy: Path) -> None
             open_run(run)
 
 
-@pytest.mark.parametrize("damage", ["a bit", "cut", "an object", "the metadata", "the seal", "the seal's bit"])
+@pytest.mark.parametrize(
+    "damage",
+    [
+        "a bit",
+        "the seal",
+        *(
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in ("cut", "an object", "the metadata", "the seal's bit")
+        ),
+    ],
+)
 def test_damaged_columns_are_built_again_by_the_command_that_the_error_names(copy: Path, damage: str) -> None:
     before = hashes(copy)
     chunk = next(path for path in copy.glob("columns.zarr/*/backbone/pooled/c/**/*") if path.is_file())

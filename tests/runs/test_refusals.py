@@ -92,6 +92,7 @@ def attacked(server: BadServer, call: str, answer: str, times: int | None) -> tu
         assert server.day.seen[answer]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick")
 def test_one_bad_answer_to_any_call_changes_nothing(bad_server: BadServer) -> None:
     for call, answer in itertools.product(CALLS, ANSWERS):

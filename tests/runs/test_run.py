@@ -114,7 +114,7 @@ def every_array(run: Run) -> Iterator[tuple[str, Path]]:
             yield path.parent.relative_to(run.path / "data.zarr").as_posix(), path.parent
 
 
-@pytest.mark.parametrize("kind", ["recorded_run", "shown_run"])
+@pytest.mark.parametrize("kind", [pytest.param("recorded_run", marks=pytest.mark.slow), "shown_run"])
 def test_other_tools_read_all_of_a_finished_run_at_once(kind: str, request: pytest.FixtureRequest) -> None:
     run: Run = request.getfixturevalue(kind)
     tree = xr.open_datatree(run.path / "data.zarr", engine="zarr", consolidated=False, chunks=None)

@@ -508,6 +508,7 @@ def test_intervals_of_accuracies_cover_their_share(truth: float, sizes: NDArray[
     assert np.mean(covered) > 0.92
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("groups", "rate", "alike"), [(24, 0.97, 0.5), (40, 0.9, 1.0), (150, 0.03, 1.0)])
 def test_success_rates_of_very_unequal_groups_are_covered(groups: int, rate: float, alike: float) -> None:
     generator = np.random.default_rng(0)

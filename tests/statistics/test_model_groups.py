@@ -128,6 +128,7 @@ def test_empty_groups_and_missing_values_are_refused() -> None:
             compare([0.1, float("nan")], [0.2])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("few", "many"), [(2, 8), (3, 6), (4, 8), (3, 9), (5, 5), (6, 6)])
 def test_p_that_is_shown_holds_its_level_whatever_the_spreads(few: int, many: int) -> None:
     generator = np.random.default_rng(0)

@@ -252,6 +252,7 @@ def test_groups_that_train_each_others_probes_widen_the_spread_of_an_accuracy(ab
     assert np.sqrt(1 + excess) <= SHARED_DECISIONS + 1e-12
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("above", [0.0, 0.05, 0.2])
 @pytest.mark.parametrize("sites", [1, 4])
 def test_sites_of_shared_probes_rarely_exceed_a_control_that_is_as_good(above: float, sites: int) -> None:

@@ -39,7 +39,11 @@ MECHANISMS = {
     "gradients_at_sites_are_central_differences",
 }
 """Checks of code that all families share; edits stay in the default suite, because taps are of each family."""
-LOADING = {"every_file_that_is_read_reaches_the_card", "random_twins_differ_by_their_seed_and_repeat_by_it"}
+LOADING = {
+    "every_file_that_is_read_reaches_the_card",
+    "random_twins_differ_by_their_seed_and_repeat_by_it",
+    "weights_that_are_not_exactly_the_models_are_refused",
+}
 """Checks of code that families with the same loader share."""
 
 

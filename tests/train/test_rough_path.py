@@ -95,6 +95,7 @@ def test_a_finer_optimum_has_a_narrower_bound(monkeypatch: pytest.MonkeyPatch) -
 # -- the choice of C -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @given(
     groups=st.integers(6, 14),
     width=st.integers(1, 50),

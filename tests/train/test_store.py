@@ -144,7 +144,8 @@ def test_saving_keeps_what_is_there(planted_run: PlantedRun) -> None:
 
 
 @pytest.mark.parametrize(
-    "stored_format", [pytest.param(1, marks=pytest.mark.slow), FORMAT - 1, FORMAT + 1, "labels-3", None]
+    "stored_format",
+    [*(pytest.param(other, marks=pytest.mark.slow) for other in (1, FORMAT - 1, None)), FORMAT + 1, "labels-3"],
 )
 def test_results_of_another_format_are_refused_by_its_name(
     planted_run: PlantedRun, stored_format: int | str | None
@@ -166,7 +167,16 @@ FORGED: dict[str, Callable[[NDArray[Any]], NDArray[Any]]] = {
 
 
 @pytest.mark.parametrize("forged", FORGED)
-@pytest.mark.parametrize("member", ["decisions", "labels", "groups", "null", "sites", "direction"])
+@pytest.mark.parametrize(
+    "member",
+    [
+        "decisions",
+        *(
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in ("labels", "groups", "null", "sites", "direction")
+        ),
+    ],
+)
 def test_arrays_of_probes_that_contradict_each_other_are_damage(
     planted_run: PlantedRun, member: str, forged: str
 ) -> None:

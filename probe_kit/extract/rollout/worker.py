@@ -366,8 +366,9 @@ def write_episode(
         frames=len(ending.small_frames) or None if machine.frames == "all" else None,
     )  # fmt: skip
     with writer.location.explained_errors():
-        # Not before: the certificate holds fire counts and proofs, which the first inference gives.
-        writer.write_certificate({**certificate_of(controller, fitted), **certified})
+        if not writer.is_certified:
+            # Not before: the certificate holds fire counts and proofs, which the first inference gives.
+            writer.write_certificate({**certificate_of(controller, fitted), **certified})
         writer.write(record)
     return Done(playing.planned.index, outcome)
 

@@ -220,7 +220,7 @@ def test_options_are_arguments_of_the_class() -> None:
         open_environment(EnvironmentSettings(HOME + "ReachEnv", {"colour": "red"}))  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize(("name", "code"), [("ReachEnv", 0), ("Forgetful", 1)])
+@pytest.mark.parametrize(("name", "code"), [pytest.param("ReachEnv", 0, marks=pytest.mark.slow), ("Forgetful", 1)])
 def test_the_command_prints_a_line_per_promise_and_exits_with_the_result(
     name: str, code: int, capsys: pytest.CaptureFixture[str]
 ) -> None:

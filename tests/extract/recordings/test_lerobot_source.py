@@ -364,6 +364,7 @@ def extract(*words: str, code: int = 0) -> str:
     return ended.output
 
 
+@pytest.mark.slow
 def test_a_run_is_repeated_from_any_folder_and_its_files_are_found_again(
     run_and_files: tuple[str, Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

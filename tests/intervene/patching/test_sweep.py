@@ -67,7 +67,10 @@ def test_a_heatmap_has_layers_by_roles(copied: pt.Sweep) -> None:
 
 
 @pytest.mark.parametrize("quantity", ["heads", "a_quantity_with_a_name_that_is_as_long_as_any"])
-@pytest.mark.parametrize(("places", "roles"), [(1, 1), (4, 1), (32, 1), (6, 3)])
+@pytest.mark.parametrize(
+    ("places", "roles"),
+    [(1, 1), *(pytest.param(*size, marks=pytest.mark.slow) for size in ((4, 1), (32, 1), (6, 3)))],
+)
 def test_a_heatmap_leaves_its_cells_room_beside_long_names(
     copied: pt.Sweep, places: int, roles: int, quantity: str
 ) -> None:

@@ -201,6 +201,7 @@ ORDERS = [list(POOL), list(POOL)[::-1], random.Random(0).sample(list(POOL), len(
 """Of any two, each comes last in one of them."""
 
 
+@pytest.mark.slow
 def test_the_selected_results_do_not_depend_on_the_order_in_which_they_were_stored(run: ArrayRun) -> None:
     made_in(run, ORDERS[0])
     first = read(run)
