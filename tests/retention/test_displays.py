@@ -33,7 +33,7 @@ from probe_kit.retention.displays import (
     role_curves,
     save_figures,
 )
-from probe_kit.retention.displays.display import FILLED, OPEN, ProvenanceLine, caption
+from probe_kit.retention.displays.display import FILLED, INTERVAL, OPEN, ProvenanceLine, caption
 from probe_kit.retention.displays.knowledge_action import place_labels
 from probe_kit.train import ArrayRun, load_results
 
@@ -226,7 +226,7 @@ def test_the_gap_has_a_point_per_category_and_marks_those_without_signal(probed_
     axes = display.plot().ax_
     assert {"Color", "Shape"} <= {text.get_text() for text in axes.texts}
     words = [text.get_text() for text in axes.figure.legends[0].get_texts()]
-    assert words == ["pi0", FILLED, OPEN]
+    assert words == ["pi0", INTERVAL, FILLED, OPEN]
     assert KnowledgeActionDisplay.from_table(table, "expert").points[0].accuracy == table.rows[0].action.score
 
 
@@ -315,8 +315,7 @@ def test_the_gallery_saves_every_figure_twice_and_keeps_none_open(probed_run: Pr
     run = probed_run({"color": SIGNAL, "shape": SIGNAL})
     saved = list(save_figures(collect_figures([run], retention_table([run])), tmp_path / "figures"))
     assert [path.stem for path in saved] == [
-        "success", "sides", "retention", "knowledge-action", "pi0-paired-layouts", "pi0-layer-curves",
-        "pi0-iteration-maps",
+        "knowledge-action", "pi0-paired-layouts", "pi0-layer-curves", "pi0-iteration-maps",
     ]  # fmt: skip
     assert all(path.stat().st_size > 5000 and path.with_suffix(".pdf").is_file() for path in saved)
     assert plt.get_fignums() == []

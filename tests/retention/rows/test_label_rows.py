@@ -205,7 +205,7 @@ def test_a_label_that_only_the_backbone_encodes_does_not_reach_the_action(traine
     stored = json.loads(table.to_json())
     assert stored[0]["backbone"]["site"] == "backbone.01.residual"
     assert "%" in stored[0]["finding"] or "not beyond" in stored[0]["finding"]
-    with pytest.raises(UnknownSiteError, match="probed: mean"):
+    with pytest.raises(UnknownSiteError, match=r"not probed in view 'last'; probed: .* in views mean"):
         retention_table([trained], ["last"], target="sim.tool_y")
 
 
@@ -347,7 +347,7 @@ def test_stored_probes_are_chosen_by_key_for_one_target_that_they_are_of(three: 
         retention_table([three], target=["kind", "kind"])
     code, _, error = retention_csv(run_path, "--target", "kind")
     assert code == 2
-    assert "is given twice" in error
+    assert "reads one run, and 2 are given" in error
 
 
 # -- recordings --------------------------------------------------------------------------------------------------
