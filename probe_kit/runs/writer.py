@@ -373,7 +373,8 @@ class RunWriter:
         if self.location.exists(commit_key(number)):
             return
         self._say_who_plays()  # before any commit names it
-        self.write_certificate({})  # unless the player wrote its own: a run without any certificate is damaged
+        if not self.is_certified:
+            self.write_certificate({})  # a run without any certificate is damaged
         commit = self._write_objects(episode)
         # Before the commit: an episode that counts has its seconds, or all were deleted.
         write_seconds(self.root, number, episode.seconds)
@@ -429,14 +430,13 @@ class RunWriter:
         stored = {name: value for name, value in optional.items() if value is not None}
         return Commit.model_validate({**parts, **stored})
 
-    def write_certificate(self, certificate: dict[str, Any], again: bool = False) -> None:
-        """Record what this process loaded and checked, once; the certificate of the first process stays whole.
+    def write_certificate(self, certificate: dict[str, Any]) -> None:
+        """Record what this process loaded and checked; the certificate of the first process stays whole.
 
-        With `again` it is a further record, of what a process knows at its end alone.
+        A second call makes a further record, of what a process knows at its end alone.
         """
-        if again or not self.is_certified:
-            write_certificate(self.root, certificate, self.provenance)
-            self.is_certified = True
+        write_certificate(self.root, certificate, self.provenance)
+        self.is_certified = True
 
     def give_up(self, number: int, reason: str, traceback: str = "") -> None:
         """Record why episode `number` is not played, with the traceback of its error."""

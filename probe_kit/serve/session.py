@@ -354,7 +354,7 @@ class Session:
             return None
         with self._held, self._location.explained_errors():
             if self.committed:
-                self._writer.write_certificate({**self._certificate(), **self.certified()}, again=True)
+                self._writer.write_certificate({**self._certificate(), **self.certified()})
             seal(self._location)
         return Run(self._location)
 
@@ -780,7 +780,7 @@ class Session:
             return
         assert self._writer is not None, "its episode is committed"
         with suppress(OSError, ProbeKitError):  # the episode is committed, and the record at the end raises
-            self._writer.write_certificate({**self._certificate(), **self.certified()}, again=True)
+            self._writer.write_certificate({**self._certificate(), **self.certified()})
             self._certified.add(name)
 
     def _add(self, row: Row, spans: Sequence[Mapping[str, Sequence[tuple[str, int, int]]]]) -> Row:
