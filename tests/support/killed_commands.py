@@ -17,7 +17,7 @@ from random import Random
 from uuid import uuid4
 
 from probe_kit.runs import verify_run
-from probe_kit.runs.layout import CERTIFICATES, COMMITS
+from probe_kit.runs.layout import CERTIFICATES, COMMITS, RUN_FILE
 from probe_kit.runs.layout import TIMES as TIMES_OF_EPISODES
 from probe_kit.runs.results import HEAD, PARTIAL
 from probe_kit.runs.results import TIMES as TIMES_OF_RESULTS
@@ -250,5 +250,9 @@ def committed(*runs: Path) -> set[str]:
 
 
 def run_problems(*runs: Path) -> tuple[str, ...]:
-    """What `run verify --deep` finds in those that are there."""
-    return tuple(problem for run in runs if run.is_dir() for problem in verify_run(run, deep=True).problems)
+    """What `run verify --deep` finds in those that were begun.
+
+    `run.json` is the last object of a beginning: a folder that was killed before it has no episode either.
+    """
+    begun = [run for run in runs if (run / RUN_FILE).exists() or committed(run)]
+    return tuple(problem for run in begun for problem in verify_run(run, deep=True).problems)
