@@ -276,11 +276,13 @@ def _open_stored(name: str, typed: Mapping[str, Any], request: _Request) -> "Run
     """Return a stored run that can be diagnosed as requested; raises what is known without its weights."""
     from probe_kit.diagnose.diagnosis import check_base, check_network
     from probe_kit.diagnose.inputs import cameras_of
+    from probe_kit.hooks.registry import find_family
     from probe_kit.intervene.open_session import check_pairs, check_readable
     from probe_kit.runs import open_run
 
     run = open_run(name)
     check_network(run)
+    find_family(run.model)  # a third party's, whose package may not be installed here
     request.check_cameras(cameras_of(run))
     request.check_episodes(run.episodes, str(run.location), run.source.is_scene)
     source = _replay_source(run, typed)

@@ -161,6 +161,12 @@ def test_a_scripted_model_is_refused_before_it_plays(tmp_path: Path) -> None:
     assert not (tmp_path / "run").exists()
 
 
+def test_a_stored_run_of_a_family_that_is_not_installed_is_refused_by_its_name(little_runs: Path) -> None:
+    answer = run_command(little_runs / "run")
+    assert answer.exit_code == 2, answer.output
+    assert "unknown model 'little'" in answer.output
+
+
 def test_a_camera_that_a_run_has_not_is_refused_before_its_model_is_loaded(folder: Path) -> None:
     answer = run_command(folder / "run", "--require", "picture.wrist", "--base", "no/such-model")
     assert (answer.exit_code, "there are instruction, picture, state" in answer.output) == (2, True)
