@@ -45,7 +45,11 @@ def lists(path: Path) -> None:
     pq.write_table(pa.table({"a": nested}), path, compression="zstd")
 
 
-@pytest.mark.parametrize("make", [one_long_text, one_number, zeros, lists], ids=lambda make: make.__name__)
+@pytest.mark.parametrize(
+    "make",
+    [one_long_text, lists, *(pytest.param(make, marks=pytest.mark.slow) for make in (one_number, zeros))],
+    ids=lambda make: make.__name__,
+)
 def test_a_small_file_that_stands_for_much_is_refused_before_its_cells_are_in_memory(
     make: Callable[[Path], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -213,7 +213,9 @@ def tables_in(text: str) -> int:
 @pytest.mark.parametrize(
     "width", [WIDTHS[0], *(pytest.param(width, marks=pytest.mark.slow) for width in WIDTHS[1:])]
 )
-@pytest.mark.parametrize("name", PRINTED)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name == "demo")) for name in PRINTED]
+)
 def test_a_command_prints_one_table_and_ends_on_a_sentence(
     name: str, width: int, run: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -27,7 +27,9 @@ def makers(name: str) -> set[str]:
     }
 
 
-@pytest.mark.parametrize("name", PLACES)
+@pytest.mark.parametrize(
+    "name", [name if name == "Decided" else pytest.param(name, marks=pytest.mark.slow) for name in PLACES]
+)
 def test_a_state_is_made_in_one_place(name: str) -> None:
     assert makers(name) == PLACES[name]
 

@@ -478,7 +478,9 @@ def test_a_folder_without_an_adapter_has_none(folders: tuple[Path, Path]) -> Non
     assert adapter_in(folders[0]) is None
 
 
-@pytest.mark.parametrize("family", families())
+@pytest.mark.parametrize(
+    "family", [pytest.param(name, marks=[pytest.mark.slow] * (name != "pi0")) for name in families()]
+)
 def test_an_adapter_alone_is_its_base_plus_what_it_learned_in_every_family(family: str, tmp_path: Path) -> None:
     """As with the base's small files beside it: the same weights, streams and settings."""
     write, options = WRITERS[family]

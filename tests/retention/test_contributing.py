@@ -73,6 +73,7 @@ def use(tmp_path: Path, outcome_table: Callable[..., pd.DataFrame]) -> Callable[
     return run
 
 
+@pytest.mark.slow
 def test_a_column_is_two_files_and_stands_in_every_format(use: Callable[[str, str], str]) -> None:
     diff = block("To add a column to the tables", "diff")
     assert diff.count("\n+++ ") == 2

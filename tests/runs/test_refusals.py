@@ -110,8 +110,11 @@ def test_one_bad_answer_to_an_upload_in_parts_changes_nothing(bad_server: BadSer
 
 
 @pytest.mark.usefixtures("quick")
-def test_a_call_that_is_refused_for_good_is_an_error_that_names_the_key(bad_server: BadServer) -> None:
-    for call, answer in itertools.product(("put", "create", "get", "head", "delete"), ("conflict", "failed")):
+@pytest.mark.parametrize("answer", ["conflict", pytest.param("failed", marks=pytest.mark.slow)])
+def test_a_call_that_is_refused_for_good_is_an_error_that_names_the_key(
+    bad_server: BadServer, answer: str
+) -> None:
+    for call in ("put", "create", "get", "head", "delete"):
         with pytest.raises(StoreError) as caught:
             attacked(bad_server, call, answer, None)
         key = {"put": "object", "create": "created"}.get(call, "kept")

@@ -259,13 +259,8 @@ def reference_run(suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Pat
     return run
 
 
-@pytest.mark.parametrize(
-    "point",
-    [
-        "before-commit",
-        *(pytest.param(point, marks=pytest.mark.slow) for point in ("after-commit", "before-put", "after-put")),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("point", ["before-commit", "after-commit", "before-put", "after-put"])
 def test_a_kill_at_any_point_of_an_episode_costs_at_most_that_episode(
     point: str, suite: Suite, reference_run: Path, tmp_path: Path
 ) -> None:

@@ -40,6 +40,8 @@ from probe_kit.suite.generators.traffic import ROAD_SIGN_ICONS, ROAD_SIGNS
 from probe_kit.suite.items import MOST_WORDS, instruction_for, side_words
 
 THUMBNAILS = Path(__file__).with_name("thumbnails.png")
+CATEGORY_PARAMETERS = [pytest.param(name, marks=[pytest.mark.slow] * (name == "symmetry")) for name in GENERATORS]
+"""Tiles of symmetry take a second to draw."""
 
 
 def couples(category: str, count: int = 60) -> list[Couple]:
@@ -86,13 +88,13 @@ def test_a_tile_is_256_pixels_square_and_nothing_touches_its_border(category: st
         assert (border == tile.background).all()
 
 
-@pytest.mark.parametrize("category", list(GENERATORS))
+@pytest.mark.parametrize("category", CATEGORY_PARAMETERS)
 def test_ink_stands_out_from_the_background(category: str) -> None:
     for tile in tiles(category):
         assert abs(lightness(tile.ink) - lightness(tile.background)) >= INK_CONTRAST
 
 
-@pytest.mark.parametrize("category", list(GENERATORS))
+@pytest.mark.parametrize("category", CATEGORY_PARAMETERS)
 def test_nuisances_are_drawn_for_each_tile_on_its_own(category: str) -> None:
     both = [(couple.left_tile, couple.right_tile) for couple in couples(category)]
     backgrounds = np.array([[lightness(tile.background) for tile in pair] for pair in both])
@@ -464,17 +466,20 @@ def test_twins_show_the_same_pictures_in_the_same_places_and_ask_both_ways(embed
         assert first.group_id == second.group_id
 
 
+@pytest.mark.slow
 def test_every_concept_is_target_as_often_as_distractor(embedded: Suite) -> None:
     targets = Counter((item.category, item.target_concept) for item in embedded.items)
     assert targets == Counter((item.category, item.distractor_concept) for item in embedded.items)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("category", list(GENERATORS))
 def test_each_original_layout_has_as_many_answers_left_as_right(embedded: Suite, category: str) -> None:
     sides = Counter(item.correct_side for item in embedded.items if item.category == category)
     assert sides["left"] == sides["right"] == 10
 
 
+@pytest.mark.slow
 def test_no_phrase_leans_to_a_side_in_the_original_layout(embedded: Suite) -> None:
     lean: Counter[str] = Counter()
     for item in embedded.items:
@@ -482,17 +487,20 @@ def test_no_phrase_leans_to_a_side_in_the_original_layout(embedded: Suite) -> No
     assert max(map(abs, lean.values())) <= 2
 
 
+@pytest.mark.slow
 def test_which_twin_comes_first_says_nothing_about_its_side(embedded: Suite) -> None:
     left_first = np.mean([first.correct_side == "left" for first, _ in twins_of(embedded)])
     assert abs(left_first - 0.5) < 3 * np.sqrt(0.25 / len(twins_of(embedded)))
 
 
+@pytest.mark.slow
 def test_instructions_name_no_side_and_follow_one_form(embedded: Suite) -> None:
     for item in embedded.items:
         assert item.instruction == f"Put the cube on the {item.object_phrase}"
         assert not {"left", "right", "first", "second", "centre", "middle"} & set(item.instruction.lower().split())
 
 
+@pytest.mark.slow
 def test_an_item_says_where_its_pictures_come_from_and_how_they_were_drawn(embedded: Suite) -> None:
     item = embedded.select(["color"], 2).items[0]
     assert item.source["benchmark"] == "a2a-embedded"
@@ -501,6 +509,7 @@ def test_an_item_says_where_its_pictures_come_from_and_how_they_were_drawn(embed
     assert set(item.gen["left"]) == set(item.gen["right"])
 
 
+@pytest.mark.slow
 def test_every_field_has_one_type_so_that_tables_can_be_inferred(embedded: Suite) -> None:
     for field in fields(Item):
         assert len({type(getattr(item, field.name)) for item in embedded.items}) == 1

@@ -206,6 +206,7 @@ def test_the_probes_of_an_untrained_network_are_read_only_where_no_others_were_a
     assert load_results(other).settings.permutations == 2
 
 
+@pytest.mark.slow
 def test_controls_name_the_untrained_network_even_where_two_networks_are_equally_accurate(
     planted_run: PlantedRun,
 ) -> None:
