@@ -56,11 +56,6 @@ REFERENCES = {
     "vlm/prismatic": ("prismatic", 14),
 }
 """By folder, the family and how many quantities agree."""
-FOLDERS = [
-    folder if folder in ("pi0", "vlm/paligemma") else pytest.param(folder, marks=pytest.mark.slow)
-    for folder in REFERENCES
-]
-"""The contract of adapters, which the default suite holds every family to, computes what was recorded too."""
 KEYS = [
     pytest.param(family, file, marks=() if "vlm" not in folder or "hub" in file.name else pytest.mark.slow)
     for folder, (family, _) in REFERENCES.items()
@@ -79,7 +74,7 @@ def verified(folder: str) -> Verification:
     return verify_reference(REFERENCES[folder][0], GOLDEN / folder)
 
 
-@pytest.mark.parametrize("folder", FOLDERS)
+@pytest.mark.parametrize("folder", REFERENCES)
 def test_every_recorded_quantity_is_reproduced(folder: str) -> None:
     verification, count = verified(folder), REFERENCES[folder][1]
     assert verification.passed
