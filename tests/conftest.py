@@ -91,7 +91,8 @@ def _modules_of_a_test_end_with_it(request: pytest.FixtureRequest) -> Iterator[N
         return
     last = next(reversed(sys.modules))  # what is imported later stands behind it; a set of all takes a millisecond
     yield
-    if (folder := request.node.funcargs.get("tmp_path")) is None:  # a fixture skipped the test before it was made
+    # There is none where a fixture skipped the test before it was made, and no arguments after Ctrl-C.
+    if (folder := (request.node.funcargs or {}).get("tmp_path")) is None:
         return
     for name in list(takewhile(lambda name: name != last, reversed(sys.modules))):
         if str(getattr(sys.modules[name], "__file__", "")).startswith(str(folder)):

@@ -241,7 +241,7 @@ class Folder:
     def _clear_drafts(self) -> None:
         for pattern in _DRAFTS:
             for draft in self._path.glob(pattern):
-                draft.unlink()
+                draft.unlink(missing_ok=True)  # a process that begins the run has no lock yet, and removes its own
 
     @contextmanager
     def take_turns(self, folder: str) -> Iterator[None]:

@@ -273,6 +273,25 @@ def test_a_kill_at_any_point_of_an_episode_costs_at_most_that_episode(
     assert hashes(run) == hashes(reference_run)
 
 
+def test_a_draft_that_its_writer_removes_while_leftovers_are_cleared_is_no_error(
+    little_runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A process that begins a run writes `run.json` before it can lock it."""
+    run = Path(shutil.copytree(little_runs / "run", tmp_path / "run"))
+    (run / "0123456789abcdef.tmp").write_bytes(b"run.json of a process that begins")
+    listed_by_glob = Path.glob
+
+    def removed_after_listing(folder: Path, pattern: str) -> Iterator[Path]:
+        for path in list(listed_by_glob(folder, pattern)):
+            path.unlink()
+            yield path
+
+    monkeypatch.setattr(Path, "glob", removed_after_listing)
+    with locate(run).locked(lambda: None):
+        pass
+    assert not (run / "0123456789abcdef.tmp").exists()
+
+
 @pytest.mark.slow
 def test_leftovers_of_a_killed_process_are_cleared_by_the_next_owner(
     suite: Suite, reference_run: Path, tmp_path: Path
