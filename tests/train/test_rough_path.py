@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from probe_kit.statistics.folds import Fold
 from probe_kit.train.crossval import logistic_folds
+from probe_kit.train.crossval.distinct_labels import DistinctProblems
 from probe_kit.train.crossval.logistic_folds import can_be_rough, choose_roughly, choose_strengths, cross_validate
 from probe_kit.train.crossval.nested_folds import STRENGTHS, NestedFold, can_be_least, nested_folds
 from probe_kit.train.samples import Samples
@@ -144,7 +145,8 @@ def test_columns_that_rough_optima_leave_open_are_solved_exactly(monkeypatch: py
 def test_a_large_c_is_left_out_where_some_inner_folds_show_that_it_loses() -> None:
     samples, labels, folds = study(12, 40, columns=50, seed=3)
     inner = [[logistic_folds._Training.of(samples, part) for part in fold.inner] for fold in folds]
-    loss, bound = logistic_folds._rough_losses(labels, inner)
+    problems = [[DistinctProblems.of(labels[part.train]) for part in fold.inner] for fold in folds]
+    loss, bound = logistic_folds._rough_losses(labels, inner, problems)
     is_left_out = np.isinf(loss)
     assert is_left_out[-1].mean() > 0.5
     assert not is_left_out[: logistic_folds.CHEAP].any()

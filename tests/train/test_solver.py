@@ -66,7 +66,7 @@ def beside_another_fold(coordinates: Projection, labels: np.ndarray, strengths: 
     """With samples filled up to the size of a larger fold."""
     larger = Projection.fit(np.random.default_rng(1).standard_normal((95, 120)))
     count, (samples, rank) = labels.shape[1], coordinates.train.shape
-    design = StackedDesign.of_folds([coordinates.train, larger.train], count)
+    design = StackedDesign.of_folds([coordinates.train, larger.train], [count, count])
     signs = np.zeros((95, 2 * count))
     signs[:samples, :count] = 2.0 * labels - 1.0
     signs[:, count:] = np.where(np.arange(95) % 2, 1.0, -1.0)[:, None]

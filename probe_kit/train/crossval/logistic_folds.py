@@ -8,7 +8,7 @@ optima do for that, as long as the bounds of their errors leave no doubt about t
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import batched
+from itertools import batched, chain
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from probe_kit._system.types import Matrix
 from probe_kit.errors import TooFewGroupsError
 from probe_kit.statistics.folds import INNER_FOLDS, OUTER_FOLDS, Fold
+from probe_kit.train.crossval.distinct_labels import DistinctProblems
 from probe_kit.train.crossval.joint_objective import JointProblems, JointSite, solve
 from probe_kit.train.crossval.nested_folds import (
     STRENGTHS,
@@ -38,7 +39,7 @@ from probe_kit.train.solver.design_matrix import (
     fold_samples,
     stack_samples,
 )
-from probe_kit.train.solver.logistic import LogisticSolver, check_single_class
+from probe_kit.train.solver.logistic import LogisticSolver
 from probe_kit.train.solver.rough_path import RoughOptima, decision_bounds
 
 # -- the probes of a site -----------------------------------------------------------------------------------------
@@ -131,8 +132,9 @@ def _choose_alone(
 
 def _path(samples: Samples, labels: NDArray[np.bool_], training: _Training, strengths: Matrix) -> Iterator[Array]:
     """Yield the optimal weights (R, K) of a fold's training samples, for each of ascending `strengths`."""
-    by_sample = samples.of(training.fold.train).repeat(labels[training.fold.train])
-    return LogisticSolver(training.design).path(by_sample, strengths)
+    problems = DistinctProblems.of(labels[training.fold.train])
+    by_sample = samples.of(training.fold.train).repeat(problems.labels)
+    return map(problems.by_column, LogisticSolver(training.design).path(by_sample, strengths))
 
 
 def _fit_fold(
@@ -178,8 +180,9 @@ def choose_together(samples: Samples, labels: NDArray[np.bool_], folds: Sequence
 def _choose_stacked(
     labels: NDArray[np.bool_], inner: Sequence[Sequence[_Training]], strengths: Matrix = STRENGTHS
 ) -> list[Choice]:
-    some = _at_once([training for trainings in inner for training in trainings], labels)
-    parts = [_Together.of(trainings, labels).losses(strengths) for trainings in some]
+    trainings = [training for of_fold in inner for training in of_fold]
+    problems = [DistinctProblems.of(labels[training.fold.train]) for training in trainings]
+    parts = [together.losses(strengths) for together in _Together.parts(trainings, labels, problems)]
     loss, by_episode = (np.concatenate(part, axis=1) for part in zip(*parts, strict=True))
     begins = _first_inner(inner)
     loss, by_episode = _sum_inner(loss, begins), _sum_inner(by_episode, begins)
@@ -204,42 +207,48 @@ def _fit_together(
     samples: Samples, labels: NDArray[np.bool_], folds: Sequence[NestedFold], choices: Sequence[Choice]
 ) -> list[FittedFold]:
     """Return the probes of every outer fold, each column of (E, K) labels on its own."""
-    fitted: list[FittedFold] = []
-    for some in _at_once(zip(folds, choices, strict=True), labels):
-        trainings, coordinates = zip(*(_Training.projected(samples, fold.outer) for fold, _ in some), strict=True)
-        of_folds = _Together.of(trainings, labels).decide([strengths for _, (strengths, _) in some])
-        for projection, (weights, decisions), (_, choice) in zip(coordinates, of_folds, some, strict=True):
-            fitted.append(FittedFold.of(projection, weights, decisions, *choice))
-    return fitted
-
-
-def _at_once[T](folds: Iterable[T], labels: NDArray[np.bool_]) -> Iterator[tuple[T, ...]]:
-    """Yield parts of `folds`, or of their data, whose problems fit into a processor's cache."""
-    return batched(folds, max(1, COLUMNS_AT_ONCE // labels.shape[1]))
+    trainings, coordinates = zip(*(_Training.projected(samples, fold.outer) for fold in folds), strict=True)
+    problems = [
+        DistinctProblems.of(labels[fold.outer.train], strengths)
+        for fold, (strengths, _) in zip(folds, choices, strict=True)
+    ]
+    decided = (together.decide() for together in _Together.parts(trainings, labels, problems))
+    of_folds = zip(coordinates, chain.from_iterable(decided), choices, strict=True)
+    return [
+        FittedFold.of(projection, weights, decisions, *choice)
+        for projection, (weights, decisions), choice in of_folds
+    ]
 
 
 @dataclass(frozen=True)
 class _Together:
-    """The training sets of F folds, and K label columns for each.
+    """The problems of F folds, solved together.
 
-    Column f · K + k of the solver is of fold f.
+    The solver's columns are the problems of the first fold, then those of the second one, and so on.
 
     Attributes:
         labels: (E, K) labels of all episodes.
         trainings: Training and test samples of every fold.
-        signs: (N, F · K) labels −1/+1, 0 where a fold has fewer than N samples.
+        problems: The problems of every fold.
+        signs: (N, P) labels −1/+1 of all problems, 0 where a fold has fewer than N samples.
     """
 
     labels: NDArray[np.bool_]
     trainings: Sequence[_Training]
+    problems: Sequence[DistinctProblems]
     solver: LogisticSolver
     signs: Array
 
     @classmethod
-    def of(cls, trainings: Sequence[_Training], labels: NDArray[np.bool_]) -> "_Together":
-        design = StackedDesign.of_folds([training.design for training in trainings], labels.shape[1])
-        columns = _stacked_signs(trainings, labels).transpose(1, 0, 2).reshape(design.shape[0], -1)
-        return cls(labels, trainings, LogisticSolver(design), to_device_of(design.samples, columns))
+    def parts(
+        cls, trainings: Sequence[_Training], labels: NDArray[np.bool_], problems: Sequence[DistinctProblems]
+    ) -> Iterator[Self]:
+        """Yield the folds in parts whose problems fit into a processor's cache."""
+        at_once = max(1, COLUMNS_AT_ONCE // max(map(len, problems)))
+        for some, their_problems in zip(batched(trainings, at_once), batched(problems, at_once), strict=True):
+            design = StackedDesign.of_folds([part.design for part in some], [len(part) for part in their_problems])
+            signs = np.hstack([_fill_up(part.signs, design.shape[0]) for part in their_problems])
+            yield cls(labels, some, their_problems, LogisticSolver(design), to_device_of(design.samples, signs))
 
     def losses(self, strengths: Matrix) -> tuple[Matrix, Matrix]:
         """Return the log-losses along ascending C: of all label columns, and of the first one by episode.
@@ -260,34 +269,25 @@ class _Together:
                 by_episode[step, number, test] = log_losses(decisions[:, 0], truth[:, 0])
         return loss, by_episode
 
-    def decide(self, strengths: Sequence[Matrix]) -> Iterator[tuple[Array, Matrix]]:
-        """Yield the weights (R, K) of every fold at its (K,) strengths, and the decisions (m, K)."""
-        of_columns = to_device_of(self.signs, np.concatenate(strengths))
-        (weights,) = self.solver.path_of_signs(self.signs, [of_columns])
+    def decide(self) -> Iterator[tuple[Array, Matrix]]:
+        """Yield the weights (R, K) of every fold at the C of its problems, and the decisions (m, K)."""
+        strengths = np.concatenate([of_fold.strengths for of_fold in self.problems])
+        (weights,) = self.solver.path_of_signs(self.signs, [to_device_of(self.signs, strengths)])
         for training, of_fold in zip(self.trainings, self._of_folds(weights), strict=True):
             yield of_fold, to_numpy(training.held_out @ of_fold)
 
     def _of_folds(self, weights: Array) -> Iterator[Array]:
         """Yield the weights (R, K) of every fold, without the padding."""
-        count = self.labels.shape[1]
-        for number, training in enumerate(self.trainings):
-            of_fold = weights[:, number * count : (number + 1) * count]
-            rank = training.design.shape[1]
-            yield array_namespace(of_fold).concatenate([of_fold[: rank - 1], of_fold[-1:]])
+        first = 0
+        for training, problems in zip(self.trainings, self.problems, strict=True):
+            of_fold, rank = weights[:, first : first + len(problems)], training.design.shape[1]
+            first += len(problems)
+            yield problems.by_column(array_namespace(of_fold).concatenate([of_fold[: rank - 1], of_fold[-1:]]))
 
 
-def _stacked_signs(trainings: Sequence[_Training], labels: NDArray[np.bool_]) -> Matrix:
-    """Return labels −1/+1 of the training episodes, (F, N, K), 0 where a fold has fewer than N.
-
-    Raises:
-        TooFewGroupsError: For a training set with a single class.
-    """
-    signs = np.zeros((len(trainings), max(part.fold.train.size for part in trainings), labels.shape[1]))
-    for number, part in enumerate(trainings):
-        of_fold = labels[part.fold.train]
-        check_single_class(of_fold)
-        signs[number, : len(of_fold)] = 2.0 * of_fold - 1.0
-    return signs
+def _fill_up(signs: Matrix, count: int) -> Matrix:
+    """Return signs (n, U) with so many rows, the further ones 0."""
+    return np.pad(signs, ((0, count - len(signs)), (0, 0)))
 
 
 # -- rough optima, where they settle the choice of C --------------------------------------------------------------
@@ -316,8 +316,10 @@ def choose_roughly(samples: Samples, labels: NDArray[np.bool_], folds: Sequence[
         TooFewGroupsError: For a training set with a single class.
     """
     inner = [[_Training.of(samples, fold) for fold in nested.inner] for nested in folds]
-    at_once = max(1, ROUGH_AT_ONCE // (labels.shape[1] * INNER_FOLDS))
-    parts = [_rough_losses(labels, some) for some in batched(inner, at_once)]
+    problems = [[DistinctProblems.of(labels[fold.train]) for fold in nested.inner] for nested in folds]
+    at_once = max(1, ROUGH_AT_ONCE // max(sum(map(len, of_fold)) for of_fold in problems))
+    some_at_once = zip(batched(inner, at_once), batched(problems, at_once), strict=True)
+    parts = [_rough_losses(labels, *some) for some in some_at_once]
     loss, bound = (np.concatenate(part, axis=1) for part in zip(*parts, strict=True))
     best, can_be_best = select_c(loss), can_be_least(loss - bound, loss + bound)
     # What one outer fold leaves open is solved for all: few columns more, in the same calls.
@@ -341,13 +343,16 @@ def choose_roughly(samples: Samples, labels: NDArray[np.bool_], folds: Sequence[
 
 @dataclass(frozen=True)
 class _InnerFolds:
-    """Inner folds of several outer folds, F together, with K label columns.
+    """Inner folds of several outer folds, F together, with K label columns that pose up to U problems in each.
 
     Attributes:
         samples: (F, N, R) training samples, filled up with zeros.
-        signs: (F, K, N) their labels −1/+1, filled up with zeros.
+        signs: (F, U, N) their labels −1/+1 in every problem, filled up with zeros; a fold of fewer problems
+            repeats its last one.
         held_out: (F, T, R) test samples, filled up with zeros.
-        truth: (F, K, T) their labels −1/+1, filled up with zeros.
+        truth: (F, K, T) their labels −1/+1, filled up with zeros, and with exchanged classes where the column's
+            problem has them so.
+        problem_of: (F, K) problem of every label column.
         outer: (F,) number of the outer fold of each.
         turn: (F,) number of each among those of its outer fold.
     """
@@ -356,47 +361,69 @@ class _InnerFolds:
     signs: Matrix
     held_out: Matrix
     truth: Matrix
+    problem_of: NDArray[np.intp]
     outer: NDArray[np.intp]
     turn: NDArray[np.intp]
 
     @classmethod
-    def of(cls, inner: Sequence[Sequence[_Training]], labels: NDArray[np.bool_]) -> Self:
-        """Return the folds of (E, K) labels.
-
-        Raises:
-            TooFewGroupsError: For a training set with a single class.
-        """
+    def of(
+        cls,
+        inner: Sequence[Sequence[_Training]],
+        problems: Sequence[Sequence[DistinctProblems]],
+        labels: NDArray[np.bool_],
+    ) -> Self:
+        """Return the folds of (E, K) labels with their problems."""
         trainings = [training for of_fold in inner for training in of_fold]
-        samples = StackedDesign.of_folds([training.design for training in trainings], labels.shape[1]).samples
+        of_folds = [of_fold for of_outer in problems for of_fold in of_outer]
+        counts = [len(part) for part in of_folds]
+        samples = StackedDesign.of_folds([part.design for part in trainings], counts).samples
+        repeated = np.arange(max(counts))
+        signs = np.stack(
+            [_fill_up(part.signs, samples.shape[1]).T[repeated.clip(max=len(part) - 1)] for part in of_folds]
+        )
         held_out = stack_samples([part.held_out for part in trainings])
         truth = np.zeros((len(trainings), labels.shape[1], held_out.shape[1]))
-        for signs, training in zip(truth, trainings, strict=True):
-            signs[:, : training.fold.test.size] = 2.0 * labels[training.fold.test].T - 1.0
+        for of_fold, training, part in zip(truth, trainings, of_folds, strict=True):
+            of_fold[:, : training.fold.test.size] = part.sign[:, None] * (2.0 * labels[training.fold.test].T - 1.0)
         numbers = [(outer, turn) for outer, of_fold in enumerate(inner) for turn in range(len(of_fold))]
-        return cls(
-            samples, _stacked_signs(trainings, labels).swapaxes(1, 2), held_out, truth, *np.array(numbers).T
-        )
+        problem_of = np.stack([part.problem_of for part in of_folds])
+        return cls(samples, signs, held_out, truth, problem_of, *np.array(numbers).T)
+
+    def are_needed(self, folds: NDArray[np.intp], columns: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Return which problems (G, U) of `folds` (G,) are those of a mask of label columns (G, K)."""
+        needed = np.zeros((folds.size, self.signs.shape[1]), bool)
+        fold, column = np.nonzero(columns)
+        needed[fold, self.problem_of[folds[fold], column]] = True
+        return needed
 
     def losses(
-        self, optima: RoughOptima, strength: float, folds: NDArray[np.intp], columns: NDArray[np.intp]
-    ) -> tuple[Matrix, Matrix]:
-        """Return the log-losses (G, L), summed over the test samples, and by how much they can differ.
+        self, optima: RoughOptima, strength: float, folds: NDArray[np.intp], problems: NDArray[np.intp]
+    ) -> tuple[tuple[NDArray[np.intp], NDArray[np.intp]], Matrix, Matrix]:
+        """Return log-losses of label columns, summed over the test samples.
 
         Args:
-            optima: Of `folds` (G,) and, of each, `columns` (G, L).
+            optima: Of `folds` (G,) and, of each, `problems` (G, L).
             strength: Their C.
             folds: Numbers of the folds.
-            columns: Numbers of the label columns.
+            problems: Numbers of the problems.
+
+        Returns:
+            Folds and columns of the losses, (M,) each: all columns whose problem is among `problems`. Their losses
+            (M,), and by how much these can differ.
         """
-        held_out, truth = self.held_out[folds], self.truth[folds[:, None], columns]
+        held_out = self.held_out[folds]
         decisions = optima.weights @ held_out.swapaxes(1, 2)
-        samples, signs = self.samples[folds], self.signs[folds[:, None], columns]
-        bounds = decision_bounds(samples, signs, optima.weights, strength, held_out)
-        is_test = abs(truth)
-        losses = np.logaddexp(0.0, -truth * decisions)
+        signs = self.signs[folds[:, None], problems]
+        bounds = decision_bounds(self.samples[folds], signs, optima.weights, strength, held_out)
         # Not by a product, in which an infinite bound of what fills up would be no number.
-        bounds[np.broadcast_to(is_test == 0, bounds.shape)] = 0.0
-        return (losses * is_test).sum(axis=2), bounds.sum(axis=2)
+        bounds[np.broadcast_to(self.truth[folds, :1] == 0, bounds.shape)] = 0.0
+        place_of = np.full((folds.size, self.signs.shape[1]), -1)
+        np.put_along_axis(place_of, problems, np.arange(problems.shape[1])[None], axis=1)
+        places = np.take_along_axis(place_of, self.problem_of[folds], axis=1)
+        fold, column = np.nonzero(places >= 0)
+        place, truth = places[fold, column], self.truth[folds[fold], column]
+        losses = np.logaddexp(0.0, -truth * decisions[fold, place]) * abs(truth)
+        return (folds[fold], column), losses.sum(axis=1), bounds.sum(axis=2)[fold, place]
 
 
 @dataclass(frozen=True)
@@ -443,7 +470,11 @@ CHEAP = 5
 they are tried in one inner fold after another, since few label columns can still prefer them after the first."""
 
 
-def _rough_losses(labels: NDArray[np.bool_], inner: Sequence[Sequence[_Training]]) -> tuple[Matrix, Matrix]:
+def _rough_losses(
+    labels: NDArray[np.bool_],
+    inner: Sequence[Sequence[_Training]],
+    problems: Sequence[Sequence[DistinctProblems]],
+) -> tuple[Matrix, Matrix]:
     """Return log-losses (C, F, K) of the inner test episodes, summed, of rough optima, and bounds of their errors.
 
     The loss is infinite where it cannot be the least: losses are not negative, so that those of some inner folds
@@ -452,26 +483,28 @@ def _rough_losses(labels: NDArray[np.bool_], inner: Sequence[Sequence[_Training]
     Args:
         labels: (E, K) labels.
         inner: Inner folds of F outer folds.
+        problems: The problems of every inner fold.
     """
-    folds = _InnerFolds.of(inner, labels)
+    folds = _InnerFolds.of(inner, problems, labels)
     sums = _RoughLosses.none(_first_inner(inner), folds.turn.size, labels.shape[1])
     start = RoughOptima.start(folds.samples, folds.signs)
     cheap, dear = np.split(np.arange(STRENGTHS.size), [CHEAP])
     by_turn = [np.flatnonzero(folds.turn == turn) for turn in range(folds.turn.max() + 1)]
     for some, steps in ((np.arange(folds.turn.size), cheap), *((turn, dear) for turn in by_turn)):
-        columns = np.tile(np.arange(labels.shape[1]), (some.size, 1))
-        optima = start if steps is cheap else start.select(some, columns)
+        left = np.tile(np.arange(folds.signs.shape[1]), (some.size, 1))
+        optima = start if steps is cheap else start.select(some, left)
         for step in steps:
-            is_needed: NDArray[np.bool_] = np.any(sums.can_win()[step:], axis=0)
-            is_needed = np.take_along_axis(is_needed[folds.outer[some]], columns, 1)
+            can_win: NDArray[np.bool_] = np.any(sums.can_win()[step:], axis=0)
+            is_needed = np.take_along_axis(folds.are_needed(some, can_win[folds.outer[some]]), left, 1)
             most = is_needed.sum(axis=1).max()
             if most == 0:
                 break
-            if most < columns.shape[1]:  # as many of every fold, first those that are needed
+            if most < left.shape[1]:  # as many of every fold, first those that are needed
                 order = np.argsort(~is_needed, axis=1, kind="stable")[:, :most]
-                columns, optima = np.take_along_axis(columns, order, 1), optima.select(np.arange(some.size), order)
+                left, optima = np.take_along_axis(left, order, 1), optima.select(np.arange(some.size), order)
             optima.advance(STRENGTHS[step])
-            sums.add((step, some[:, None], columns), *folds.losses(optima, STRENGTHS[step], some, columns))
+            where, loss, bound = folds.losses(optima, STRENGTHS[step], some, left)
+            sums.add((step, *where), loss, bound)
     return sums.totals()
 
 

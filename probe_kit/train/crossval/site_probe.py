@@ -21,6 +21,7 @@ from probe_kit._system.types import Matrix
 from probe_kit.errors import NonFiniteActivationError
 from probe_kit.statistics.folds import Fold
 from probe_kit.train.choices import Task
+from probe_kit.train.crossval.distinct_labels import distinct_columns
 from probe_kit.train.crossval.logistic_folds import cross_validate
 from probe_kit.train.crossval.nested_folds import FittedFold, InnerQuality, NestedFold
 from probe_kit.train.crossval.task_scores import balanced_scores, correctness, explained_scores
@@ -207,7 +208,9 @@ def probe_site(
     """
     check_non_finite(samples)
     columns = np.column_stack([labels, permuted_labels])
-    columns, column_of = (columns, np.arange(columns.shape[1])) if task is None else _distinct(columns)
+    # Labels that are constant in a group have few different permutations.
+    different, column_of = distinct_columns(columns)
+    columns = columns[:, different]
     predictions = _predict(samples, columns, task, folds)
     scores = _scores(predictions.values, columns, task, folds)
     inner: NDArray[np.floating]
@@ -304,14 +307,3 @@ def _above_permutations(inner: InnerQuality, columns: NDArray[np.intp], train: N
     if columns.size:
         above[train] -= inner.total[columns].mean() / train.size
     return above
-
-
-def _distinct(labels: Matrix) -> tuple[Matrix, NDArray[np.intp]]:
-    """Return the different columns of (E, K) labels, the first one first, and each column's place among them.
-
-    Labels that are constant in a group have few different permutations.
-    """
-    first: dict[bytes, int] = {}
-    column_of = [first.setdefault(column.tobytes(), len(first)) for column in labels.T.copy()]
-    different = [column_of.index(number) for number in range(len(first))]
-    return labels[:, different], np.array(column_of, np.intp)

@@ -202,11 +202,10 @@ class StackedDesign:
     small = True
 
     @classmethod
-    def of_folds(cls, folds: "Sequence[DenseDesign | StreamedDesign]", columns: int) -> "StackedDesign":
-        """Return the stack of dense designs, each with so many label columns of its own."""
+    def of_folds(cls, folds: "Sequence[DenseDesign | StreamedDesign]", columns: Sequence[int]) -> "StackedDesign":
+        """Return the stack of dense designs, each with so many label columns of its own as `columns` (F,) say."""
         filled = stack_samples([fold.samples for fold in folds if isinstance(fold, DenseDesign)])
-        numbers = array_namespace(filled).arange(len(folds) * columns, device=filled.device)
-        return cls(filled, numbers // columns)
+        return cls(filled, to_device_of(filled, np.repeat(np.arange(len(folds)), columns)))
 
     @property
     def shape(self) -> tuple[int, int]:
