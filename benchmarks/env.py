@@ -52,7 +52,7 @@ def naive_picture(scene: Scene) -> PictureArray:
     """The whole scene drawn in one go."""
     for body, color in ((scene.table, TABLE_COLOR), (scene.floor, FLOOR_COLOR)):
         scene.client.changeVisualShape(body, -1, rgbaColor=color)
-    picture = scene.frame().rgb
+    picture = scene.camera.render(scene.client, scene.spec.light, scene.spec.light_level).rgb
     for body in (scene.table, scene.floor):
         scene.client.changeVisualShape(body, -1, rgbaColor=INVISIBLE)
     return picture
@@ -92,7 +92,7 @@ def speed(episodes: int) -> None:
             "an expert episode failed, so these speeds mean nothing; run the tests of the environment"
         )
     frames = [seconds(lambda draw=draw: draw(env), time.process_time, 20) for draw in (
-        lambda env: naive_picture(env.scene), lambda env: env.scene.picture(env.scene.frame()))]  # fmt: skip
+        lambda env: naive_picture(env.scene), lambda env: env.scene.frame().picture)]  # fmt: skip
     naive = 2 / seconds(lambda: play_naively(2), time.process_time)
     ours = episodes / seconds(lambda: env.play(episodes), time.process_time)
     env.close()
@@ -154,7 +154,7 @@ def first_frame(spec: SceneSpec) -> Image.Image:
     scene.reset(pictures, (*spec.cube_xy, spec.cube_start_z), spec.cube_yaw)
     if spec.closing_steps:
         scene.close_hand(spec.closing_steps)
-    picture = scene.picture(scene.frame())
+    picture = scene.frame().picture
     scene.close()
     return Image.fromarray(picture).resize((CELL, CELL), Image.Resampling.LANCZOS)
 

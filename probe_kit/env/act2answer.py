@@ -15,7 +15,7 @@ from probe_kit._system.types import Matrix, PictureArray
 from probe_kit.env.arm import DeltaController, check_action
 from probe_kit.env.scene import SIDES, Scene
 from probe_kit.env.scoring import LED_TO, REST_SPEED, Ending, Outcome, Trajectory, distance, zone
-from probe_kit.env.simulation import RenderedFrame
+from probe_kit.env.simulation import LayeredFrame
 from probe_kit.env.spec import XY, SceneSpec
 from probe_kit.errors import EpisodeOverError, SceneError
 from probe_kit.suite.items import LAYOUTS, Episode, Item, Layout, Side, other_side
@@ -209,8 +209,7 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
         self._question = Question.built_in()
         self._scene: Scene | None = None
         self._trial: Trial | None = None
-        self._frame: RenderedFrame | None = None
-        self._picture: PictureArray | None = None
+        self._frame: LayeredFrame | None = None
         self._closed = False
 
     # -- gymnasium ---------------------------------------------------------------------------------------
@@ -240,11 +239,8 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
 
     def render(self) -> PictureArray:
         """Return the picture (H, W, 3) uint8 of the scene now, as rendered."""
-        scene, frame = self.scene, self._current_frame()
-        if self._picture is None:
-            self._picture = scene.picture(frame)
         # What a caller paints into it must not be what the next one sees.
-        return self._picture.copy()
+        return self._current_frame().picture.copy()
 
     def render_small(self, height: int) -> PictureArray:
         """Return a picture (height, w, 3) uint8 of the scene now, for films and not for models.
@@ -293,7 +289,7 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
                 some colours; None for the next one.
         """
         if number is not None:
-            self._frame, self._picture = self.scene.frame(number), None
+            self._frame = self.scene.frame(number)
         picture, size = self.render(), self.scene_spec.picture_size
         if size is not None:
             picture = np.array(Image.fromarray(picture).resize(size, Image.Resampling.LANCZOS))
@@ -306,13 +302,13 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
 
         It shows the other layout of the item in this very state; the episode is unchanged.
         """
-        before = self._current_frame(), self._picture
+        before = self._current_frame()
         try:
             with self.scene.exchanged():
                 self._frame = None
                 return self.observe(), self.render()
         finally:
-            self._frame, self._picture = before
+            self._frame = before
 
     def outcome(self) -> Outcome:
         """Return the record of the episode so far.
@@ -393,9 +389,10 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
         self._frame = None
         return Trial(scene, self._question)
 
-    def _current_frame(self) -> RenderedFrame:
+    def _current_frame(self) -> LayeredFrame:
+        scene = self.scene
         if self._frame is None:
-            self._frame, self._picture = self.scene.frame(), None
+            self._frame = scene.frame()
         return self._frame
 
     def _info(self) -> Info:

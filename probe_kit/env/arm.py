@@ -289,6 +289,11 @@ class Arm:
         """Return the measured joint angles (n,)."""
         return np.array([state[0] for state in self._client.getJointStates(self.body, self.model.joints)])
 
+    def posture(self) -> tuple[float, ...]:
+        """Return the positions of all joints, also of fingers and of joints that nothing drives."""
+        joints = range(self._client.getNumJoints(self.body))
+        return tuple(state[0] for state in self._client.getJointStates(self.body, joints))
+
     def tool_state(self) -> Matrix:
         """Return the measured x, y, z, roll, pitch, yaw (6,) of the tool.
 

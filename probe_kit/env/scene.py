@@ -4,6 +4,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 
@@ -17,14 +18,15 @@ from probe_kit.env.culling import ViewCulling
 from probe_kit.env.rotations import Pose, to_vector, yaw_quaternion
 from probe_kit.env.simulation import (
     INVISIBLE,
-    Backdrop,
     BulletClient,
     Camera,
-    FilmCamera,
+    LayerCamera,
+    LayeredFrame,
     RenderedFrame,
     TextureCache,
     VisualShapes,
     load_photo,
+    without_bodies,
     without_file_cache,
     wooden_table,
     write_quad,
@@ -59,6 +61,8 @@ _TILE_PIXELS: dict[tuple[CameraSpec, float, float, float, tuple[XY, ...]], dict[
 """Pixels of the tiles' pictures in these scenes."""
 _MOST_CACHED = 8
 """Most entries of each of the two caches."""
+SMALL_DRIFT = 2e-4
+"""Drift at which tiles still rest in small pictures: metres, or parts of a unit quaternion; under 0.1 pixels."""
 
 
 @dataclass(frozen=True)
@@ -88,6 +92,8 @@ class Scene:
         self.camera = Camera(spec.camera)
         self._folder = tempfile.TemporaryDirectory(prefix="probe-kit-scene-")
         self._closed: tuple[tuple[int, float, bytes, bytes], int] | None = None
+        self._home: tuple[float, ...] = ()
+        self._saved: int
         self._frames = 0
         try:
             self._build()
@@ -107,27 +113,29 @@ class Scene:
         self.client.restoreState(self._saved)
         # The saved cube floats far above the table: one step lets contacts of the last episode expire.
         self.client.stepSimulation()
-        self._shown = {side: self.textures.load(pictures[side]) for side in SIDES}
-        self._show()
+        self.show(pictures)
         self._frames = 0
         if self.spec.tile_mass > 0:
             for side in SIDES:
                 self._put(self.tiles[side], self._tile_start(side), self.spec.tile_yaw)
         self._put(self.cube, cube_position, cube_yaw)
         self.arm.set_joints(self.home_q, self.spec.home_opening)
+        self._home = self.arm.posture()
         self.arm.command_gripper(self.spec.home_opening)
+
+    def show(self, pictures: Mapping[Side, Image.Image]) -> None:
+        """Put these pictures on the tiles; nothing moves."""
+        self._show({side: self.textures.load(pictures[side]) for side in SIDES})
 
     @contextmanager
     def exchanged(self) -> Iterator[None]:
         """Exchange the two pictures; nothing else differs, because pictures have no weight."""
         before = self._shown
-        self._shown = {side: before[other_side(side)] for side in SIDES}
-        self._show()
+        self._show({side: before[other_side(side)] for side in SIDES})
         try:
             yield
         finally:
-            self._shown = before
-            self._show()
+            self._show(before)
 
     def advance(self, q_from: Matrix, q_to: Matrix, opening: float) -> bool:
         """Drive the arm from one commanded posture to the next in one action; False if the state broke."""
@@ -205,47 +213,60 @@ class Scene:
         """Whether the cube touches a tile."""
         return any(self.touches_tile(side) for side in SIDES)
 
-    def frame(self, number: int | None = None) -> RenderedFrame:
-        """Draw robot, cube and tiles as the camera sees them, without the table.
+    def frame(self, number: int | None = None) -> LayeredFrame:
+        """Draw what the camera sees.
 
         Frame n of an episode always has the same parity of drawings before it, whatever former episodes and small
-        pictures drew: see `ViewCulling`.
+        pictures drew: see `ViewCulling`. An arm at its home looks the same in every episode, and is drawn once.
 
         Args:
             number: The number that the frame has in an episode that is played again; None for the next one.
         """
         if self.spec.tile_mass > 0:
             self._lay_pictures()
-        if number is not None:
-            self._frames = number
+        number = self._frames if number is None else number
+        self._frames = number + 1
+        posture = self.arm.posture()
+        if posture != self._home:
+            self._prepare_arm(number)
+            return self._layers.frame(self._textures)
+        arm = _drawn_once(self._arms_at_home, (posture, number % 2), partial(self._draw_arm, number))
+        with self._arm.away():
+            return LayeredFrame(arm, self._layers.frame(self._textures).flat())
+
+    def _draw_arm(self, number: int) -> RenderedFrame:
+        """Draw the arm alone, as in frame `number` of an episode."""
+        self._prepare_arm(number)
+        with without_bodies([self._cube, *self._resting]):
+            return self.camera.render(self.client, self.spec.light, self.spec.light_level)
+
+    def _prepare_arm(self, number: int) -> None:
+        """Hide what the camera does not see of the arm, and let its next drawing be that of frame `number`."""
         self._culling.hide_unseen(self.camera)
         row, light = self.camera.at_height(1), self.spec.light
-        self._culling.align(self._frames, lambda: row.render(self.client, light, self.spec.light_level))
-        self._frames += 1
+        self._culling.align(number, lambda: row.render(self.client, light, self.spec.light_level))
         self._culling.count_drawing()
-        return self._draw()
 
     def small_picture(self, height: int) -> PictureArray:
         """Return the finished picture (height, w, 3), drawn with fewer pixels, so that edges are less smooth."""
         if self.spec.tile_mass > 0:
             self._lay_pictures()
-        camera, spec = self.camera.at_height(height), self.spec
-        self._culling.hide_unseen(camera)
+        if height not in self._small_layers:
+            self._small_layers[height] = self._layer_camera(self.camera.at_height(height), SMALL_DRIFT)
+        layers = self._small_layers[height]
+        self._culling.hide_unseen(layers.camera)
         self._culling.count_drawing()
-        return self._film.picture(camera, spec.light, spec.light_level, tuple(self._shown.values()))
+        return layers.frame(self._textures).picture
 
-    def _draw(self) -> RenderedFrame:
-        return self.camera.render(self.client, self.spec.light, self.spec.light_level)
+    @property
+    def _textures(self) -> tuple[int, ...]:
+        return tuple(self._shown.values())
 
-    def picture(self, frame: RenderedFrame) -> PictureArray:
-        """Return the finished picture (H, W, 3) of a frame."""
-        return self.backdrop.under(frame)
-
-    def tile_visibility(self, frame: RenderedFrame) -> dict[Side, float]:
+    def tile_visibility(self, frame: LayeredFrame) -> dict[Side, float]:
         """Return the share of each picture that is on screen and that neither robot nor cube hides in `frame`."""
         return {side: float((frame.bodies == self.quads[side]).sum() / self._tile_pixels[side]) for side in SIDES}
 
-    def tile_masks(self, frame: RenderedFrame) -> dict[Side, NDArray[np.bool_]]:
+    def tile_masks(self, frame: LayeredFrame) -> dict[Side, NDArray[np.bool_]]:
         """Return masks (H, W) of where each tile's picture is seen in the frame."""
         return {side: np.asarray(frame.bodies == self.quads[side]) for side in SIDES}
 
@@ -262,9 +283,9 @@ class Scene:
         self.textures = TextureCache(client, folder)
         self.table = self._box(TABLE_SIZE, TABLE_CENTRE, TABLE_COLOR)
         self.floor = self._box(FLOOR_SIZE, FLOOR_CENTRE, FLOOR_COLOR)
-        empty = _drawn_once(_EMPTY_TABLES, (spec.camera, spec.light, spec.light_level), self._draw)
-        # Contiguous, so that a copy for every frame takes a tenth of the time.
-        self.backdrop = Backdrop(np.ascontiguousarray(self._surroundings(empty)), empty.depth)
+        look = spec.camera, spec.light, spec.light_level
+        draw = partial(self.camera.render, client, spec.light, spec.light_level)
+        self.surroundings = self._around(_drawn_once(_EMPTY_TABLES, look, draw))
         for body in (self.table, self.floor):
             client.changeVisualShape(body, -1, rgbaColor=INVISIBLE)
         self._load_tiles()
@@ -273,13 +294,16 @@ class Scene:
         # An edited mesh of a user's arm would be drawn as it was before.
         with nullcontext() if spec.arm_urdf is None else without_file_cache(client):
             self.arm = Arm(client, model, spec.physics, spec.arm_urdf or model.urdf(folder))
-        resting = [VisualShapes(client, body) for body in (*self.tiles.values(), *self.quads.values())]
-        cube, arm = (VisualShapes(client, body) for body in (self.cube, self.arm.body))
-        self._film = FilmCamera(client, self.backdrop, resting, (cube, arm))
-        self._culling = ViewCulling(client, arm)
+        self._resting = [VisualShapes(client, body) for body in (*self.tiles.values(), *self.quads.values())]
+        self._cube, self._arm = (VisualShapes(client, body) for body in (self.cube, self.arm.body))
+        self._layers = self._layer_camera(self.camera)
+        self._small_layers: dict[int, LayerCamera] = {}
+        self._culling = ViewCulling(client, self._arm)
+        self._arms_at_home: dict[tuple[tuple[float, ...], int], RenderedFrame] = {}
         self._frames = 0
         self.home_q = self._find_home()
         self.arm.set_joints(self.home_q, spec.home_opening)
+        self._home = self.arm.posture()
         if spec.tile_mass > 0:
             # Contacts of tiles survive restoreState: without this an episode depends on the one before.
             for side in SIDES:
@@ -325,16 +349,26 @@ class Scene:
             )
         return q
 
-    def _surroundings(self, empty: RenderedFrame) -> PictureArray:
-        """Return the colours behind robot, cube and tiles; a photo is scaled with the light of the scene."""
-        spec = self.spec
-        if spec.rendering == "raw":
-            return empty.rgb
-        if spec.background is None:
-            photo = wooden_table(self.camera)
-        else:
-            photo = load_photo(spec.background, spec.camera.width, spec.camera.height)
-        return np.clip(photo * spec.light_level, 0, 255).astype(np.uint8)
+    def _layer_camera(self, camera: Camera, drift: float = 0.0) -> LayerCamera:
+        spec, surroundings = self.spec, self.surroundings
+        if camera is not self.camera:
+            surroundings = surroundings.at_size(camera.spec)
+        moving = self._cube, self._arm
+        return LayerCamera(
+            self.client, camera, spec.light, spec.light_level, surroundings, self._resting, moving, drift
+        )
+
+    def _around(self, empty: RenderedFrame) -> RenderedFrame:
+        """Return what is behind robot, cube and tiles; a photo is scaled with the light of the scene."""
+        spec, rgb = self.spec, empty.rgb
+        if spec.rendering != "raw":
+            if spec.background is None:
+                photo = wooden_table(self.camera)
+            else:
+                photo = load_photo(spec.background, spec.camera.width, spec.camera.height)
+            rgb = np.clip(photo * spec.light_level, 0, 255).astype(np.uint8)
+        # Contiguous, so that a copy for every frame takes a tenth of the time.
+        return RenderedFrame(np.ascontiguousarray(rgb), empty.depth, np.full_like(empty.bodies, -1))
 
     def _load_tiles(self) -> None:
         spec = self.spec
@@ -365,8 +399,9 @@ class Scene:
     def _tile_start(self, side: Side) -> XYZ:
         return (*self.spec.tile_xy(side), self.spec.tile_height / 2)
 
-    def _show(self) -> None:
-        for side, texture in self._shown.items():
+    def _show(self, textures: Mapping[Side, int]) -> None:
+        self._shown = textures
+        for side, texture in textures.items():
             self.client.changeVisualShape(self.quads[side], -1, textureUniqueId=texture)
 
     def _lay_pictures(self) -> None:

@@ -1,8 +1,9 @@
-"""PyBullet's side of the scene: clients, the camera, pictures on tiles, photographed backgrounds, films.
+"""PyBullet's side of the scene: clients, the camera, pictures on tiles, photographed backgrounds, layers.
 
-Pixels covered by the table cost most of the rendering time and never change. So the empty table is drawn once (the
-*backdrop*), hidden from the renderer afterwards, and every frame is composed with it by depth. The result is the
-naive rendering bit for bit; under visual matching, a photo replaces the backdrop's colours.
+Pixels covered by the table cost most of the rendering time and never change. So the empty table is drawn once and
+hidden from the renderer afterwards. The tiles are drawn once per episode, as long as they rest. Every frame is
+composed with these layers by depth. The result is the naive rendering bit for bit; under visual matching, a photo
+replaces the colours of the table and all around it.
 
 PyBullet stretches a texture on a box so that only a corner of it shows, and it loads broken files without an
 error. So a tile is a box with a quad of our own mesh on top, and every texture is a PNG that this module wrote.
@@ -15,7 +16,7 @@ import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
 from importlib import import_module
 from math import ceil
 from pathlib import Path
@@ -127,6 +128,52 @@ class RenderedFrame:
     depth: NDArray[np.float32]
     bodies: NDArray[np.int32]
 
+    def at_size(self, spec: CameraSpec) -> "RenderedFrame":
+        """Return the frame with the pixels of `spec`: mean colours, and depth and body of the nearest pixel."""
+        size = (spec.width, spec.height)
+        rgb = Image.fromarray(self.rgb).resize(size, Image.Resampling.BOX)
+        depth, bodies = (
+            Image.fromarray(part).resize(size, Image.Resampling.NEAREST) for part in (self.depth, self.bodies)
+        )
+        return RenderedFrame(np.asarray(rgb), np.asarray(depth), np.asarray(bodies))
+
+
+@dataclass(frozen=True)
+class LayeredFrame:
+    """Some bodies that were drawn alone, and all that lies behind them. The nearer surface is visible.
+
+    Attributes:
+        front: The bodies.
+        behind: All other bodies, and surroundings of body id −1.
+    """
+
+    front: RenderedFrame
+    behind: RenderedFrame
+
+    @cached_property
+    def picture(self) -> PictureArray:
+        """The finished picture (H, W, 3)."""
+        return self._composed(self.behind.rgb, self.front.rgb)
+
+    @cached_property
+    def bodies(self) -> NDArray[np.int32]:
+        """The body that is visible in every pixel (H, W), −1 for the surroundings."""
+        return self._composed(self.behind.bodies, self.front.bodies)
+
+    def flat(self) -> RenderedFrame:
+        """Return both in one frame."""
+        return RenderedFrame(self.picture, self._composed(self.behind.depth, self.front.depth), self.bodies)
+
+    @cached_property
+    def _in_front(self) -> tuple[NDArray[np.intp], ...]:
+        # The renderer lets the surface that is drawn later win a tie, and what is behind is drawn first.
+        return np.nonzero((self.front.bodies >= 0) & (self.front.depth <= self.behind.depth))
+
+    def _composed[Pixel: np.generic](self, behind: NDArray[Pixel], front: NDArray[Pixel]) -> NDArray[Pixel]:
+        composed = behind.copy()
+        composed[self._in_front] = front[self._in_front]
+        return composed
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -225,29 +272,6 @@ class Camera:
             np.asarray(depth, np.float32).reshape(height, width),
             np.asarray(bodies, np.int32).reshape(height, width),
         )
-
-
-@dataclass(frozen=True)
-class Backdrop:
-    """The scene without robot, cube and tiles: colours (H, W, 3) and depth buffer (H, W)."""
-
-    rgb: PictureArray
-    depth: NDArray[np.float32]
-
-    def at_size(self, spec: CameraSpec) -> "Backdrop":
-        """Return the backdrop with the pixels of `spec`: mean colours, and the depth of the nearest pixel."""
-        size = (spec.width, spec.height)
-        rgb = Image.fromarray(self.rgb).resize(size, Image.Resampling.BOX)
-        depth = Image.fromarray(self.depth).resize(size, Image.Resampling.NEAREST)
-        return Backdrop(np.asarray(rgb), np.asarray(depth))
-
-    def under(self, frame: RenderedFrame) -> PictureArray:
-        """Return the picture (H, W, 3) of `frame` composed with the backdrop: the nearer surface is visible."""
-        # The renderer lets the surface that is drawn later win a tie, and the table is drawn first.
-        in_front = np.nonzero((frame.bodies >= 0) & (frame.depth <= self.depth))
-        picture = self.rgb.copy()
-        picture[in_front] = frame.rgb[in_front]
-        return picture
 
 
 # -- pictures on tiles ----------------------------------------------------------------------------------------
@@ -437,85 +461,76 @@ class VisualShapes:
             self.hide(before)
 
 
-# -- films ----------------------------------------------------------------------------------------------------
-
-REST = 2e-4
-"""Largest drift of resting bodies, in metres or parts of a unit quaternion: under a tenth of a film's pixel."""
+# -- layers ---------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class _Resting:
-    """The scene without its moving bodies.
+    """The bodies that rest, as they were when they were last looked at.
 
     Attributes:
-        places: (bodies, 7) positions and quaternions of the resting bodies.
-        pictures: Textures that the resting bodies show.
+        places: (bodies, 7) their positions and quaternions.
+        textures: Textures that they show.
+        layer: The scene without its moving bodies; None if it was not drawn yet.
     """
 
-    backdrop: Backdrop
     places: Matrix
-    pictures: tuple[int, ...]
+    textures: tuple[int, ...]
+    layer: RenderedFrame | None
 
 
-class FilmCamera:
-    """A camera that draws one scene with fewer pixels.
+class LayerCamera:
+    """A camera that draws the bodies that rest once, and again only when they moved or changed.
 
     Args:
         client: Server of the scene.
-        backdrop: The scene without robot, cube and tiles.
-        resting: Bodies that are drawn once while they rest.
+        camera: The camera.
+        light: The lamp.
+        level: Factor of all light.
+        surroundings: The scene without robot, cube and tiles, at the camera's size.
+        resting: Bodies that mostly rest.
         moving: Bodies that move, which are drawn later.
+        drift: Largest change of place, in metres or parts of a unit quaternion, at which bodies still rest.
     """
 
     def __init__(
         self,
         client: BulletClient,
-        backdrop: Backdrop,
+        camera: Camera,
+        light: LightSpec,
+        level: float,
+        surroundings: RenderedFrame,
         resting: Iterable[VisualShapes],
         moving: Iterable[VisualShapes],
+        drift: float = 0.0,
     ) -> None:
-        self._client, self._empty = client, backdrop
+        self.camera = camera
+        self._draw = partial(camera.render, client, light, level)
+        self._client, self._surroundings, self._drift = client, surroundings, drift
         self._resting, self._moving = tuple(resting), tuple(moving)
-        self._drawn: _Resting | None = None
+        self._seen: _Resting | None = None
 
-    def picture(self, camera: Camera, light: LightSpec, level: float, pictures: tuple[int, ...]) -> PictureArray:
-        """Return the finished picture (h, w, 3).
-
-        Args:
-            camera: Camera at the film's size.
-            light: The lamp.
-            level: Factor of all light.
-            pictures: Textures that the resting bodies show.
-        """
-        backdrop = self._backdrop(camera, light, level, pictures)
-        with _away(self._resting):
-            return backdrop.under(camera.render(self._client, light, level))
-
-    def _backdrop(self, camera: Camera, light: LightSpec, level: float, pictures: tuple[int, ...]) -> Backdrop:
+    def frame(self, textures: tuple[int, ...]) -> LayeredFrame:
+        """Return the scene now, in which the resting bodies show these textures."""
         states = (self._client.getBasePositionAndOrientation(shapes.body) for shapes in self._resting)
-        places = np.array([np.concatenate(state) for state in states])
-        drawn, shape = self._drawn, (camera.spec.height, camera.spec.width)
-        if (
-            drawn is None
-            or drawn.backdrop.depth.shape != shape
-            or drawn.pictures != pictures
-            or np.abs(drawn.places - places).max() > REST
-        ):
-            with _away(self._moving):
-                frame = camera.render(self._client, light, level)
-            self._drawn = drawn = _Resting(_over(self._empty.at_size(camera.spec), frame), places, pictures)
-        return drawn.backdrop
+        places, seen = np.array([np.concatenate(state) for state in states]), self._seen
+        if seen is None or seen.textures != textures or np.abs(seen.places - places).max() > self._drift:
+            # Of one picture alone a layer does not pay.
+            self._seen = _Resting(places, textures, None)
+            return LayeredFrame(self._draw(), self._surroundings)
+        layer = seen.layer
+        if layer is None:
+            with without_bodies(self._moving):
+                layer = LayeredFrame(self._draw(), self._surroundings).flat()
+            self._seen = replace(seen, layer=layer)
+        with without_bodies(self._resting):
+            return LayeredFrame(self._draw(), layer)
 
 
 @contextmanager
-def _away(bodies: Iterable[VisualShapes]) -> Iterator[None]:
+def without_bodies(bodies: Iterable[VisualShapes]) -> Iterator[None]:
+    """Hide bodies from the renderer in the body of the statement."""
     with ExitStack() as stack:
         for shapes in bodies:
             stack.enter_context(shapes.away())
         yield
-
-
-def _over(backdrop: Backdrop, frame: RenderedFrame) -> Backdrop:
-    """Return the backdrop with the bodies of a frame in front of it."""
-    nearer = np.where(frame.bodies >= 0, np.minimum(frame.depth, backdrop.depth), backdrop.depth)
-    return Backdrop(backdrop.under(frame), nearer)

@@ -119,7 +119,7 @@ class Recorder:
         frame = scene.frame()
         tiles = np.stack([model_view(255 * np.uint8(frame.bodies == scene.quads[name])) for name in SIDES])
         state = np.array([*scene.arm.tool_state(), 0.0, scene.arm.opening()], np.float32)
-        return model_view(scene.picture(frame)), tiles, state
+        return model_view(frame.picture), tiles, state
 
 
 def record(path: Path, seeds: range, processes: int, report: Callable[[str], None]) -> Demonstrations:

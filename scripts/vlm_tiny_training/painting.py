@@ -67,10 +67,9 @@ def calibrate(spec: SceneSpec) -> Surface:
 
 def _view(scene: Scene, texture: Image.Image) -> tuple[NDArray[np.uint8], list[NDArray[np.bool_]]]:
     """The scene as it stands, with this texture on both tiles, and which pixels show them."""
-    for side in SIDES:
-        scene.client.changeVisualShape(scene.quads[side], -1, textureUniqueId=scene.textures.load(texture))
+    scene.show(dict.fromkeys(SIDES, texture))
     frame = scene.frame()
-    return scene.picture(frame), [frame.bodies == scene.quads[side] for side in SIDES]
+    return frame.picture, [frame.bodies == scene.quads[side] for side in SIDES]
 
 
 def sheet(height: int, width: int) -> Surface:

@@ -34,7 +34,7 @@ def play(scene, seed):
         joints = target
         if random.random() < 0.4:
             pictures.append(scene.small_picture(48))
-        pictures.append(scene.picture(scene.frame()))
+        pictures.append(scene.frame().picture)
     return pictures, scene.arm.joints()
 
 
@@ -61,7 +61,7 @@ def test_the_camera_of_the_protocol_works_through_the_hand_alone():
     scene = Scene(SceneSpec())
     scene.reset(PICTURES, (0.5, 0.0, 0.02), 0.0)
     scene.frame()
-    (arm,) = [shapes for shapes in scene._film._moving if shapes.body == scene.arm.body]
+    arm = scene._arm
     assert arm.visible == {-1, 8, 9, 10}, "base, hand and fingers"
     assert arm.hidden == set(range(7))
     scene.close()

@@ -38,13 +38,13 @@ def test_the_cube_weighs_what_the_spec_says(scene):
 
 def test_reset_brings_back_joints_cube_and_pictures(scene):
     scene.reset(PLAIN, START, 0.0)
-    before = scene.picture(scene.frame())
+    before = scene.frame().picture
     far = scene.home_q + 0.2
     scene.advance(scene.home_q, far, 0.0)
     scene.reset({"left": PLAIN["right"], "right": PLAIN["left"]}, (0.2, 0.0, 0.1), 1.0)
-    assert (scene.picture(scene.frame()) != before).any()
+    assert (scene.frame().picture != before).any()
     scene.reset(PLAIN, START, 0.0)
-    np.testing.assert_array_equal(scene.picture(scene.frame()), before)
+    np.testing.assert_array_equal(scene.frame().picture, before)
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
@@ -90,7 +90,7 @@ def test_a_state_that_is_not_finite_is_noticed_and_healed(own_scene):
 @pytest.mark.slow
 def test_a_spent_texture_budget_reloads_the_scene(own_scene):
     own_scene.reset(PLAIN, START, 0.0)
-    before = own_scene.picture(own_scene.frame())
+    before = own_scene.frame().picture
     spent = own_scene.textures
     spent._budget = 3
     for shade in range(0, 250, 50):
@@ -99,7 +99,7 @@ def test_a_spent_texture_budget_reloads_the_scene(own_scene):
     assert len(spent._ids) <= 3
     assert len(own_scene.textures._ids) >= 5, "of the scene loaded after it"
     own_scene.reset(PLAIN, START, 0.0)
-    np.testing.assert_array_equal(own_scene.picture(own_scene.frame()), before)
+    np.testing.assert_array_equal(own_scene.frame().picture, before)
 
 
 def test_a_home_out_of_reach_is_refused():

@@ -16,6 +16,7 @@ from probe_kit.env.simulation import (
     TEXTURE_PIXELS,
     BulletClient,
     Camera,
+    LayeredFrame,
     TextureCache,
     as_texture,
     load_photo,
@@ -167,9 +168,46 @@ def test_the_layered_picture_equals_the_naive_rendering_bit_for_bit(preset, make
     for action in ([0, 0, 0, 0, 0, 0, 1], [0.1, 0.1, -0.1, 0.2, 0, 0.3, 0], [0, -0.1, -0.1, 0, 0.4, 0, 0]):
         layered = env.step(np.array(action))[0]["pixels"]["image"]
         show_table(env.scene, True)
-        naive = env.scene.frame().rgb
+        naive = env.scene.camera.render(env.scene.client, env.scene.spec.light, env.scene.spec.light_level).rgb
         show_table(env.scene, False)
         np.testing.assert_array_equal(layered, naive)
+
+
+def frames_of_episodes(env, *, draws_all):
+    """Frames of two episodes, some in the exchanged layout and some of an episode that is played again."""
+    random = np.random.default_rng(3)
+    frames = []
+
+    def look(number=None):
+        if draws_all:
+            env.scene._home, env.scene._layers._seen = (), None
+        frames.append(env.scene.frame(number))
+
+    for seed in range(2):
+        env.reset(seed=seed)
+        look(0)
+        with env.scene.exchanged():
+            look()
+        for step in range(6):
+            env.advance(np.r_[random.uniform(-0.08, 0.08, 3), random.uniform(-0.5, 0.5, 3), 1.0])
+            look(step // 2 if seed else None)
+            if step % 3 == 0:
+                env.scene.small_picture(HEIGHT)
+        with env.scene.exchanged():
+            look()
+    return frames
+
+
+@pytest.mark.parametrize(
+    "preset",
+    ["bridge", *(pytest.param(name, marks=pytest.mark.slow) for name in ("act2answer", "vl-think", "frontal"))],
+)
+def test_what_rests_is_drawn_once_and_no_bit_of_any_frame_differs(preset, make_env):
+    layered, whole = (frames_of_episodes(make_env(preset), draws_all=draws_all) for draws_all in (False, True))
+    for frame, expected in zip(layered, whole, strict=True):
+        np.testing.assert_array_equal(frame.picture, expected.picture)
+        np.testing.assert_array_equal(frame.bodies, expected.bodies)
+        np.testing.assert_array_equal(frame.flat().depth, expected.flat().depth)
 
 
 @pytest.mark.slow
@@ -185,7 +223,7 @@ def test_a_white_picture_does_not_clip_at_the_brightest_light(make_env):
     env = make_env(light_level=1.3)
     env.reset(seed=0)
     frame = env.scene.frame()
-    tile = frame.rgb[frame.bodies == env.scene.tiles["left"]]
+    tile = frame.picture[frame.bodies == env.scene.tiles["left"]]
     assert tile.max() < 255
 
 
@@ -251,7 +289,7 @@ def test_pictures_lie_upright_and_unmirrored(preset, make_env):
             x, y = np.add(spec.tile_xy(side), turn @ [0.02 * dx, 0.02 * dy])
             u, v = scene.camera.project((x, y, spec.tile_height)).astype(int)
             np.testing.assert_array_equal(
-                frame.rgb[v, u] > 100, np.array(color, bool), err_msg=f"{side} {dx} {dy}"
+                frame.picture[v, u] > 100, np.array(color, bool), err_msg=f"{side} {dx} {dy}"
             )
 
 
@@ -302,9 +340,8 @@ PICTURES = {"left": Image.new("RGB", (8, 8), "red"), "right": Image.new("RGB", (
 def whole_drawing(scene):
     """The small picture with every body drawn."""
     camera = scene.camera.at_height(HEIGHT)
-    return scene.backdrop.at_size(camera.spec).under(
-        camera.render(scene.client, scene.spec.light, scene.spec.light_level)
-    )
+    drawn = camera.render(scene.client, scene.spec.light, scene.spec.light_level)
+    return LayeredFrame(drawn, scene.surroundings.at_size(camera.spec)).picture
 
 
 @pytest.mark.parametrize("preset", ["bridge", "frontal"])
@@ -352,7 +389,7 @@ def alternating_frames(env, count):
         env.advance(
             np.r_[random.uniform(-0.08, 0.08, 3), random.uniform(-0.5, 0.5, 3), float(random.random() > 0.5)]
         )
-    return [env.scene.frame().rgb for _ in range(count)]
+    return [env.scene.frame().picture for _ in range(count)]
 
 
 @pytest.mark.slow
@@ -366,5 +403,5 @@ def test_neither_small_pictures_nor_former_episodes_change_a_bit_of_the_frames_o
     for small in (1, 2):
         for _ in range(small):
             env.scene.small_picture(HEIGHT)
-        between.append(env.scene.frame().rgb)
+        between.append(env.scene.frame().picture)
     np.testing.assert_array_equal(between, alone)

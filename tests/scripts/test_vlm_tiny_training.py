@@ -46,7 +46,7 @@ def pairs(banks: list[PictureBank]) -> Pairs:
 def test_a_painted_first_frame_looks_like_a_rendered_one(preset: str, surfaces: dict[str, Surface]) -> None:
     env = Act2AnswerEnv(SceneSpec.preset(preset))
     env.reset(seed=0)
-    rendered = model_view(env.scene.picture(env.scene.frame())).astype(np.float32)
+    rendered = model_view(env.scene.frame().picture).astype(np.float32)
     env.close()
     painted = surfaces[preset].background.copy()
     for side, area in zip(SIDES, surfaces[preset].places, strict=True):

@@ -22,7 +22,7 @@ from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.sites import CAMERA
 from probe_kit.runs.layout import CAPTURE_ONLY, FIRST_FRAME
 from probe_kit.runs.plan import Row
-from probe_kit.runs.small_frames import FILM_HEIGHT, shrink
+from probe_kit.runs.small_frames import FILM_HEIGHT, HEIGHT, shrink
 from probe_kit.suite import Episode, Suite, default_suite, load_suite
 from probe_kit.suite.build import ITEMS, default_folder
 from probe_kit.suite.items import Side, Wording, in_words
@@ -138,9 +138,11 @@ class ScenePlayer(Player):
         return None
 
     def _keep_small(self) -> None:
-        if self._played.frames != "none":
-            every = self._played.frames == "all"
-            self._small_frames.append(self._env.render_small(FILM_HEIGHT) if every else shrink(self._env.render()))
+        if self._played.frames == "all":
+            self._small_frames.append(self._env.render_small(FILM_HEIGHT))
+        elif self._played.frames != "none":
+            # No model sees the last frame: drawn with a quarter of the pixels, it looks the same in small.
+            self._small_frames.append(shrink(self._env.render_small(2 * HEIGHT)))
 
     def _see(self) -> Observation:
         return self._observe(self._env.observe())
