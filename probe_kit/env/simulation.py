@@ -153,23 +153,23 @@ class LayeredFrame:
     @cached_property
     def picture(self) -> PictureArray:
         """The finished picture (H, W, 3)."""
-        return self._composed(self.behind.rgb, self.front.rgb)
+        return self._compose(self.behind.rgb, self.front.rgb)
 
     @cached_property
     def bodies(self) -> NDArray[np.int32]:
         """The body that is visible in every pixel (H, W), −1 for the surroundings."""
-        return self._composed(self.behind.bodies, self.front.bodies)
+        return self._compose(self.behind.bodies, self.front.bodies)
 
     def flat(self) -> RenderedFrame:
         """Return both in one frame."""
-        return RenderedFrame(self.picture, self._composed(self.behind.depth, self.front.depth), self.bodies)
+        return RenderedFrame(self.picture, self._compose(self.behind.depth, self.front.depth), self.bodies)
 
     @cached_property
     def _in_front(self) -> tuple[NDArray[np.intp], ...]:
         # The renderer lets the surface that is drawn later win a tie, and what is behind is drawn first.
         return np.nonzero((self.front.bodies >= 0) & (self.front.depth <= self.behind.depth))
 
-    def _composed[Pixel: np.generic](self, behind: NDArray[Pixel], front: NDArray[Pixel]) -> NDArray[Pixel]:
+    def _compose[Pixel: np.generic](self, behind: NDArray[Pixel], front: NDArray[Pixel]) -> NDArray[Pixel]:
         composed = behind.copy()
         composed[self._in_front] = front[self._in_front]
         return composed
@@ -508,21 +508,21 @@ class LayerCamera:
         self._draw = partial(camera.render, client, light, level)
         self._client, self._surroundings, self._drift = client, surroundings, drift
         self._resting, self._moving = tuple(resting), tuple(moving)
-        self._seen: _Resting | None = None
+        self._latest: _Resting | None = None
 
     def frame(self, textures: tuple[int, ...]) -> LayeredFrame:
         """Return the scene now, in which the resting bodies show these textures."""
         states = (self._client.getBasePositionAndOrientation(shapes.body) for shapes in self._resting)
-        places, seen = np.array([np.concatenate(state) for state in states]), self._seen
-        if seen is None or seen.textures != textures or np.abs(seen.places - places).max() > self._drift:
+        places, latest = np.array([np.concatenate(state) for state in states]), self._latest
+        if latest is None or latest.textures != textures or np.abs(latest.places - places).max() > self._drift:
             # Of one picture alone a layer does not pay.
-            self._seen = _Resting(places, textures, None)
+            self._latest = _Resting(places, textures, None)
             return LayeredFrame(self._draw(), self._surroundings)
-        layer = seen.layer
+        layer = latest.layer
         if layer is None:
             with without_bodies(self._moving):
                 layer = LayeredFrame(self._draw(), self._surroundings).flat()
-            self._seen = replace(seen, layer=layer)
+            self._latest = replace(latest, layer=layer)
         with without_bodies(self._resting):
             return LayeredFrame(self._draw(), layer)
 

@@ -16,6 +16,7 @@ from probe_kit._terminal.notebook import facts_html
 from probe_kit.env.scoring import DEFAULT_RULE, check_rule
 from probe_kit.errors import (
     NoTrajectoryError,
+    RunDamagedError,
     RunIncompleteError,
     UnknownSiteError,
     UsageError,
@@ -206,7 +207,7 @@ class Run:
     @property
     def model(self) -> str:
         """The model's name, as given to `probe-kit extract`."""
-        return str(self.settings["model"])
+        return str(self._setting("model"))
 
     @cached_property
     def label(self) -> str:
@@ -222,12 +223,21 @@ class Run:
     @property
     def weights_sha256(self) -> str | None:
         """The hash of the weights that acted; None for a scripted run."""
-        return cast("str | None", self.settings["weights_sha256"])
+        return cast("str | None", self._setting("weights_sha256"))
 
     @property
     def random_weights(self) -> bool:
         """Whether this run was made with random weights."""
-        return bool(self.settings["random_weights"])
+        return bool(self._setting("random_weights"))
+
+    def _setting(self, name: str) -> Any:
+        """Return a setting that every run stores. Raises RunDamagedError for a run without it."""
+        if name not in self.settings:
+            raise RunDamagedError(
+                f"{self.location} does not store the setting {name!r}, which every run of probe_kit has. "
+                "Extract it again, or take the run from where it was copied"
+            )
+        return self.settings[name]
 
     @property
     def capture_only(self) -> bool:

@@ -180,7 +180,7 @@ def frames_of_episodes(env, *, draws_all):
 
     def look(number=None):
         if draws_all:
-            env.scene._home, env.scene._layers._seen = (), None
+            env.scene._home, env.scene._layers._latest = (), None
         frames.append(env.scene.frame(number))
 
     for seed in range(2):
@@ -203,8 +203,10 @@ def frames_of_episodes(env, *, draws_all):
     ["bridge", *(pytest.param(name, marks=pytest.mark.slow) for name in ("act2answer", "vl-think", "frontal"))],
 )
 def test_what_rests_is_drawn_once_and_no_bit_of_any_frame_differs(preset, make_env):
-    layered, whole = (frames_of_episodes(make_env(preset), draws_all=draws_all) for draws_all in (False, True))
-    for frame, expected in zip(layered, whole, strict=True):
+    layered, drawn_at_once = (
+        frames_of_episodes(make_env(preset), draws_all=draws_all) for draws_all in (False, True)
+    )
+    for frame, expected in zip(layered, drawn_at_once, strict=True):
         np.testing.assert_array_equal(frame.picture, expected.picture)
         np.testing.assert_array_equal(frame.bodies, expected.bodies)
         np.testing.assert_array_equal(frame.flat().depth, expected.flat().depth)

@@ -582,3 +582,18 @@ def test_the_command_prints_a_line_per_number_and_json_every_episode(
     answer = json.loads(CliRunner().invoke(app, [*command, "--json"]).stdout)
     assert [row["number"] for row in answer["numbers"]] == ["dx", "grip"]
     assert [row["source_episode"] for row in answer["episodes"]] == [0, 1, 2]
+
+
+def test_a_run_without_a_setting_that_all_have_is_named_and_hides_no_other_run(
+    little_runs: Path, tmp_path: Path
+) -> None:
+    plan = recorded_plan(3)
+    settings = {"model": "shown", "captured_calls": CALLS, "tokens": "pooled", "codec": "zstd", "seed": 0}
+    RunWriter(locate(tmp_path / "other"), plan, {**settings, **plan.identity})
+    shutil.copytree(little_runs / "run", tmp_path / "run")
+    with pytest.raises(RunDamagedError, match="does not store the setting 'random_weights'"):
+        _ = open_run(tmp_path / "other", allow_partial=True).random_weights
+    printed = CliRunner().invoke(app, ["run", "show", str(tmp_path)])
+    assert printed.exit_code == 0, printed.output
+    assert "setting" in printed.output
+    assert "little" in printed.output

@@ -23,10 +23,9 @@ def distinct_columns(labels: NDArray[Any]) -> tuple[NDArray[np.intp], NDArray[np
     positions: list[int] = []
     places: list[int] = []
     for position, column in enumerate(np.ascontiguousarray(labels.T)):
-        place = first.setdefault(column.tobytes(), len(first))
-        if place == len(positions):
+        places.append(first.setdefault(column.tobytes(), len(first)))
+        if places[-1] == len(positions):
             positions.append(position)
-        places.append(place)
     return np.array(positions, np.intp), np.array(places, np.intp)
 
 

@@ -421,9 +421,9 @@ class _InnerFolds:
         np.put_along_axis(place_of, problems, np.arange(problems.shape[1])[None], axis=1)
         places = np.take_along_axis(place_of, self.problem_of[folds], axis=1)
         fold, column = np.nonzero(places >= 0)
-        place, truth = places[fold, column], self.truth[folds[fold], column]
-        losses = np.logaddexp(0.0, -truth * decisions[fold, place]) * abs(truth)
-        return (folds[fold], column), losses.sum(axis=1), bounds.sum(axis=2)[fold, place]
+        truth, solved = self.truth[folds[fold], column], (fold, places[fold, column])
+        losses = np.logaddexp(0.0, -truth * decisions[solved]) * abs(truth)
+        return (folds[fold], column), losses.sum(axis=1), bounds.sum(axis=2)[solved]
 
 
 @dataclass(frozen=True)
