@@ -238,13 +238,15 @@ class Scene:
         """Draw the arm alone, as in frame `number` of an episode."""
         self._prepare_arm(number)
         with without_bodies([self._cube, *self._resting]):
-            return self.camera.render(self.client, self.spec.light, self.spec.light_level)
+            return self._draw(self.camera)
+
+    def _draw(self, camera: Camera) -> RenderedFrame:
+        return camera.render(self.client, self.spec.light, self.spec.light_level)
 
     def _prepare_arm(self, number: int) -> None:
         """Hide what the camera does not see of the arm, and let its next drawing be that of frame `number`."""
         self._culling.hide_unseen(self.camera)
-        row, light = self.camera.at_height(1), self.spec.light
-        self._culling.align(number, lambda: row.render(self.client, light, self.spec.light_level))
+        self._culling.align(number, partial(self._draw, self.camera.at_height(1)))
         self._culling.count_drawing()
 
     def small_picture(self, height: int) -> PictureArray:
@@ -284,8 +286,7 @@ class Scene:
         self.table = self._box(TABLE_SIZE, TABLE_CENTRE, TABLE_COLOR)
         self.floor = self._box(FLOOR_SIZE, FLOOR_CENTRE, FLOOR_COLOR)
         look = spec.camera, spec.light, spec.light_level
-        draw = partial(self.camera.render, client, spec.light, spec.light_level)
-        self.surroundings = self._around(_drawn_once(_EMPTY_TABLES, look, draw))
+        self.surroundings = self._around(_drawn_once(_EMPTY_TABLES, look, partial(self._draw, self.camera)))
         for body in (self.table, self.floor):
             client.changeVisualShape(body, -1, rgbaColor=INVISIBLE)
         self._load_tiles()
@@ -303,7 +304,6 @@ class Scene:
         self._frames = 0
         self.home_q = self._find_home()
         self.arm.set_joints(self.home_q, spec.home_opening)
-        self._home = self.arm.posture()
         if spec.tile_mass > 0:
             # Contacts of tiles survive restoreState: without this an episode depends on the one before.
             for side in SIDES:
@@ -393,7 +393,7 @@ class Scene:
 
     def _count_tile_pixels(self) -> dict[Side, int]:
         """Count the pixels of each picture with nothing in front of it, on screen or just outside."""
-        bodies = self.camera.widened().render(self.client, self.spec.light, self.spec.light_level).bodies
+        bodies = self._draw(self.camera.widened()).bodies
         return {side: int((bodies == self.quads[side]).sum()) for side in SIDES}
 
     def _tile_start(self, side: Side) -> XYZ:

@@ -491,19 +491,20 @@ def _rough_losses(
     cheap, dear = np.split(np.arange(STRENGTHS.size), [CHEAP])
     by_turn = [np.flatnonzero(folds.turn == turn) for turn in range(folds.turn.max() + 1)]
     for some, steps in ((np.arange(folds.turn.size), cheap), *((turn, dear) for turn in by_turn)):
-        left = np.tile(np.arange(folds.signs.shape[1]), (some.size, 1))
-        optima = start if steps is cheap else start.select(some, left)
+        numbers = np.tile(np.arange(folds.signs.shape[1]), (some.size, 1))
+        optima = start if steps is cheap else start.select(some, numbers)
         for step in steps:
             can_win: NDArray[np.bool_] = np.any(sums.can_win()[step:], axis=0)
-            is_needed = np.take_along_axis(folds.are_needed(some, can_win[folds.outer[some]]), left, 1)
+            is_needed = np.take_along_axis(folds.are_needed(some, can_win[folds.outer[some]]), numbers, 1)
             most = is_needed.sum(axis=1).max()
             if most == 0:
                 break
-            if most < left.shape[1]:  # as many of every fold, first those that are needed
+            if most < numbers.shape[1]:  # as many of every fold, first those that are needed
                 order = np.argsort(~is_needed, axis=1, kind="stable")[:, :most]
-                left, optima = np.take_along_axis(left, order, 1), optima.select(np.arange(some.size), order)
+                numbers = np.take_along_axis(numbers, order, 1)
+                optima = optima.select(np.arange(some.size), order)
             optima.advance(STRENGTHS[step])
-            where, loss, bound = folds.losses(optima, STRENGTHS[step], some, left)
+            where, loss, bound = folds.losses(optima, STRENGTHS[step], some, numbers)
             sums.add((step, *where), loss, bound)
     return sums.totals()
 
