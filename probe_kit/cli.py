@@ -4,6 +4,7 @@ Every package keeps its own commands, which parse, call the library and print; t
 stderr.
 """
 
+import gc
 import re
 import sys
 import warnings
@@ -245,4 +246,7 @@ def main() -> None:
         if isinstance(stream, TextIOWrapper):  # signs that the terminal's encoding lacks are no reason to fail
             stream.reconfigure(errors="backslashreplace")
     warnings.showwarning = _show_warning
+    # Python looks through all objects that imports made whenever a quarter is new, which costs most commands about
+    # half a second and finds nothing. What was made lately is looked through as often as ever.
+    gc.set_threshold(*gc.get_threshold()[:2], 100)
     app()

@@ -23,6 +23,7 @@ from probe_kit._tables.table import Cell, Table, group_headings
 from probe_kit._terminal.console import markup
 from probe_kit.extract import AskSettings, ExtractSettings, ask_run, extract_run
 from probe_kit.extract.prompts import TEMPLATES
+from probe_kit.extract.sources.player import reusing_processes
 from probe_kit.intervene import ImageSwap, ReplayFiles, run_intervention
 from probe_kit.retention import RetentionRow, RetentionTable, retention_table
 from probe_kit.retention.columns.columns import FOLLOWS, MARGIN
@@ -329,6 +330,7 @@ class Demo:
         return markup("[bold]Open[/]    probe-kit view {} {}", *runs)
 
 
+@reusing_processes()
 def compare_organisms(folder: Path, stage: NamedProgress) -> list[OrganismVerdict]:
     """Judge the VLM and every organism on the questions of `FULL`.
 
@@ -352,6 +354,7 @@ def _questions(folder: Path, size: Size, stage: NamedProgress) -> Suite:
     return build_suite(folder / "suite", tuple(size.items), size.items, progress=stage("drawing questions"))
 
 
+@reusing_processes()
 def run_demo(folder: Path, stage: NamedProgress, size: Size = QUICK) -> Demo:
     """Make suite, answers, episodes, probes, table, figure, film and report; called again, it continues.
 

@@ -168,6 +168,7 @@ class Scene:
         start = (actions, self.arm.opening(), cube.position.tobytes(), cube.quaternion.tobytes())
         if self._closed is not None and self._closed[0] == start:
             self.client.restoreState(self._closed[1])
+            self._home = self.arm.posture()  # from now on every episode that starts so shares its drawing
             self.arm.command_gripper(0.0)
             self.arm.command_joints(self.home_q)
             return

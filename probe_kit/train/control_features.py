@@ -18,6 +18,7 @@ from probe_kit.errors import UsageError
 from probe_kit.runs.reader import RunReader
 from probe_kit.train.builtin_columns import frames_of_inferences, why_no_sim
 from probe_kit.train.results.control_scores import RANDOM_FEATURES
+from probe_kit.train.solver.arrays import threads_for
 from probe_kit.train.target_samples import TargetSamples
 
 if TYPE_CHECKING:
@@ -259,9 +260,10 @@ def random_layer(parts: Sequence[Features], width: int, seed: int) -> Features:
         values = part.astype(np.float64)
         spread = values.std(axis=0)
         varying = (values - values.mean(axis=0))[:, spread > 0] / spread[spread > 0]
+        weights = generator.standard_normal((varying.shape[1], width))
+        with threads_for(varying):
+            outputs = varying @ weights
         # Divided by the root of its width, so that a thousand pixels do not drown ten words.
-        mixed.append(
-            varying @ generator.standard_normal((varying.shape[1], width)) / max(1, varying.shape[1]) ** 0.5
-        )
-    outputs: Features = np.tanh(sum(mixed)).astype(np.float32)
-    return outputs
+        mixed.append(outputs / max(1, varying.shape[1]) ** 0.5)
+    layer: Features = np.tanh(sum(mixed)).astype(np.float32)
+    return layer

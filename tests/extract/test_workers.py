@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 from probe_kit.cli import app
@@ -23,11 +24,12 @@ from probe_kit.extract import ExtractSettings, extract_run, prepare
 from probe_kit.extract.rollout import calibration
 from probe_kit.extract.rollout.calibration import _infer, choose, inference_times, largest_batch
 from probe_kit.extract.rollout.controllers import PolicyController
-from probe_kit.extract.sources.player import ProcessPlayer
+from probe_kit.extract.sources.player import ProcessPlayer, reusing_processes
 from probe_kit.extract.sources.scene_source import ScenePlayer
 from probe_kit.hooks.checkpoints.third_party import while_acting
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.runs import open_run
+from probe_kit.runs.plan import Row
 from probe_kit.suite import Suite, build_suite
 
 SHORT = SceneSpec(max_steps=2)
@@ -91,6 +93,39 @@ def test_a_simulator_that_dies_costs_its_episode_and_is_replaced(suite: Suite) -
         assert isinstance(stage.answer(), Observation)
     finally:
         stage.close()
+
+
+def pictures_of(stage: ProcessPlayer, rows: Sequence[Row]) -> list[NDArray[np.uint8]]:
+    """The picture with which each episode begins, and the one after an action."""
+    pictures = []
+    for row in rows:
+        stage.ask("begin", row, False)
+        pictures.append(stage.answer().image)
+        stage.ask("advance", np.full((1, 7), 0.02, np.float32))
+        pictures.append(stage.answer().image)
+    return pictures
+
+
+@pytest.mark.slow
+def test_a_player_in_a_process_that_another_one_left_shows_the_same_pictures(suite: Suite) -> None:
+    rows = prepare(ExtractSettings("expert", suite=suite.folder)).plan.episodes[:3]
+    opens = partial(ScenePlayer, SHORT)
+    alone = ProcessPlayer(opens)
+    expected = pictures_of(alone, rows)
+    alone.close()
+    assert alone._child.close() == 0, "outside of the body a process ends with its player"
+    with reusing_processes():
+        before = ProcessPlayer(partial(ScenePlayer, SceneSpec.preset("act2answer", max_steps=3)))
+        pictures_of(before, rows[:1])
+        busy = ProcessPlayer(opens)
+        busy.ask("begin", rows[0], False)
+        busy.close()
+        before.close()
+        following = ProcessPlayer(opens)
+        assert following._child.pid == before._child.pid != busy._child.pid, "one that still works is ended"
+        np.testing.assert_array_equal(pictures_of(following, rows), expected)
+        following.close()
+    assert following._child.close() == 0
 
 
 @pytest.mark.slow

@@ -11,6 +11,7 @@ from PIL import Image
 from safetensors import safe_open
 from safetensors.torch import load_file
 from transformers import PaliGemmaForConditionalGeneration
+from transformers.models.paligemma.modeling_paligemma import create_causal_mask_mapping
 from typer.testing import CliRunner
 
 from probe_kit.cli import app
@@ -26,6 +27,7 @@ from probe_kit.hooks.families.embedded import ACTION_DIMS
 from probe_kit.hooks.families.paligemma.adapter import PaliGemma, load_vlm_tiny
 from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.hooks.registry import find_family, own_families
+from probe_kit.models.decoding import LeftPacked
 from probe_kit.models.embedded import embedded_checkpoint
 from probe_kit.models.embedded.words import SPECIAL, WORDS, known_words, words_in
 from probe_kit.suite import Terms, build_suite, suite_from_csv
@@ -211,6 +213,17 @@ def test_transformers_reads_the_same_network_from_the_same_folder(vlm: PaliGemma
         ).logits[0, -1]
     options = [vlm.text.option(vlm.prompt(question), letter) for letter in "AB"]
     np.testing.assert_allclose(reading.option_logits[0], logits[options].numpy(), atol=1e-5)
+
+
+def test_its_attention_mask_is_the_one_that_transformers_makes_of_the_token_types(vlm: PaliGemma) -> None:
+    packed = LeftPacked.of([(2, 5, 6, 1), (2, 5, 6, 7, 8, 1)], vlm.text.padding, vlm.loaded.device)
+    inputs = vlm.other_inputs(packed)
+    theirs = create_causal_mask_mapping(
+        vlm.network.config, torch.zeros(*packed.ids.shape, vlm.text_config.hidden_size), packed.mask, None,
+        packed.positions(1), inputs["token_type_ids"],
+    )  # fmt: skip
+    torch.testing.assert_close(inputs["attention_mask"], theirs, rtol=0, atol=0)
+    assert not theirs.all(), "the shorter row is padded"
 
 
 @pytest.mark.slow

@@ -2,7 +2,8 @@
 
 import traceback
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from hashlib import blake2b
 from multiprocessing.connection import Connection
@@ -242,6 +243,29 @@ class LocalPlayer:
         self._player.close()
 
 
+_idle: list[Child] | None = None
+"""Child processes without a player, for the next ones; None where each player has a process of its own."""
+
+
+@contextmanager
+def reusing_processes() -> Iterator[None]:
+    """Let a player in the body take the process of one that was closed before: starting one takes a second.
+
+    Code that the process has imported is not read again, so that the body should be a single command.
+    """
+    global _idle
+    if _idle is not None:
+        yield
+        return
+    _idle = []
+    try:
+        yield
+    finally:
+        idle, _idle = _idle, None
+        for child in idle:
+            child.close()
+
+
 class ProcessPlayer:
     """A player in a child process, of which several work at a time.
 
@@ -250,18 +274,24 @@ class ProcessPlayer:
 
     def __init__(self, opens: Opens) -> None:
         self._opens = opens
-        self._start()
+        self._start(_idle.pop() if _idle else self._child_process())
 
-    def _start(self) -> None:
-        self._child = Child("probe_kit.extract.sources.player:serve")
-        self._child.connection.send(self._opens)
+    @staticmethod
+    def _child_process() -> Child:
+        return Child("probe_kit.extract.sources.player:serve")
+
+    def _start(self, child: Child) -> None:
+        self._child, self._answers_due = child, 0
+        self._send(self._opens)
+
+    def _send(self, message: Any) -> None:
+        with suppress(BrokenPipeError, ConnectionResetError):  # `answer` finds out and says so
+            self._child.connection.send(message)
 
     def ask(self, method: str, *arguments: Any, then: Request | None = None) -> None:
         """Send the request; the child works while this process continues."""
-        try:
-            self._child.connection.send(((method, arguments), then))
-        except (BrokenPipeError, ConnectionResetError):
-            return  # `answer` finds out and says so
+        self._then, self._answers_due = then, 1
+        self._send(((method, arguments), then))
 
     def answer(self) -> Answer:
         """Wait for the answer."""
@@ -269,17 +299,24 @@ class ProcessPlayer:
             answer = self._child.connection.recv()
         except (EOFError, ConnectionResetError):
             code = self._child.close()
-            self._start()
+            self._start(self._child_process())
             raise StageDiedError(
                 f"the process that simulates the episode ended with code {code}; look above for its last words"
             ) from None
+        began_another = self._then is not None and isinstance(answer, Ending)
+        self._then, self._answers_due = None, int(began_another)
         if isinstance(answer, ProbeKitError):
             raise answer
         result: Answer = answer
         return result
 
     def close(self) -> None:
-        """End the child."""
+        """End the child, or leave it to the next player; one that still works is ended."""
+        if _idle is not None and not self._answers_due:
+            with suppress(BrokenPipeError, ConnectionResetError):
+                self._child.connection.send(None)
+                _idle.append(self._child)
+                return
         self._child.close()
 
 
@@ -287,22 +324,29 @@ AskablePlayer = LocalPlayer | ProcessPlayer
 
 
 def serve(connection: Connection) -> None:
-    """Answer requests in the child process until the parent hangs up."""
-    try:
-        player = connection.recv()()
-    except ProbeKitError as error:
-        connection.recv()
-        connection.send(error)
-        return
-    try:
-        while True:
-            request, then = connection.recv()
-            answer = _answer_of_call(player, request)
-            connection.send(answer)
-            if then is not None and isinstance(answer, Ending):
-                connection.send(_answer_of_call(player, then))
-    finally:
-        player.close()
+    """Open one player after the other in the child process and answer its requests, until the parent hangs up."""
+    while True:
+        opens = connection.recv()
+        try:
+            player = opens()
+        except ProbeKitError as error:
+            connection.recv()
+            connection.send(error)
+            return
+        try:
+            _serve_player(player, connection)
+        finally:
+            player.close()
+
+
+def _serve_player(player: Player, connection: Connection) -> None:
+    """Answer requests up to the one that closes the player."""
+    while (message := connection.recv()) is not None:
+        request, then = message
+        answer = _answer_of_call(player, request)
+        connection.send(answer)
+        if then is not None and isinstance(answer, Ending):
+            connection.send(_answer_of_call(player, then))
 
 
 def _answer_of_call(player: Player, request: Request) -> Answer | ProbeKitError:

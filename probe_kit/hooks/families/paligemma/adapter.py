@@ -59,8 +59,17 @@ class PaliGemma(VisionLanguageModel):
         return packed.positions(_FIRST_POSITION)
 
     def other_inputs(self, packed: LeftPacked) -> dict[str, Tensor]:
-        """Return `token_type_ids`: zero marks a position of the prompt, which attends both ways."""
-        return {"token_type_ids": torch.zeros_like(packed.ids)}
+        """Return `token_type_ids`, and `attention_mask` (B, 1, T, T), True where a query sees a key.
+
+        A type of zero marks a position of the prompt, which attends both ways. transformers makes the same mask of
+        the types by `torch.vmap`, which takes longer than all else in a pass of the embedded network. It makes
+        another kind of mask for an attention other than torch's own, and is left to it then.
+        """
+        types = {"token_type_ids": torch.zeros_like(packed.ids)}
+        if self.text_config._attn_implementation != "sdpa":  # transformers has no public name for it
+            return types
+        seen = packed.mask.bool()[:, None, None, :].expand(-1, 1, packed.ids.shape[1], -1)
+        return {**types, "attention_mask": seen.contiguous()}
 
 
 def load_vlm_tiny(

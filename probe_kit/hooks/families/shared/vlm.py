@@ -63,15 +63,14 @@ class Prefill:
             network: The network, called like transformers' own classes.
             packed: The prompts as one batch.
             counted: (…, B, T) positions.
-            picture_inputs: Further keywords, such as pictures.
+            picture_inputs: Further keywords, such as pictures, or an `attention_mask` in place of the padding's.
         """
         output = network(
             input_ids=packed.ids,
-            attention_mask=packed.mask,
             position_ids=counted,
             use_cache=True,
             logits_to_keep=1,
-            **picture_inputs,
+            **{"attention_mask": packed.mask, **picture_inputs},
         )
         last = counted.amax(dim=-1, keepdim=True)
         return cls(network, packed.mask, last, output.logits[:, -1], output.past_key_values)
