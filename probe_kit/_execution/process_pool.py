@@ -16,6 +16,7 @@ from importlib import import_module
 from multiprocessing.connection import Connection, wait
 from typing import Any, Self
 
+from probe_kit._execution.array_connection import ArrayConnection, open_shared_memory
 from probe_kit._execution.executor import Lost, Work
 from probe_kit._system.machine import CORES, cores_here
 
@@ -31,15 +32,17 @@ class Child:
 
     def __init__(self, service: str, environment: Mapping[str, str] | None = None) -> None:
         ours, theirs = socket.socketpair()
+        memory = open_shared_memory()
         with theirs:
+            descriptors = theirs.fileno(), memory
             # The child imports from wherever this process does, also where a script or notebook changed it.
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "probe_kit._execution.process_pool", service, str(theirs.fileno())],
-                pass_fds=[theirs.fileno()],
+                [sys.executable, "-m", "probe_kit._execution.process_pool", service, *map(str, descriptors)],
+                pass_fds=descriptors,
                 env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path)), **(environment or {})},
                 start_new_session=True,
             )
-        self.connection = Connection(ours.detach())
+        self.connection = ArrayConnection(Connection(ours.detach()), memory, is_child=False)
 
     @property
     def pid(self) -> int:
@@ -57,10 +60,10 @@ class Child:
 
 
 def main() -> None:
-    """Serve the connection whose file descriptor is the second argument."""
+    """Serve the connection whose file descriptor is the second argument; that of its memory is the third."""
     module, name = sys.argv[1].split(":")
-    service: Callable[[Connection], None] = getattr(import_module(module), name)
-    with Connection(int(sys.argv[2])) as connection:
+    service: Callable[[ArrayConnection], None] = getattr(import_module(module), name)
+    with ArrayConnection(Connection(int(sys.argv[2])), int(sys.argv[3]), is_child=True) as connection:
         try:
             service(connection)
         except (EOFError, BrokenPipeError, ConnectionResetError):
@@ -138,11 +141,12 @@ class ProcessPool:
 
     def receive(self) -> Iterator[tuple[int, Any]]:
         """Wait until workers send something; yield number and message of each, and `Lost` for one that died."""
-        connections = [child.connection for child in self._children.values()]
-        while not (ready := wait(connections, LONGEST_WAIT_S)):
+        # Between two messages the executor may start others.
+        waiting = {child.connection.fileno(): (slot, child) for slot, child in self._children.items()}
+        while not (ready := wait(waiting, LONGEST_WAIT_S)):
             pass
-        for slot, child in self._children.copy().items():  # between two messages the executor may start others
-            if child.connection not in ready:
+        for descriptor, (slot, child) in waiting.items():
+            if descriptor not in ready:
                 continue
             try:
                 message = child.connection.recv()

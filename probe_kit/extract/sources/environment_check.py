@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import NoReturn
 
@@ -10,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from probe_kit._execution.array_connection import ArrayConnection
 from probe_kit._execution.process_pool import Child
 from probe_kit._system.counting import plural
 from probe_kit.errors import MissingExtraError, ProbeKitError, UsageError
@@ -176,7 +176,7 @@ class _BrokenError(ProbeKitError):
     """The error of a broken promise."""
 
 
-def serve(connection: Connection) -> None:
+def serve(connection: ArrayConnection) -> None:
     """Play one episode in this process, and send its steps or its error."""
     source, episode = connection.recv()
     try:

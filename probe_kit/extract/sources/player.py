@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from hashlib import blake2b
-from multiprocessing.connection import Connection
 from time import perf_counter
 from typing import Any
 
@@ -14,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from probe_kit._execution.array_connection import ArrayConnection
 from probe_kit._execution.process_pool import Child
 from probe_kit.errors import (
     ActionError,
@@ -323,7 +323,7 @@ class ProcessPlayer:
 AskablePlayer = LocalPlayer | ProcessPlayer
 
 
-def serve(connection: Connection) -> None:
+def serve(connection: ArrayConnection) -> None:
     """Open one player after the other in the child process and answer its requests, until the parent hangs up."""
     while True:
         opens = connection.recv()
@@ -339,7 +339,7 @@ def serve(connection: Connection) -> None:
             player.close()
 
 
-def _serve_player(player: Player, connection: Connection) -> None:
+def _serve_player(player: Player, connection: ArrayConnection) -> None:
     """Answer requests up to the one that closes the player."""
     while (message := connection.recv()) is not None:
         request, then = message

@@ -82,7 +82,11 @@ def begin_randomness(seed: int) -> None:
 
     random.seed(seed)
     np.random.seed(seed % 2**32)  # noqa: NPY002
-    torch.manual_seed(seed)
+    if torch.accelerator.is_available():
+        torch.manual_seed(seed)
+    else:
+        # The former would write down three stack traces, for GPUs that are not there: 1 ms deep in a run.
+        torch.default_generator.manual_seed(seed)
 
 
 def copy_observations(observations: Sequence[Observation]) -> list[Observation]:

@@ -1,8 +1,10 @@
 """Arrays of numpy and torch, rows of large ones, and their standardisation."""
 
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -84,11 +86,22 @@ WORTH_THREADS = 2**18
 @contextmanager
 def threads_for(features: "Features") -> Iterator[None]:
     """Let BLAS compute in one thread here, unless products of (N, D) features are worth several."""
-    from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
-
     count, width = features.shape
-    with threadpool_limits(None if count * min(count, width) >= WORTH_THREADS else 1, user_api="blas"):
+    limit = None if count * min(count, width) >= WORTH_THREADS else 1
+    with _thread_pools(len(sys.modules)).limit(limits=limit, user_api="blas"):
         yield
+
+
+@lru_cache(maxsize=1)
+def _thread_pools(modules: int) -> Any:
+    """Return the control of the libraries that have threads, while no more `modules` are imported.
+
+    It looks for them among all libraries of the process, which takes some milliseconds beside torch and lerobot.
+    """
+    from threadpoolctl import ThreadpoolController  # type: ignore[import-untyped]
+
+    del modules
+    return ThreadpoolController()
 
 
 # -- rows of large arrays ------------------------------------------------------------------------------------
