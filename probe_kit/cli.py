@@ -246,7 +246,7 @@ def main() -> None:
         if isinstance(stream, TextIOWrapper):  # signs that the terminal's encoding lacks are no reason to fail
             stream.reconfigure(errors="backslashreplace")
     warnings.showwarning = _show_warning
-    # Python looks through all objects that imports made whenever a quarter is new, which costs most commands about
-    # half a second and finds nothing. What was made lately is looked through as often as ever.
+    # Python looks for cyclic garbage among all objects whenever a quarter of them is new. Imports make hundreds of
+    # thousands that stay, which costs commands with a model half a second. New ones are looked at as before.
     gc.set_threshold(*gc.get_threshold()[:2], 100)
     app()

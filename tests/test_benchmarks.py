@@ -16,6 +16,7 @@ SMALLEST: dict[str, list[str]] = {
     "diagnose_organisms": ["OUT", "--draws", "1", "--frames", "6", "--organisms", "deaf"],
     "drift_null": ["--draws", "1"],
     "env": ["speed", "--episodes", "1"],
+    "exchange": ["--observations", "2"],
     "extract": ["--episodes", "4", "--width", "16", "--loop", "2", "--repeats", "1"],
     "full_run": ["OUT", "--episodes", "264", "--permutations", "1"],
     "integrity": ["--episodes", "8", "--width", "16", "--repeats", "1", "--gigabytes", "0.01"],

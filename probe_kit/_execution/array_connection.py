@@ -25,7 +25,7 @@ _ALL_BYTES = mmap.PAGESIZE + 2 * _DIRECTION_BYTES
 
 def open_shared_memory() -> int:
     """Return the descriptor of new memory for two ends; it takes room only where something was written."""
-    if hasattr(os, "memfd_create"):  # Linux alone; elsewhere a file that nobody else can open
+    if hasattr(os, "memfd_create"):  # Linux alone; elsewhere a file without a name
         descriptor = os.memfd_create("probe-kit")
     else:
         with tempfile.TemporaryFile() as file:

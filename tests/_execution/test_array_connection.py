@@ -1,10 +1,10 @@
 """Messages between a process and its child arrive as they were sent, whatever way their arrays take."""
 
+import os
 import socket
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from multiprocessing.connection import Connection
-from os import dup
 from typing import Any
 
 import numpy as np
@@ -17,12 +17,14 @@ Ends = tuple[ArrayConnection, ArrayConnection]
 PICTURE = np.arange(480 * 640 * 3, dtype=np.uint8).reshape(480, 640, 3)
 
 
-@pytest.fixture
-def ends() -> Iterator[Ends]:
+@pytest.fixture(params=["memory", "file"])
+def ends(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[Ends]:
     """The parent's and the child's end; both in this process."""
+    if request.param == "file":  # of systems other than Linux
+        monkeypatch.delattr(os, "memfd_create", raising=False)
     ours, theirs = (Connection(end.detach()) for end in socket.socketpair())
     memory = open_shared_memory()
-    with ArrayConnection(ours, dup(memory), False) as parent, ArrayConnection(theirs, memory, True) as child:
+    with ArrayConnection(ours, os.dup(memory), False) as parent, ArrayConnection(theirs, memory, True) as child:
         yield parent, child
 
 

@@ -68,8 +68,8 @@ class PaliGemma(VisionLanguageModel):
         types = {"token_type_ids": torch.zeros_like(packed.ids)}
         if self.text_config._attn_implementation != "sdpa":  # transformers has no public name for it
             return types
-        seen = packed.mask.bool()[:, None, None, :].expand(-1, 1, packed.ids.shape[1], -1)
-        return {**types, "attention_mask": seen.contiguous()}
+        by_query = packed.mask.bool()[:, None, None, :].expand(-1, 1, packed.ids.shape[1], -1)
+        return {**types, "attention_mask": by_query.contiguous()}
 
 
 def load_vlm_tiny(
