@@ -33,7 +33,7 @@ def demo(
 ) -> None:
     """Run the whole pipeline on the embedded models: answers, episodes, activations, probes, retention.
 
-    Takes about 2 minutes on 2 cores and downloads nothing. --full takes four times as long, --compare 20 times.
+    Takes 1 to 2 minutes on 2 cores and downloads nothing. --full takes four times as long, --compare 20 times.
     """
     from probe_kit.demo.pipeline import FULL, QUICK, compare_organisms, run_demo
 

@@ -361,7 +361,7 @@ def run_demo(folder: Path, stage: NamedProgress, size: Size = QUICK) -> Demo:
     Args:
         folder: Folder of all products.
         stage: Gives a progress callback (done, total, …) for a stage of this name.
-        size: Items and permutations; by default about 2 minutes of work.
+        size: Items and permutations; by default 1 to 2 minutes of work on two cores.
     """
     suite = _questions(folder, size, stage)
     vlm_run = ask_vlm(VLM, suite, folder, stage)
