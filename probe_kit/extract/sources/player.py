@@ -218,6 +218,11 @@ Opens = Callable[[], Player]
 """A function that opens a player; a child process imports it by its name."""
 
 
+def request_after(answer: object, then: Request | None) -> Request | None:
+    """Return the request that a player starts by itself after an answer: `then` if its episode ended, else none."""
+    return then if isinstance(answer, Ending) else None
+
+
 class LocalPlayer:
     """A player in this process, asked first and answered later: the work is done when the answer is wanted."""
 
@@ -234,8 +239,8 @@ class LocalPlayer:
     def answer(self) -> Answer:
         """Return the answer to the last request, or raise its error."""
         answer = self._player.answer(*self._request)
-        if self._then is not None and isinstance(answer, Ending):
-            self._request, self._then = self._then, None
+        if (following := request_after(answer, self._then)) is not None:
+            self._request, self._then = following, None
         return answer
 
     def close(self) -> None:
@@ -281,7 +286,7 @@ class ProcessPlayer:
         return Child("probe_kit.extract.sources.player:serve")
 
     def _start(self, child: Child) -> None:
-        self._child, self._answers_due = child, 0
+        self._child, self._is_working = child, False
         self._send(self._opens)
 
     def _send(self, message: Any) -> None:
@@ -290,7 +295,7 @@ class ProcessPlayer:
 
     def ask(self, method: str, *arguments: Any, then: Request | None = None) -> None:
         """Send the request; the child works while this process continues."""
-        self._then, self._answers_due = then, 1
+        self._then, self._is_working = then, True
         self._send(((method, arguments), then))
 
     def answer(self) -> Answer:
@@ -303,8 +308,8 @@ class ProcessPlayer:
             raise StageDiedError(
                 f"the process that simulates the episode ended with code {code}; look above for its last words"
             ) from None
-        began_another = self._then is not None and isinstance(answer, Ending)
-        self._then, self._answers_due = None, int(began_another)
+        self._is_working = request_after(answer, self._then) is not None
+        self._then = None
         if isinstance(answer, ProbeKitError):
             raise answer
         result: Answer = answer
@@ -312,7 +317,7 @@ class ProcessPlayer:
 
     def close(self) -> None:
         """End the child, or leave it to the next player; one that still works is ended."""
-        if _idle is not None and not self._answers_due:
+        if _idle is not None and not self._is_working:
             with suppress(BrokenPipeError, ConnectionResetError):
                 self._child.connection.send(None)
                 _idle.append(self._child)
@@ -345,8 +350,8 @@ def _serve_player(player: Player, connection: ArrayConnection) -> None:
         request, then = message
         answer = _answer_of_call(player, request)
         connection.send(answer)
-        if then is not None and isinstance(answer, Ending):
-            connection.send(_answer_of_call(player, then))
+        if (following := request_after(answer, then)) is not None:
+            connection.send(_answer_of_call(player, following))
 
 
 def _answer_of_call(player: Player, request: Request) -> Answer | ProbeKitError:
