@@ -219,7 +219,7 @@ Opens = Callable[[], Player]
 
 
 def request_after(answer: object, then: Request | None) -> Request | None:
-    """Return the request that a player starts by itself after an answer: `then` if its episode ended, else none."""
+    """Return the request that a player starts after an answer: `then` if its episode ended, else None."""
     return then if isinstance(answer, Ending) else None
 
 
